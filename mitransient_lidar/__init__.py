@@ -1,0 +1,62 @@
+"""Simulator of multipixel depth-sounding lidar, built on Mitsuba 3 and Dr.Jit.
+
+Importing the package finds LLVM, chooses a Mitsuba variant when none is set, and registers the plugins, so
+that plain Mitsuba loads and renders lidar scenes::
+
+    import mitransient_lidar  # before mitsuba: it tells Dr.Jit where LLVM is
+    import mitsuba as mi
+
+    scene = mi.load_file("scene.xml")
+    energy = mi.render(scene)  # received energy in J, (pixel, time)
+
+:func:`render` renders to an accuracy instead and returns waveforms with standard errors as an
+``xarray.Dataset``; :func:`open` reads such a result back from an EXR stack or a NetCDF file.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mitransient_lidar._version import __version__
+
+if importlib.util.find_spec("mitransient_lidar.plugins") is None:
+    # Run from the repository root, this folder shadows the installed package; plugins/ and scenes/ lie beside it.
+    __path__.append(str(Path(__file__).resolve().parent.parent))
+
+from mitransient_lidar import variants as _variants
+
+_variants.prepare_llvm()
+
+import mitsuba as _mi  # noqa: E402  (Dr.Jit looks for LLVM when it is first imported)
+
+_mi.detail.add_variant_callback(_variants.register_plugins)
+try:
+    if _mi.variant() is None:
+        _mi.set_variant(_variants.choose_variant())
+    else:
+        if _mi.variant().startswith("llvm"):
+            _variants.check_llvm()
+        _variants.register_plugins(None, _mi.variant())
+except _variants.UserError as _error:
+    raise ImportError(str(_error)) from None
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["__version__", "open", "render"]
+
+
+def render(scene: Any, **options: Any) -> xarray.Dataset:
+    """Render a lidar scene to an accuracy; see :func:`mitransient_lidar.rendering.render`."""
+    from mitransient_lidar.rendering import render as render_scene
+
+    return render_scene(scene, **options)
+
+
+def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect
+    """Read a result from an EXR stack or a NetCDF file; see :func:`mitransient_lidar.results.open`."""
+    from mitransient_lidar.results import open as open_result
+
+    return open_result(path)

@@ -1,0 +1,168 @@
+"""Stacks of time bins in OpenEXR files.
+
+A file holds one part of 32-bit floating-point scan lines, compressed with ZIP. Every time bin is a layer: the stack
+``bin`` with the components ``Y`` and ``stderr`` becomes the channels ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y``
+and so on, with four digits, or as many as the last bin needs.
+
+The attributes of a stack are written twice. OpenEXR knows integers and floats of 32 bits only and no empty list, so
+one JSON string (header attribute ``mitransientLidar``) carries them exactly, and readable copies under their own names
+serve ``exrheader`` and other programs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+
+from mitransient_lidar.errors import UserError
+
+SIGNATURE = b"\x76\x2f\x31\x01"  #: The first four bytes of every OpenEXR file.
+
+_EXACT = "mitransientLidar"
+_LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
+_LONGEST_NAME = 255  # bytes; OpenEXR drops attributes with longer names without a word
+_INT32 = np.iinfo(np.int32)
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+Stacks = dict[str, dict[str, npt.NDArray[np.float32]]]
+
+
+def write(
+    path: str | os.PathLike[str],
+    stacks: Mapping[str, Mapping[str, npt.NDArray[Any]]],
+    exact: Mapping[str, Any],
+    readable: Mapping[str, Any],
+) -> None:
+    """Write stacks of time bins.
+
+    Parameters
+    ----------
+    path : path
+        File to write; an existing one is overwritten.
+    stacks : mapping of str to mapping of str to array
+        Stack name (letters) to component name to values of shape (row, column, time); stored as 32-bit floats.
+    exact : mapping
+        Metadata that must come back exactly; anything that JSON holds.
+    readable : mapping of str to int, float, str or a list of those
+        Attributes for readers of the header. Integers and floats beyond 32 bits are written as text, empty lists are
+        left out.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    channels: dict[str, npt.NDArray[np.float32]] = {}
+    for stack, components in stacks.items():
+        for component, values in components.items():
+            # Bins first, so that every channel is one contiguous image.
+            images = np.ascontiguousarray(np.moveaxis(np.asarray(values, dtype=np.float32), -1, 0))
+            digits = max(4, len(str(len(images) - 1)))
+            for index, image in enumerate(images):
+                channels[f"{stack}{index:0{digits}d}.{component}"] = image
+
+    header = {name: _plain(value) for name, value in readable.items() if _is_storable(name, value)}
+    header[_EXACT] = json.dumps(exact)
+    header["compression"] = OpenEXR.ZIP_COMPRESSION
+    header["type"] = OpenEXR.scanlineimage
+    with _silent_library():
+        try:
+            with OpenEXR.File(header, channels) as file:
+                file.write(os.fspath(path))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+
+def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
+    """Read what `write` has written.
+
+    Parameters
+    ----------
+    path : path
+        An OpenEXR file.
+
+    Returns
+    -------
+    stacks : dict of str to dict of str to float32 array
+        Stack name to component name to values of shape (row, column, time).
+    exact : dict
+        The exact metadata.
+
+    Raises
+    ------
+    UserError
+        If the file is damaged, truncated, or was not written by `write`.
+    """
+    damaged = f"{path} is damaged or truncated: its OpenEXR data cannot be read."
+    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
+    with _silent_library():
+        try:
+            with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+                # Closing the file empties its dictionaries and frees the pixels.
+                header = dict(file.header())
+                images = {name: channel.pixels.copy() for name, channel in file.channels().items()}
+        except (RuntimeError, ValueError) as error:
+            raise UserError(damaged) from error
+    if _EXACT not in header:
+        raise UserError(foreign)
+
+    layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
+    for name, image in images.items():
+        if match := _LAYER.fullmatch(name):
+            layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
+    stacks: Stacks = {}
+    for (stack, component), by_bin in layers.items():
+        if sorted(by_bin) != list(range(len(by_bin))):
+            raise UserError(damaged)
+        stacks.setdefault(stack, {})[component] = np.stack([by_bin[index] for index in range(len(by_bin))], axis=-1)
+    try:
+        exact = json.loads(header[_EXACT])
+    except ValueError as error:
+        raise UserError(damaged) from error
+    if not isinstance(exact, dict):
+        raise UserError(foreign)
+    return stacks, exact
+
+
+def _is_storable(name: str, value: Any) -> bool:
+    """Tell whether an OpenEXR header can hold the attribute: no empty list, no overlong name."""
+    return value != [] and 0 < len(name.encode()) <= _LONGEST_NAME
+
+
+def _plain(value: Any) -> Any:
+    """Replace numbers that do not fit into 32 bits by text: OpenEXR would store 0 or infinity."""
+    if isinstance(value, list):
+        plain = [_plain(item) for item in value]
+        return [str(item) for item in value] if any(isinstance(item, str) for item in plain) else plain
+    if isinstance(value, int):
+        return value if _INT32.min <= value <= _INT32.max else str(value)
+    if isinstance(value, float) and _FLOAT32_MAX < abs(value) < float("inf"):
+        return str(value)
+    return value
+
+
+@contextlib.contextmanager
+def _silent_library() -> Iterator[None]:
+    """Keep OpenEXR's own messages off the terminal: its errors reach the user as one sentence.
+
+    The library prints from C (file descriptor 2) and from Python (stdout), with no switch for either.
+    """
+    saved = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(nowhere)

@@ -1,0 +1,55 @@
+"""Validators of numeric parameters: each returns the clean value or raises ``ValueError`` in one sentence."""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def finite(name: str, value: object) -> float:
+    """Return `value` as a float; reject anything that is not a finite number."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {value!r} must be a number") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{name} = {number} must be finite")
+    return number
+
+
+def positive(name: str, value: object) -> float:
+    """Return `value` as a float above 0."""
+    number = finite(name, value)
+    if number <= 0:
+        raise ValueError(f"{name} = {number:g} must be greater than 0")
+    return number
+
+
+def non_negative(name: str, value: object) -> float:
+    """Return `value` as a float of at least 0."""
+    number = finite(name, value)
+    if number < 0:
+        raise ValueError(f"{name} = {number:g} must not be negative")
+    return number
+
+
+def in_range(name: str, value: object, low: float, high: float) -> float:
+    """Return `value` as a float in the closed interval [`low`, `high`]."""
+    number = finite(name, value)
+    if not low <= number <= high:
+        raise ValueError(f"{name} = {number:g} must lie between {low:g} and {high:g}")
+    return number
+
+
+def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
+    """Return `values` as a new float64 array without NaN or infinity."""
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {values!r} must hold numbers only") from None
+    if not np.all(np.isfinite(array)):
+        bad = array[~np.isfinite(array)][0]
+        raise ValueError(f"{name} holds {bad} but every value must be finite")
+    return array

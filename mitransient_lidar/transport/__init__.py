@@ -1,0 +1,1 @@
+"""Light transport that the integrators share: poses, fields of view, flight through water, the surface connection."""

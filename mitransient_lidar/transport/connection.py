@@ -1,0 +1,124 @@
+"""The surface connection: how a vertex under water reaches a point laser in the air through a rough, wavy surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.transport.path import optical_length
+from mitransient_lidar.transport.system import LidarScene
+
+
+@dataclass
+class LaserDirection:
+    """How the laser appears from a point under water, through a flat mean surface.
+
+    Attributes
+    ----------
+    in_air
+        Unit direction from the surface to the laser.
+    in_water
+        Unit direction from the point up to the surface, refracted by Snell's law.
+    """
+
+    in_air: mi.Vector3f
+    in_water: mi.Vector3f
+
+
+class SurfaceLobe:
+    """Directions in the water, from a point up to the surface, along which light from the laser may arrive.
+
+    The lobe is that of a flat virtual interface with Gaussian slopes, lit along the direction in which the laser is
+    seen; its slope variance is that of ripples and waves together, so that it covers every facet of the real surface.
+
+    Parameters
+    ----------
+    system
+        The lidar scene.
+    """
+
+    def __init__(self, system: LidarScene) -> None:
+        self.laser = mi.Point3f(system.transmitter.pose.origin.tolist())
+        self.index = float(system.refractive_index)
+        self.slope_variance = float(system.slope_variance)
+
+    def towards_laser(self, point: mi.Point3f) -> LaserDirection:
+        """Return the laser's direction in the air and, refracted, in the water (two fixed-point steps)."""
+        depth = dr.maximum(-point.z, 0)
+        crossing = mi.Point3f(point.x, point.y, 0)
+        for _ in range(3):
+            in_air = dr.normalize(self.laser - crossing)
+            in_water = self._refract(in_air, mi.Normal3f(0, 0, 1))
+            crossing = point + in_water * (depth / in_water.z)
+        return LaserDirection(in_air, in_water)
+
+    def _refract(self, in_air: mi.Vector3f, normal: mi.Normal3f) -> mi.Vector3f:
+        """Return the direction in the water, up to the facet, of light that comes from `in_air` through a facet."""
+        cosine = dr.dot(in_air, normal)
+        eta = 1 / self.index
+        # The light goes on along -in_water; what is returned points back up.
+        root = dr.safe_sqrt(1 - eta * eta * (1 - cosine * cosine))
+        return eta * in_air + (root - eta * cosine) * mi.Vector3f(normal)
+
+    def sample(self, laser: LaserDirection, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+        """Sample a direction of the lobe; return it and its density [1/sr] (0 when the facet is not lit)."""
+        slope = dr.sqrt(-self.slope_variance * dr.log(1 - u.x))
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        normal = mi.Normal3f(dr.normalize(mi.Vector3f(-slope * cos, -slope * sin, 1)))
+        direction = self._refract(laser.in_air, normal)
+        return direction, self.pdf(laser, direction)
+
+    def pdf(self, laser: LaserDirection, direction: mi.Vector3f) -> mi.Float:
+        """Return the density [1/sr] of a direction in the water.
+
+        The facet that refracts the laser's light into it has its normal along n w - i (generalised half vector; Walter
+        et al. 2007, equations 16 and 17, doi:10.2312/EGWR/EGSR07/195-206).
+        """
+        half = self.index * direction - laser.in_air
+        length = dr.norm(half)
+        normal = half / length
+        slope2 = (dr.square(normal.x) + dr.square(normal.y)) / dr.square(normal.z)
+        slopes = dr.exp(-slope2 / self.slope_variance) / (np.pi * self.slope_variance)
+        cos_water = dr.dot(direction, normal)
+        # d(slopes) = d(normal) / cos^3, d(normal) = n^2 |w.m| / |n w - i|^2 d(w).
+        jacobian = dr.square(self.index) * cos_water / dr.square(length)
+        valid = (normal.z > 0) & (cos_water > 0) & (dr.dot(laser.in_air, normal) > 0)
+        cos3 = normal.z * normal.z * normal.z
+        return dr.select(valid, slopes / cos3 * jacobian, 0)
+
+
+def laser_through(
+    system: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
+    """Connect a surface point to the laser by a straight line in the air.
+
+    Parameters
+    ----------
+    system
+        The lidar scene.
+    si
+        Where the light meets the surface; ``si.wi`` is the direction it goes on to.
+    active
+        Which lanes ask.
+
+    Returns
+    -------
+    radiance
+        Energy per area and solid angle [J/(m^2 sr)] that leaves along ``si.wi``: intensity, BSDF with its cosine, and
+        inverse square of the distance; 0 where something is in the way or the surface turns its wet side to the laser.
+    length
+        Optical length of the line [m].
+    """
+    laser = mi.Point3f(system.transmitter.pose.origin.tolist())
+    offset = laser - si.p
+    distance = dr.norm(offset)
+    direction = offset / distance
+    active = active & ~(system.is_surface(si.shape) & (dr.dot(direction, si.n) <= 0))
+    bsdf = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)
+    radiance = bsdf[0] * system.transmitter.intensity(-direction) / dr.square(distance)
+    active &= radiance > 0
+    active &= ~system.scene.ray_test(si.spawn_ray_to(laser), active)
+    return dr.select(active, radiance, 0), optical_length(system, distance, False)

@@ -1,0 +1,272 @@
+"""Shapes of a field of view in tangent-plane angles: area, membership and uniform sampling.
+
+Coordinates (gx, gy) are radians about the optical axis, +gx away from nadir; areas are radians squared.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.optics.checks import finite, in_range, positive
+
+#: Bisection steps that bring an inverted distribution function to float32 accuracy.
+_BISECTION_STEPS = 25
+
+
+class Field(ABC):
+    """A region of the tangent plane."""
+
+    area: float
+
+    @abstractmethod
+    def contains(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
+        """Return whether points lie inside."""
+
+    @abstractmethod
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers in the unit square to points that are uniform in the region."""
+
+    @abstractmethod
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Return (gx_min, gx_max, gy_min, gy_max)."""
+
+    def centroid(self) -> tuple[float, float]:
+        """Return the centre of gravity (gx, gy) in radians, within a hundredth of the extent."""
+        gx_min, gx_max, gy_min, gy_max = self.bounds()
+        fraction = (np.arange(200) + 0.5) / 200
+        gx, gy = np.meshgrid(gx_min + fraction * (gx_max - gx_min), gy_min + fraction * (gy_max - gy_min))
+        inside = np.array(self.contains(mi.Float(gx.ravel()), mi.Float(gy.ravel())), dtype=bool)
+        return float(gx.ravel()[inside].mean()), float(gy.ravel()[inside].mean())
+
+
+@dataclass(frozen=True)
+class Sector(Field):
+    """Circle, ring or sector of a ring about a centre.
+
+    Parameters
+    ----------
+    outer, inner
+        Radii [rad], 0 <= inner < outer.
+    start, extent
+        Azimuth at which the sector begins, from +gx towards +gy, and its size [rad]; extent 2 pi is a whole ring.
+    centre
+        (gx, gy) of the centre [rad].
+    """
+
+    outer: float
+    inner: float = 0.0
+    start: float = 0.0
+    extent: float = 2 * np.pi
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        positive("outer radius of the field of view", self.outer)
+        in_range("inner radius of the field of view", self.inner, 0.0, self.outer * (1 - 1e-9))
+        positive("extent of the field-of-view sector", self.extent)
+        in_range("extent of the field-of-view sector", self.extent, 0.0, 2 * np.pi + 1e-9)
+
+    @property
+    def area(self) -> float:  # type: ignore[override]
+        """Area [rad^2]."""
+        return 0.5 * self.extent * (self.outer**2 - self.inner**2)
+
+    def contains(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
+        """Return whether points lie inside."""
+        x, y = gx - self.centre[0], gy - self.centre[1]
+        r2 = x * x + y * y
+        inside = (r2 <= self.outer**2) & (r2 >= self.inner**2)
+        if self.extent < 2 * np.pi:
+            azimuth = dr.atan2(y, x) - self.start
+            azimuth -= 2 * np.pi * dr.floor(azimuth * dr.inv_two_pi)
+            inside &= azimuth < self.extent
+        return inside
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points."""
+        r = dr.sqrt(dr.lerp(self.inner**2, self.outer**2, u.x))
+        sin, cos = dr.sincos(self.start + self.extent * u.y)
+        return dr.fma(r, cos, self.centre[0]), dr.fma(r, sin, self.centre[1])
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Return (gx_min, gx_max, gy_min, gy_max) of the whole circle."""
+        (x, y), r = self.centre, self.outer
+        return x - r, x + r, y - r, y + r
+
+
+@dataclass(frozen=True)
+class Rectangle(Field):
+    """Rectangle with sides along gx and gy [rad]."""
+
+    gx_min: float
+    gx_max: float
+    gy_min: float
+    gy_max: float
+
+    def __post_init__(self) -> None:
+        positive("extent of the field of view along gx", self.gx_max - self.gx_min)
+        positive("extent of the field of view along gy", self.gy_max - self.gy_min)
+
+    @property
+    def area(self) -> float:  # type: ignore[override]
+        """Area [rad^2]."""
+        return (self.gx_max - self.gx_min) * (self.gy_max - self.gy_min)
+
+    def contains(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
+        """Return whether points lie inside; the lower edges belong to the rectangle, the upper ones do not."""
+        return (gx >= self.gx_min) & (gx < self.gx_max) & (gy >= self.gy_min) & (gy < self.gy_max)
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points."""
+        return dr.lerp(self.gx_min, self.gx_max, u.x), dr.lerp(self.gy_min, self.gy_max, u.y)
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Return (gx_min, gx_max, gy_min, gy_max)."""
+        return self.gx_min, self.gx_max, self.gy_min, self.gy_max
+
+
+@dataclass(frozen=True)
+class Strip(Field):
+    """Part of a circle about the axis between two lines of constant gx: a pixel of the published 1x4 receiver.
+
+    Parameters
+    ----------
+    radius
+        Radius of the circle [rad], positive.
+    gx_min, gx_max
+        The lines [rad]; they must leave a part of the circle between them.
+    """
+
+    radius: float
+    gx_min: float
+    gx_max: float
+
+    def __post_init__(self) -> None:
+        positive("radius of the field of view", self.radius)
+        low, high = self._limits()
+        if not high > low:
+            raise ValueError(
+                f"strip from gx = {self.gx_min} to {self.gx_max} rad must overlap the circle of radius {self.radius} rad"
+            )
+
+    def _limits(self) -> tuple[float, float]:
+        return max(self.gx_min, -self.radius), min(self.gx_max, self.radius)
+
+    @staticmethod
+    def _half_disc(x: float) -> float:
+        """Area of the unit disc's part with abscissa below x, less half the disc."""
+        return float(x * np.sqrt(max(0.0, 1 - x * x)) + np.arcsin(x))
+
+    @property
+    def area(self) -> float:  # type: ignore[override]
+        """Area [rad^2]."""
+        low, high = self._limits()
+        return self.radius**2 * (self._half_disc(high / self.radius) - self._half_disc(low / self.radius))
+
+    def contains(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
+        """Return whether points lie inside."""
+        return (gx * gx + gy * gy <= self.radius**2) & (gx >= self.gx_min) & (gx < self.gx_max)
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points: invert the area left of gx by bisection, then pick gy on the chord."""
+        low, high = (limit / self.radius for limit in self._limits())
+        target = dr.lerp(self._half_disc(low), self._half_disc(high), u.x)
+        left, right = mi.Float(low), mi.Float(high)
+        for _ in range(_BISECTION_STEPS):
+            middle = 0.5 * (left + right)
+            above = middle * dr.safe_sqrt(1 - middle * middle) + dr.safe_asin(middle) > target
+            left, right = dr.select(above, left, middle), dr.select(above, middle, right)
+        x = 0.5 * (left + right)
+        return x * self.radius, (2 * u.y - 1) * dr.safe_sqrt(1 - x * x) * self.radius
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Return (gx_min, gx_max, gy_min, gy_max)."""
+        low, high = self._limits()
+        return low, high, -self.radius, self.radius
+
+
+class Polygon(Field):
+    """Simple polygon, convex or not.
+
+    Parameters
+    ----------
+    vertices
+        Corners (gx, gy) [rad] in order, shape (n, 2), at least three, not all on one line.
+    """
+
+    def __init__(self, vertices: Sequence[tuple[float, float]]) -> None:
+        points = np.asarray(vertices, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+            raise ValueError(f"polygon: needs at least three corners (gx, gy), got an array of shape {points.shape}")
+        for value in points.ravel():
+            finite("polygon corner", float(value))
+        x, y = points.T
+        signed = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+        if abs(signed) < 1e-18:
+            raise ValueError("polygon: its corners lie on one line, the field of view must have an area")
+        self.vertices = points if signed > 0 else points[::-1].copy()
+        self.area = abs(signed)
+        triangles = _triangulate(self.vertices)
+        areas = np.array([0.5 * abs(_cross(*self.vertices[list(t)])) for t in triangles])
+        self._corners = self.vertices[np.array(triangles)]
+        self._cdf = np.cumsum(areas) / areas.sum()
+
+    def contains(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
+        """Return whether points lie inside: an odd number of edges is crossed on the way to gx = infinity."""
+        inside = mi.Bool(False)
+        for (x0, y0), (x1, y1) in zip(self.vertices, np.roll(self.vertices, -1, axis=0), strict=True):
+            if y0 == y1:
+                continue
+            crosses = (gy < y0) != (gy < y1)
+            inside ^= crosses & (gx < x0 + (gy - y0) * ((x1 - x0) / (y1 - y0)))
+        return inside
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points: pick a triangle by its area, then a point in it."""
+        cdf = mi.Float(self._cdf)
+        index = dr.minimum(
+            dr.binary_search(0, len(self._cdf), lambda i: dr.gather(mi.Float, cdf, i) <= u.x), len(self._cdf) - 1
+        )
+        low = dr.select(index > 0, dr.gather(mi.Float, cdf, index - 1, index > 0), 0)
+        fraction = (u.x - low) / (dr.gather(mi.Float, cdf, index) - low)
+        root = dr.sqrt(dr.clip(fraction, 0, 1))
+        weights = (1 - root, root * (1 - u.y), root * u.y)
+        table = mi.Float(self._corners.ravel())
+        return tuple(
+            sum(w * dr.gather(mi.Float, table, index * 6 + 2 * corner + axis) for corner, w in enumerate(weights))
+            for axis in (0, 1)
+        )
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Return (gx_min, gx_max, gy_min, gy_max)."""
+        (x0, y0), (x1, y1) = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        return float(x0), float(x1), float(y0), float(y1)
+
+
+def _cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
+    """Twice the signed area of a triangle, positive when its corners turn left."""
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
+def _triangulate(points: np.ndarray) -> list[tuple[int, int, int]]:
+    """Cut ears off a polygon whose corners turn left; raise ValueError when its edges cross each other."""
+    rest, triangles = list(range(len(points))), []
+    while len(rest) > 3:
+        for k in range(len(rest)):
+            i, j, m = rest[k - 1], rest[k], rest[(k + 1) % len(rest)]
+            a, b, c = points[[i, j, m]]
+            others = (points[o] for o in rest if o not in (i, j, m))
+            if _cross(a, b, c) >= 0 and not any(
+                _cross(a, b, p) > 0 and _cross(b, c, p) > 0 and _cross(c, a, p) > 0 for p in others
+            ):
+                triangles.append((i, j, m))
+                del rest[k]
+                break
+        else:
+            raise ValueError("polygon: its edges must not cross each other")
+    return [*triangles, (rest[0], rest[1], rest[2])]

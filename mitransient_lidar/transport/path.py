@@ -1,0 +1,80 @@
+"""State of a path and the one function that advances it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.system import LidarScene
+
+
+@dataclass
+class Path:
+    """Where a path has got to.
+
+    Attributes
+    ----------
+    point, direction
+        Last vertex [m] (offset from surfaces against self-intersection) and unit direction of the next leg.
+    in_water
+        Whether the next leg runs in water.
+    length
+        Optical length so far [m]: distance times group index, summed over the legs.
+    throughput
+        Product of the path's factors since the receiver.
+    scatterings
+        Number of scattering events in the water so far.
+    lobe_ratio
+        Density of the surface connection's proposal over that of the walk, for the direction of the next leg; 0 where
+        no connection was tried.
+    active
+        Whether the path goes on.
+    """
+
+    point: mi.Point3f
+    direction: mi.Vector3f
+    in_water: mi.Bool
+    length: mi.Float
+    throughput: mi.Float
+    scatterings: mi.UInt32
+    lobe_ratio: mi.Float
+    active: mi.Bool
+
+    @property
+    def depth(self) -> mi.Float:
+        """Depth below the mean sea level [m]."""
+        return -self.point.z
+
+    @property
+    def downward(self) -> mi.Float:
+        """Vertical component of the direction, positive downwards."""
+        return -self.direction.z
+
+    def ray(self) -> mi.Ray3f:
+        """Return the next leg as a ray."""
+        return mi.Ray3f(self.point, self.direction)
+
+
+def optical_length(system: LidarScene, distance: mi.Float, in_water: mi.Bool | bool) -> mi.Float:
+    """Return the optical length [m] of a leg: its distance times the group index of the medium that it crosses."""
+    return distance * dr.select(mi.Bool(in_water), mi.Float(system.group_index), 1)
+
+
+def advance(path: Path, system: LidarScene, distance: mi.Float, point: mi.Point3f) -> None:
+    """Move a path along its direction to its next vertex.
+
+    Parameters
+    ----------
+    path
+        The path; its vertex and its optical length change.
+    system
+        The lidar scene, whose water times the leg.
+    distance
+        Length of the leg [m].
+    point
+        The vertex at its end [m]. On surfaces the intersection is more accurate than distance times direction.
+    """
+    path.length = dr.select(path.active, path.length + optical_length(system, distance, path.in_water), path.length)
+    path.point = dr.select(path.active, point, path.point)

@@ -1,0 +1,105 @@
+"""Position and axis of the transmitter or the receiver, and tangent-plane coordinates about the axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.optics.checks import finite, in_range, positive
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a transmitter or receiver is and where it looks.
+
+    A point of the tangent plane about the axis is (gx, gy), in radians: its direction is the unit vector along
+    ``axis + gx * far + gy * left``. +gx points away from nadir, and +gy along +y for the default pose.
+
+    Parameters
+    ----------
+    origin
+        Position [m], shape (3,).
+    axis, far, left
+        Orthonormal directions: the optical axis, the direction of +gx and the direction of +gy.
+    """
+
+    origin: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    far: NDArray[np.float64]
+    left: NDArray[np.float64]
+
+    @classmethod
+    def from_angles(cls, altitude: float, off_nadir_deg: float, shot_x: float = 0.0, shot_y: float = 0.0) -> Pose:
+        """Return the pose whose axis lies in the x-z plane, points to +x and down, and meets z = 0 at the shot.
+
+        Parameters
+        ----------
+        altitude
+            Height above the mean sea level [m], positive.
+        off_nadir_deg
+            Angle of the axis from the vertical [deg], 0 to below 90.
+        shot_x, shot_y
+            Where the axis meets the mean sea level [m].
+
+        Raises
+        ------
+        ValueError
+            When a value is out of range.
+        """
+        altitude = positive("altitude", altitude)
+        angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9))
+        sin, cos = np.sin(angle), np.cos(angle)
+        origin = np.array([finite("shot_x", shot_x) - altitude * sin / cos, finite("shot_y", shot_y), altitude])
+        return cls(origin, np.array([sin, 0.0, -cos]), np.array([cos, 0.0, sin]), np.array([0.0, 1.0, 0.0]))
+
+    @classmethod
+    def from_properties(cls, props: mi.Properties) -> Pose:
+        """Read ``to_world``, or ``altitude``, ``off_nadir_deg``, ``shot_x`` and ``shot_y``, from plugin parameters.
+
+        ``to_world`` maps the local axes as Mitsuba's ``look_at`` with ``up = (0, 0, 1)`` does: z is the optical
+        axis, y is +gx (away from nadir) and x is +gy.
+        """
+        if "to_world" in props:
+            if "altitude" in props or "off_nadir_deg" in props:
+                raise ValueError(f"{props.plugin_name()}: give either to_world or altitude and off_nadir_deg, not both")
+            matrix = np.array(props["to_world"].matrix, dtype=np.float64)
+            frame = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+            if not np.allclose(frame.T @ frame, np.eye(3), atol=1e-4):
+                raise ValueError(f"{props.plugin_name()}: to_world must be a rotation and a translation, without shear")
+            return cls(matrix[:3, 3], frame[:, 2], frame[:, 1], frame[:, 0])
+        return cls.from_angles(
+            props.get("altitude", 200.0),
+            props.get("off_nadir_deg", 20.0),
+            props.get("shot_x", 0.0),
+            props.get("shot_y", 0.0),
+        )
+
+    def direction(self, gx: mi.Float, gy: mi.Float) -> mi.Vector3f:
+        """Return the unit direction of the tangent-plane point (gx, gy)."""
+        far, left, axis = (mi.Vector3f(v.tolist()) for v in (self.far, self.left, self.axis))
+        return dr.normalize(dr.fma(far, gx, dr.fma(left, gy, axis)))
+
+    def tangent(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return (gx, gy) of a direction and its cosine with the axis, which is negative behind the tangent plane."""
+        cos_axis = dr.dot(direction, mi.Vector3f(self.axis.tolist()))
+        scale = dr.rcp(cos_axis)
+        return (
+            dr.dot(direction, mi.Vector3f(self.far.tolist())) * scale,
+            dr.dot(direction, mi.Vector3f(self.left.tolist())) * scale,
+            cos_axis,
+        )
+
+    def ground_point(self) -> NDArray[np.float64]:
+        """Return where the axis meets the mean sea level z = 0 [m]; far ahead when it does not look down."""
+        slope = min(float(self.axis[2]), -1e-6)
+        return self.origin + self.axis * (-float(self.origin[2]) / slope)
+
+    def tangent_of_point(self, point: NDArray[np.float64]) -> tuple[float, float]:
+        """Return (gx, gy) in radians of a point [m], shape (3,)."""
+        offset = point - self.origin
+        along = float(offset @ self.axis)
+        return float(offset @ self.far) / along, float(offset @ self.left) / along

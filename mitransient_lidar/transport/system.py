@@ -1,0 +1,109 @@
+"""The parts of a lidar scene that the integrators need, found and checked once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from operator import or_
+
+import mitsuba as mi
+
+from mitransient_lidar.transport.receiving import Receiver
+
+#: Total slope variance assumed for a surface that does not tell its own: a broad lobe serves any sea.
+_UNKNOWN_SLOPE_VARIANCE = 0.04
+
+
+@dataclass(frozen=True)
+class LidarScene:
+    """Transmitter, receiver, film, water and sea surface of a Mitsuba scene.
+
+    Attributes
+    ----------
+    scene
+        The Mitsuba scene.
+    transmitter
+        The ``lidar_transmitter``.
+    receiver
+        Pose, aperture and pixels of the sensor.
+    film
+        Its ``time_gated_film``.
+    water
+        The ``layered_water``, or None in a scene without any.
+    surfaces
+        Shapes that have the water as interior medium.
+    slope_variance
+        Total slope variance of the sea, which shapes the proposals of the surface connection.
+    """
+
+    scene: mi.Scene
+    transmitter: mi.Emitter
+    receiver: Receiver
+    film: mi.Film
+    water: mi.Medium | None
+    surfaces: list[mi.Shape]
+    slope_variance: float
+
+    @classmethod
+    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor) -> LidarScene:
+        """Find the parts in a loaded scene.
+
+        Raises
+        ------
+        ValueError
+            When a part is missing, of a foreign kind, or there is more than one where one is allowed.
+        """
+        if not isinstance(getattr(sensor, "receiver", None), Receiver):
+            raise ValueError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
+        film = sensor.film()
+        if not hasattr(film, "add_transient"):
+            raise ValueError("film: the lidar integrators need a time_gated_film inside the sensor")
+        transmitters = [emitter for emitter in scene.emitters() if hasattr(emitter, "pulse_energy")]
+        if len(transmitters) != 1 or len(scene.emitters()) != 1:
+            raise ValueError(
+                f"emitters: the scene has {len(scene.emitters())} of which {len(transmitters)} are lidar_transmitter; "
+                "allowed is exactly one lidar_transmitter"
+            )
+        surfaces, waters = [], []
+        for shape in scene.shapes():
+            if not shape.is_medium_transition():
+                continue
+            if shape.exterior_medium() is not None:
+                raise ValueError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
+            water = shape.interior_medium()
+            if not hasattr(water, "flight"):
+                raise ValueError(f"shape {shape.id()!r}: its interior medium must be layered_water")
+            surfaces.append(shape)
+            if not any(water is other for other in waters):
+                waters.append(water)
+        for shape in scene.shapes():
+            if hasattr(shape, "ripple_variance") and shape not in surfaces:
+                raise ValueError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
+        if len(waters) > 1:
+            raise ValueError(f"media: the scene has {len(waters)} layered_water, allowed is one that shapes share by reference")
+        if sensor.receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
+            raise ValueError("altitude: transmitter and receiver must be above the mean sea level z = 0")
+        variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
+        return cls(
+            scene,
+            transmitters[0],
+            sensor.receiver,
+            film,
+            waters[0] if waters else None,
+            surfaces,
+            max(variances, default=_UNKNOWN_SLOPE_VARIANCE),
+        )
+
+    @property
+    def refractive_index(self) -> float:
+        """Refractive index of the water, 1 without water."""
+        return self.water.refractive_index if self.water is not None else 1.0
+
+    @property
+    def group_index(self) -> float:
+        """Group index of the water, 1 without water."""
+        return self.water.group_index if self.water is not None else 1.0
+
+    def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:
+        """Return whether a shape bounds the water."""
+        return reduce(or_, (shape == mi.ShapePtr(surface) for surface in self.surfaces), mi.Bool(False))

@@ -1,0 +1,352 @@
+"""Integrator plugin ``lidar_volpath``: unidirectional, transient, unbiased."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.optics.checks import in_range
+from mitransient_lidar.transport.connection import LaserDirection, SurfaceLobe, laser_through
+from mitransient_lidar.transport.path import Path, advance, optical_length
+from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
+from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.system import LidarScene
+
+#: Share of scattering events whose new direction is drawn from a broad lobe towards the laser instead of the phase
+#: function, and the asymmetry of that lobe: every echo needs one large-angle scattering, which is rare by nature.
+TURN_SHARE = 0.25
+TURN_ASYMMETRY = 0.7
+
+_CONNECTIONS = ("combined", "lobe", "walk")
+
+
+@dataclass
+class Turn:
+    """Directions that leave a vertex, as density and as value of phase function or BSDF.
+
+    Attributes
+    ----------
+    value
+        Phase function [1/sr], or BSDF times cosine.
+    pdf
+        Density with which the walk draws the direction [1/sr].
+    """
+
+    value: mi.Float
+    pdf: mi.Float
+
+
+class LidarVolpath(mi.CppADIntegrator):
+    r"""Transient volumetric path tracer with surface connection (``lidar_volpath``).
+
+    =====================  =======  ====================================================================================
+    Parameter              Type     Meaning
+    =====================  =======  ====================================================================================
+    paths_per_pass       integer  Paths of one pass, 1024 to 2^28, unless the sample count per pixel (``spp``) is given
+                                    to ``mi.render``. Default: 262144
+    max_scatterings        integer  Largest number of scattering events in the water, -1 for any. Default: -1
+    roulette_threshold     float    Throughput below which Russian roulette begins, 0 to 1. Default: 0.05
+    connection             string   How vertices under water reach the laser: ``combined``, or for checks only
+                                    ``lobe`` or ``walk``. Default: ``combined``
+    =====================  =======  ====================================================================================
+
+    The unbiased reference. Paths start at the receiver, cross the surface (waves and ripples), scatter to any order,
+    meet bottom and targets, and are reflected inside the surface. A point laser cannot be met by chance through a
+    refracting surface, so each vertex under water proposes directions from the lobe in which the laser appears through
+    a flat sea of the same total slope variance, traces one to the real surface, and connects there; where the walk
+    itself reaches the surface unscattered it connects, too. Both estimate the same paths and are combined by the
+    balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498).
+
+    Every leg is timed with the group index of the medium that it crosses.
+
+    .. code-block:: xml
+
+        <integrator type="lidar_volpath">
+            <integer name="paths_per_pass" value="262144"/>
+        </integrator>
+
+    .. code-block:: python
+
+        {'type': 'lidar_volpath', 'paths_per_pass': 262144}
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.paths_per_pass = int(
+            in_range("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
+        )
+        self.max_scatterings = int(in_range("max_scatterings", props.get("max_scatterings", -1), -1, 2**30))
+        self.roulette_threshold = in_range("roulette_threshold", props.get("roulette_threshold", 0.05), 0.0, 1.0)
+        self.connection = props.get("connection", "combined")
+        if self.connection not in _CONNECTIONS:
+            raise ValueError(f"connection = {self.connection!r} must be one of {', '.join(_CONNECTIONS)}")
+        #: Energy [J] that the last pass received, and that left through the border of the surface patch.
+        self.balance = mi.Float64(0, 0)
+        self._prepared: tuple[mi.Scene, mi.Sensor, LidarScene, ViewSampler] | None = None
+
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[LidarScene, ViewSampler]:
+        """Find and check the parts of a scene; done once for a scene and sensor."""
+        if self._prepared is None or self._prepared[0] is not scene or self._prepared[1] is not sensor:
+            system = LidarScene.from_scene(scene, sensor)
+            self._prepared = scene, sensor, system, ViewSampler(system.receiver, system.transmitter)
+        return self._prepared[2], self._prepared[3]
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: mi.UInt32 = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render one pass.
+
+        Parameters
+        ----------
+        scene, sensor
+            What to render; a sensor or its index.
+        seed
+            Seed of the pass; passes with different seeds are independent.
+        spp
+            Paths for each pixel; 0 takes ``paths_per_pass`` for all pixels together.
+        develop
+            Whether to return the energies instead of leaving them in the film.
+        evaluate
+            Whether to compute now.
+
+        Returns
+        -------
+        TensorXf
+            Received energy [J], shape (pixel, time) or (row, column, time).
+        """
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        system, view = self.prepare(scene, sensor)
+        count = spp * system.receiver.pixels.count if spp > 0 else self.paths_per_pass
+        system.film.prepare_pixels(system.receiver.pixels.count, system.receiver.pixels.grid)
+        self.balance = dr.zeros(mi.Float64, 2)
+        with dr.suspend_grad():
+            self.sample(system, view, count, int(np.array(seed).item()))
+        if evaluate:
+            dr.eval(system.film._energy, self.balance)
+        return system.film.develop() if develop else mi.TensorXf()
+
+    def sample(self, system: LidarScene, view: ViewSampler, count: int, seed: int) -> None:
+        """Trace `count` paths from the receiver and add what they find to the film."""
+        words = np.random.SeedSequence(seed).generate_state(3, np.uint64)
+        # Opaque, so that another seed is the same kernel.
+        state, stream, shift = (dr.opaque(mi.UInt64, int(word)) for word in words)
+        rng = mi.PCG32(count, initstate=state, initseq=stream)
+        start = view.sample(dr.arange(mi.UInt32, count), count, shift, rng.next_float32())
+        path = Path(
+            point=mi.Point3f(system.receiver.pose.origin.tolist()),
+            direction=start.direction,
+            in_water=mi.Bool(False),
+            length=mi.Float(0),
+            throughput=mi.Float(1),
+            scatterings=mi.UInt32(0),
+            lobe_ratio=mi.Float(0),
+            active=start.weight > 0,
+        )
+        lobe = SurfaceLobe(system)
+
+        def body(path: Path, rng: mi.PCG32) -> tuple[Path, mi.PCG32]:
+            self._step(system, lobe, path, rng, start.pixel, start.weight)
+            return path, rng
+
+        dr.while_loop((path, rng), lambda path, rng: path.active, body, label="lidar_volpath")
+
+    def _step(
+        self, system: LidarScene, lobe: SurfaceLobe, path: Path, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float
+    ) -> None:
+        """Go to the next vertex, connect it to the laser, and choose the direction in which the path goes on."""
+        # Advance to whichever comes first, a scattering event or a surface.
+        si = system.scene.ray_intersect(path.ray(), path.active)
+        scattered, distance, transmittance = self._fly(system, path, si, rng)
+        path.active &= scattered | si.is_valid()
+        in_leg = mi.Bool(path.in_water)
+        advance(path, system, distance, dr.select(scattered, path.point + path.direction * distance, si.p))
+        path.scatterings += dr.select(scattered, mi.UInt32(1), 0)
+        if self.max_scatterings >= 0:
+            path.active &= path.scatterings <= self.max_scatterings
+
+        # What happens here: scattering, a solid, or the sea surface.
+        scattered &= path.active
+        hit = path.active & ~scattered
+        at_sea = hit & system.is_surface(si.shape)
+        submerged = scattered | (hit & in_leg & ~at_sea)
+        mei, phase, albedo = self._medium(system, path, scattered)
+        path.throughput *= dr.select(scattered, albedo, 1)
+
+        # Connect: from under water through the surface, from the surface and from solids in the air directly.
+        laser = lobe.towards_laser(path.point)
+        up, lobe_pdf = lobe.sample(laser, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        tried = submerged & (lobe_pdf > 0) if self.connection != "walk" else mi.Bool(False)
+        turn = self._turn(laser, si, mei, phase, scattered, tried, up)
+        above = system.scene.ray_intersect(dr.select(scattered, mi.Ray3f(path.point, up), si.spawn_ray(up)), tried)
+        met = tried & above.is_valid() & system.is_surface(above.shape)
+        clear = dr.exp(-self._optical_depth(system, path.depth, -up.z, above.t, met))
+        combined = lobe_pdf + (turn.pdf * clear if self.connection == "combined" else 0)
+        factor = dr.select(met, turn.value * clear / combined, self._walk_weight(path, transmittance))
+        crossing = dr.select(met, above, si)
+        direct = hit & (at_sea | ~in_leg)
+        radiance, air_length = laser_through(system, crossing, met | direct)
+        water_length = dr.select(met, optical_length(system, above.t, True), 0)
+        energy = weight * path.throughput * factor * radiance
+        system.film.add_transient(pixel, path.length + water_length + air_length, energy, radiance > 0)
+        lost = tried & ~above.is_valid()
+        self._account(system, laser, energy, radiance > 0, weight * path.throughput * turn.value / combined * lobe_pdf,
+                      path, up, lost)
+
+        # Choose the next direction; beyond the film's end nothing can arrive any more.
+        self._turn_path(system, lobe, laser, path, si, mei, phase, scattered, submerged, at_sea, rng)
+        path.active &= path.length + dr.norm(lobe.laser - path.point) < system.film.path_end
+        self._roulette(path, rng)
+
+    def _fly(
+        self, system: LidarScene, path: Path, si: mi.SurfaceInteraction3f, rng: mi.PCG32
+    ) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        """Return whether the path scatters before the surface, how far it goes, and the leg's transmittance."""
+        if system.water is None:
+            return mi.Bool(False), si.t, mi.Float(1)
+        drawn = -dr.log(1 - rng.next_float32())
+        flight = system.water.flight
+        wet = path.active & path.in_water
+        distance = flight.distance(path.depth, path.downward, drawn)
+        scattered = wet & (distance < si.t)
+        to_surface = self._optical_depth(system, path.depth, path.downward, si.t, wet & si.is_valid())
+        return scattered, dr.select(scattered, distance, si.t), dr.exp(-to_surface)
+
+    @staticmethod
+    def _optical_depth(
+        system: LidarScene, depth: mi.Float, downward: mi.Float, length: mi.Float, active: mi.Bool
+    ) -> mi.Float:
+        """Return the optical depth of a leg in water, 0 for inactive lanes."""
+        if system.water is None:
+            return mi.Float(0)
+        return dr.select(active, system.water.flight.optical_depth(depth, downward, length), 0)
+
+    @staticmethod
+    def _medium(
+        system: LidarScene, path: Path, scattered: mi.Bool
+    ) -> tuple[mi.MediumInteraction3f, object, mi.Float]:
+        """Return the interaction, the phase function and the albedo at a scattering event."""
+        mei = dr.zeros(mi.MediumInteraction3f)
+        mei.p = path.point
+        mei.wi = -path.direction
+        mei.sh_frame = mi.Frame3f(mei.wi)
+        mei.t = dr.select(scattered, mi.Float(1), dr.inf)
+        if system.water is None:
+            return mei, None, mi.Float(0)
+        layer = system.water.flight.layer_at(path.depth)
+        return mei, system.water.phase_at(layer), system.water.flight.albedo(layer)
+
+    @staticmethod
+    def _turn(
+        laser: LaserDirection,
+        si: mi.SurfaceInteraction3f,
+        mei: mi.MediumInteraction3f,
+        phase: object,
+        scattered: mi.Bool,
+        active: mi.Bool,
+        direction: mi.Vector3f,
+    ) -> Turn:
+        """Return value and density of a direction at a scattering event or a solid."""
+        value, pdf = mi.Float(0), mi.Float(0)
+        if phase is not None:
+            at_event = scattered & active
+            phase_value, phase_pdf = phase.eval_pdf(mi.PhaseFunctionContext(), mei, direction, at_event)
+            broad = henyey_greenstein(dr.dot(direction, laser.in_water), TURN_ASYMMETRY)
+            value = dr.select(at_event, phase_value[0], 0)
+            pdf = dr.select(at_event, dr.lerp(phase_pdf, broad, TURN_SHARE), 0)
+        at_solid = active & ~scattered
+        solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), at_solid)
+        return Turn(dr.select(at_solid, solid_value[0], value), dr.select(at_solid, solid_pdf, pdf))
+
+    def _walk_weight(self, path: Path, transmittance: mi.Float) -> mi.Float:
+        """Return the weight of a connection that the walk made: balance heuristic against the lobe."""
+        if self.connection == "walk":
+            return mi.Float(1)
+        if self.connection == "lobe":
+            return dr.select(path.lobe_ratio > 0, mi.Float(0), 1)
+        return dr.select(path.lobe_ratio > 0, transmittance / (transmittance + path.lobe_ratio), 1)
+
+    def _account(
+        self,
+        system: LidarScene,
+        laser: LaserDirection,
+        received: mi.Float,
+        arrived: mi.Bool,
+        proposal: mi.Float,
+        path: Path,
+        up: mi.Vector3f,
+        lost: mi.Bool,
+    ) -> None:
+        """Sum the energy received, and an estimate of what would have arrived had the surface not ended.
+
+        Where a connection misses the surface its light is taken as if it had crossed a flat one, at normal transmittance.
+        """
+        crossing = path.point + up * (dr.maximum(path.depth, 0) / dr.maximum(up.z, 1e-3))
+        offset = mi.Point3f(system.transmitter.pose.origin.tolist()) - crossing
+        index = float(system.refractive_index)
+        through = 4 * index / (1 + index) ** 2 * index**2 * laser.in_air.z / laser.in_water.z
+        missing = proposal * through * system.transmitter.intensity(-dr.normalize(offset)) / dr.squared_norm(offset)
+        dr.scatter_add(self.balance, mi.Float64(received), mi.UInt32(0), arrived)
+        dr.scatter_add(self.balance, mi.Float64(missing), mi.UInt32(1), lost)
+
+    def _turn_path(
+        self,
+        system: LidarScene,
+        lobe: SurfaceLobe,
+        laser: LaserDirection,
+        path: Path,
+        si: mi.SurfaceInteraction3f,
+        mei: mi.MediumInteraction3f,
+        phase: object,
+        scattered: mi.Bool,
+        submerged: mi.Bool,
+        at_sea: mi.Bool,
+        rng: mi.PCG32,
+    ) -> None:
+        """Draw the direction in which the path goes on, and update throughput, medium and lobe ratio."""
+        pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        at_surface = path.active & ~scattered
+        bs, bsdf_weight = si.bsdf().sample(mi.BSDFContext(), si, pick, u, at_surface)
+        direction, pdf = si.to_world(bs.wo), bs.pdf
+        factor = bsdf_weight[0]
+        if phase is not None:
+            # Rescaled, the number that picks the lobe serves the phase function, too.
+            broadly = pick < TURN_SHARE
+            rest = dr.clip((pick - TURN_SHARE) / (1 - TURN_SHARE), 0, 1)
+            natural, _, _ = phase.sample(mi.PhaseFunctionContext(), mei, rest, u, scattered)
+            cosine = sample_henyey_greenstein(u.x, TURN_ASYMMETRY)
+            broad = deflect(mi.Frame3f(laser.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
+            drawn = dr.select(broadly, broad, natural)
+            turn = self._turn(laser, si, mei, phase, scattered, scattered, drawn)
+            direction = dr.select(scattered, dr.normalize(drawn), direction)
+            pdf = dr.select(scattered, turn.pdf, pdf)
+            factor = dr.select(scattered, turn.value / turn.pdf, factor)
+        delta = at_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        path.lobe_ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf(laser, direction) / pdf, 0)
+        path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
+        path.throughput *= dr.select(path.active, factor, 1)
+        path.active &= path.throughput > 0
+        path.point = dr.select(at_surface, si.spawn_ray(direction).o, path.point)
+        path.direction = dr.select(path.active, direction, path.direction)
+
+    def _roulette(self, path: Path, rng: mi.PCG32) -> None:
+        """End paths of little throughput at random, and give their share to the ones that go on."""
+        survival = dr.minimum(path.throughput / max(self.roulette_threshold, 1e-30), 1)
+        path.active &= rng.next_float32() < survival
+        path.throughput = dr.select(path.active, path.throughput / survival, path.throughput)
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"LidarVolpath[paths_per_pass={self.paths_per_pass}, connection={self.connection}]"
+
+
+mi.register_integrator("lidar_volpath", lambda props: LidarVolpath(props))

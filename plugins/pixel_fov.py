@@ -1,0 +1,115 @@
+"""Sensor plugin ``pixel_fov``: the field of view of one pixel."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.optics.checks import finite, finite_array, positive
+from mitransient_lidar.transport.fields import Field, Polygon, Rectangle, Sector, Strip
+from mitransient_lidar.transport.pixels import ShapedPixels
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.receiving import Receiver, ReceiverOptics
+
+
+class PixelFov(mi.Sensor):
+    r"""Field of view of one pixel (``pixel_fov``).
+
+    ====================  ========  ==================================================================================
+    Parameter             Type      Meaning (angles are full angles or positions in the tangent plane about the axis)
+    ====================  ========  ==================================================================================
+    shape                 string    ``circle``, ``ring``, ``sector``, ``rectangle``, ``strip`` or ``polygon``. Default: ``circle``
+    field_of_view_mrad    float     Full angle of the circle, ring, sector, or of the circle that a strip is cut from
+                                    [mrad], positive. Default: 30
+    inner_mrad            float     ring, sector: full angle of the hole [mrad], less than field_of_view_mrad. Default: 0
+    start_deg,            float     sector: first azimuth, from +gx (far) towards +gy [deg], and size [deg], up to 360.
+    extent_deg                      Defaults: 0, 360
+    width_mrad,           float     rectangle: full angle along gy and along gx [mrad], positive. Defaults: 15, 15
+    height_mrad
+    gx_min_mrad,          float     strip: the part of the circle between these gx [mrad]
+    gx_max_mrad
+    gx_mrad, gy_mrad      float     circle, ring, sector, rectangle: centre [mrad]. Default: 0
+    vertices_mrad         string    polygon: corners ``gx gy, gx gy, ...`` [mrad], at least three, edges not crossing
+    pixel_name            string    Name in the result. Default: ``pixel`` (numbered by ``multipixel_receiver``)
+    altitude, off_nadir_deg, ...    As for ``lidar_transmitter``, when used alone
+    aperture_area, ...              As for ``multipixel_receiver``, when used alone
+    ====================  ========  ==================================================================================
+
+    Nested in ``multipixel_receiver`` only the shape and the name are used: pose, aperture and losses are the
+    receiver's. As the only sensor of a scene it is a receiver with one pixel.
+
+    .. code-block:: xml
+
+        <sensor type="pixel_fov">
+            <string name="shape" value="ring"/>
+            <float name="field_of_view_mrad" value="30"/>
+            <float name="inner_mrad" value="10"/>
+            <film type="time_gated_film"/>
+        </sensor>
+
+    .. code-block:: python
+
+        {'type': 'pixel_fov', 'shape': 'ring', 'field_of_view_mrad': 30.0, 'inner_mrad': 10.0,
+         'film': {'type': 'time_gated_film'}}
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.field = _field(props)
+        self.pixel_name = str(props.get("pixel_name", ""))
+        pixels = ShapedPixels([self.field], [self.pixel_name or "pixel"])
+        self.receiver = Receiver(Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels)
+        self.m_needs_sample_2 = True
+        self.m_needs_sample_3 = False
+
+    def sample_ray(
+        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Sample a ray uniformly over the field of view, for Mitsuba's own integrators."""
+        return self.receiver.sensor_ray(time, sample2, active)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return an invalid box: the sensor does not extend the scene."""
+        return mi.ScalarBoundingBox3f()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters: a changed pixel is loaded anew."""
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"PixelFov[{self.field}]"
+
+
+def _field(props: mi.Properties) -> Field:
+    """Build the shape from the plugin's parameters."""
+
+    def mrad(name: str, default: float) -> float:
+        return 1e-3 * finite(name, props.get(name, default))
+
+    shape = props.get("shape", "circle")
+    centre = (mrad("gx_mrad", 0.0), mrad("gy_mrad", 0.0))
+    if shape in ("circle", "ring", "sector"):
+        outer = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+        if shape == "circle":
+            return Sector(outer, centre=centre)
+        start, extent = (0.0, 360.0) if shape == "ring" else (props.get("start_deg", 0.0), props.get("extent_deg", 360.0))
+        return Sector(outer, 0.5 * mrad("inner_mrad", 0.0), np.deg2rad(start), np.deg2rad(extent), centre)
+    if shape == "rectangle":
+        width = 0.5e-3 * positive("width_mrad", props.get("width_mrad", 15.0))
+        height = 0.5e-3 * positive("height_mrad", props.get("height_mrad", 15.0))
+        return Rectangle(centre[0] - height, centre[0] + height, centre[1] - width, centre[1] + width)
+    if shape == "strip":
+        radius = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+        return Strip(radius, mrad("gx_min_mrad", -1e3 * radius), mrad("gx_max_mrad", 1e3 * radius))
+    if shape == "polygon":
+        words = str(props.get("vertices_mrad", "")).replace(",", " ").split()
+        numbers = finite_array("vertices_mrad", words)
+        if numbers.size % 2 or numbers.size < 6:
+            raise ValueError(
+                f"vertices_mrad = {props.get('vertices_mrad', '')!r} must hold pairs 'gx gy' of at least three corners"
+            )
+        return Polygon(1e-3 * numbers.reshape(-1, 2))
+    raise ValueError(f"shape = {shape!r} must be one of circle, ring, sector, rectangle, strip, polygon")
+
+
+mi.register_sensor("pixel_fov", lambda props: PixelFov(props))
