@@ -186,6 +186,14 @@ def register_plugins(_old: str | None, new: str) -> None:
     _registered_for = new
 
 
+def versions() -> dict[str, str]:
+    """Return the variant and the versions that a result records."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return {"variant": mi.variant() or "none", "mitsuba_version": mi.__version__, "drjit_version": dr.__version__}
+
+
 def describe() -> dict[str, str]:
     """Return what ``mitransient-lidar info`` prints: versions, variant, LLVM and GPU."""
     import drjit as dr
@@ -200,7 +208,9 @@ def describe() -> dict[str, str]:
         "drjit": dr.__version__,
         "python": platform.python_version(),
         "variant": mi.variant() or "none",
-        "LLVM": f"{'.'.join(map(str, llvm))} ({os.environ.get(_LLVM_VARIABLE) or 'found by Dr.Jit'})" if llvm else "none",
+        "LLVM": f"{'.'.join(map(str, llvm))} ({os.environ.get(_LLVM_VARIABLE) or 'found by Dr.Jit'})"
+        if llvm
+        else "none",
         "GPU": "usable" if dr.has_backend(dr.JitBackend.CUDA) else "none",
         "threads": str(dr.thread_count()),
     }

@@ -109,7 +109,9 @@ class LayeredWater(mi.Medium):
 
     def to_string(self) -> str:
         """Return a description."""
-        return f"LayeredWater[{self.column}, refractive_index={self.refractive_index:g}, group_index={self.group_index:g}]"
+        return (
+            f"LayeredWater[{self.column}, refractive_index={self.refractive_index:g}, group_index={self.group_index:g}]"
+        )
 
 
 def _phases_of_layers(

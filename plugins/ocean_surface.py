@@ -124,9 +124,7 @@ class OceanSurface(mi.Mesh):
         )
 
 
-def _total_variance(
-    props: mi.Properties, wind_speed: float, waves: ElfouhailySpectrum | None
-) -> tuple[float, float]:
+def _total_variance(props: mi.Properties, wind_speed: float, waves: ElfouhailySpectrum | None) -> tuple[float, float]:
     """Return the total slope variances (upwind, crosswind) that ``slope_variance`` asks for."""
     wanted = props.get("slope_variance", "cox_munk")
     if wanted == "cox_munk":
@@ -141,9 +139,7 @@ def _total_variance(
     return half, half
 
 
-def _grid(
-    heights: np.ndarray, size: float, wind_direction: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _grid(heights: np.ndarray, size: float, wind_direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices [m], faces and texture coordinates of a periodic height field with one more row and column."""
     cells = len(heights)
     closed = np.pad(heights, ((0, 1), (0, 1)), mode="wrap")

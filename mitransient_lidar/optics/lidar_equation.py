@@ -18,7 +18,7 @@ from .refraction import fresnel, snell, solid_angle_per_area
 from .water import C0, WaterColumn
 
 Attenuation = Literal["c", "a+bb"]
-"""'c': every scattered photon is lost, a lower bound. 'a+bb': forward-scattered light stays in the beam, an estimate."""
+"""'c': every scattered photon is lost, a lower bound. 'a+bb': forward-scattered light stays in, an estimate."""
 
 
 @dataclass(frozen=True)

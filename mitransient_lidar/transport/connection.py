@@ -90,9 +90,7 @@ class SurfaceLobe:
         return dr.select(valid, slopes / cos3 * jacobian, 0)
 
 
-def laser_through(
-    system: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool
-) -> tuple[mi.Float, mi.Float]:
+def laser_through(system: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Connect a surface point to the laser by a straight line in the air.
 
     Parameters

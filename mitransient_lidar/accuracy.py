@@ -1,0 +1,82 @@
+"""Means and standard errors over independent passes, and the error by which a render is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class PassStatistics:
+    """Mean and standard error of arrays that come one a pass (Welford 1962, doi:10.1080/00401706.1962.10490022)."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._mean: FloatArray | None = None
+        self._squares: FloatArray | None = None
+
+    def add(self, values: FloatArray) -> None:
+        """Add the result of one pass."""
+        if self._mean is None or self._squares is None:
+            self._mean, self._squares = np.zeros_like(values), np.zeros_like(values)
+        self.count += 1
+        deviation = values - self._mean
+        self._mean += deviation / self.count
+        self._squares += deviation * (values - self._mean)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean over the passes."""
+        if self._mean is None:
+            raise ValueError("passes = 0 must be at least 1 for a mean")
+        return self._mean
+
+    @property
+    def stderr(self) -> FloatArray:
+        """Standard error of the mean; NaN before the second pass."""
+        if self._squares is None:
+            raise ValueError("passes = 0 must be at least 1 for a standard error")
+        if self.count < 2:
+            return np.full_like(self._squares, np.nan)
+        return np.sqrt(self._squares / (self.count - 1) / self.count)
+
+
+@dataclass(frozen=True)
+class ErrorWindow:
+    """The bins in which a waveform's error counts: from the surface echo to the end of the bottom echo.
+
+    Parameters
+    ----------
+    start_ns, end_ns
+        Limits for each pixel [ns], shape (pixels,).
+    time_ns
+        Centres of the bins [ns], shape (time,).
+    """
+
+    start_ns: FloatArray
+    end_ns: FloatArray
+    time_ns: FloatArray
+
+    def bins(self) -> NDArray[np.bool_]:
+        """Return which bins count, shape (pixels, time)."""
+        return np.asarray((self.time_ns >= self.start_ns[:, None]) & (self.time_ns <= self.end_ns[:, None]))
+
+    def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
+        """Return the relative standard errors of the bins that count, infinite where nothing was received.
+
+        Pixels that receive less than a thousandth of the brightest one are dark and do not count.
+
+        Parameters
+        ----------
+        waveform, stderr
+            Waveform and its standard error [W], shape (pixels, time).
+        """
+        energy = waveform.sum(axis=1)
+        lit = energy > 1e-3 * energy.max(initial=0.0)
+        chosen = self.bins() & lit[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = stderr[chosen] / waveform[chosen]
+        return np.asarray(np.where(waveform[chosen] > 0, relative, np.inf))

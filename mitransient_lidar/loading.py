@@ -1,0 +1,101 @@
+"""Loading scenes, with mistakes told in one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import os
+import re
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from mitransient_lidar import resources
+from mitransient_lidar.errors import UserError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.Scene, str, dict[str, str]]:
+    """Load a scene.
+
+    Parameters
+    ----------
+    scene
+        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, or a loaded scene.
+    params
+        Values for the ``<default>`` parameters of an XML scene.
+
+    Returns
+    -------
+    scene, name, parameters
+        The loaded scene, its name, and all its parameters with their values as text (empty unless it is XML).
+
+    Raises
+    ------
+    UserError
+        When there is no such scene, a parameter is unknown, or a plugin refuses a value.
+    """
+    import mitsuba as mi
+
+    if isinstance(scene, mi.Scene):
+        _no_parameters(params, "a loaded scene")
+        return scene, scene.id() or "scene", {}
+    if isinstance(scene, Mapping):
+        _no_parameters(params, "a dict")
+        with readable_errors(loading=True):
+            return mi.load_dict({"type": "scene", **scene}), "scene", {}
+    if not isinstance(scene, (str, os.PathLike)):
+        raise UserError(f"scene = {scene!r} must be a shipped name, a path, a dict or a loaded scene")
+    path = resources.scene_path(scene)
+    parameters = {**resources.scene_parameters(path)}
+    for name, value in (params or {}).items():
+        if name not in parameters:
+            close = difflib.get_close_matches(name, parameters, n=3)
+            hint = f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(parameters))}"
+            raise UserError(f"parameter {name!r} is not one of scene {path.stem}: {hint}")
+        parameters[name] = _text(value)
+    with readable_errors(loading=True):
+        return mi.load_file(str(path), **parameters), path.stem, parameters
+
+
+@contextlib.contextmanager
+def readable_errors(loading: bool = False) -> Iterator[None]:
+    """Turn what plugins and Mitsuba's parser raise about a user's mistake into a UserError of one sentence.
+
+    Mitsuba wraps the ``ValueError`` of a Python plugin in a traceback inside a ``RuntimeError``. While loading, any
+    RuntimeError is the parser's complaint about the scene; later only a wrapped ValueError is the user's.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(_sentence(str(error))) from error
+    except RuntimeError as error:
+        text = str(error)
+        wrapped = re.findall(r"(?:ValueError|UserError): (.*)", text)
+        if wrapped:
+            raise UserError(_sentence(wrapped[-1])) from error
+        if loading:
+            raise UserError(_sentence(re.sub(r"\[\w+(\.cpp:\d+)?\] ", "", text))) from error
+        raise
+
+
+def _sentence(text: str) -> str:
+    """Return a message on one line."""
+    return " ".join(text.split())
+
+
+def _text(value: Any) -> str:
+    """Write a parameter's value as it stands in XML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (list, tuple)):
+        return ", ".join(str(item) for item in value)
+    return str(value)
+
+
+def _no_parameters(params: Mapping[str, Any] | None, what: str) -> None:
+    if params:
+        raise UserError(f"params = {sorted(params)} need an XML scene; {what} has no <default> parameters to fill")

@@ -1,0 +1,1 @@
+"""Shipped scenes: Mitsuba XML files, made to be read, copied and edited."""
