@@ -128,8 +128,8 @@ def render(
     integrator
         Name or dict of an integrator plugin, or an integrator, instead of the scene's.
     target_error
-        Relative standard error, greater than 0: passes end when 95 % of the waveform's bins, of every lit pixel from the
-        surface echo to the end of the bottom echo, have reached it (after at least 8 passes).
+        Relative standard error, greater than 0: passes end when 95 % of the waveform's bins, of every lit pixel from
+        the surface echo to the end of the bottom echo, have reached it (after at least 8 passes).
     max_time
         Longest time for the passes [s], greater than 0.
     passes
@@ -236,9 +236,7 @@ def _integrator(scene: mi.Scene, wanted: Any) -> Any:
         with readable_errors(loading=True):
             engine = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
     if not hasattr(engine, "plugin"):
-        raise UserError(
-            "integrator: the scene has none of the lidar integrators; add <integrator type='lidar_volpath'/>"
-        )
+        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_volpath'/>")
     return engine
 
 
@@ -269,7 +267,7 @@ def _error_window(system: LidarScene, probe: EchoProbe) -> ErrorWindow:
     film = system.film
     time_ns = film.time_start_ns + film.bin_width_ns * (np.arange(film.bin_count) + 0.5)
     start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * system.transmitter.pulse.fwhm_ns
-    # A pixel that sees no surface (a plate in the air) or no bottom is judged from the start or to the end of the record.
+    # A pixel that sees no surface (a plate in the air) or no bottom is judged from the record's start or to its end.
     start = np.where(np.isnan(start), time_ns[0], start)
     return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
 
@@ -284,8 +282,8 @@ def _check_record(system: LidarScene, probe: EchoProbe) -> None:
     first = float(np.nanmin(arrivals))
     if end <= first:
         raise UserError(
-            f"time_start_ns = {film.time_start_ns:g} with bin_count = {film.bin_count} bins of {film.bin_width_ns:g} ns "
-            f"ends the record at {end:g} ns, before the surface echo at {first:.1f} ns: it must end later"
+            f"time_start_ns = {film.time_start_ns:g} and bin_count = {film.bin_count} bins of {film.bin_width_ns:g} ns "
+            f"end the record at {end:g} ns: it must end after the surface echo, which comes at {first:.1f} ns"
         )
 
 
@@ -295,14 +293,14 @@ def _warn_of_losses(system: LidarScene, probe: EchoProbe, lost: float) -> None:
         return
     if probe.missed_beam > _TOLERATED_LOSS:
         logger.warning(
-            "the surface patch is smaller than the footprint: %.2g %% of the beam in the field of view passes beside it; "
-            "enlarge the surface's size",
+            "the surface patch is smaller than the footprint: %.2g %% of the beam in the field of view "
+            "passes beside it; enlarge the surface's size",
             100 * probe.missed_beam,
         )
     if lost > _TOLERATED_LOSS:
         logger.warning(
-            "the surface patch is smaller than the spread of the light in the water: about %.2g %% of the received energy "
-            "is lost at its border; enlarge the surface's size",
+            "the surface patch is smaller than the spread of the light in the water: about %.2g %% of the received "
+            "energy is lost at its border; enlarge the surface's size",
             100 * lost,
         )
 

@@ -208,9 +208,7 @@ def describe() -> dict[str, str]:
         "drjit": dr.__version__,
         "python": platform.python_version(),
         "variant": mi.variant() or "none",
-        "LLVM": f"{'.'.join(map(str, llvm))} ({os.environ.get(_LLVM_VARIABLE) or 'found by Dr.Jit'})"
-        if llvm
-        else "none",
+        "LLVM": f"{'.'.join(map(str, llvm))} ({os.environ.get(_LLVM_VARIABLE, 'system')})" if llvm else "none",
         "GPU": "usable" if dr.has_backend(dr.JitBackend.CUDA) else "none",
         "threads": str(dr.thread_count()),
     }

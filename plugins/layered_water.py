@@ -32,8 +32,8 @@ class LayeredWater(mi.Medium):
     group_index          float   Group index, times them, 1 to 2. Default: 1.364 (sea water at 532 nm)
     ===================  ======  =======================================================================================
 
-    The first layer also fills the wave crests above z = 0, the last goes down without end. With ``petzold``, ``hg`` or a
-    nested phase function, bb follows from that function and ``backscattering`` is only checked.
+    The first layer also fills the wave crests above z = 0, the last goes down without end. With ``petzold``, ``hg`` or
+    a nested phase function, bb follows from that function and ``backscattering`` is only checked.
 
     The lidar integrators sample free flights and transmittances through all layers in closed form. Mitsuba's own
     volumetric integrators work as well, with null collisions against the largest attenuation.

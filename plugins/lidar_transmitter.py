@@ -19,7 +19,7 @@ class LidarTransmitter(mi.Emitter):
     Parameter               Type       Meaning
     ======================  =========  ==============================================================================
     altitude                float      Height above the mean sea level [m], positive. Default: 200
-    off_nadir_deg           float      Angle of the beam's axis from the vertical, towards +x [deg], 0 to 89.9. Default: 20
+    off_nadir_deg           float      Angle of the axis from the vertical, towards +x [deg], 0 to 89.9. Default: 20
     shot_x, shot_y          float      Where the axis meets the mean sea level [m]. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], positive. Default: 5

@@ -297,7 +297,7 @@ class LidarVolpath(mi.CppADIntegrator):
     ) -> None:
         """Sum the energy received, and an estimate of what would have arrived had the surface not ended.
 
-        Where a connection misses the surface its light is taken as if it had crossed a flat one, at normal transmittance.
+        Where a connection misses the surface its light is taken as if it had crossed a flat one at normal incidence.
         """
         crossing = path.point + up * (dr.maximum(path.depth, 0) / dr.maximum(up.z, 1e-3))
         offset = mi.Point3f(system.transmitter.pose.origin.tolist()) - crossing

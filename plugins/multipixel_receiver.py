@@ -29,7 +29,7 @@ class MultipixelReceiver(mi.Sensor):
     aperture_area                       float      Area of the aperture [m^2], positive. Default: 0.025
     optical_efficiency                  float      Share of light that the optics pass, above 0 to 1. Default: 0.9
     two_way_atmospheric_transmittance   float      Share of light that survives the air, both ways. Default: 0.9
-    response_time_ns                    float      Time constant of the exponential response [ns], 0 is ideal. Default: 0
+    response_time_ns                    float      Time constant of the exponential response [ns]. Default: 0
     altitude, off_nadir_deg, shot_x,               Pose, as for ``lidar_transmitter``
     shot_y, to_world
     (nested)                            film       ``time_gated_film``
@@ -71,7 +71,7 @@ class MultipixelReceiver(mi.Sensor):
                 str(props.get("layout", "2x2")),
                 1e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0)),
                 props.get("field_of_view_shape", "circle"),
-                props["imager"] if "imager" in props else None,
+                props.get("imager", None),
             )
         self.receiver = Receiver(Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels)
         self.m_needs_sample_2 = True

@@ -18,10 +18,11 @@ class PixelFov(mi.Sensor):
     ====================  ========  ==================================================================================
     Parameter             Type      Meaning (angles are full angles or positions in the tangent plane about the axis)
     ====================  ========  ==================================================================================
-    shape                 string    ``circle``, ``ring``, ``sector``, ``rectangle``, ``strip`` or ``polygon``. Default: ``circle``
+    shape                 string    ``circle``, ``ring``, ``sector``, ``rectangle``, ``strip`` or ``polygon``.
+                                    Default: ``circle``
     field_of_view_mrad    float     Full angle of the circle, ring, sector, or of the circle that a strip is cut from
                                     [mrad], positive. Default: 30
-    inner_mrad            float     ring, sector: full angle of the hole [mrad], less than field_of_view_mrad. Default: 0
+    inner_mrad            float     ring, sector: full angle of the hole [mrad]. Default: 0
     start_deg,            float     sector: first azimuth, from +gx (far) towards +gy [deg], and size [deg], up to 360.
     extent_deg                      Defaults: 0, 360
     width_mrad,           float     rectangle: full angle along gy and along gx [mrad], positive. Defaults: 15, 15

@@ -151,7 +151,7 @@ class Strip(Field):
         low, high = self._limits()
         if not high > low:
             raise ValueError(
-                f"strip from gx = {self.gx_min} to {self.gx_max} rad must overlap the circle of radius {self.radius} rad"
+                f"strip from gx = {self.gx_min} to {self.gx_max} rad must cut the circle of radius {self.radius} rad"
             )
 
     def _limits(self) -> tuple[float, float]:

@@ -78,7 +78,7 @@ class LayeredFlight:
         return dr.select((beyond > 0) & (to_edge < dr.inf), through, within)
 
     def _way_out(self, layer: mi.UInt32, depth: mi.Float, downward: mi.Float) -> tuple[mi.Float, mi.UInt32]:
-        """Return the distance to the edge through which a ray leaves its layer, and the layer whose top that edge is."""
+        """Return the distance to the edge through which a ray leaves its layer, and the layer that begins there."""
         edge = dr.select(downward > 0, layer + 1, layer)
         # Upwards from the first layer and downwards from the last there is no edge.
         leaves = dr.select(downward > 0, layer + 1 < self.count, (layer > 0) & (downward < 0))

@@ -95,7 +95,7 @@ def sample_henyey_greenstein(u: mi.Float, g: float) -> mi.Float:
 
 
 def _alias_table(probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Walker's acceptance thresholds and aliases of a discrete distribution (Vose 1991, doi:10.1109/32.92917)."""
+    """Return Walker's thresholds and aliases of a discrete distribution (Vose 1991, doi:10.1109/32.92917)."""
     count = len(probability)
     scaled = probability / probability.sum() * count
     alias = np.arange(count)

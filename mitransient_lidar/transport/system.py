@@ -80,9 +80,7 @@ class LidarScene:
             if hasattr(shape, "ripple_variance") and shape not in surfaces:
                 raise ValueError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
         if len(waters) > 1:
-            raise ValueError(
-                f"media: the scene has {len(waters)} layered_water, allowed is one that shapes share by reference"
-            )
+            raise ValueError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
         if sensor.receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
             raise ValueError("altitude: transmitter and receiver must be above the mean sea level z = 0")
         variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
