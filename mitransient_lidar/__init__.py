@@ -26,6 +26,7 @@ if importlib.util.find_spec("mitransient_lidar.plugins") is None:
     __path__.append(str(Path(__file__).resolve().parent.parent))
 
 from mitransient_lidar import variants as _variants
+from mitransient_lidar.errors import UserError as _UserError
 
 _variants.prepare_llvm()
 
@@ -39,7 +40,7 @@ try:
         if _mi.variant().startswith("llvm"):
             _variants.check_llvm()
         _variants.register_plugins(None, _mi.variant())
-except _variants.UserError as _error:
+except _UserError as _error:
     raise ImportError(str(_error)) from None
 
 if TYPE_CHECKING:

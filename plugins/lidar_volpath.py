@@ -88,6 +88,8 @@ class LidarVolpath(mi.CppADIntegrator):
             raise ValueError(f"connection = {self.connection!r} must be one of {', '.join(_CONNECTIONS)}")
         #: Energy [J] that the last pass received, and that left through the border of the surface patch.
         self.balance = mi.Float64(0, 0)
+        #: Number of rays that the last pass traced.
+        self.rays = mi.Float64(0)
         self._prepared: tuple[mi.Scene, mi.Sensor, LidarScene, ViewSampler] | None = None
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[LidarScene, ViewSampler]:
@@ -135,7 +137,8 @@ class LidarVolpath(mi.CppADIntegrator):
         with dr.suspend_grad():
             self.sample(system, view, count, int(np.array(seed).item()))
         if evaluate:
-            dr.eval(system.film._energy, self.balance)
+            system.film.schedule_storage()
+            dr.eval(self.balance, self.rays)
         return system.film.develop() if develop else mi.TensorXf()
 
     def sample(self, system: LidarScene, view: ViewSampler, count: int, seed: int) -> None:
@@ -153,6 +156,7 @@ class LidarVolpath(mi.CppADIntegrator):
             throughput=mi.Float(1),
             scatterings=mi.UInt32(0),
             lobe_ratio=mi.Float(0),
+            rays=mi.UInt32(0),
             active=start.weight > 0,
         )
         lobe = SurfaceLobe(system)
@@ -161,7 +165,8 @@ class LidarVolpath(mi.CppADIntegrator):
             self._step(system, lobe, path, rng, start.pixel, start.weight)
             return path, rng
 
-        dr.while_loop((path, rng), lambda path, rng: path.active, body, label="lidar_volpath")
+        path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="lidar_volpath")
+        self.rays = dr.sum(mi.Float64(path.rays))
 
     def _step(
         self, system: LidarScene, lobe: SurfaceLobe, path: Path, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float
@@ -200,6 +205,9 @@ class LidarVolpath(mi.CppADIntegrator):
         radiance, air_length = laser_through(system, crossing, met | direct)
         water_length = dr.select(met, optical_length(system, above.t, True), 0)
         energy = weight * path.throughput * factor * radiance
+        # One ray along the path, one up to the surface, one to the laser.
+        path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(tried, mi.UInt32(1), 0)
+        path.rays += dr.select(met | direct, mi.UInt32(1), 0)
         system.film.add_transient(pixel, path.length + water_length + air_length, energy, radiance > 0)
         lost = tried & ~above.is_valid()
         self._account(

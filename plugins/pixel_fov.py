@@ -93,10 +93,12 @@ def _field(props: mi.Properties) -> Field:
         outer = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
         if shape == "circle":
             return Sector(outer, centre=centre)
-        start, extent = (
-            (0.0, 360.0) if shape == "ring" else (props.get("start_deg", 0.0), props.get("extent_deg", 360.0))
-        )
-        return Sector(outer, 0.5 * mrad("inner_mrad", 0.0), np.deg2rad(start), np.deg2rad(extent), centre)
+        inner = 0.5 * mrad("inner_mrad", 0.0)
+        if shape == "ring":
+            return Sector(outer, inner, centre=centre)
+        start = np.deg2rad(finite("start_deg", props.get("start_deg", 0.0)))
+        extent = np.deg2rad(finite("extent_deg", props.get("extent_deg", 360.0)))
+        return Sector(outer, inner, start, extent, centre)
     if shape == "rectangle":
         width = 0.5e-3 * positive("width_mrad", props.get("width_mrad", 15.0))
         height = 0.5e-3 * positive("height_mrad", props.get("height_mrad", 15.0))

@@ -199,7 +199,7 @@ def petzold_average_particle() -> Callable[[npt.ArrayLike], FloatArray]:
     72-78. The raw table integrates to 0.9929 under this interpolation and is divided by that. It then has a mean cosine
     of 0.9241 and bb/b = 0.01826; interpolating p linearly, as the paper does, integrates to 1.0200 instead.
     """
-    text = resources.files("mitransient_lidar.optics").joinpath("data/petzold_average_particle.csv").read_text("utf-8")
+    text = resources.files("mitransient_lidar.optics").joinpath("petzold_average_particle.csv").read_text("utf-8")
     degrees, values = np.loadtxt(text.splitlines(), delimiter=",", unpack=True)
     log_theta, log_p = np.log(np.radians(degrees)), np.log(values)
 

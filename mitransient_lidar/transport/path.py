@@ -29,6 +29,8 @@ class Path:
     lobe_ratio
         Density of the surface connection's proposal over that of the walk, for the direction of the next leg; 0 where
         no connection was tried.
+    rays
+        Number of rays traced so far, for the bench.
     active
         Whether the path goes on.
     """
@@ -40,6 +42,7 @@ class Path:
     throughput: mi.Float
     scatterings: mi.UInt32
     lobe_ratio: mi.Float
+    rays: mi.UInt32
     active: mi.Bool
 
     @property

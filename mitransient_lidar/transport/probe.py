@@ -82,7 +82,7 @@ def _quantiles(
     result = np.full((count, 2), np.nan)
     seen = weight > 0
     order = np.lexsort((values[seen], pixel[seen]))
-    values, weight, pixel = (a[seen][order] for a in (values, weight, pixel))
+    values, weight, pixel = values[seen][order], weight[seen][order], pixel[seen][order]
     edges = np.searchsorted(pixel, np.arange(count + 1))
     for index in np.flatnonzero(np.diff(edges)):
         part = slice(edges[index], edges[index + 1])

@@ -64,7 +64,8 @@ class LidarScene:
                 f"emitters: the scene has {len(scene.emitters())} of which {len(transmitters)} are lidar_transmitter; "
                 "allowed is exactly one lidar_transmitter"
             )
-        surfaces, waters = [], []
+        surfaces: list[mi.Shape] = []
+        waters: list[mi.Medium] = []
         for shape in scene.shapes():
             if not shape.is_medium_transition():
                 continue

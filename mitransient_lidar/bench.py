@@ -1,0 +1,198 @@
+"""Benchmark: how fast the integrators are, and how accurate for their time.
+
+Every case and integrator runs in a process of its own, so that peak memory and compile time are its own.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+import resource
+import statistics
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from mitransient_lidar.errors import UserError
+
+#: Parameters that turn a shipped scene into each case: (scene, parameters).
+CASES: dict[str, tuple[str, dict[str, str]]] = {
+    "flat": ("fig09_2x2", {"spectrum": "flat"}),
+    "clear": ("fig09_2x2", {}),
+    "turbid": ("fig09_2x2", {"attenuation": "1.5", "scattering": "1.2", "backscattering": "0.024"}),
+    "layered": (
+        "fig09_2x2",
+        {
+            "layer_tops": "0, 3",
+            "attenuation": "0.9, 0.5",
+            "scattering": "0.7, 0.35",
+            "backscattering": "0.014, 0.007",
+            "field_of_view_mrad": "35",
+        },
+    ),
+    "imager": ("fig09_2x2", {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}),
+}
+
+#: Cases of ``--quick``.
+QUICK_CASES = ("flat", "clear")
+
+INTEGRATORS = ("lidar_volpath",)
+
+#: Passes after the first one, which compiles.
+_QUICK_PASSES = 16
+_PASSES = 64
+
+
+def run(
+    *, quick: bool = False, json: bool = False, case: str | None = None, target_error: float | None = None
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Run the benchmark and print its figures to stdout.
+
+    Parameters
+    ----------
+    quick
+        Only the cases ``flat`` and ``clear``, with few passes.
+    json
+        Print one JSON object instead of a table.
+    case
+        Only this case.
+    target_error
+        Go on until the 95th percentile of the relative standard error has come down to this, greater than 0.
+
+    Returns
+    -------
+    dict
+        ``{case: {integrator: {wall_s, cpu_s, compile_s, paths_per_s, rays_per_s, ray_rate_ratio, peak_mb,
+        error_median, error_p95, figure_of_merit}}}``.
+
+    Raises
+    ------
+    UserError
+        When the case is unknown or the target is not positive.
+    """
+    if case is not None and case not in CASES:
+        raise UserError(f"case = {case!r} must be one of {', '.join(CASES)}")
+    if target_error is not None and not target_error > 0:
+        raise UserError(f"target_error = {target_error} must be greater than 0")
+    names = [case] if case else list(QUICK_CASES if quick else CASES)
+    figures: dict[str, dict[str, dict[str, float]]] = {}
+    if not json:
+        print(_row("case", "integrator", list(_COLUMNS.values())))
+    for name in names:
+        figures[name] = {}
+        for integrator in INTEGRATORS:
+            task = {"case": name, "integrator": integrator, "quick": quick, "target_error": target_error}
+            done = subprocess.run(
+                [sys.executable, "-m", "mitransient_lidar.bench", json_module.dumps(task)],
+                check=False,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            if done.returncode:
+                raise UserError(f"case {name} with {integrator} ended with exit code {done.returncode}")
+            figures[name][integrator] = json_module.loads(done.stdout)
+            if not json:
+                values = figures[name][integrator]
+                print(_row(name, integrator, [f"{values[key]:.4g}" for key in _COLUMNS]), flush=True)
+    if json:
+        print(json_module.dumps(figures, indent=2))
+    return figures
+
+
+_COLUMNS = {
+    "wall_s": "wall s",
+    "cpu_s": "CPU s",
+    "compile_s": "compile s",
+    "paths_per_s": "paths/s",
+    "rays_per_s": "rays/s",
+    "ray_rate_ratio": "of plain",
+    "peak_mb": "peak MB",
+    "error_median": "median err",
+    "error_p95": "p95 err",
+    "figure_of_merit": "1/(var s)",
+}
+
+
+def _row(case: str, integrator: str, cells: list[str]) -> str:
+    return f"{case:<8} {integrator:<14} " + " ".join(f"{cell:>10}" for cell in cells)
+
+
+def measure(case: str, integrator: str, quick: bool, target_error: float | None) -> dict[str, float]:
+    """Measure one case with one integrator in this process; see `run` for the figures.
+
+    Rates and times are those of the passes after the first one, which also compiles. The figure of merit is
+    1 / (median relative variance x CPU time) of the waveform's bins.
+    """
+    import mitsuba as mi
+
+    from mitransient_lidar import rendering, variants
+
+    variants.set_variant()
+    scene, parameters = CASES[case]
+    marks: list[tuple[float, float]] = []
+
+    def progress(_: rendering.Progress) -> None:
+        marks.append((time.perf_counter(), time.process_time()))
+
+    passes = None if target_error else 1 + (_QUICK_PASSES if quick else _PASSES)
+    start = time.perf_counter()
+    engine = mi.load_dict({"type": integrator})
+    result = rendering.render(
+        scene,
+        params=parameters,
+        integrator=engine,
+        passes=passes,
+        target_error=target_error,
+        max_time=120.0 if target_error else None,
+        progress=progress,
+    )
+    times = np.array(marks)
+    steps = np.diff(times[:, 0])
+    warm = len(steps)
+    wall, cpu = times[-1] - times[0]
+    relative_variance = result.attrs["error_median"] ** 2
+    rays = float(np.array(engine.rays).item()) * warm
+    return {
+        "wall_s": float(wall),
+        "cpu_s": float(cpu),
+        "compile_s": float(marks[0][0] - start - statistics.median(steps)),
+        "paths_per_s": engine.paths_per_pass * warm / float(wall),
+        "rays_per_s": rays / float(wall),
+        "ray_rate_ratio": rays / float(wall) / _plain_ray_rate(scene, parameters),
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "error_median": result.attrs["error_median"],
+        "error_p95": result.attrs["error_p95"],
+        "figure_of_merit": 1 / (relative_variance * float(cpu)),
+    }
+
+
+def _plain_ray_rate(scene_name: str, parameters: dict[str, str]) -> float:
+    """Return how many rays a second plain ``scene.ray_intersect`` traces from the receiver on the same scene."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mitransient_lidar.loading import load_scene
+    from mitransient_lidar.transport.receiving import ViewSampler
+    from mitransient_lidar.transport.system import LidarScene
+
+    scene, _, _ = load_scene(scene_name, parameters)
+    system = LidarScene.from_scene(scene, scene.sensors()[0])
+    view = ViewSampler(system.receiver, system.transmitter)
+    count, rates = 2**21, []
+    for attempt in range(6):
+        start = view.sample(dr.arange(mi.UInt32, count), count, dr.opaque(mi.UInt64, attempt), mi.Float(0.5))
+        ray = mi.Ray3f(mi.Point3f(system.receiver.pose.origin.tolist()), start.direction)
+        dr.eval(ray)
+        dr.sync_thread()
+        begin = time.perf_counter()
+        si = scene.ray_intersect(ray)
+        dr.eval(si.p, si.n)
+        dr.sync_thread()
+        rates.append(count / (time.perf_counter() - begin))
+    # The first one compiles.
+    return statistics.median(rates[1:])
+
+
+if __name__ == "__main__":
+    print(json_module.dumps(measure(**json_module.loads(sys.argv[1]))))

@@ -1,0 +1,81 @@
+"""Fixtures that every kind of test shares."""
+
+# First of all: it tells Dr.Jit where LLVM is.
+import mitransient_lidar  # noqa: F401, I001
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def clean_drjit():
+    """Leave Dr.Jit's flags as they were, whatever a test sets."""
+    flags = {flag: dr.flag(flag) for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicCalls)}
+    yield
+    for flag, value in flags.items():
+        dr.set_flag(flag, value)
+
+
+def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None, bottom=8.0, rho=0.1, extra=None):
+    """Return a loaded scene: the table system over a flat, almost smooth sea, with changes by group."""
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "lidar_volpath", "paths_per_pass": 2**16, **(integrator or {})},
+        "tx": {"type": "lidar_transmitter", **(tx or {})},
+        "rx": {
+            "type": "multipixel_receiver",
+            "film": {
+                "type": "time_gated_film",
+                **{"time_start_ns": 1390.0, "bin_width_ns": 1.0, "bin_count": 160, **(film or {})},
+            },
+            **(rx or {}),
+        },
+        "sea": {
+            "type": "ocean_surface",
+            "interior": {"type": "layered_water", "refractive_index": 1.34, "group_index": 1.34, **(water or {})},
+            **{"spectrum": "flat", "slope_variance": "1e-4", **(sea or {})},
+        },
+        **(extra or {}),
+    }
+    if bottom is not None:
+        scene["bottom"] = {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -bottom]).scale(500),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": rho}},
+        }
+    return mi.load_dict(scene)
+
+
+@pytest.fixture
+def lidar_scene():
+    """Builder of scenes; see `_build`."""
+    return _build
+
+
+@pytest.fixture
+def passes():
+    """Function that renders independent passes: energies [J], shape (passes, pixels, bins)."""
+
+    def run(scene, count, first_seed=0):
+        film = scene.sensors()[0].film()
+        result = []
+        for seed in range(first_seed, first_seed + count):
+            scene.integrator().render(scene, 0, seed=seed, develop=False)
+            result.append(film.energy())
+        return np.array(result)
+
+    return run
+
+
+@pytest.fixture
+def z_score():
+    """Function (samples over passes, expected) -> (z, relative standard error), along axis 0."""
+
+    def z(samples, expected):
+        mean = samples.mean(axis=0)
+        error = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+        return (mean - expected) / error, error / np.abs(mean)
+
+    return z

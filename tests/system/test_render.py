@@ -1,0 +1,257 @@
+"""Rendering as a user does it: shipped scenes, options, files, warnings and mistakes."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar import accuracy, loading, rendering, resources, results
+from mitransient_lidar.errors import UserError
+
+SMALL = {"type": "lidar_volpath", "paths_per_pass": 2**14}
+
+
+def small(scene="table1", **options):
+    options.setdefault("passes", 3)
+    return mitransient_lidar.render(scene, integrator=SMALL, **options)
+
+
+@pytest.mark.parametrize("name", resources.scene_names())
+def test_every_shipped_scene_renders_and_its_files_read_back(name, tmp_path):
+    shot = small(name, seed=5)
+    assert shot.sizes["time"] == 150
+    assert float(shot.impulse_response.sum()) > 0
+    assert np.isfinite(shot.waveform).all()
+    # EXR keeps 32 bits, NetCDF everything.
+    for suffix, rtol in ((".exr", 6e-8), (".nc", 0)):
+        results.save(shot, tmp_path / f"shot{suffix}")
+        again = mitransient_lidar.open(tmp_path / f"shot{suffix}")
+        for variable in shot.data_vars:
+            np.testing.assert_allclose(again[variable], shot[variable], rtol=rtol, atol=1e-38)
+        assert again.attrs == shot.attrs
+        assert list(again.pixel.values) == list(shot.pixel.values)
+
+
+def test_parameters_have_the_same_names_in_every_scene():
+    wanted = {
+        *("pulse_energy_mj", "pulse_fwhm_ns", "divergence_mrad", "field_of_view_mrad", "layout", "aperture_area"),
+        *("altitude", "off_nadir_deg", "wind_speed", "wind_direction_deg", "spectrum", "slope_variance"),
+        *("surface_seed", "refractive_index", "group_index", "attenuation", "scattering", "backscattering"),
+        *("phase", "phase_g", "bottom_depth", "bottom_reflectivity", "time_start_ns", "bin_width_ns", "bin_count"),
+    }
+    for name in resources.scene_names():
+        assert wanted <= set(resources.scene_parameters(resources.scene_path(name)))
+
+
+@pytest.mark.parametrize("phase", ["fournier_forand", "petzold", "hg"])
+def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(phase):
+    scene, _, parameters = loading.load_scene(
+        "table1", {"phase": phase, "phase_g": 0.8, "spectrum": "flat", "slope_variance": 0.02, "layer_tops": [0, 3]}
+    )
+    (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
+    assert surface.slope_variance == pytest.approx(0.02)
+    assert surface.ripple_variance[0] == surface.ripple_variance[1]
+    assert surface.interior_medium().column.count == 2
+    assert parameters["layer_tops"] == "0, 3"
+
+
+def test_result_says_how_it_was_made():
+    shot = small(params={"wind_speed": 4.5}, seed=11)
+    assert shot.attrs["scene.wind_speed"] == "4.5"
+    assert (shot.attrs["scene"], shot.attrs["seed"], shot.attrs["passes"]) == ("table1", 11, 3)
+    assert shot.attrs["integrator"] == "lidar_volpath"
+    assert shot.attrs["mitsuba_version"] == mi.__version__
+    assert shot.waveform.attrs["units"] == "W"
+    # The depth axis' zero: 2 H / (c0 cos 20 deg) = 1419.886 ns on a flat mean surface; waves move it by centimetres.
+    assert shot.attrs["surface_time_ns"] == pytest.approx(1419.886, abs=1.0)
+
+
+def test_same_seed_same_result_other_seed_another():
+    first, again, other = small(seed=3), small(seed=3), small(seed=4)
+    np.testing.assert_allclose(first.impulse_response, again.impulse_response, rtol=1e-10)
+    assert not np.allclose(first.impulse_response, other.impulse_response, rtol=1e-3)
+
+
+def test_dict_and_loaded_scenes_render_like_the_file():
+    scene, _, _ = loading.load_scene("table1")
+    from_file, loaded = small(seed=2), small(scene, seed=2)
+    np.testing.assert_allclose(loaded.impulse_response, from_file.impulse_response, rtol=1e-10)
+    with pytest.raises(UserError, match="params"):
+        small(scene, params={"wind_speed": 1})
+
+
+def test_plain_mitsuba_renders_the_scene():
+    energy = np.array(mi.render(mi.load_file(str(resources.scene_path("table1"))), spp=2**12, seed=1))
+    assert energy.shape == (4, 150)
+    assert 3e-12 < energy.sum() < 7e-12  # closed forms of PHYSICS G bracket it: 2.1e-12 (K = c) to 5.4e-12 J
+
+
+def test_imager_keeps_rows_and_columns():
+    shot = small(params={"layout": "6x5", "bin_width_ns": 10, "bin_count": 15})
+    assert shot.waveform.dims == ("row", "column", "time")
+    assert shot.waveform.shape == (6, 5, 15)
+
+
+def test_stops_at_the_target_and_reports_progress():
+    reports = []
+    shot = mitransient_lidar.render("table1", target_error=0.2, max_time=60, progress=reports.append)
+    assert shot.attrs["error_p95"] <= 0.2
+    assert shot.attrs["passes"] == len(reports) == reports[-1].passes_done >= rendering.SMALLEST_PASS_COUNT
+    assert reports[-1].error_p95 == shot.attrs["error_p95"]
+    assert reports[-1].target_error == 0.2
+
+
+def test_max_time_ends_the_passes():
+    start = time.perf_counter()
+    shot = mitransient_lidar.render("table1", max_time=0.5)
+    assert shot.attrs["passes"] >= 2
+    assert time.perf_counter() - start < 30
+
+
+def test_interruption_keeps_what_was_rendered():
+    def stop(progress):
+        if progress.passes_done == 4:
+            raise KeyboardInterrupt
+
+    shot = small(passes=100, progress=stop)
+    assert (shot.attrs["interrupted"], shot.attrs["passes"]) == (1, 4)
+
+
+def test_ctrl_c_on_the_command_line_writes_the_files(tmp_path):
+    command = [sys.executable, "-m", "mitransient_lidar.cli", "render", "table1", "--passes", "100000", "-o"]
+    process = subprocess.Popen([*command, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(8)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["table1.exr", "table1.nc", "table1.png"]
+    assert mitransient_lidar.open(tmp_path / "table1.nc").attrs["interrupted"] == 1
+
+
+def test_standard_error_is_that_of_the_mean():
+    """Against NumPy on the passes themselves: a missing square root or factor of n - 1 would show."""
+    rng = np.random.default_rng(1)
+    values = rng.normal(5, 2, (30, 4, 7))
+    statistics = accuracy.PassStatistics()
+    for value in values:
+        statistics.add(value)
+    np.testing.assert_allclose(statistics.mean, values.mean(axis=0))
+    np.testing.assert_allclose(statistics.stderr, values.std(axis=0, ddof=1) / np.sqrt(30))
+
+
+def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite():
+    time_ns = np.arange(5.0)
+    window = accuracy.ErrorWindow(np.array([1.0, 1.0, 1.0]), np.array([3.0, 3.0, 3.0]), time_ns)
+    waveform = np.array([[1, 1, 2, 4, 1], [0, 1, 0, 1, 0], [0, 1e-9, 0, 0, 0]], dtype=float)
+    errors = window.relative_errors(waveform, np.ones((3, 5)))
+    assert errors.tolist() == [1, 0.5, 0.25, 1, np.inf, 1]
+
+
+def test_twice_the_paths_half_the_variance():
+    """Over three doublings the variance of the total falls as 1/n: 8 times less, 95 % limits from the F distribution."""
+    totals = []
+    for paths in (2**12, 2**15):
+        engine = mi.load_dict({"type": "lidar_volpath", "paths_per_pass": paths})
+        scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
+        film = scene.sensors()[0].film()
+        total = []
+        for seed in range(96):
+            engine.render(scene, 0, seed=seed, develop=False)
+            # Late light only: surface echo and early column are stratified and fall faster.
+            total.append(film.energy()[:, 60:].sum())
+        totals.append(np.var(total, ddof=1))
+    from scipy.stats import f
+
+    low, high = f.interval(0.9999, 95, 95)
+    assert 8 * low < totals[0] / totals[1] < 8 * high * 2
+
+
+MISTAKES = [
+    ({"scene": "tabel1"}, "did you mean table1"),
+    ({"params": {"wind_sped": 3}}, "wind_sped.*did you mean wind_speed"),
+    ({"params": {"wind_speed": -3}}, "wind_speed = -3"),
+    ({"params": {"attenuation": -0.1}}, "attenuation = -0.1 must not be negative"),
+    ({"params": {"attenuation": "nan"}}, "attenuation"),
+    ({"params": {"scattering": 0.4}}, "scattering = 0.4 must not exceed attenuation = 0.3"),
+    ({"params": {"backscattering": 0.2}}, "backscattering = 0.2 must not exceed scattering = 0.15"),
+    ({"params": {"layer_tops": "0, 5, 3"}}, "layers out of order"),
+    ({"params": {"bin_width_ns": 0}}, "bin_width_ns = 0 must be greater than 0"),
+    ({"params": {"time_start_ns": 100}}, "time_start_ns = 100.*surface echo"),
+    ({"params": {"field_of_view_mrad": 0}}, "field_of_view_mrad = 0 must be greater than 0"),
+    ({"params": {"layout": "two"}}, "layout = 'two'"),
+    ({"params": {"bin_count": "many"}}, "bin_count|many"),
+    ({"variant": "scalar_rgb"}, "scalar_rgb.*llvm_ad_mono"),
+    ({"variant": "nonsense"}, "nonsense.*llvm_ad_mono"),
+    ({"target_error": 0}, "target_error = 0"),
+    ({"max_time": float("nan")}, "max_time = nan"),
+    ({"passes": 1}, "passes = 1 must be at least 2"),
+    ({"integrator": "lidar_nothing"}, "lidar_nothing"),
+    ({"integrator": "path"}, "lidar integrator"),
+    ({"scene": 3}, "scene = 3"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), MISTAKES)
+def test_mistakes_are_told_in_one_sentence(options, message):
+    options = {"scene": "table1", "passes": 2, **options}
+    with pytest.raises(UserError, match=message) as caught:
+        mitransient_lidar.render(options.pop("scene"), **options)
+    assert "\n" not in str(caught.value)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
+    text = resources.scene_text("table1")
+    for wrong, right, message in (
+        ("lidar_transmiter", "lidar_transmitter", "lidar_transmiter"),
+        ('name="pulse_enrgy_mj"  ', 'name="pulse_energy_mj" ', "pulse_enrgy_mj"),
+    ):
+        assert right in text
+        (tmp_path / "wrong.xml").write_text(
+            text.replace(f'type="{right}"', f'type="{wrong}"').replace(f"<float {right}", f"<float {wrong}")
+        )
+        with pytest.raises(UserError, match=message):
+            small(tmp_path / "wrong.xml")
+
+
+def test_command_line_mistake_is_exit_code_2_without_files(tmp_path):
+    command = [sys.executable, "-m", "mitransient_lidar.cli", "render", "table1", "-D", "wind_speed=40", "-o"]
+    done = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "wind_speed = 40 must lie between 0 and 30" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.rglob("*.*"))
+
+
+def test_small_patch_warns_of_the_light_that_it_loses(caplog):
+    small(params={"surface_size": 4, "surface_resolution": 16})
+    assert "smaller than the footprint" in caplog.text
+    caplog.clear()
+    # A patch that holds the beam (3 sigma are 3.4 m) but not what the water spreads.
+    small(
+        params={"surface_size": 8, "surface_resolution": 32, "divergence_mrad": 4, "attenuation": 1, "scattering": 0.9}
+    )
+    assert "smaller than the spread of the light in the water" in caplog.text
+    caplog.clear()
+    small()
+    assert caplog.text == ""
+
+
+def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives():
+    """The loss is estimated on a flat sea where a large patch tells the truth: missing energy within 25 % of itself."""
+    common = {"spectrum": "flat", "slope_variance": 0.02, "attenuation": 0.5, "scattering": 0.45, "bottom_depth": 12}
+    common |= {"divergence_mrad": 4, "bin_count": 250}
+    small_patch = mitransient_lidar.render("table1", params={**common, "surface_size": 8}, passes=24, seed=1)
+    large_patch = mitransient_lidar.render("table1", params={**common, "surface_size": 400}, passes=24, seed=2)
+    received, whole = (float(shot.impulse_response.sum()) for shot in (small_patch, large_patch))
+    errors = [float(np.sqrt((shot.impulse_response_stderr**2).sum())) for shot in (small_patch, large_patch)]
+    missing = 1 - received / whole
+    uncertainty = 4 * np.hypot(*errors) / whole
+    assert missing > uncertainty  # otherwise nothing is shown
+    assert small_patch.attrs["lost_at_surface_border"] == pytest.approx(missing, abs=0.25 * missing + uncertainty)
