@@ -178,6 +178,8 @@ class LidarVolpath(mi.CppADIntegrator):
         path.active &= scattered | si.is_valid()
         in_leg = mi.Bool(path.in_water)
         advance(path, system, distance, dr.select(scattered, path.point + path.direction * distance, si.p))
+        # Light that has passed beside the surface patch is lost.
+        path.active &= ~system.beside_surface(path.point.z, in_leg)
         path.scatterings += dr.select(scattered, mi.UInt32(1), 0)
         if self.max_scatterings >= 0:
             path.active &= path.scatterings <= self.max_scatterings
@@ -197,7 +199,10 @@ class LidarVolpath(mi.CppADIntegrator):
         turn = self._turn(laser, si, mei, phase, scattered, tried, up)
         above = system.scene.ray_intersect(dr.select(scattered, mi.Ray3f(path.point, up), si.spawn_ray(up)), tried)
         met = tried & above.is_valid() & system.is_surface(above.shape)
-        clear = dr.exp(-self._optical_depth(system, path.depth, -up.z, above.t, met))
+        # Where the surface patch has ended, a flat sea stands in for it in the account of what is lost.
+        lost = tried & ~above.is_valid() & (up.z > 0)
+        leg = dr.select(lost, dr.maximum(path.depth, 0) / up.z, above.t)
+        clear = dr.exp(-self._optical_depth(system, path.depth, -up.z, leg, met | lost))
         combined = lobe_pdf + (turn.pdf * clear if self.connection == "combined" else 0)
         factor = dr.select(met, turn.value * clear / combined, self._walk_weight(path, transmittance))
         crossing = dr.select(met, above, si)
@@ -209,16 +214,10 @@ class LidarVolpath(mi.CppADIntegrator):
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(tried, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
         system.film.add_transient(pixel, path.length + water_length + air_length, energy, radiance > 0)
-        lost = tried & ~above.is_valid()
+        # The lobe's own density stands for the surface's in what is lost.
+        lobe_share = weight * path.throughput * turn.value * clear / combined * lobe_pdf
         self._account(
-            system,
-            laser,
-            energy,
-            radiance > 0,
-            weight * path.throughput * turn.value / combined * lobe_pdf,
-            path,
-            up,
-            lost,
+            system, laser, dr.select(radiance > 0, energy, 0), dr.select(lost, lobe_share, 0), path.point + up * leg
         )
 
         # Choose the next direction; beyond the film's end nothing can arrive any more.
@@ -297,23 +296,20 @@ class LidarVolpath(mi.CppADIntegrator):
         system: LidarScene,
         laser: LaserDirection,
         received: mi.Float,
-        arrived: mi.Bool,
-        proposal: mi.Float,
-        path: Path,
-        up: mi.Vector3f,
-        lost: mi.Bool,
+        lobe_share: mi.Float,
+        crossing: mi.Point3f,
     ) -> None:
         """Sum the energy received, and an estimate of what would have arrived had the surface not ended.
 
         Where a connection misses the surface its light is taken as if it had crossed a flat one at normal incidence.
         """
-        crossing = path.point + up * (dr.maximum(path.depth, 0) / dr.maximum(up.z, 1e-3))
         offset = mi.Point3f(system.transmitter.pose.origin.tolist()) - crossing
         index = float(system.refractive_index)
-        through = 4 * index / (1 + index) ** 2 * index**2 * laser.in_air.z / laser.in_water.z
-        missing = proposal * through * system.transmitter.intensity(-dr.normalize(offset)) / dr.squared_norm(offset)
-        dr.scatter_add(self.balance, mi.Float64(received), mi.UInt32(0), arrived)
-        dr.scatter_add(self.balance, mi.Float64(missing), mi.UInt32(1), lost)
+        transmittance = 4 * index / (1 + index) ** 2
+        through = transmittance * laser.in_air.z / laser.in_water.z
+        missing = lobe_share * through * system.transmitter.intensity(-dr.normalize(offset)) / dr.squared_norm(offset)
+        dr.scatter_add(self.balance, mi.Float64(received), mi.UInt32(0), received > 0)
+        dr.scatter_add(self.balance, mi.Float64(missing), mi.UInt32(1), missing > 0)
 
     def _turn_path(
         self,

@@ -62,12 +62,12 @@ def probe_echoes(system: LidarScene, view: ViewSampler) -> EchoProbe:
     surface, bottom = np.array(at_sea), np.array(solid)
     count = system.receiver.pixels.count
     per_ns = 1e9 / C0
-    hit = np.array(first.is_valid())
+    beside = ~surface if system.surfaces else np.zeros_like(surface)
     total = weight.sum()
     return EchoProbe(
         _quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)),
         _quantiles(np.array(air + water) * per_ns, weight * bottom, pixel, count, (None, 1 - _TAIL)),
-        float(weight[~hit].sum() / total) if total > 0 else 1.0,
+        float(weight[beside].sum() / total) if total > 0 else 1.0,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 
+import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.receiving import Receiver
@@ -104,6 +105,15 @@ class LidarScene:
     def group_index(self) -> float:
         """Group index of the water, 1 without water."""
         return self.water.group_index if self.water is not None else 1.0
+
+    def beside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
+        """Return whether a height [m] can only be reached beside the surface: wet above it, or dry below it."""
+        if not self.surfaces:
+            return mi.Bool(False)
+        boxes = [surface.bbox() for surface in self.surfaces]
+        lowest, highest = min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)
+        # A millimetre of room for points that lie on the surface to rounding.
+        return dr.select(in_water, z > highest + 1e-3, z < lowest - 1e-3)
 
     def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a shape bounds the water."""

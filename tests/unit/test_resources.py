@@ -106,7 +106,7 @@ def test_copy_into_a_missing_folder(folder, tmp_path):
 
 def test_shipped_scenes_are_found_and_described():
     names = resources.scene_names()
-    assert "fig09" in names
+    assert "fig09_2x2" in names
     for name in names:
         assert resources.scene_path(name).is_file()
         assert resources.scene_summary(name), name

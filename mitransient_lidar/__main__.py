@@ -1,0 +1,6 @@
+"""Run the command line with ``python -m mitransient_lidar``."""
+
+from mitransient_lidar.cli import main
+
+if __name__ == "__main__":
+    main()
