@@ -11,6 +11,12 @@ import numpy as np
 from mitransient_lidar.transport.path import optical_length
 from mitransient_lidar.transport.system import LidarScene
 
+#: Newton steps towards Snell's law: three leave 1e-6 rad at an altitude of the depth, less from higher up.
+_NEWTON_STEPS = 3
+
+#: Depth below which a point counts as this deep [m], which keeps the equations regular at the surface.
+_SMALLEST_DEPTH = 1e-4
+
 
 @dataclass
 class LaserDirection:
@@ -46,14 +52,29 @@ class SurfaceLobe:
         self.slope_variance = float(system.slope_variance)
 
     def towards_laser(self, point: mi.Point3f) -> LaserDirection:
-        """Return the laser's direction in the air and, refracted, in the water (two fixed-point steps)."""
-        depth = dr.maximum(-point.z, 0)
-        crossing = mi.Point3f(point.x, point.y, 0)
-        for _ in range(3):
-            in_air = dr.normalize(self.laser - crossing)
-            in_water = self._refract(in_air, mi.Normal3f(0, 0, 1))
-            crossing = point + in_water * (depth / in_water.z)
-        return LaserDirection(in_air, in_water)
+        """Return the laser's direction in the air and, refracted, in the water.
+
+        Newton's method on Snell's law for the horizontal distance between the point and where the ray crosses z = 0. It
+        starts below the root, at the refracted straight line; there the sine of the angle in water is concave in the
+        distance, so that the steps approach the root from one side at any altitude and angle.
+        """
+        depth = dr.maximum(-point.z, _SMALLEST_DEPTH)
+        height = self.laser.z
+        offset = mi.Vector2f(self.laser.x - point.x, self.laser.y - point.y)
+        total = dr.norm(offset)
+        sine = total * dr.rsqrt(dr.square(total) + dr.square(height + depth)) / self.index
+        wet = depth * sine * dr.rsqrt(1 - sine * sine)
+        for _ in range(_NEWTON_STEPS):
+            dry = total - wet
+            r_air = dr.rsqrt(dry * dry + height * height)
+            r_water = dr.rsqrt(wet * wet + depth * depth)
+            slope_air = dr.square(height * r_air) * r_air
+            slope_water = self.index * dr.square(depth * r_water) * r_water
+            wet += (dry * r_air - self.index * wet * r_water) / (slope_air + slope_water)
+        horizontal = offset * dr.select(total > 0, wet / total, 0)
+        crossing = mi.Point3f(point.x + horizontal.x, point.y + horizontal.y, 0)
+        in_air = dr.normalize(self.laser - crossing)
+        return LaserDirection(in_air, self._refract(in_air, mi.Normal3f(0, 0, 1)))
 
     def _refract(self, in_air: mi.Vector3f, normal: mi.Normal3f) -> mi.Vector3f:
         """Return the direction in the water, up to the facet, of light that comes from `in_air` through a facet."""

@@ -1,0 +1,152 @@
+"""Absolute arrival times of echoes against straight-line geometry: a wrong index on any leg shows here.
+
+Timing the air leg with the water's index would bring every echo 241 ns late; timing the water with the refractive
+index where the group index belongs is 1.8 % of the time in the water, 1.3 ns at 8 m.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitransient_lidar.optics.refraction import bottom_time_ns, surface_time_ns
+
+BIN_NS = 0.25
+#: A pencil beam from 200 m: across 0.1 mrad the arrival at 20 degrees changes by 0.05 ns, evenly about the mean.
+PENCIL = {"divergence_mrad": 0.1}
+
+
+def centroid_ns(energy, start_ns):
+    """Return mean arrival [ns] and its standard error over the passes; the bins' centres stand for the bins."""
+    total = energy.sum(axis=1)
+    centres = start_ns + BIN_NS * (np.arange(energy.shape[-1]) + 0.5)
+    times = (total * centres).sum(axis=1) / total.sum(axis=1)
+    return times.mean(), times.std(ddof=1) / np.sqrt(len(times))
+
+
+def shoot(lidar_scene, passes, start_ns, *, altitude, angle, water, bottom, slope_variance="1e-4", scatterings=0):
+    """Time a beam of 1 cm radius on the surface, seen by a field of view of 0.2 m radius."""
+    pose = {"altitude": altitude, "off_nadir_deg": angle}
+    distance = altitude / np.cos(np.radians(angle))
+    scene = lidar_scene(
+        integrator={"max_scatterings": scatterings, "paths_per_pass": 2**14},
+        tx={**pose, "divergence_mrad": 1e3 * 0.02 / distance},
+        rx={**pose, "field_of_view_mrad": 1e3 * 0.4 / distance, "layout": "1x1"},
+        film={"time_start_ns": start_ns, "bin_width_ns": BIN_NS, "bin_count": 64},
+        sea={"slope_variance": slope_variance},
+        water=water,
+        bottom=bottom,
+    )
+    return centroid_ns(passes(scene, 8), start_ns)
+
+
+@pytest.mark.parametrize("altitude", [10.0, 200.0, 3000.0])
+@pytest.mark.parametrize("angle", [0.0, 20.0, 40.0])
+@pytest.mark.parametrize("group_index", [1.34, 1.364])
+def test_bottom_arrives_when_geometry_says(lidar_scene, passes, altitude, angle, group_index):
+    expected = float(bottom_time_ns(altitude, 8.0, np.radians(angle), 1.34, group_index))
+    water = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0, "group_index": group_index}
+    start = BIN_NS * round((expected - 8) / BIN_NS)
+    mean, error = shoot(lidar_scene, passes, start, altitude=altitude, angle=angle, water=water, bottom=8.0)
+    assert error < BIN_NS / 10
+    assert abs(mean - expected) < BIN_NS / 2
+
+
+@pytest.mark.parametrize("altitude", [10.0, 200.0, 3000.0])
+@pytest.mark.parametrize("angle", [0.0, 20.0, 40.0])
+def test_surface_arrives_when_geometry_says(lidar_scene, passes, altitude, angle):
+    expected = float(surface_time_ns(altitude, np.radians(angle)))
+    water = {"attenuation": 100.0, "scattering": 0.0, "backscattering": 0.0}
+    start = BIN_NS * round((expected - 8) / BIN_NS)
+    mean, error = shoot(
+        *(lidar_scene, passes, start), altitude=altitude, angle=angle, water=water, bottom=None, slope_variance="0.1"
+    )
+    assert error < BIN_NS / 10
+    assert abs(mean - expected) < BIN_NS / 2
+
+
+def test_bottom_under_layers_arrives_at_the_same_time(lidar_scene, passes):
+    """Layers of one index differ in attenuation, not in time."""
+    expected = float(bottom_time_ns(200.0, 8.0, np.radians(20.0), 1.34, 1.364))
+    water = {"tops": "0, 1.5, 4", "attenuation": "0.5, 0.05, 0.3", "scattering": "0", "backscattering": "0"}
+    start = BIN_NS * round((expected - 8) / BIN_NS)
+    water["group_index"] = 1.364
+    mean, error = shoot(lidar_scene, passes, start, altitude=200.0, angle=20.0, water=water, bottom=8.0)
+    assert error < BIN_NS / 10
+    assert abs(mean - expected) < BIN_NS / 2
+
+
+def test_layer_seen_by_its_scattering_begins_at_its_slanted_depth(lidar_scene, passes):
+    """Clear water above 3 m and a scattering layer below: nothing before the edge's time, light right after it."""
+    edge = float(bottom_time_ns(200.0, 3.0, np.radians(20.0), 1.34, 1.34))
+    start = BIN_NS * round((edge - 8) / BIN_NS)
+    scene = lidar_scene(
+        integrator={"max_scatterings": 1, "paths_per_pass": 2**15},
+        tx=PENCIL,
+        rx={"field_of_view_mrad": 2.0, "layout": "1x1"},
+        film={"time_start_ns": start, "bin_width_ns": BIN_NS, "bin_count": 64},
+        water={"tops": "0, 3", "attenuation": "0.1, 0.5", "scattering": "0, 0.4", "backscattering": "0, 0.016"},
+        bottom=None,
+    )
+    energy = passes(scene, 8).sum(axis=(0, 1))
+    edges = start + BIN_NS * np.arange(65)
+    assert energy[edges[1:] < edge - 0.1].sum() < 1e-4 * energy.sum()
+    assert energy[(edges[:-1] > edge) & (edges[:-1] < edge + 1)].min() > 0
+
+
+def test_tilted_bottom_arrives_by_its_own_distance(lidar_scene, passes):
+    """A bottom tilted by 10 degrees about y, under a pencil beam at nadir, is hit at its centre's depth."""
+    expected = float(bottom_time_ns(200.0, 8.0, 0.0, 1.34, 1.34))
+    start = BIN_NS * round((expected - 8) / BIN_NS)
+    tilted = mi.ScalarTransform4f().translate([0, 0, -8]).rotate([0, 1, 0], 10).scale(40)
+    scene = lidar_scene(
+        integrator={"max_scatterings": 0, "paths_per_pass": 2**14},
+        tx={**PENCIL, "off_nadir_deg": 0.0},
+        rx={"field_of_view_mrad": 2.0, "layout": "1x1", "off_nadir_deg": 0.0},
+        film={"time_start_ns": start, "bin_width_ns": BIN_NS, "bin_count": 64},
+        water={"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0},
+        bottom=None,
+        extra={"tilted": {"type": "rectangle", "to_world": tilted, "bsdf": {"type": "diffuse"}}},
+    )
+    mean, error = centroid_ns(passes(scene, 8), start)
+    assert error < BIN_NS / 10
+    assert abs(mean - expected) < BIN_NS / 2
+
+
+def test_plate_in_the_air_without_any_water(lidar_scene, passes):
+    """Energy E0 eta^2 T^2 rho/pi cos(theta) A / R^2 and time 2 R / c0 of a Lambertian plate at 20 degrees."""
+    distance = 200.0 / np.cos(np.radians(20.0))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "lidar_volpath", "paths_per_pass": 2**16},
+            "tx": {"type": "lidar_transmitter", **PENCIL},
+            "rx": {
+                "type": "multipixel_receiver",
+                "field_of_view_mrad": 2.0,
+                "film": {"type": "time_gated_film", "time_start_ns": 1410.0, "bin_width_ns": 0.25, "bin_count": 64},
+            },
+            "plate": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(10),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.1}},
+            },
+        }
+    )
+    energy = passes(scene, 16)
+    totals = energy.sum(axis=(1, 2))
+    expected = 5e-3 * 0.81 * 0.9 * 0.1 / np.pi * np.cos(np.radians(20.0)) * 0.025 / distance**2
+    error = totals.std(ddof=1) / np.sqrt(16)
+    # Across the 0.01 mrad beam the closed form is exact to 1e-5.
+    assert abs(totals.mean() - expected) < 4 * error + 1e-4 * expected
+    assert error < 0.005 * expected
+    mean, _ = centroid_ns(energy, 1410.0)
+    assert abs(mean - 2e9 * distance / 299792458.0) < 0.125
+
+
+def test_bins_are_half_open_and_their_sum_is_the_energy():
+    film = mi.load_dict({"type": "time_gated_film", "time_start_ns": 0.0, "bin_width_ns": 1.0, "bin_count": 4})
+    film.prepare_pixels(2)
+    metre = 299792458e-9  # optical length of 1 ns
+    times = np.array([-0.001, 0.0, 0.999, 1.001, 2.5, 3.999, 4.001, np.nan])
+    film.add_transient(mi.UInt32(1), mi.Float(times * metre), mi.Float(np.arange(1.0, 9.0)), mi.Bool(True))
+    assert film.energy().tolist() == [[0, 0, 0, 0], [2 + 3, 4, 5, 6]]
