@@ -15,10 +15,8 @@ from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.system import LidarScene
 
-#: Share of scattering events whose new direction is drawn from a broad lobe towards the laser instead of the phase
-#: function, and the asymmetry of that lobe: every echo needs one large-angle scattering, which is rare by nature.
-#: Of shares 0.1 to 0.55 and asymmetries 0.7 to 0.95 these served clear and turbid water best.
-TURN_SHARE = 0.4
+#: Asymmetry of the broad lobe towards the laser from which a share of the turns is drawn. Of asymmetries 0.7 to 0.95
+#: with shares 0.1 to 0.55 this one, with the default share, served clear and turbid water best.
 TURN_ASYMMETRY = 0.87
 
 _CONNECTIONS = ("combined", "lobe", "walk")
@@ -51,6 +49,9 @@ class LidarVolpath(mi.CppADIntegrator):
     max_scatterings        integer  Largest number of scattering events in the water, -1 for any. Default: -1
     roulette_threshold     float    Throughput below which Russian roulette begins, 0 to 1. A path that has
                                     turned carries little throughput and much signal, so this is low. Default: 0.001
+    turn_share             float    Share of scattering events whose direction is drawn from a broad lobe towards the
+                                    laser instead of the phase function, 0 to 0.99: every echo needs one large-angle
+                                    scattering, which is rare by nature. Default: 0.4
     connection             string   How vertices under water reach the laser: ``combined``, or for checks only
                                     ``lobe`` or ``walk``. Default: ``combined``
     =====================  =======  ====================================================================================
@@ -83,6 +84,7 @@ class LidarVolpath(mi.CppADIntegrator):
         self.paths_per_pass = int(in_range("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28))
         self.max_scatterings = int(in_range("max_scatterings", props.get("max_scatterings", -1), -1, 2**30))
         self.roulette_threshold = in_range("roulette_threshold", props.get("roulette_threshold", 0.001), 0.0, 1.0)
+        self.turn_share = in_range("turn_share", props.get("turn_share", 0.4), 0.0, 0.99)
         self.connection = props.get("connection", "combined")
         if self.connection not in _CONNECTIONS:
             raise ValueError(f"connection = {self.connection!r} must be one of {', '.join(_CONNECTIONS)}")
@@ -261,8 +263,8 @@ class LidarVolpath(mi.CppADIntegrator):
         layer = system.water.flight.layer_at(path.depth)
         return mei, system.water.phase_at(layer), system.water.flight.albedo(layer)
 
-    @staticmethod
     def _turn(
+        self,
         laser: LaserDirection,
         si: mi.SurfaceInteraction3f,
         mei: mi.MediumInteraction3f,
@@ -278,7 +280,7 @@ class LidarVolpath(mi.CppADIntegrator):
             phase_value, phase_pdf = phase.eval_pdf(mi.PhaseFunctionContext(), mei, direction, at_event)
             broad = henyey_greenstein(dr.dot(direction, laser.in_water), TURN_ASYMMETRY)
             value = dr.select(at_event, phase_value[0], 0)
-            pdf = dr.select(at_event, dr.lerp(phase_pdf, broad, TURN_SHARE), 0)
+            pdf = dr.select(at_event, dr.lerp(phase_pdf, broad, self.turn_share), 0)
         at_solid = active & ~scattered
         solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), at_solid)
         return Turn(dr.select(at_solid, solid_value[0], value), dr.select(at_solid, solid_pdf, pdf))
@@ -333,8 +335,8 @@ class LidarVolpath(mi.CppADIntegrator):
         factor = bsdf_weight[0]
         if phase is not None:
             # Rescaled, the number that picks the lobe serves the phase function, too.
-            broadly = pick < TURN_SHARE
-            rest = dr.clip((pick - TURN_SHARE) / (1 - TURN_SHARE), 0, 1)
+            broadly = pick < self.turn_share
+            rest = dr.clip((pick - self.turn_share) / (1 - self.turn_share), 0, 1)
             natural, _, _ = phase.sample(mi.PhaseFunctionContext(), mei, rest, u, scattered)
             cosine = sample_henyey_greenstein(u.x, TURN_ASYMMETRY)
             broad = deflect(mi.Frame3f(laser.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)

@@ -96,8 +96,8 @@ def _field(props: mi.Properties) -> Field:
         inner = 0.5 * mrad("inner_mrad", 0.0)
         if shape == "ring":
             return Sector(outer, inner, centre=centre)
-        start = np.deg2rad(finite("start_deg", props.get("start_deg", 0.0)))
-        extent = np.deg2rad(finite("extent_deg", props.get("extent_deg", 360.0)))
+        start = float(np.deg2rad(finite("start_deg", props.get("start_deg", 0.0))))
+        extent = float(np.deg2rad(finite("extent_deg", props.get("extent_deg", 360.0))))
         return Sector(outer, inner, start, extent, centre)
     if shape == "rectangle":
         width = 0.5e-3 * positive("width_mrad", props.get("width_mrad", 15.0))

@@ -1,0 +1,197 @@
+"""Properties that the estimator must have whatever the scene: sums, reciprocity, strategies that agree, energy."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+WAVY = {"spectrum": "elfouhaily", "slope_variance": "cox_munk"}
+ROUGH = {"slope_variance": "0.01836"}
+
+
+def sidak(count, false_alarm=1e-3):
+    """Return the |z| that the largest of `count` independent deviates exceeds with probability `false_alarm`."""
+    return norm.isf(0.5 * (1 - (1 - false_alarm) ** (1 / count)))
+
+
+def gates(energy, width):
+    """Sum bins into gates of `width` bins, pixels added: shape (passes, gates)."""
+    total = energy.sum(axis=1)
+    return total[:, : total.shape[1] // width * width].reshape(len(total), -1, width).sum(axis=-1)
+
+
+def compare(first, second, z_limit=None):
+    """Assert that two sets of passes have the same mean in every column that both know to 10 %; return the columns."""
+    mean = np.array([first.mean(axis=0), second.mean(axis=0)])
+    error = np.array([a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (first, second)])
+    known = np.all(error < 0.1 * mean, axis=0) & np.all(mean > 0, axis=0)
+    z = (mean[0] - mean[1])[known] / np.hypot(*error)[known]
+    assert np.all(np.abs(z) < (z_limit or sidak(known.sum()))), z
+    return known
+
+
+@pytest.mark.parametrize("layout", ["2x2", "1x4", "8x8"])
+def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes, layout):
+    """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
+    energies = []
+    for name in (layout, "1x1"):
+        scene = lidar_scene(rx={"layout": name, "imager": False}, sea=WAVY, integrator={"paths_per_pass": 2**16})
+        energies.append(passes(scene, 1).sum(axis=1))
+    np.testing.assert_allclose(energies[0], energies[1], rtol=1e-10)
+
+
+def test_pixels_sum_to_the_single_pixel_with_other_seeds(lidar_scene, passes):
+    pixels = lidar_scene(rx={"layout": "2x2"}, sea=WAVY, integrator={"paths_per_pass": 2**17})
+    single = lidar_scene(rx={"layout": "1x1"}, sea=WAVY, integrator={"paths_per_pass": 2**17})
+    known = compare(passes(pixels, 40).sum(axis=1), passes(single, 40, 1000).sum(axis=1))
+    assert known.sum() > 80
+
+
+def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
+    """Quadrants as sectors of a circle, drawn pixel by pixel, against the layout that cuts the circle."""
+    quadrants = {"red": 270.0, "green": 0.0, "blue": 180.0, "black": 90.0}
+    nested = {
+        name: {"type": "pixel_fov", "shape": "sector", "start_deg": start, "extent_deg": 90.0, "pixel_name": name}
+        for name, start in quadrants.items()
+    }
+    nested_scene = lidar_scene(rx=nested, sea=ROUGH)
+    names = nested_scene.sensors()[0].receiver.pixels.names
+    # +gx is far, +gy left: red is far and -gy, the azimuths 270 to 360 degrees; blue near and -gy, 180 to 270.
+    order = [names.index(name) for name in ("red", "green", "blue", "black")]
+    first = passes(nested_scene, 48)[:, order]
+    second = passes(lidar_scene(sea=ROUGH), 48, 1000)
+    for pixel in range(4):
+        assert compare(gates(first[:, [pixel]], 8), gates(second[:, [pixel]], 8)).sum() >= 10
+
+
+def connected(lidar_scene, passes, sea, count, **integrator):
+    """Return energies of a single pixel in gates of 20 ns: 1 to 4 the water, 5 the bottom, then light that lags."""
+    scene = lidar_scene(
+        integrator={"paths_per_pass": 2**15, **integrator},
+        rx={"layout": "1x1"},
+        sea=sea,
+        film={"bin_width_ns": 20.0, "bin_count": 8},
+    )
+    return passes(scene, count)[:, 0]
+
+
+@pytest.mark.parametrize("sea", [ROUGH, WAVY])
+def test_connections_by_lobe_by_walk_and_combined_have_one_mean(lidar_scene, passes, sea):
+    """Each alone is complete; weights that do not sum to one would lose or double what both can find."""
+    combined = connected(lidar_scene, passes, sea, 64)
+    for other, count in (("lobe", 64), ("walk", 256)):
+        alone = connected(lidar_scene, passes, sea, count, connection=other)
+        assert compare(combined[:, 1:7], alone[:, 1:7], z_limit=4).sum() >= 5
+
+
+@pytest.mark.parametrize("sea", [ROUGH, WAVY])
+def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
+    """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
+    combined = connected(lidar_scene, passes, sea, 64).sum(axis=1)
+    walk = connected(lidar_scene, passes, sea, 192, connection="walk", turn_share=0.0).sum(axis=1)
+    assert walk.var(ddof=1) > 50 * combined.var(ddof=1)
+
+
+@pytest.mark.parametrize("sea", [ROUGH, WAVY])
+def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
+    """A uniform beam seen by a uniform field of view, and the two exchanged, per solid angle of the field of view.
+
+    A factor that is not symmetric - the n^2 of one crossing only, a one-sided cosine - would show in every bin.
+    """
+    signals = []
+    for beam, view in ((16.0, 8.0), (8.0, 16.0)):
+        scene = lidar_scene(
+            tx={"beam_profile": "top_hat", "divergence_mrad": beam},
+            rx={"field_of_view_mrad": view, "layout": "1x1"},
+            sea=sea,
+            film={"bin_width_ns": 4.0, "bin_count": 32},
+            integrator={"paths_per_pass": 2**17},
+        )
+        signals.append(passes(scene, 48)[:, 0] / view**2)
+    assert compare(*signals).sum() >= 15
+
+
+def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
+    """One metre apart across the axis, looking at one point, exchanged: equal beams and views see the same signal."""
+    energies = []
+    places = [np.array([-72.8, -0.5, 200.0]), np.array([-72.8, 0.5, 200.0])]
+    for source, receiver in (places, places[::-1]):
+        pose = [
+            mi.ScalarTransform4f().look_at(origin=p.tolist(), target=[0.3, 0.4, 0], up=[0, 0, 1])
+            for p in (source, receiver)
+        ]
+        scene = lidar_scene(
+            tx={"beam_profile": "top_hat", "divergence_mrad": 12.0, "to_world": pose[0]},
+            rx={"field_of_view_mrad": 12.0, "layout": "1x1", "to_world": pose[1]},
+            sea=WAVY,
+            film={"bin_width_ns": 4.0, "bin_count": 32},
+            integrator={"paths_per_pass": 2**17},
+        )
+        energies.append(passes(scene, 40)[:, 0])
+    assert compare(*energies).sum() >= 15
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.05])
+def test_roulette_changes_no_mean(lidar_scene, passes, threshold):
+    first = passes(lidar_scene(sea=ROUGH), 48)
+    second = passes(lidar_scene(sea=ROUGH, integrator={"roulette_threshold": threshold}), 96, 500)
+    assert compare(gates(first, 10), gates(second, 10)).sum() >= 8
+
+
+def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
+    energies = []
+    for symbolic in (True, False):
+        dr.set_flag(dr.JitFlag.SymbolicLoops, symbolic)
+        energies.append(passes(lidar_scene(sea=WAVY, integrator={"paths_per_pass": 2**14}), 1))
+    # Fused and separate kernels round differently, which now and then moves a path to the next bin.
+    assert energies[0].sum() == pytest.approx(energies[1].sum(), rel=1e-3)
+    assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.95
+
+
+def test_identical_layers_are_homogeneous_water(lidar_scene, passes):
+    energies = [
+        passes(lidar_scene(sea=ROUGH, water=water, integrator={"paths_per_pass": 2**15}), 4)
+        for water in ({}, {"tops": "0, 2, 5", "attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006"})
+    ]
+    # The same random numbers; layers add rounding, which moves a few paths across a bin's edge.
+    assert energies[0].sum() == pytest.approx(energies[1].sum(), rel=1e-4)
+    assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.9
+
+
+def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, passes):
+    """Absorption alone, without scattering, leaves the surface echo and dims the bottom by exp(-2 da L)."""
+    bottoms = []
+    for attenuation in (0.1, 0.2):
+        water = {"attenuation": attenuation, "scattering": 0.0, "backscattering": 0.0}
+        # The record ends before light comes that the bottom has reflected twice.
+        film = {"time_start_ns": 1450.0, "bin_count": 60}
+        scene = lidar_scene(water=water, film=film, integrator={"paths_per_pass": 2**15})
+        bottoms.append(passes(scene, 32).sum(axis=(1, 2)))
+    path = 8 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
+    mean = [b.mean() for b in bottoms]
+    relative = np.hypot(*(b.std(ddof=1) / np.sqrt(32) / b.mean() for b in bottoms))
+    assert relative < 5e-3
+    # Rays of the beam within 5 mrad cross 0.1 % more or less water.
+    assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < 4 * relative + 1e-3
+
+
+def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
+    """White bottom, no absorption, and a receiver that would see it all: still less than what a white plate returns."""
+    scene = lidar_scene(
+        water={"attenuation": 0.5, "scattering": 0.5, "backscattering": 0.02},
+        rx={"field_of_view_mrad": 200.0, "layout": "1x1"},
+        film={"time_start_ns": 1300.0, "bin_width_ns": 10.0, "bin_count": 300},
+        rho=1.0,
+    )
+    energy = passes(scene, 8).sum(axis=(1, 2)).mean()
+    plate = 5e-3 * 0.81 * 0.9 * 0.025 * np.cos(np.radians(20)) / np.pi / (200 / np.cos(np.radians(20))) ** 2
+    assert 0.3 * plate < energy < plate
+
+
+def test_sample_count_per_pixel_and_default(lidar_scene):
+    scene = lidar_scene(integrator={"paths_per_pass": 2**12})
+    few, many = (np.array(mi.render(scene, spp=spp, seed=1)).sum() for spp in (0, 2**14))
+    assert few == pytest.approx(many, rel=0.2)
+    # spp = 1024 for each of four pixels is the pass of 4096 paths.
+    assert np.array(mi.render(scene, spp=1024, seed=1)).sum() == pytest.approx(few, rel=1e-5)

@@ -1,0 +1,111 @@
+"""Multiple scattering against an independent random walk in plain NumPy, in double precision.
+
+The walk knows nothing of Mitsuba: photons go down through a flat, smooth surface at nadir, scatter by
+Henyey-Greenstein, are reflected inside the surface by Fresnel's law, and at every event send the share of light that
+the phase function turns towards the far receiver through the refracting surface (Poole, Venable and Campbell 1981,
+doi:10.1364/AO.20.003653).
+"""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.optics.phase import henyey_greenstein
+from mitransient_lidar.optics.refraction import fresnel, refracted_path, solid_angle_per_area
+from mitransient_lidar.optics.water import C0
+
+HEIGHT, INDEX, G = 200.0, 1.34, 0.9
+HALF_VIEW = 0.05  # tangent of the field of view's half angle: 10 m on the surface
+GATES_NS = 2e9 * HEIGHT / C0 + np.array([0.0, 10, 20, 35, 50, 75, 100, 150])
+ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # J m^2
+
+
+def random_walk(attenuation, scattering, photons, seed):
+    """Return the received energy [J] in each gate from light scattered once or more, without any bottom."""
+    rng = np.random.default_rng(seed)
+    position = np.zeros((photons, 3))
+    direction = np.tile([0.0, 0.0, -1.0], (photons, 1))
+    weight = np.full(photons, float(fresnel(0.0, INDEX)[1]))
+    length = np.zeros(photons)
+    energy = np.zeros(len(GATES_NS) - 1)
+    longest = INDEX * 0.5 * (GATES_NS[-1] - GATES_NS[0]) * 1e-9 * C0 * 2 / INDEX**2
+    while len(weight):
+        step = -np.log(rng.random(len(weight))) / attenuation
+        # Light that gets to the surface is reflected back down; what leaves there is not the receiver's to see.
+        up = direction[:, 2] > 0
+        to_surface = np.where(up, -position[:, 2] / np.where(up, direction[:, 2], 1), np.inf)
+        crosses = step > to_surface
+        travel = np.minimum(step, to_surface)
+        position += direction * travel[:, None]
+        length += travel
+        if crosses.any():
+            sine = INDEX * np.sqrt(np.maximum(0, 1 - direction[crosses, 2] ** 2))
+            inside = np.where(sine < 1, fresnel(np.arcsin(np.minimum(sine, 1 - 1e-12)), INDEX)[0], 1.0)
+            weight[crosses] *= inside
+            direction[crosses, 2] *= -1
+            position[crosses, 2] = -1e-12
+        event = ~crosses
+        weight[event] *= scattering / attenuation
+        energy += connect(position[event], direction[event], weight[event], length[event], attenuation)
+        direction[event] = scatter(rng, direction[event])
+        keep = (length < longest) & (weight > 1e-6)
+        position, direction, weight, length = position[keep], direction[keep], weight[keep], length[keep]
+    return energy * ENERGY / photons
+
+
+def connect(position, direction, weight, length, attenuation):
+    """Return what the events send to the receiver, by gate [1/m^2]."""
+    radius, depth = np.hypot(position[:, 0], position[:, 1]), -position[:, 2]
+    theta, phi = refracted_path(radius, HEIGHT, depth, INDEX)
+    seen = np.tan(theta) < HALF_VIEW
+    horizontal = -np.sin(phi)[:, None] * position[:, :2] / np.maximum(radius, 1e-12)[:, None]
+    up = np.column_stack([horizontal, np.cos(phi)])
+    angle = np.arccos(np.clip(np.sum(up * direction, axis=1), -1, 1))
+    wet = depth / np.cos(phi)
+    share = weight * henyey_greenstein(angle, G) * solid_angle_per_area(HEIGHT, depth, theta, INDEX)
+    share *= np.exp(-attenuation * wet) * fresnel(theta, INDEX)[1]
+    time_ns = 1e9 / C0 * (HEIGHT + INDEX * (length + wet) + HEIGHT / np.cos(theta))
+    return np.histogram(time_ns[seen], GATES_NS, weights=share[seen])[0]
+
+
+def scatter(rng, direction):
+    """Return directions turned by Henyey-Greenstein angles."""
+    u = rng.random(len(direction))
+    cosine = (1 + G**2 - ((1 - G**2) / (1 - G + 2 * G * u)) ** 2) / (2 * G)
+    sine, azimuth = np.sqrt(np.maximum(0, 1 - cosine**2)), 2 * np.pi * rng.random(len(direction))
+    helper = np.where(np.abs(direction[:, [2]]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    first = np.cross(direction, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(direction, first)
+    side = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * second
+    turned = cosine[:, None] * direction + sine[:, None] * side
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("attenuation", "scattering"), [(0.3, 0.15), (0.8, 0.64)])
+def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, attenuation, scattering):
+    walks = np.array([random_walk(attenuation, scattering, 40_000, seed) for seed in range(24)])
+    # By reciprocity (tested on its own) the pencil beam and the wide view of the walk may be exchanged: a wide beam
+    # lights every vertex, where a pencil would be met by chance. Energies go with the solid angle that is seen.
+    view, beam = 0.5e-3, 2 * HALF_VIEW
+    scene = {
+        "integrator": {"paths_per_pass": 2**16},
+        "tx": {"off_nadir_deg": 0.0, "beam_profile": "top_hat", "divergence_mrad": 1e3 * beam},
+        "rx": {"off_nadir_deg": 0.0, "field_of_view_mrad": 1e3 * view, "layout": "1x1"},
+        "film": {"time_start_ns": float(GATES_NS[0]), "bin_width_ns": 0.5, "bin_count": 300},
+        "bottom": None,
+    }
+    water = {"attenuation": attenuation, "scattering": scattering, "backscattering": 0.01}
+    water |= {"phase_function": "hg", "phase_g": G}
+    # The surface echo comes in the first bins, which are left out below.
+    energy = passes(lidar_scene(**scene, water=water), 40)[:, 0] * (beam / view) ** 2
+    edges = np.round((GATES_NS - GATES_NS[0]) / 0.5).astype(int)
+    rendered = np.array([energy[:, a:b].sum(axis=1) for a, b in pairwise(edges)]).T[:, 1:]
+    reference = walks[:, 1:]
+    error = np.hypot(*(a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (rendered, reference)))
+    z = (rendered.mean(axis=0) - reference.mean(axis=0)) / error
+    assert np.all(np.abs(z) < 4), (z, rendered.mean(axis=0) / reference.mean(axis=0))
+    relative = error / reference.mean(axis=0)
+    assert np.all(relative[:4] < 0.04), relative
+    assert np.all(relative < 0.1), relative
