@@ -110,6 +110,9 @@ def check_llvm() -> None:
     if version is not None and version[0] >= OLDEST_USABLE_LLVM:
         return
     problem = "Dr.Jit finds no LLVM" if version is None else f"LLVM {version[0]} does not work with Dr.Jit"
+    own = os.environ.get(_LLVM_VARIABLE)
+    if own and Path(own) != find_llvm():
+        raise UserError(llvm_advice(f"{problem} at {_LLVM_VARIABLE} = {own!r}"))
     if find_llvm() is not None:
         raise UserError(
             f"{problem}, because mitsuba or drjit was imported before mitransient_lidar: "

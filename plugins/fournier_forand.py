@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.optics.checks import in_range
 from mitransient_lidar.optics.phase import fournier_forand_backscatter_ratio, fournier_forand_parameters
 from mitransient_lidar.optics.phase_table import PowerLawTable
 from mitransient_lidar.transport.phase import TabulatedPhase, deflect, half_angle
@@ -16,8 +17,7 @@ class FournierForand(mi.PhaseFunction):
     ====================  =====  =======================================================================================
     Parameter             Type   Meaning
     ====================  =====  =======================================================================================
-    backscatter_ratio     float  Backscattered share of the scattering bb/b, 0.0001 to 0.4 or as the family of index and
-                                 slope allows. Default: 0.0183
+    backscatter_ratio     float  Backscattered share of the scattering bb/b, 3.4e-8 to 0.4999. Default: 0.0183
     refractive_index,     float  Instead: index of the particles relative to water, above 1, and slope of their size
     junge_slope                  distribution, 3 to 5 (give both)
     ====================  =====  =======================================================================================
@@ -45,7 +45,8 @@ class FournierForand(mi.PhaseFunction):
         if "refractive_index" in props or "junge_slope" in props:
             if "backscatter_ratio" in props or not ("refractive_index" in props and "junge_slope" in props):
                 raise ValueError("fournier_forand: give backscatter_ratio, or both refractive_index and junge_slope")
-            self.refractive_index, self.junge_slope = props["refractive_index"], props["junge_slope"]
+            self.refractive_index = in_range("refractive_index", props["refractive_index"], 1.0001, 2.0)
+            self.junge_slope = in_range("junge_slope", props["junge_slope"], 3.0001, 4.9999)
         else:
             ratio = props.get("backscatter_ratio", 0.0183)
             self.refractive_index, self.junge_slope = fournier_forand_parameters(ratio)

@@ -66,6 +66,9 @@ class LayeredWater(mi.Medium):
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
         if kind not in _PHASES:
             raise ValueError(f"phase_function = {kind!r} must be one of {', '.join(_PHASES)}")
+        # Mitsuba's own media hold one phase function; the others are this plugin's.
+        for name in list(phases)[1:]:
+            del props[name]
         super().__init__(props)
         self.phases = _phases_of_layers(self.column, phases, kind, phase_g)
         # One pointer a layer; layers that share a function share the pointer, and the call.

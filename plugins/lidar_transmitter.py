@@ -66,7 +66,10 @@ class LidarTransmitter(mi.Emitter):
             raise ValueError(f"beam_profile = {self.beam_profile!r} must be 'gaussian' or 'top_hat'")
         self.divergence = _divergence(props, self.beam_profile)
         if "pulse_file" in props:
-            self.pulse = Pulse.from_file(props["pulse_file"])
+            try:
+                self.pulse = Pulse.from_file(props["pulse_file"])
+            except OSError as error:
+                raise ValueError(f"pulse_file = {props['pulse_file']!r} cannot be read: {error.strerror}") from error
         else:
             self.pulse = Pulse.gaussian(positive("pulse_fwhm_ns", props.get("pulse_fwhm_ns", 5.0)))
         self.m_needs_sample_2 = False

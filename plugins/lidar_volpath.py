@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import in_range
+from mitransient_lidar.optics.checks import in_range, whole
 from mitransient_lidar.transport.connection import LaserDirection, SurfaceLobe, laser_through
 from mitransient_lidar.transport.path import Path, advance, optical_length
 from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
@@ -81,8 +81,8 @@ class LidarVolpath(mi.CppADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.paths_per_pass = int(in_range("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28))
-        self.max_scatterings = int(in_range("max_scatterings", props.get("max_scatterings", -1), -1, 2**30))
+        self.paths_per_pass = whole("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
+        self.max_scatterings = whole("max_scatterings", props.get("max_scatterings", -1), -1, 2**30)
         self.roulette_threshold = in_range("roulette_threshold", props.get("roulette_threshold", 0.001), 0.0, 1.0)
         self.turn_share = in_range("turn_share", props.get("turn_share", 0.4), 0.0, 0.99)
         self.connection = props.get("connection", "combined")
@@ -148,8 +148,11 @@ class LidarVolpath(mi.CppADIntegrator):
         words = np.random.SeedSequence(seed).generate_state(3, np.uint64)
         # Opaque, so that another seed is the same kernel.
         state, stream, shift = (dr.opaque(mi.UInt64, int(word)) for word in words)
-        rng = mi.PCG32(count, initstate=state, initseq=stream)
-        start = view.sample(dr.arange(mi.UInt32, count), count, shift, rng.next_float32())
+        index = dr.arange(mi.UInt32, count)
+        # Neighbouring streams of PCG32 are correlated unless their states are scrambled (TEA, Zafar et al. 2010).
+        high, low = mi.sample_tea_32(index, mi.UInt32(stream))
+        rng = mi.PCG32(initstate=state ^ ((mi.UInt64(high) << 32) | mi.UInt64(low)), initseq=stream + mi.UInt64(index))
+        start = view.sample(index, count, shift, rng.next_float32())
         path = Path(
             point=mi.Point3f(system.receiver.pose.origin.tolist()),
             direction=start.direction,

@@ -7,7 +7,7 @@ import logging
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import finite, in_range, positive
+from mitransient_lidar.optics.checks import finite, in_range, positive, whole
 from mitransient_lidar.optics.sea import ElfouhailySpectrum, cox_munk, mesh_slope_variance, realise
 
 logger = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ class OceanSurface(mi.Mesh):
                                  sea. Default: ``cox_munk``
     size                float    Side of the square patch about the origin [m]. Default: 32, flat: 1000
     resolution          integer  Cells a side, even, 2 to 4096. Default: 128
-    surface_seed        integer  Which sea: the same seed is the same sea at any resolution. Default: 1
+    surface_seed        integer  Which sea, 0 to 2^53: the same seed is the same sea at any resolution. Default: 1
     (nested)            bsdf     Any BSDF instead of the ripples
     interior            medium   The water: ``layered_water``
     ==================  =======  =======================================================================================
@@ -70,9 +70,9 @@ class OceanSurface(mi.Mesh):
         self.spectrum = spectrum
         self.wind_speed = wind_speed
         self.size = positive("size", props.get("size", 1000.0 if spectrum == "flat" else 32.0))
-        resolution = 2 if spectrum == "flat" else int(in_range("resolution", props.get("resolution", 128), 2, 4096))
+        resolution = 2 if spectrum == "flat" else whole("resolution", props.get("resolution", 128), 2, 4096)
         props.mark_queried("resolution")
-        seed = int(props.get("surface_seed", 1))
+        seed = whole("surface_seed", props.get("surface_seed", 1), 0, 2**53)
         if spectrum == "flat":
             heights, resolved = np.zeros((2, 2)), (0.0, 0.0)
             total = _total_variance(props, wind_speed, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import finite, finite_array, positive
+from mitransient_lidar.optics.checks import finite, finite_array, in_range, positive
 from mitransient_lidar.transport.fields import Field, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.pixels import ShapedPixels
 from mitransient_lidar.transport.pose import Pose
@@ -93,11 +93,11 @@ def _field(props: mi.Properties) -> Field:
         outer = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
         if shape == "circle":
             return Sector(outer, centre=centre)
-        inner = 0.5 * mrad("inner_mrad", 0.0)
+        inner = 0.5e-3 * in_range("inner_mrad", props.get("inner_mrad", 0.0), 0.0, 2e3 * outer * (1 - 1e-6))
         if shape == "ring":
             return Sector(outer, inner, centre=centre)
-        start = float(np.deg2rad(finite("start_deg", props.get("start_deg", 0.0))))
-        extent = float(np.deg2rad(finite("extent_deg", props.get("extent_deg", 360.0))))
+        start = np.deg2rad(finite("start_deg", props.get("start_deg", 0.0)))
+        extent = np.deg2rad(in_range("extent_deg", props.get("extent_deg", 360.0), 1e-3, 360.0))
         return Sector(outer, inner, start, extent, centre)
     if shape == "rectangle":
         width = 0.5e-3 * positive("width_mrad", props.get("width_mrad", 15.0))
@@ -105,7 +105,11 @@ def _field(props: mi.Properties) -> Field:
         return Rectangle(centre[0] - height, centre[0] + height, centre[1] - width, centre[1] + width)
     if shape == "strip":
         radius = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
-        return Strip(radius, mrad("gx_min_mrad", -1e3 * radius), mrad("gx_max_mrad", 1e3 * radius))
+        low = in_range("gx_min_mrad", props.get("gx_min_mrad", -1e3 * radius), -1e6, 1e3 * radius * (1 - 1e-6))
+        high = max(low, -1e3 * radius) * (1 + 1e-6) + 1e-9
+        return Strip(
+            radius, 1e-3 * low, 1e-3 * in_range("gx_max_mrad", props.get("gx_max_mrad", 1e3 * radius), high, 1e6)
+        )
     if shape == "polygon":
         words = str(props.get("vertices_mrad", "")).replace(",", " ").split()
         numbers = finite_array("vertices_mrad", words)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import finite, in_range, positive
+from mitransient_lidar.optics.checks import finite, positive, whole
 from mitransient_lidar.optics.water import C0
 
 #: More bins than this do not fit the memory of a laptop.
@@ -44,7 +44,7 @@ class TimeGatedFilm(mi.Film):
     def __init__(self, props: mi.Properties) -> None:
         self.time_start_ns = finite("time_start_ns", props.get("time_start_ns", 1390.0))
         self.bin_width_ns = positive("bin_width_ns", props.get("bin_width_ns", 0.5))
-        self.bin_count = int(in_range("bin_count", props.get("bin_count", 320), 1, 1_000_000))
+        self.bin_count = whole("bin_count", props.get("bin_count", 320), 1, 1_000_000)
         props["width"], props["height"] = self.bin_count, 1
         super().__init__(props)
         self._shape: tuple[int, ...] = (1,)

@@ -43,6 +43,14 @@ def in_range(name: str, value: object, low: float, high: float) -> float:
     return number
 
 
+def whole(name: str, value: object, low: int, high: int) -> int:
+    """Return `value` as a whole number in the closed interval [`low`, `high`]."""
+    number = in_range(name, value, low, high)
+    if number != int(number):
+        raise ValueError(f"{name} = {number:g} must be a whole number")
+    return int(number)
+
+
 def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
     """Return `values` as a new float64 array without NaN or infinity."""
     try:

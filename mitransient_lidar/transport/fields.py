@@ -66,6 +66,9 @@ class Sector(Field):
     centre: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        # NumPy scalars would turn Dr.Jit arrays into NumPy ones in the formulas below.
+        for name in ("outer", "inner", "start", "extent"):
+            object.__setattr__(self, name, float(getattr(self, name)))
         positive("outer radius of the field of view", self.outer)
         in_range("inner radius of the field of view", self.inner, 0.0, self.outer * (1 - 1e-9))
         positive("extent of the field-of-view sector", self.extent)
@@ -109,6 +112,8 @@ class Rectangle(Field):
     gy_max: float
 
     def __post_init__(self) -> None:
+        for name in ("gx_min", "gx_max", "gy_min", "gy_max"):
+            object.__setattr__(self, name, float(getattr(self, name)))
         positive("extent of the field of view along gx", self.gx_max - self.gx_min)
         positive("extent of the field of view along gy", self.gy_max - self.gy_min)
 
@@ -147,6 +152,8 @@ class Strip(Field):
     gx_max: float
 
     def __post_init__(self) -> None:
+        for name in ("radius", "gx_min", "gx_max"):
+            object.__setattr__(self, name, float(getattr(self, name)))
         positive("radius of the field of view", self.radius)
         low, high = self._limits()
         if not high > low:
@@ -205,6 +212,8 @@ class Polygon(Field):
             raise ValueError(f"polygon: needs at least three corners (gx, gy), got an array of shape {points.shape}")
         for value in points.ravel():
             finite("polygon corner", float(value))
+        if _crosses_itself(points):
+            raise ValueError("polygon: its edges must not cross each other")
         x, y = points.T
         signed = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
         if abs(signed) < 1e-18:
@@ -253,8 +262,20 @@ def _cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
+def _crosses_itself(points: np.ndarray) -> bool:
+    """Return whether two edges of a polygon that share no corner cross."""
+    count = len(points)
+    for i in range(count):
+        a, b = points[i], points[(i + 1) % count]
+        for j in range(i + 2, count - (i == 0)):
+            c, d = points[j], points[(j + 1) % count]
+            if _cross(a, b, c) * _cross(a, b, d) < 0 and _cross(c, d, a) * _cross(c, d, b) < 0:
+                return True
+    return False
+
+
 def _triangulate(points: np.ndarray) -> list[tuple[int, int, int]]:
-    """Cut ears off a polygon whose corners turn left; raise ValueError when its edges cross each other."""
+    """Cut ears off a simple polygon whose corners turn left."""
     rest, triangles = list(range(len(points))), []
     while len(rest) > 3:
         for k in range(len(rest)):

@@ -7,6 +7,9 @@ import mitsuba as mi
 
 from mitransient_lidar.optics.water import WaterColumn
 
+#: What is left of a flight at least where it ends: in clear water even that is never reached.
+_SMALLEST_OPTICAL_DEPTH = 1e-30
+
 
 class LayeredFlight:
     """Dr.Jit side of a :class:`WaterColumn`: which layer, how far, how much is left.
@@ -68,13 +71,22 @@ class LayeredFlight:
             return within
         to_edge, edge = self._way_out(layer, depth, downward)
         beyond = optical_depth - here * to_edge
-        # The remaining optical depth, as a vertical one counted from z = 0, is found among the tabulated edges.
-        target = dr.gather(mi.Float, self._edge, edge) + beyond * downward
-        last = dr.binary_search(0, self.count - 1, lambda i: dr.gather(mi.Float, self._edge, i + 1) <= target)
-        depth_reached = dr.gather(mi.Float, self._top, last) + (
-            target - dr.gather(mi.Float, self._edge, last)
-        ) / self.attenuation(last)
-        through = to_edge + (depth_reached - dr.gather(mi.Float, self._top, edge)) / downward
+        # The remaining optical depth, as a vertical one counted from z = 0, is found among the tabulated edges. Upwards
+        # an edge that rounding meets exactly is still to be crossed, and the clear layers that share it.
+        from_edge = dr.gather(mi.Float, self._edge, edge)
+        target = from_edge + beyond * downward
+
+        def passed(i: mi.UInt32) -> mi.Bool:
+            following = dr.gather(mi.Float, self._edge, i + 1)
+            return dr.select(downward > 0, following <= target, following < target)
+
+        last = dr.binary_search(0, self.count - 1, passed)
+        # Counted from the edge through which it enters the last layer, so that nearly level flights keep their length.
+        enter = dr.select(downward > 0, last, dr.minimum(last + 1, self.count - 1))
+        between = (dr.gather(mi.Float, self._edge, enter) - from_edge) / downward
+        last_part = dr.maximum(beyond - between, _SMALLEST_OPTICAL_DEPTH) / self.attenuation(last)
+        to_last = (dr.gather(mi.Float, self._top, enter) - dr.gather(mi.Float, self._top, edge)) / downward
+        through = to_edge + to_last + last_part
         return dr.select((beyond > 0) & (to_edge < dr.inf), through, within)
 
     def _way_out(self, layer: mi.UInt32, depth: mi.Float, downward: mi.Float) -> tuple[mi.Float, mi.UInt32]:
@@ -109,4 +121,6 @@ class LayeredFlight:
         enter = dr.select(downward > 0, end, dr.minimum(end + 1, self.count - 1))
         between = (dr.gather(mi.Float, self._edge, enter) - dr.gather(mi.Float, self._edge, edge)) / downward
         last_part = (end_depth - dr.gather(mi.Float, self._top, enter)) / downward * self.attenuation(end)
-        return dr.select(length <= to_edge, here * length, here * to_edge + between + last_part)
+        # To rounding, a nearly horizontal segment may pass an edge without leaving the layer.
+        within = (length <= to_edge) | (end == layer)
+        return dr.select(within, here * length, here * to_edge + between + last_part)

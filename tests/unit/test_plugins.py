@@ -1,0 +1,213 @@
+"""Plugins: what their constructors refuse, what their manuals promise, and how they work with Mitsuba's own parts."""
+
+import ast
+import importlib
+import logging
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar import loading, variants
+from mitransient_lidar.errors import UserError
+from mitransient_lidar.transport.system import LidarScene
+
+SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10], [0, 0, 0, 1]])
+CIRCLE = {"type": "pixel_fov", "field_of_view_mrad": 10.0}
+
+REFUSED = [
+    ({"type": "lidar_transmitter", "altitude": -1.0}, "altitude = -1 must be greater than 0"),
+    ({"type": "lidar_transmitter", "off_nadir_deg": 95.0}, "off_nadir_deg = 95 must lie between 0 and 89.9"),
+    ({"type": "lidar_transmitter", "pulse_energy_mj": 0.0}, "pulse_energy_mj = 0 must be greater than 0"),
+    ({"type": "lidar_transmitter", "optical_efficiency": 1.1}, "optical_efficiency = 1.1 must lie between"),
+    ({"type": "lidar_transmitter", "beam_profile": "donut"}, "beam_profile = 'donut'"),
+    ({"type": "lidar_transmitter", "divergence_mrad": 0.0}, "divergence_mrad = 0 must be greater than 0"),
+    ({"type": "lidar_transmitter", "divergence_mrad": 1.0, "divergence_1e2_mrad": 2.0}, "give one of"),
+    ({"type": "lidar_transmitter", "beam_profile": "top_hat", "divergence_fwhm_mrad": 2.0}, "divergence_fwhm_mrad"),
+    ({"type": "lidar_transmitter", "pulse_file": "nowhere.txt"}, "pulse_file = 'nowhere.txt' cannot be read"),
+    ({"type": "lidar_transmitter", "pulse_fwhm_ns": float("nan")}, "pulse_fwhm_ns = nan"),
+    ({"type": "lidar_transmitter", "to_world": SHEAR}, "to_world must be a rotation"),
+    ({"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f(), "altitude": 3.0}, "not both"),
+    ({"type": "lidar_transmitter", "wavelength_nm": 5.0}, "wavelength_nm = 5 must lie between 300 and 1100"),
+    ({"type": "lidar_transmitter", "power": 5.0}, "power"),
+    ({"type": "pixel_fov", "field_of_view_mrad": 0.0}, "field_of_view_mrad = 0 must be greater than 0"),
+    ({"type": "pixel_fov", "shape": "blob"}, "shape = 'blob' must be one of circle"),
+    ({"type": "pixel_fov", "shape": "ring", "inner_mrad": 40.0}, "inner_mrad = 40 must lie between 0 and 30"),
+    ({"type": "pixel_fov", "shape": "sector", "extent_deg": 0.0}, "extent_deg = 0 must lie between"),
+    ({"type": "pixel_fov", "shape": "strip", "gx_min_mrad": 20.0}, "gx_min_mrad = 20 must lie between"),
+    ({"type": "pixel_fov", "shape": "rectangle", "width_mrad": 0.0}, "width_mrad = 0"),
+    ({"type": "pixel_fov", "shape": "polygon"}, "at least three corners"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 1 1, 2 2"}, "lie on one line"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 3, 4 0, 0 2"}, "must not cross each other"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 4, 4 0, 0 4"}, "must not cross each other"),
+    ({"type": "pixel_fov", "shape": "strip", "gx_min_mrad": 5.0, "gx_max_mrad": 4.0}, "gx_max_mrad = 4 must lie"),
+    ({"type": "time_gated_film", "bin_count": 10.5}, "bin_count = 10.5 must be a whole number"),
+    ({"type": "ocean_surface", "surface_seed": "x"}, "surface_seed = 'x' must be a number"),
+    ({"type": "fournier_forand", "junge_slope": 6.0, "refractive_index": 1.1}, "junge_slope = 6 must lie between"),
+    ({"type": "multipixel_receiver", "layout": "2by2"}, "layout = '2by2' must be rows x columns"),
+    ({"type": "multipixel_receiver", "layout": "0x2"}, "layout = '0x2'"),
+    ({"type": "multipixel_receiver", "layout": "9999x9999"}, "at most 1048576"),
+    ({"type": "multipixel_receiver", "field_of_view_shape": "oval"}, "field_of_view_shape = 'oval'"),
+    ({"type": "multipixel_receiver", "aperture_area": 0.0}, "aperture_area = 0"),
+    ({"type": "multipixel_receiver", "response_time_ns": -1.0}, "response_time_ns = -1 must not be negative"),
+    ({"type": "multipixel_receiver", "layout": "2x2", "a": CIRCLE}, "nested pixel_fov sensors or layout"),
+    ({"type": "multipixel_receiver", "a": {"type": "perspective"}}, "nested sensors must be pixel_fov"),
+    ({"type": "time_gated_film", "bin_width_ns": 0.0}, "bin_width_ns = 0 must be greater than 0"),
+    ({"type": "time_gated_film", "bin_count": 0}, "bin_count = 0 must lie between 1"),
+    ({"type": "time_gated_film", "time_start_ns": float("inf")}, "time_start_ns = inf must be finite"),
+    ({"type": "layered_water", "attenuation": -0.1}, "attenuation = -0.1 must not be negative"),
+    ({"type": "layered_water", "scattering": float("nan")}, "scattering"),
+    ({"type": "layered_water", "scattering": 0.4}, "scattering = 0.4 must not exceed attenuation = 0.3"),
+    ({"type": "layered_water", "backscattering": 0.2}, "backscattering = 0.2 must not exceed scattering = 0.15"),
+    ({"type": "layered_water", "tops": "0, 4, 3"}, "layers out of order"),
+    ({"type": "layered_water", "tops": "1, 2"}, "first layer must start at 0"),
+    ({"type": "layered_water", "attenuation": "0.3, 0.4, 0.5", "tops": "0, 1"}, "attenuation has 3 values"),
+    ({"type": "layered_water", "phase_function": "mie"}, "phase_function = 'mie'"),
+    ({"type": "layered_water", "phase_g": 1.0}, "phase_g = 1 must lie between"),
+    ({"type": "layered_water", "refractive_index": 0.9}, "refractive_index = 0.9"),
+    ({"type": "layered_water", "a": {"type": "petzold"}, "b": {"type": "petzold"}}, "nested phase functions"),
+    ({"type": "fournier_forand", "backscatter_ratio": 0.6}, "backscatter_ratio = 0.6 must lie between"),
+    ({"type": "fournier_forand", "junge_slope": 3.5}, "both refractive_index and junge_slope"),
+    ({"type": "two_term_henyey_greenstein", "weight": 1.5}, "weight = 1.5 must lie between 0 and 1"),
+    ({"type": "ocean_surface", "wind_speed": -1.0}, "wind_speed = -1 must lie between 0 and 30"),
+    ({"type": "ocean_surface", "wind_speed": 31.0}, "wind_speed = 31 must lie between 0 and 30"),
+    ({"type": "ocean_surface", "spectrum": "swell"}, "spectrum = 'swell' must be one of"),
+    ({"type": "ocean_surface", "slope_variance": "some"}, "slope_variance = 'some' must be"),
+    ({"type": "ocean_surface", "slope_variance": "2"}, "slope_variance = 2 must lie between"),
+    ({"type": "ocean_surface", "resolution": 3}, "resolution = 3 must be an even"),
+    ({"type": "ocean_surface", "size": 0.0}, "size = 0 must be greater than 0"),
+    ({"type": "lidar_volpath", "connection": "best"}, "connection = 'best' must be one of"),
+    ({"type": "lidar_volpath", "paths_per_pass": 3}, "paths_per_pass = 3 must lie between 1024"),
+    ({"type": "lidar_volpath", "turn_share": 1.0}, "turn_share = 1 must lie between"),
+    ({"type": "lidar_volpat"}, "lidar_volpat"),
+]
+
+
+@pytest.mark.parametrize(("plugin", "message"), REFUSED)
+def test_what_plugins_refuse_is_told_in_one_sentence(plugin, message):
+    with pytest.raises(UserError, match=re.escape(message)) as caught, loading.readable_errors(loading=True):
+        mi.load_dict(plugin)
+    assert "\n" not in str(caught.value)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_overlapping_pixels_are_warned_of_and_names_must_differ(caplog):
+    with caplog.at_level(logging.WARNING):
+        mi.load_dict({"type": "multipixel_receiver", "a": CIRCLE, "b": {**CIRCLE, "gx_mrad": 4.0}})
+    assert "'pixel0' and 'pixel1' overlap" in caplog.text
+    with pytest.raises(RuntimeError, match="names must differ"):
+        mi.load_dict({"type": "multipixel_receiver", "a": {**CIRCLE, "pixel_name": "x"},
+                      "b": {**CIRCLE, "gx_mrad": 20.0, "pixel_name": "x"}})  # fmt: skip
+
+
+def test_defaults_are_the_published_system():
+    transmitter = mi.load_dict({"type": "lidar_transmitter"})
+    receiver = mi.load_dict({"type": "multipixel_receiver"}).receiver
+    water = mi.load_dict({"type": "layered_water"})
+    assert (transmitter.pulse_energy, transmitter.divergence, transmitter.pulse.fwhm_ns) == (5e-3, 10e-3, 5.0)
+    assert transmitter.optical_efficiency == 0.9
+    optics = receiver.optics
+    assert (optics.aperture_area, optics.optical_efficiency) == (0.025, 0.9)
+    assert optics.two_way_atmospheric_transmittance == 0.9
+    assert receiver.pixels.layout == "2x2"
+    np.testing.assert_allclose(transmitter.pose.origin, [-200 * np.tan(np.radians(20)), 0, 200])
+    column = water.column
+    assert (column.attenuation[0], column.scattering[0], column.backscattering[0]) == (0.3, 0.15, 0.006)
+
+
+def test_look_at_agrees_with_altitude_and_angle():
+    """Local x of Mitsuba's look_at is +gy, local y is +gx: mixed up, far and left pixels would be swapped."""
+    place = [-200 * np.tan(np.radians(20)), 0, 200]
+    to_world = mi.ScalarTransform4f().look_at(origin=place, target=[0, 0, 0], up=[0, 0, 1])
+    poses = [mi.load_dict({"type": "lidar_transmitter", **p}).pose for p in ({}, {"to_world": to_world})]
+    for name in ("origin", "axis", "far", "left"):
+        np.testing.assert_allclose(getattr(poses[0], name), getattr(poses[1], name), atol=2e-5)
+
+
+@pytest.mark.parametrize("module", variants._PLUGIN_MODULES)
+def test_examples_in_the_manual_load(module):
+    classes = vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
+    (manual,) = (c.__doc__ for c in classes if isinstance(c, type) and "code-block:: xml" in (c.__doc__ or ""))
+    assert f"(``{module}``)" in manual
+    xml, python = re.search(r"code-block:: xml\n(.*?)\.\. code-block:: python\n(.*)", manual, re.DOTALL).groups()
+    load = ast.literal_eval(python.strip())
+    assert load["type"] == module
+    mi.load_dict(load)
+    if "<film" in xml and "<sensor" not in xml:
+        return  # a film loads inside a sensor only, and the sensors' examples hold one
+    if "<phase" in xml:
+        xml = f'<medium type="layered_water" name="interior">{xml}</medium>'
+    if "<medium" in xml and "<shape" not in xml:
+        xml = f'<shape type="ocean_surface">{xml}</shape>'
+    mi.load_string(f'<scene version="3.0.0">{xml}</scene>')
+
+
+def scene(**parts):
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "tx": {"type": "lidar_transmitter"},
+            "rx": {"type": "multipixel_receiver", "film": {"type": "time_gated_film"}},
+            "sea": {"type": "ocean_surface", "interior": {"type": "layered_water"}},
+            **parts,
+        }
+    )
+
+
+WRONG_SCENES = [
+    ({"rx": {"type": "perspective"}}, "multipixel_receiver or pixel_fov"),
+    ({"rx": {"type": "multipixel_receiver"}}, "time_gated_film"),
+    ({"tx": {"type": "constant"}}, "exactly one lidar_transmitter"),
+    ({"tx2": {"type": "lidar_transmitter"}}, "has 2 of which 2"),
+    ({"sea": {"type": "ocean_surface"}}, "needs a layered_water"),
+    ({"sea": {"type": "ocean_surface", "interior": {"type": "homogeneous"}}}, "must be layered_water"),
+    ({"sea": {"type": "ocean_surface", "exterior": {"type": "layered_water"}}}, "interior medium"),
+    ({"more": {"type": "sphere", "interior": {"type": "layered_water", "attenuation": 1.0}}}, "allowed is one"),
+    ({"tx": {"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}}, "altitude"),
+]
+
+
+@pytest.mark.parametrize(("parts", "message"), WRONG_SCENES)
+def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
+    loaded = scene(**parts)
+    with pytest.raises(ValueError, match=message):
+        LidarScene.from_scene(loaded, loaded.sensors()[0])
+
+
+def test_users_bsdf_wins_and_ripples_take_the_waters_index():
+    own = scene(sea={"type": "ocean_surface", "bsdf": {"type": "dielectric"}, "interior": {"type": "layered_water"}})
+    (surface,) = (s for s in own.shapes() if hasattr(s, "ripple_variance"))
+    assert not surface.has_ripples
+    water = {"type": "layered_water", "refractive_index": 1.25}
+    loaded = scene(sea={"type": "ocean_surface", "interior": water})
+    indices = [float(value[0]) if hasattr(value, "__len__") else float(value)
+               for key, value in mi.traverse(loaded) if key.endswith(".eta")]  # fmt: skip
+    assert indices == [pytest.approx(1.25)]
+
+
+def test_no_wind_is_a_flat_sea():
+    (surface,) = (s for s in scene(sea={"type": "ocean_surface", "wind_speed": 0.0,
+                  "interior": {"type": "layered_water"}}).shapes() if hasattr(s, "ripple_variance"))  # fmt: skip
+    assert surface.bbox().max.z == surface.bbox().min.z == 0
+    assert surface.spectrum == "flat"
+
+
+def test_other_integrators_see_the_layers():
+    """Mitsuba's volumetric path tracers ask for coefficients with a null part up to the largest attenuation."""
+    water = mi.load_dict({"type": "layered_water", "tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.6, 0.2"})
+    mei = mi.MediumInteraction3f()
+    mei.p = mi.Point3f(0, 0, mi.Float([-1.0, -4.0]))
+    scattering, null, total = (np.array(c).ravel() for c in water.get_scattering_coefficients(mei))
+    np.testing.assert_allclose(scattering, [0.6, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(total, [0.9, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
+
+
+def test_a_pixel_alone_is_a_receiver():
+    alone = scene(rx={**CIRCLE, "film": {"type": "time_gated_film"}}, integrator={"type": "lidar_volpath"})
+    energy = np.array(mi.render(alone, seed=1, spp=2**14))
+    assert energy.shape == (1, 320)
+    assert energy.sum() > 0
+    assert mitransient_lidar.render(alone, passes=2).pixel.values.tolist() == ["pixel"]
