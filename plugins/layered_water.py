@@ -36,7 +36,8 @@ class LayeredWater(mi.Medium):
     a nested phase function, bb follows from that function and ``backscattering`` is only checked.
 
     The lidar integrators sample free flights and transmittances through all layers in closed form. Mitsuba's own
-    volumetric integrators work as well, with null collisions against the largest attenuation.
+    volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
+    phase function in all layers.
 
     .. code-block:: xml
 
@@ -69,8 +70,11 @@ class LayeredWater(mi.Medium):
         # Mitsuba's own media hold one phase function; the others are this plugin's.
         for name in list(phases)[1:]:
             del props[name]
-        super().__init__(props)
         self.phases = _phases_of_layers(self.column, phases, kind, phase_g)
+        if not phases:
+            # For Mitsuba's own integrators, which would take an isotropic function where none is nested.
+            props["phase_0"] = self.phases[0]
+        super().__init__(props)
         # One pointer a layer; layers that share a function share the pointer, and the call.
         self._same_phase = all(phase is self.phases[0] for phase in self.phases)
         self.flight = LayeredFlight(self.column)

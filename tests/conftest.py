@@ -8,6 +8,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.variants import SUPPORTED_VARIANTS
+
+
+@pytest.fixture(autouse=True, scope="session")
+def variant():
+    """Run in the variant that the package has chosen, and leave it set: in another one there are no plugins."""
+    chosen = mi.variant()
+    assert chosen in SUPPORTED_VARIANTS
+    yield chosen
+    assert mi.variant() == chosen
+
 
 @pytest.fixture(autouse=True)
 def clean_drjit():

@@ -58,9 +58,12 @@ class TabulatedPhase:
 
     def sample(self, u: mi.Float, v: mi.Float) -> mi.Float:
         """Map two uniform numbers to s = sin^2(theta/2) distributed as 4 pi times the phase function."""
-        scaled = u * (self._segments + 1)
+        cells = self._segments + 1
+        scaled = u * cells
         index = dr.minimum(mi.UInt32(scaled), self._segments)
-        rejected = scaled - mi.Float(index) >= dr.gather(mi.Float, self._accept, index)
+        # The 24 bits of u leave 12 for the fraction: without more from v, improbable cells are drawn too often.
+        fraction = scaled - mi.Float(index) + v * (cells * 2**-24)
+        rejected = fraction >= dr.gather(mi.Float, self._accept, index)
         index = dr.gather(mi.UInt32, self._alias, index, rejected) | dr.select(rejected, 0, index)
         k = dr.gather(mi.Float, self._k, index)
         growth = dr.gather(mi.Float, self._growth, index)

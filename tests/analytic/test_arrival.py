@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.optics.refraction import bottom_time_ns, surface_time_ns
+from mitransient_lidar.optics.water import C0
 
 BIN_NS = 0.25
 #: A pencil beam from 200 m: across 0.1 mrad the arrival at 20 degrees changes by 0.05 ns, evenly about the mean.
@@ -112,6 +113,40 @@ def test_tilted_bottom_arrives_by_its_own_distance(lidar_scene, passes):
     assert abs(mean - expected) < BIN_NS / 2
 
 
+@pytest.mark.parametrize("depth", [0.0, 8.0])
+def test_facet_that_faces_the_lidar_lets_light_straight_through(passes, depth):
+    """A plane surface tilted by 20 degrees towards the lidar: the echo of its centre, and of a level bottom below.
+
+    Light meets it at normal incidence and goes on at 20 degrees; refracted by a level surface instead it would go at
+    14.8 degrees and come back 2.1 ns early from 8 m.
+    """
+    distance = 200.0 / np.cos(np.radians(20.0))
+    expected = 2e9 * (distance + 1.34 * depth / np.cos(np.radians(20.0))) / C0
+    start = BIN_NS * round((expected - 8) / BIN_NS)
+    water = {"attenuation": 0.1 if depth else 100.0, "scattering": 0.0, "backscattering": 0.0, "group_index": 1.34}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "lidar_volpath", "paths_per_pass": 2**15},
+        "tx": {"type": "lidar_transmitter", **PENCIL},
+        "rx": {
+            "type": "multipixel_receiver",
+            "layout": "1x1",
+            "field_of_view_mrad": 2.0,
+            "film": {"type": "time_gated_film", "time_start_ns": start, "bin_width_ns": BIN_NS, "bin_count": 64},
+        },
+        "sea": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], -20).scale(10),
+            "interior": {"type": "layered_water", "refractive_index": 1.34, **water},
+            "bsdf": {"type": "roughdielectric", "int_ior": 1.34, "ext_ior": 1.0, "alpha": 0.03},
+        },
+        "bottom": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).scale(500)},
+    }
+    mean, error = centroid_ns(passes(mi.load_dict(scene), 8), start)
+    assert error < BIN_NS / 10
+    assert abs(mean - expected) < BIN_NS / 2
+
+
 def test_plate_in_the_air_without_any_water(lidar_scene, passes):
     """Energy E0 eta^2 T^2 rho/pi cos(theta) A / R^2 and time 2 R / c0 of a Lambertian plate at 20 degrees."""
     distance = 200.0 / np.cos(np.radians(20.0))
@@ -140,7 +175,7 @@ def test_plate_in_the_air_without_any_water(lidar_scene, passes):
     assert abs(totals.mean() - expected) < 4 * error + 1e-4 * expected
     assert error < 0.005 * expected
     mean, _ = centroid_ns(energy, 1410.0)
-    assert abs(mean - 2e9 * distance / 299792458.0) < 0.125
+    assert abs(mean - 2e9 * distance / C0) < BIN_NS / 2
 
 
 def test_bins_are_half_open_and_their_sum_is_the_energy():
@@ -150,3 +185,10 @@ def test_bins_are_half_open_and_their_sum_is_the_energy():
     times = np.array([-0.001, 0.0, 0.999, 1.001, 2.5, 3.999, 4.001, np.nan])
     film.add_transient(mi.UInt32(1), mi.Float(times * metre), mi.Float(np.arange(1.0, 9.0)), mi.Bool(True))
     assert film.energy().tolist() == [[0, 0, 0, 0], [2 + 3, 4, 5, 6]]
+
+
+def test_bins_sum_to_a_film_of_one_bin(lidar_scene, passes):
+    """The same paths, sorted by time or not: a bin's edge that belonged to two bins or none would show."""
+    films = ({"bin_width_ns": 0.25, "bin_count": 640}, {"bin_width_ns": 160.0, "bin_count": 1})
+    fine, single = (passes(lidar_scene(film=film, sea={"slope_variance": "0.02"}), 2) for film in films)
+    np.testing.assert_allclose(fine.sum(axis=-1), single[..., 0], rtol=1e-10)

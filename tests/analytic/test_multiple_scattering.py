@@ -3,7 +3,7 @@
 The walk knows nothing of Mitsuba: photons go down through a flat, smooth surface at nadir, scatter by
 Henyey-Greenstein, are reflected inside the surface by Fresnel's law, and at every event send the share of light that
 the phase function turns towards the far receiver through the refracting surface (Poole, Venable and Campbell 1981,
-doi:10.1364/AO.20.003653).
+doi:10.1364/AO.20.003653). Single scattering alone would be 20 to 90 % too low here, growing with the delay.
 """
 
 from itertools import pairwise
@@ -17,7 +17,10 @@ from mitransient_lidar.optics.water import C0
 
 HEIGHT, INDEX, G = 200.0, 1.34, 0.9
 HALF_VIEW = 0.05  # tangent of the field of view's half angle: 10 m on the surface
-GATES_NS = 2e9 * HEIGHT / C0 + np.array([0.0, 10, 20, 35, 50, 75, 100, 150])
+#: The surface echo, across 1.7 ns, falls into the first gate, which is left out.
+GATES_NS = 2e9 * HEIGHT / C0 + np.array([0.0, 3, 10, 20, 35, 50, 75, 100, 150])
+#: Share of the directions that the walk draws about the vertical instead of the photon's direction, and their spread.
+UPWARD_SHARE, UPWARD_G = 0.4, 0.8
 ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # J m^2
 
 
@@ -29,7 +32,7 @@ def random_walk(attenuation, scattering, photons, seed):
     weight = np.full(photons, float(fresnel(0.0, INDEX)[1]))
     length = np.zeros(photons)
     energy = np.zeros(len(GATES_NS) - 1)
-    longest = INDEX * 0.5 * (GATES_NS[-1] - GATES_NS[0]) * 1e-9 * C0 * 2 / INDEX**2
+    longest = (GATES_NS[-1] - GATES_NS[0]) * 1e-9 * C0 / INDEX  # way in the water at the last gate's end [m]
     while len(weight):
         step = -np.log(rng.random(len(weight))) / attenuation
         # Light that gets to the surface is reflected back down; what leaves there is not the receiver's to see.
@@ -48,8 +51,9 @@ def random_walk(attenuation, scattering, photons, seed):
         event = ~crosses
         weight[event] *= scattering / attenuation
         energy += connect(position[event], direction[event], weight[event], length[event], attenuation)
-        direction[event] = scatter(rng, direction[event])
-        keep = (length < longest) & (weight > 1e-6)
+        direction[event], factor = scatter(rng, direction[event])
+        weight[event] *= factor
+        keep = (length < longest) & (weight > 1e-7)
         position, direction, weight, length = position[keep], direction[keep], weight[keep], length[keep]
     return energy * ENERGY / photons
 
@@ -70,22 +74,27 @@ def connect(position, direction, weight, length, attenuation):
 
 
 def scatter(rng, direction):
-    """Return directions turned by Henyey-Greenstein angles."""
+    """Return directions, some of them about the vertical, and phase function over density of drawing them."""
+    upward = rng.random(len(direction)) < UPWARD_SHARE
+    axis, g = np.where(upward[:, None], [0.0, 0.0, 1.0], direction), np.where(upward, UPWARD_G, G)
     u = rng.random(len(direction))
-    cosine = (1 + G**2 - ((1 - G**2) / (1 - G + 2 * G * u)) ** 2) / (2 * G)
+    cosine = (1 + g**2 - ((1 - g**2) / (1 - g + 2 * g * u)) ** 2) / (2 * g)
     sine, azimuth = np.sqrt(np.maximum(0, 1 - cosine**2)), 2 * np.pi * rng.random(len(direction))
-    helper = np.where(np.abs(direction[:, [2]]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    first = np.cross(direction, helper)
+    helper = np.where(np.abs(axis[:, [2]]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    first = np.cross(axis, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(direction, first)
+    second = np.cross(axis, first)
     side = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * second
-    turned = cosine[:, None] * direction + sine[:, None] * side
-    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    turned = cosine[:, None] * axis + sine[:, None] * side
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    phase = henyey_greenstein(np.arccos(np.clip(np.sum(turned * direction, axis=1), -1, 1)), G)
+    about_vertical = henyey_greenstein(np.arccos(np.clip(turned[:, 2], -1, 1)), UPWARD_G)
+    return turned, phase / ((1 - UPWARD_SHARE) * phase + UPWARD_SHARE * about_vertical)
 
 
 @pytest.mark.parametrize(("attenuation", "scattering"), [(0.3, 0.15), (0.8, 0.64)])
 def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, attenuation, scattering):
-    walks = np.array([random_walk(attenuation, scattering, 40_000, seed) for seed in range(24)])
+    walks = np.array([random_walk(attenuation, scattering, 20_000, seed) for seed in range(20)])
     # By reciprocity (tested on its own) the pencil beam and the wide view of the walk may be exchanged: a wide beam
     # lights every vertex, where a pencil would be met by chance. Energies go with the solid angle that is seen.
     view, beam = 0.5e-3, 2 * HALF_VIEW
@@ -98,8 +107,7 @@ def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, at
     }
     water = {"attenuation": attenuation, "scattering": scattering, "backscattering": 0.01}
     water |= {"phase_function": "hg", "phase_g": G}
-    # The surface echo comes in the first bins, which are left out below.
-    energy = passes(lidar_scene(**scene, water=water), 40)[:, 0] * (beam / view) ** 2
+    energy = passes(lidar_scene(**scene, water=water), 32)[:, 0] * (beam / view) ** 2
     edges = np.round((GATES_NS - GATES_NS[0]) / 0.5).astype(int)
     rendered = np.array([energy[:, a:b].sum(axis=1) for a, b in pairwise(edges)]).T[:, 1:]
     reference = walks[:, 1:]

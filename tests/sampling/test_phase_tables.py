@@ -1,0 +1,112 @@
+"""Phase functions as plugins: normalised on the sphere, and the published tables at every angle."""
+
+from importlib import resources
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+FRAME_WI = np.array([0.48, -0.6, 0.64])
+
+#: Fournier-Forand family by bb/b: mean cosine, p(90 degrees) and p(180 degrees) of the closed form. The mean cosine is
+#: 1 - 2 <s> from the cumulative distribution: a quadrature of p from 1e-9 rad loses 1.1e-3 in the core at bb/b = 0.005.
+FOURNIER_FORAND = {
+    0.005: (0.97655, 1.23315e-3, 7.2867e-4),
+    0.0183: (0.93000, 4.190592e-3, 2.855692e-3),
+    0.04: (0.86658, 8.564872e-3, 6.613178e-3),
+    0.05: (0.83992, 1.045472e-2, 8.429564e-3),
+}
+PLUGINS = [
+    *({"type": "fournier_forand", "backscatter_ratio": ratio} for ratio in FOURNIER_FORAND),
+    {"type": "fournier_forand", "refractive_index": 1.175, "junge_slope": 4.065},
+    {"type": "petzold"},
+    {"type": "two_term_henyey_greenstein", "weight": 0.95, "g_forward": 0.9, "g_backward": 0.3},
+    {"type": "two_term_henyey_greenstein", "weight": 0.0, "g_backward": 0.7},
+    {"type": "two_term_henyey_greenstein", "weight": 1.0, "g_forward": 0.0},
+]
+
+
+def value(plugin, theta):
+    """Return p [1/sr] of a plugin at scattering angles [rad]; directions are exact to float32 at an oblique `wi`."""
+    mei = mi.MediumInteraction3f()
+    mei.wi = mi.Vector3f(FRAME_WI.tolist())
+    frame = mi.Frame3f(-mei.wi)
+    wo = frame.to_world(mi.Vector3f(mi.Float(np.sin(theta)), 0, mi.Float(np.cos(theta))))
+    return np.array(plugin.eval_pdf(mi.PhaseFunctionContext(), mei, wo)[1], dtype=np.float64)
+
+
+@pytest.mark.parametrize("description", PLUGINS)
+def test_normalised_over_the_sphere(description):
+    """Quadrature in ln(theta) from 0.003 degree, plus the power law below: one half, or 4 pi, would be off by far."""
+    plugin = mi.load_dict(description)
+    low = np.radians(0.003)
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    edges = np.linspace(np.log(low), np.log(np.pi), 400)
+    half = np.diff(edges)[:, None] / 2
+    theta = np.exp(edges[:-1, None] + half * (1 + nodes))
+    p = value(plugin, theta.ravel()).reshape(theta.shape)
+    total = np.sum(2 * np.pi * p * np.sin(theta) * theta * half * weights)
+    # Below, p goes on as theta^-m; float32 directions no longer tell such angles.
+    ends = value(plugin, np.array([low, 2 * low]))
+    slope = np.log(ends[0] / ends[1]) / np.log(2)
+    total += 2 * np.pi * ends[0] * low**2 / (2 - slope)
+    assert total == pytest.approx(1, abs=3e-3)
+
+
+@pytest.mark.parametrize("ratio", FOURNIER_FORAND)
+def test_fournier_forand_family(ratio):
+    """The table of the family n = 1.01 + 0.1542 (mu - 3); another line through the plane of index and slope differs."""
+    mean_cosine, side, back = FOURNIER_FORAND[ratio]
+    plugin = mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
+    np.testing.assert_allclose(value(plugin, np.radians([90.0, 180.0])), [side, back], rtol=5e-4)
+    assert plugin.tabulated.table.mean_cosine == pytest.approx(mean_cosine, abs=2e-5)
+    assert plugin.tabulated.table.backscatter_ratio == pytest.approx(ratio, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("index", "slope", "ratio"),
+    [(1.040, 3.2010, 1.003e-3), (1.08, 3.483, 1.0037e-2), (1.175, 4.065, 0.10008), (1.15, 4.874, 0.40052)],
+)
+def test_fournier_forand_by_index_and_slope(index, slope, ratio):
+    """Pairs that the Ocean Optics Web Book lists with their backscatter ratios."""
+    plugin = mi.load_dict({"type": "fournier_forand", "refractive_index": index, "junge_slope": slope})
+    assert plugin.backscatter_ratio == pytest.approx(ratio, rel=1e-3)
+
+
+def test_petzold_at_every_tabulated_angle():
+    """All 55 rows over the 0.9929 that they integrate to; linear interpolation would divide by 1.0200."""
+    text = resources.files("mitransient_lidar.optics").joinpath("petzold_average_particle.csv").read_text("utf-8")
+    degrees, tabulated = np.loadtxt(text.splitlines(), delimiter=",", unpack=True)
+    assert len(degrees) == 55
+    # Rows of the paper, so that the file itself is checked.
+    for angle, row in ((0.1, 1766.61), (1.2589, 49.5803), (7.9433, 1.81927), (30, 8.60848e-2), (145, 2.31308e-3)):
+        assert tabulated[degrees == angle] == pytest.approx(row)
+    plugin = mi.load_dict({"type": "petzold"})
+    ratio = value(plugin, np.radians(degrees)) / tabulated
+    # The finer table cuts the corners of the kinks at its rows; below 1 degree float32 angles add 1e-3.
+    np.testing.assert_allclose(ratio, 1 / 0.9929, rtol=1e-2)
+    assert np.median(ratio) == pytest.approx(1 / 0.9929, rel=1e-3)
+    assert plugin.backscatter_ratio == pytest.approx(0.01826, rel=1e-3)
+
+
+def test_petzold_core_holds_five_percent():
+    """Below 0.1 degree, where the measurement ends, theta^-1.346 holds 0.05169 of the raw table's integral."""
+    count = 2**21
+    rng = mi.PCG32(count, initstate=5)
+    mei = mi.MediumInteraction3f()
+    mei.wi = mi.Vector3f(FRAME_WI.tolist())
+    first = rng.next_float32()
+    pair = mi.Point2f(rng.next_float32(), rng.next_float32())
+    wo, _, _ = mi.load_dict({"type": "petzold"}).sample(mi.PhaseFunctionContext(), mei, first, pair)
+    # Half the distance between the directions is the sine of half the angle.
+    share = np.mean(np.linalg.norm(np.array(wo).T + FRAME_WI, axis=1) < 2 * np.sin(np.radians(0.05)))
+    expected = 0.05169 / 0.9929
+    assert abs(share - expected) < 4 * np.sqrt(expected / count) + 2e-5
+
+
+def test_weight_outside_the_forward_lobe_is_the_backward_one():
+    """A sign lost in the backward lobe would double the forward one instead."""
+    plugin = mi.load_dict({"type": "two_term_henyey_greenstein", "weight": 0.0, "g_backward": 0.7})
+    forward, backward = value(plugin, np.array([0.0, np.pi]))
+    assert backward == pytest.approx(1.7 / (4 * np.pi * 0.3**2), rel=1e-3)
+    assert forward == pytest.approx(0.3 / (4 * np.pi * 1.7**2), rel=1e-3)
