@@ -49,9 +49,10 @@ class LidarVolpath(mi.CppADIntegrator):
     max_scatterings        integer  Largest number of scattering events in the water, -1 for any. Default: -1
     roulette_threshold     float    Throughput below which Russian roulette begins, 0 to 1. A path that has
                                     turned carries little throughput and much signal, so this is low. Default: 0.001
-    turn_share             float    Share of scattering events whose direction is drawn from a broad lobe towards the
-                                    laser instead of the phase function, 0 to 0.99: every echo needs one large-angle
-                                    scattering, which is rare by nature. Default: 0.4
+    turn_share             float    Share of scattering events, and of hits of rough solids under water, whose direction
+                                    is drawn from a broad lobe towards the laser instead of the phase function or
+                                    BSDF, 0 to 0.99: every echo needs one large-angle turn, which is rare by nature.
+                                    Default: 0.4
     connection             string   How vertices under water reach the laser: ``combined``, or for checks only
                                     ``lobe`` or ``walk``. Default: ``combined``
     =====================  =======  ====================================================================================
@@ -286,7 +287,14 @@ class LidarVolpath(mi.CppADIntegrator):
             pdf = dr.select(at_event, dr.lerp(phase_pdf, broad, self.turn_share), 0)
         at_solid = active & ~scattered
         solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), at_solid)
+        broad = henyey_greenstein(dr.dot(direction, laser.in_water), TURN_ASYMMETRY)
+        solid_pdf = dr.select(self._is_rough(si), dr.lerp(solid_pdf, broad, self.turn_share), solid_pdf)
         return Turn(dr.select(at_solid, solid_value[0], value), dr.select(at_solid, solid_pdf, pdf))
+
+    @staticmethod
+    def _is_rough(si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Return whether a surface has no mirror-like part, so that any direction can be drawn and weighted."""
+        return ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
 
     def _walk_weight(self, path: Path, transmittance: mi.Float) -> mi.Float:
         """Return the weight of a connection that the walk made: balance heuristic against the lobe."""
@@ -333,21 +341,24 @@ class LidarVolpath(mi.CppADIntegrator):
         """Draw the direction in which the path goes on, and update throughput, medium and lobe ratio."""
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at_surface = path.active & ~scattered
-        bs, bsdf_weight = si.bsdf().sample(mi.BSDFContext(), si, pick, u, at_surface)
+        # Scattering events and rough solids under water: a share of the directions is drawn towards the laser.
+        mixed = scattered | (submerged & at_surface & self._is_rough(si))
+        broadly = pick < self.turn_share
+        # Rescaled, the number that picks the lobe serves the phase function and the solid, too.
+        rest = dr.clip((pick - self.turn_share) / (1 - self.turn_share), 0, 1)
+        bs, bsdf_weight = si.bsdf().sample(mi.BSDFContext(), si, dr.select(mixed, rest, pick), u, at_surface)
         direction, pdf = si.to_world(bs.wo), bs.pdf
         factor = bsdf_weight[0]
         if phase is not None:
-            # Rescaled, the number that picks the lobe serves the phase function, too.
-            broadly = pick < self.turn_share
-            rest = dr.clip((pick - self.turn_share) / (1 - self.turn_share), 0, 1)
             natural, _, _ = phase.sample(mi.PhaseFunctionContext(), mei, rest, u, scattered)
+            natural = dr.select(scattered, natural, direction)
             cosine = sample_henyey_greenstein(u.x, TURN_ASYMMETRY)
             broad = deflect(mi.Frame3f(laser.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
             drawn = dr.select(broadly, broad, natural)
-            turn = self._turn(laser, si, mei, phase, scattered, scattered, drawn)
-            direction = dr.select(scattered, dr.normalize(drawn), direction)
-            pdf = dr.select(scattered, turn.pdf, pdf)
-            factor = dr.select(scattered, turn.value / turn.pdf, factor)
+            turn = self._turn(laser, si, mei, phase, scattered, mixed, drawn)
+            direction = dr.select(mixed, dr.normalize(drawn), direction)
+            pdf = dr.select(mixed, turn.pdf, pdf)
+            factor = dr.select(mixed, turn.value / turn.pdf, factor)
         delta = at_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         path.lobe_ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf(laser, direction) / pdf, 0)
         path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
