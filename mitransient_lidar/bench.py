@@ -174,6 +174,7 @@ def _plain_ray_rate(scene_name: str, parameters: dict[str, str]) -> float:
 
     from mitransient_lidar.loading import load_scene
     from mitransient_lidar.transport.receiving import ViewSampler
+    from mitransient_lidar.transport.streams import pass_streams
     from mitransient_lidar.transport.system import LidarScene
 
     scene, _, _ = load_scene(scene_name, parameters)
@@ -181,7 +182,7 @@ def _plain_ray_rate(scene_name: str, parameters: dict[str, str]) -> float:
     view = ViewSampler(system.receiver, system.transmitter)
     count, rates = 2**21, []
     for attempt in range(6):
-        start = view.sample(dr.arange(mi.UInt32, count), count, dr.opaque(mi.UInt64, attempt), mi.Float(0.5))
+        start = view.sample(dr.arange(mi.UInt32, count), count, pass_streams(attempt, 0, count))
         ray = mi.Ray3f(mi.Point3f(system.receiver.pose.origin.tolist()), start.direction)
         dr.eval(ray)
         dr.sync_thread()

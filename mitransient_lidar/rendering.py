@@ -168,7 +168,7 @@ def render(
     film, pulse = system.film, system.transmitter.pulse
     kernel = pulse.kernel(film.bin_width_ns, system.receiver.optics.response_time_ns)
     energy, power = PassStatistics(), PassStatistics()
-    balance = np.zeros(2)
+    lost_energy = 0.0
     start = time.perf_counter()
     interrupted = False
     median = p95 = None
@@ -179,7 +179,7 @@ def render(
             histogram = film.energy().reshape(system.receiver.pixels.count, film.bin_count)
             energy.add(histogram)
             power.add(waveform(histogram, film.bin_width_ns, kernel))
-            balance += np.array(engine.balance)
+            lost_energy += float(np.array(engine.lost).item())
             if energy.count > 1:
                 errors = window.relative_errors(power.mean, power.stderr)
                 median, p95 = _percentiles(errors)
@@ -192,7 +192,8 @@ def render(
             raise
         interrupted = True
     elapsed = time.perf_counter() - start
-    lost = float(balance[1] / balance.sum()) if balance.sum() > 0 else 0.0
+    received = float(np.nansum(energy.mean)) * energy.count
+    lost = lost_energy / (lost_energy + received) if lost_energy > 0 else 0.0
     _warn_of_losses(system, probe, lost)
     attributes = {
         "scene": name,
@@ -236,7 +237,7 @@ def _integrator(scene: mi.Scene, wanted: Any) -> Any:
         with readable_errors(loading=True):
             engine = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
     if not hasattr(engine, "plugin"):
-        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_volpath'/>")
+        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
     return engine
 
 

@@ -31,6 +31,7 @@ _PLUGIN_MODULES = (
     "multipixel_receiver",
     "time_gated_film",
     "lidar_volpath",
+    "lidar_merging",
 )
 
 _registered_for: str | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -78,6 +80,11 @@ class LayeredWater(mi.Medium):
         # One pointer a layer; layers that share a function share the pointer, and the call.
         self._same_phase = all(phase is self.phases[0] for phase in self.phases)
         self.flight = LayeredFlight(self.column)
+        self.scattering_flight = LayeredFlight(replace(self.column, attenuation=self.column.scattering))
+        none = np.zeros(self.column.count)
+        self.absorption_flight = LayeredFlight(
+            WaterColumn(self.column.tops, self.column.absorption, none, none)
+        )
         self._majorant = float(np.max(self.column.attenuation))
         self.m_is_homogeneous = self.column.count == 1
         self.m_has_spectral_extinction = False

@@ -13,13 +13,35 @@ from mitransient_lidar.transport.connection import LaserDirection, SurfaceLobe, 
 from mitransient_lidar.transport.path import Path, advance, optical_length
 from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.streams import pass_streams
 from mitransient_lidar.transport.system import LidarScene
+from mitransient_lidar.transport.walk import scattering_event
 
 #: Asymmetry of the broad lobe towards the laser from which a share of the turns is drawn. Of asymmetries 0.7 to 0.95
 #: with shares 0.1 to 0.55 this one, with the default share, served clear and turbid water best.
 TURN_ASYMMETRY = 0.87
 
+#: Number of this integrator's random streams within a pass.
+_STREAM = 3
+
 _CONNECTIONS = ("combined", "lobe", "walk")
+
+
+@dataclass
+class ConnectedPath(Path):
+    """A path whose vertices are connected to the laser.
+
+    Attributes
+    ----------
+    lobe_ratio
+        Density of the surface connection's proposal over that of the walk, for the direction of the next leg; 0 where
+        no connection was tried.
+    pristine
+        Whether the path has met no solid yet.
+    """
+
+    lobe_ratio: mi.Float
+    pristine: mi.Bool
 
 
 @dataclass
@@ -55,6 +77,9 @@ class LidarVolpath(mi.CppADIntegrator):
                                     Default: 0.4
     connection             string   How vertices under water reach the laser: ``combined``, or for checks only
                                     ``lobe`` or ``walk``. Default: ``combined``
+    unmerged               boolean  Whether to leave out what ``lidar_merging`` finds by merging: echoes of one vertex in
+                                    the air, all paths that scatter in the water and meet no solid, and those whose
+                                    first solid is under water and not a mirror. Default: false
     =====================  =======  ====================================================================================
 
     The unbiased reference. Paths start at the receiver, cross the surface (waves and ripples), scatter to any order,
@@ -89,8 +114,9 @@ class LidarVolpath(mi.CppADIntegrator):
         self.connection = props.get("connection", "combined")
         if self.connection not in _CONNECTIONS:
             raise ValueError(f"connection = {self.connection!r} must be one of {', '.join(_CONNECTIONS)}")
-        #: Energy [J] that the last pass received, and that left through the border of the surface patch.
-        self.balance = mi.Float64(0, 0)
+        self.unmerged = bool(props.get("unmerged", False))
+        #: Energy [J] that the last pass would have received, had the surface patch not ended.
+        self.lost = mi.Float64(0)
         #: Number of rays that the last pass traced.
         self.rays = mi.Float64(0)
         self._prepared: tuple[mi.Scene, mi.Sensor, LidarScene, ViewSampler] | None = None
@@ -135,39 +161,35 @@ class LidarVolpath(mi.CppADIntegrator):
             sensor = scene.sensors()[sensor]
         system, view = self.prepare(scene, sensor)
         count = spp * system.receiver.pixels.count if spp > 0 else self.paths_per_pass
-        system.film.prepare_pixels(system.receiver.pixels.count, system.receiver.pixels.grid)
-        self.balance = dr.zeros(mi.Float64, 2)
+        pixels, emitted = system.receiver.pixels, system.transmitter.energy
+        system.film.prepare_pixels(pixels.count, emitted, pixels.grid)
+        self.lost = dr.zeros(mi.Float64, 1)
         with dr.suspend_grad():
             self.sample(system, view, count, int(np.array(seed).item()))
         if evaluate:
             system.film.schedule_storage()
-            dr.eval(self.balance, self.rays)
+            dr.eval(self.lost, self.rays)
         return system.film.develop() if develop else mi.TensorXf()
 
     def sample(self, system: LidarScene, view: ViewSampler, count: int, seed: int) -> None:
         """Trace `count` paths from the receiver and add what they find to the film."""
-        words = np.random.SeedSequence(seed).generate_state(3, np.uint64)
-        # Opaque, so that another seed is the same kernel.
-        state, stream, shift = (dr.opaque(mi.UInt64, int(word)) for word in words)
-        index = dr.arange(mi.UInt32, count)
-        # Neighbouring streams of PCG32 are correlated unless their states are scrambled (TEA, Zafar et al. 2010).
-        high, low = mi.sample_tea_32(index, mi.UInt32(stream))
-        rng = mi.PCG32(initstate=state ^ ((mi.UInt64(high) << 32) | mi.UInt64(low)), initseq=stream + mi.UInt64(index))
-        start = view.sample(index, count, shift, rng.next_float32())
-        path = Path(
+        rng = pass_streams(seed, _STREAM, count)
+        start = view.sample(dr.arange(mi.UInt32, count), count, rng)
+        path = ConnectedPath(
             point=mi.Point3f(system.receiver.pose.origin.tolist()),
             direction=start.direction,
             in_water=mi.Bool(False),
             length=mi.Float(0),
             throughput=mi.Float(1),
             scatterings=mi.UInt32(0),
-            lobe_ratio=mi.Float(0),
             rays=mi.UInt32(0),
             active=start.weight > 0,
+            lobe_ratio=mi.Float(0),
+            pristine=mi.Bool(True),
         )
         lobe = SurfaceLobe(system)
 
-        def body(path: Path, rng: mi.PCG32) -> tuple[Path, mi.PCG32]:
+        def body(path: ConnectedPath, rng: mi.PCG32) -> tuple[ConnectedPath, mi.PCG32]:
             self._step(system, lobe, path, rng, start.pixel, start.weight)
             return path, rng
 
@@ -175,10 +197,11 @@ class LidarVolpath(mi.CppADIntegrator):
         self.rays = dr.sum(mi.Float64(path.rays))
 
     def _step(
-        self, system: LidarScene, lobe: SurfaceLobe, path: Path, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float
+        self, system: LidarScene, lobe: SurfaceLobe, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float
     ) -> None:
         """Go to the next vertex, connect it to the laser, and choose the direction in which the path goes on."""
         # Advance to whichever comes first, a scattering event or a surface.
+        first = path.length == 0
         si = system.scene.ray_intersect(path.ray(), path.active)
         scattered, distance, transmittance = self._fly(system, path, si, rng)
         path.active &= scattered | si.is_valid()
@@ -195,8 +218,10 @@ class LidarVolpath(mi.CppADIntegrator):
         hit = path.active & ~scattered
         at_sea = hit & system.is_surface(si.shape)
         submerged = scattered | (hit & in_leg & ~at_sea)
-        mei, phase, albedo = self._medium(system, path, scattered)
-        path.throughput *= dr.select(scattered, albedo, 1)
+        mei, phase, layer = scattering_event(system, path, scattered)
+        if system.water is not None:
+            path.throughput *= dr.select(scattered, system.water.flight.albedo(layer), 1)
+        merged = self._merged(path, first, scattered, hit, submerged, at_sea)
 
         # Connect: from under water through the surface, from the surface and from solids in the air directly.
         laser = lobe.towards_laser(path.point)
@@ -215,24 +240,36 @@ class LidarVolpath(mi.CppADIntegrator):
         direct = hit & (at_sea | ~in_leg)
         radiance, air_length = laser_through(system, crossing, met | direct)
         water_length = dr.select(met, optical_length(system, above.t, True), 0)
-        energy = weight * path.throughput * factor * radiance
+        energy = dr.select(merged, 0, weight * path.throughput * factor * radiance)
         # One ray along the path, one up to the surface, one to the laser.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(tried, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
         system.film.add_transient(pixel, path.length + water_length + air_length, energy, radiance > 0)
         # The lobe's own density stands for the surface's in what is lost.
         lobe_share = weight * path.throughput * turn.value * clear / combined * lobe_pdf
-        self._account(
-            system, laser, dr.select(radiance > 0, energy, 0), dr.select(lost, lobe_share, 0), path.point + up * leg
-        )
+        self._account(system, laser, dr.select(lost, lobe_share, 0), path.point + up * leg)
 
         # Choose the next direction; beyond the film's end nothing can arrive any more.
         self._turn_path(system, lobe, laser, path, si, mei, phase, scattered, submerged, at_sea, rng)
         path.active &= path.length + dr.norm(lobe.laser - path.point) < system.film.path_end
         self._roulette(path, rng)
 
+    def _merged(
+        self,
+        path: ConnectedPath,
+        first: mi.Bool,
+        scattered: mi.Bool,
+        hit: mi.Bool,
+        submerged: mi.Bool,
+        at_sea: mi.Bool,
+    ) -> mi.Bool:
+        """Return whether the connections at this vertex are left to ``lidar_merging``."""
+        if not self.unmerged:
+            return mi.Bool(False)
+        return (first & hit) | (path.pristine & (submerged | (at_sea & (path.scatterings > 0))))
+
     def _fly(
-        self, system: LidarScene, path: Path, si: mi.SurfaceInteraction3f, rng: mi.PCG32
+        self, system: LidarScene, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32
     ) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Return whether the path scatters before the surface, how far it goes, and the leg's transmittance."""
         if system.water is None:
@@ -253,19 +290,6 @@ class LidarVolpath(mi.CppADIntegrator):
         if system.water is None:
             return mi.Float(0)
         return dr.select(active, system.water.flight.optical_depth(depth, downward, length), 0)
-
-    @staticmethod
-    def _medium(system: LidarScene, path: Path, scattered: mi.Bool) -> tuple[mi.MediumInteraction3f, object, mi.Float]:
-        """Return the interaction, the phase function and the albedo at a scattering event."""
-        mei = dr.zeros(mi.MediumInteraction3f)
-        mei.p = path.point
-        mei.wi = -path.direction
-        mei.sh_frame = mi.Frame3f(mei.wi)
-        mei.t = dr.select(scattered, mi.Float(1), dr.inf)
-        if system.water is None:
-            return mei, None, mi.Float(0)
-        layer = system.water.flight.layer_at(path.depth)
-        return mei, system.water.phase_at(layer), system.water.flight.albedo(layer)
 
     def _turn(
         self,
@@ -296,7 +320,7 @@ class LidarVolpath(mi.CppADIntegrator):
         """Return whether a surface has no mirror-like part, so that any direction can be drawn and weighted."""
         return ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
 
-    def _walk_weight(self, path: Path, transmittance: mi.Float) -> mi.Float:
+    def _walk_weight(self, path: ConnectedPath, transmittance: mi.Float) -> mi.Float:
         """Return the weight of a connection that the walk made: balance heuristic against the lobe."""
         if self.connection == "walk":
             return mi.Float(1)
@@ -308,11 +332,10 @@ class LidarVolpath(mi.CppADIntegrator):
         self,
         system: LidarScene,
         laser: LaserDirection,
-        received: mi.Float,
         lobe_share: mi.Float,
         crossing: mi.Point3f,
     ) -> None:
-        """Sum the energy received, and an estimate of what would have arrived had the surface not ended.
+        """Estimate what would have arrived had the surface not ended.
 
         Where a connection misses the surface its light is taken as if it had crossed a flat one at normal incidence.
         """
@@ -321,15 +344,14 @@ class LidarVolpath(mi.CppADIntegrator):
         transmittance = 4 * index / (1 + index) ** 2
         through = transmittance * laser.in_air.z / laser.in_water.z
         missing = lobe_share * through * system.transmitter.intensity(-dr.normalize(offset)) / dr.squared_norm(offset)
-        dr.scatter_add(self.balance, mi.Float64(received), mi.UInt32(0), received > 0)
-        dr.scatter_add(self.balance, mi.Float64(missing), mi.UInt32(1), missing > 0)
+        dr.scatter_add(self.lost, mi.Float64(missing), mi.UInt32(0), missing > 0)
 
     def _turn_path(
         self,
         system: LidarScene,
         lobe: SurfaceLobe,
         laser: LaserDirection,
-        path: Path,
+        path: ConnectedPath,
         si: mi.SurfaceInteraction3f,
         mei: mi.MediumInteraction3f,
         phase: object,
@@ -360,6 +382,13 @@ class LidarVolpath(mi.CppADIntegrator):
             pdf = dr.select(mixed, turn.pdf, pdf)
             factor = dr.select(mixed, turn.value / turn.pdf, factor)
         delta = at_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        met = at_surface & ~at_sea & ~(~mixed & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null))
+        if self.unmerged:
+            # Whatever follows is merged, too, unless a mirror or a solid in the air can still come in between.
+            path.active &= ~(path.pristine & met & submerged & ~delta)
+            if not system.has_unmerged_solids:
+                path.active &= ~(path.pristine & scattered)
+        path.pristine &= ~met
         path.lobe_ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf(laser, direction) / pdf, 0)
         path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
         path.throughput *= dr.select(path.active, factor, 1)
@@ -367,7 +396,7 @@ class LidarVolpath(mi.CppADIntegrator):
         path.point = dr.select(at_surface, si.spawn_ray(direction).o, path.point)
         path.direction = dr.select(path.active, direction, path.direction)
 
-    def _roulette(self, path: Path, rng: mi.PCG32) -> None:
+    def _roulette(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths of little throughput at random, and give their share to the ones that go on."""
         survival = dr.minimum(path.throughput / max(self.roulette_threshold, 1e-30), 1)
         path.active &= rng.next_float32() < survival

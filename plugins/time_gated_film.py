@@ -12,6 +12,10 @@ from mitransient_lidar.optics.water import C0
 #: More bins than this do not fit the memory of a laptop.
 _LARGEST_FILM = 2**28
 
+#: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below which
+#: energies are summed finely. Coarse sums hold 64 times what is emitted; fine ones 2^23 of the largest they take.
+_COARSE_BITS, _FINE_BITS, _COARSEST_FINE = 57, 32, 2.0**8
+
 
 class TimeGatedFilm(mi.Film):
     r"""Time histogram of received energy, one for each pixel (``time_gated_film``).
@@ -26,7 +30,8 @@ class TimeGatedFilm(mi.Film):
     ===================  =======  ======================================================================================
 
     Bins are half open, [start, start + width). ``develop`` returns the energy [J] of the last pass as a tensor
-    (pixel, time), or (row, column, time) for imagers. Sums are kept in double precision.
+    (pixel, time), or (row, column, time) for imagers. Sums are kept as whole numbers of two units, so that they do not
+    depend on their order: the same seed gives the same bits, and pixels sum exactly to the whole.
 
     .. code-block:: xml
 
@@ -50,20 +55,29 @@ class TimeGatedFilm(mi.Film):
         self._shape: tuple[int, ...] = (1,)
         self._start = self.time_start_ns * 1e-9 * C0
         self._per_metre = 1 / (self.bin_width_ns * 1e-9 * C0)
-        self._energy = dr.zeros(mi.Float64, self.bin_count)
+        self._units = 1.0, 1.0
+        self._sums = dr.zeros(mi.Int64, 2 * self.bin_count)
+        self._invalid = dr.zeros(mi.UInt32, self.bin_count)
+
+    @property
+    def _count(self) -> int:
+        """Number of bins of all pixels."""
+        return int(np.prod(self._shape)) * self.bin_count
 
     @property
     def path_end(self) -> float:
         """Optical path length at which the record ends [m]."""
         return (self.time_start_ns + self.bin_width_ns * self.bin_count) * 1e-9 * C0
 
-    def prepare_pixels(self, pixel_count: int, grid: tuple[int, int] | None = None) -> None:
+    def prepare_pixels(self, pixel_count: int, emitted: float, grid: tuple[int, int] | None = None) -> None:
         """Clear the histogram and make room for the pixels.
 
         Parameters
         ----------
         pixel_count
             Number of pixels.
+        emitted
+            Energy that the laser emits [J]: no bin can receive more.
         grid
             (rows, columns) of an imager, or None.
 
@@ -77,30 +91,43 @@ class TimeGatedFilm(mi.Film):
                 f"bin_count = {self.bin_count} times {pixel_count} pixels must not exceed {_LARGEST_FILM} bins in all"
             )
         self._shape = grid or (pixel_count,)
-        self._energy = dr.zeros(mi.Float64, pixel_count * self.bin_count)
+        self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
+        self.clear()
 
     def add_transient(self, pixel: mi.UInt32, path_length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy [J] that arrives after an optical path of `path_length` metres (group index included)."""
         position = (path_length - self._start) * self._per_metre
         active = active & (position >= 0) & (position < self.bin_count)
         index = pixel * self.bin_count + dr.minimum(mi.UInt32(position), self.bin_count - 1)
-        dr.scatter_add(self._energy, mi.Float64(energy), index, active)
+        valid = dr.isfinite(energy)
+        dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
+        coarse, fine = self._units
+        small = energy < _COARSEST_FINE * coarse
+        number = mi.Int64(dr.round(energy * dr.select(small, mi.Float(1 / fine), mi.Float(1 / coarse))))
+        dr.scatter_add(self._sums, number, index + dr.select(small, mi.UInt32(self._count), 0), active & valid)
 
     def energy(self) -> np.ndarray:
-        """Return the energy [J] of the last pass as float64, shape (pixels, time) or (rows, columns, time)."""
-        return np.array(self._energy).reshape(*self._shape, self.bin_count)
+        """Return the energy [J] of the last pass as float64, shape (pixels, time) or (rows, columns, time).
+
+        Bins to which something not finite was added are NaN.
+        """
+        coarse, fine = np.array(self._sums).reshape(2, self._count)
+        energy = coarse * self._units[0] + fine * self._units[1]
+        energy[np.array(self._invalid) > 0] = np.nan
+        return np.asarray(energy.reshape(*self._shape, self.bin_count))
 
     def develop(self, raw: bool = False) -> mi.TensorXf:
         """Return the energy [J] of the last pass, (pixel, time) or (row, column, time)."""
-        return mi.TensorXf(mi.Float(self._energy), (*self._shape, self.bin_count))
+        return mi.TensorXf(self.energy().astype(np.float32))
 
     def clear(self) -> None:
         """Set all bins to zero."""
-        self._energy = dr.zeros(mi.Float64, dr.width(self._energy))
+        self._sums = dr.zeros(mi.Int64, 2 * self._count)
+        self._invalid = dr.zeros(mi.UInt32, self._count)
 
     def bitmap(self, raw: bool = False) -> mi.Bitmap:
         """Return the histograms as a bitmap, time along x and pixels along y."""
-        return mi.Bitmap(mi.TensorXf(mi.Float(self._energy), (int(np.prod(self._shape)), self.bin_count, 1)))
+        return mi.Bitmap(mi.TensorXf(self.energy().reshape(-1, self.bin_count, 1).astype(np.float32)))
 
     def write(self, path: str) -> None:
         """Write the bitmap of `bitmap` to an EXR file; ``mitransient_lidar.render`` writes the full stack."""
@@ -125,7 +152,7 @@ class TimeGatedFilm(mi.Film):
 
     def schedule_storage(self) -> None:
         """Schedule the histogram for evaluation."""
-        dr.schedule(self._energy)
+        dr.schedule(self._sums, self._invalid)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose no parameters: a changed film is loaded anew."""

@@ -26,9 +26,6 @@ class Path:
         Product of the path's factors since the receiver.
     scatterings
         Number of scattering events in the water so far.
-    lobe_ratio
-        Density of the surface connection's proposal over that of the walk, for the direction of the next leg; 0 where
-        no connection was tried.
     rays
         Number of rays traced so far, for the bench.
     active
@@ -41,7 +38,6 @@ class Path:
     length: mi.Float
     throughput: mi.Float
     scatterings: mi.UInt32
-    lobe_ratio: mi.Float
     rays: mi.UInt32
     active: mi.Bool
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mitransient_lidar.optics.water import C0
 from mitransient_lidar.transport.path import optical_length
 from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.streams import pass_streams
 from mitransient_lidar.transport.system import LidarScene
 
 #: Rays that probe a scene, and the share of the beam at either end of an echo that is left out of its window.
@@ -40,8 +41,7 @@ class EchoProbe:
 
 def probe_echoes(system: LidarScene, view: ViewSampler) -> EchoProbe:
     """Trace rays through the facets of the surface, without ripples and scattering, and time where they get to."""
-    index = dr.arange(mi.UInt32, _RAYS)
-    start = view.sample(index, _RAYS, mi.UInt64(0), mi.Float(0.5))
+    start = view.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
     beam = start.weight * system.transmitter.intensity(start.direction)
     laser = mi.Point3f(system.transmitter.pose.origin.tolist())
     ray = mi.Ray3f(mi.Point3f(system.receiver.pose.origin.tolist()), start.direction)

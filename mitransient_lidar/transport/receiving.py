@@ -11,9 +11,7 @@ import numpy as np
 from mitransient_lidar.optics.checks import in_range, non_negative, positive
 from mitransient_lidar.transport.pixels import PixelArray
 from mitransient_lidar.transport.pose import Pose
-
-#: Increments of the R2 sequence (M. Roberts 2018; the plastic number's powers) in units of 2^-32.
-_R2_INCREMENTS = (3242174889, 2447445414)
+from mitransient_lidar.transport.streams import stratified_point, unit_points
 
 #: The laser's footprint is worth sampling when the field of view holds at least this share of it.
 _SMALLEST_FOOTPRINT_SHARE = 0.05
@@ -79,14 +77,6 @@ def solid_angle_factor(gx: mi.Float, gy: mi.Float) -> mi.Float:
     return dr.rsqrt(dr.square(1 + gx * gx + gy * gy) * (1 + gx * gx + gy * gy))
 
 
-def r2_point(index: mi.UInt32, shift: mi.UInt64) -> mi.Point2f:
-    """Return points of the R2 low-discrepancy sequence, rotated by a random shift (two 32-bit numbers in one)."""
-    x = index * mi.UInt32(_R2_INCREMENTS[0]) + mi.UInt32(shift)
-    y = index * mi.UInt32(_R2_INCREMENTS[1]) + mi.UInt32(shift >> 32)
-    # 24 bits fill a float32 below 1 exactly.
-    return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24
-
-
 @dataclass(frozen=True)
 class View:
     """One sample of the receiver's view for every path.
@@ -110,7 +100,7 @@ class ViewSampler:
     """Samples the receiver's view, half of the paths over the field of view and half over the laser's footprint.
 
     Both halves are weighted by the balance heuristic, so any beam and any field of view are served without bias.
-    Samples are a rotated low-discrepancy sequence; rotations differ from pass to pass, so passes are independent.
+    Samples are stratified, and neighbouring ones look into neighbouring directions.
 
     Parameters
     ----------
@@ -130,8 +120,7 @@ class ViewSampler:
 
     def _footprint_share(self) -> float:
         """Return the share of the footprint's samples that fall inside a pixel."""
-        index = dr.arange(mi.UInt32, 4096)
-        gx, gy = self._sample_footprint(r2_point(index, mi.UInt64(0)))
+        gx, gy = self._sample_footprint(unit_points(4096))
         _, count = self.receiver.pixels.pixel_at(gx, gy, mi.Float(0.5))
         return float(dr.mean(dr.select(count > 0, mi.Float(1), 0))[0])
 
@@ -144,7 +133,7 @@ class ViewSampler:
         x, y = (gx - self.centre[0]) / self.sigma, (gy - self.centre[1]) / self.sigma
         return dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * self.sigma**2)
 
-    def sample(self, index: mi.UInt32, count: int, shift: mi.UInt64, u: mi.Float) -> View:
+    def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> View:
         """Sample one view for each path.
 
         Parameters
@@ -153,20 +142,18 @@ class ViewSampler:
             Number of the path, 0 to count - 1.
         count
             Number of paths.
-        shift
-            Random rotation of the sequence.
-        u
-            Uniform number that picks a pixel where several overlap.
+        rng
+            Random numbers of the paths.
         """
         if self.use_footprint:
             of_footprint = (index & 1) == 1
-            point = r2_point(index >> 1, shift)
+            point = stratified_point(index >> 1, (count + 1) // 2, rng)
             gx, gy = self.receiver.pixels.sample(point)
             fx, fy = self._sample_footprint(point)
             gx, gy = dr.select(of_footprint, fx, gx), dr.select(of_footprint, fy, gy)
         else:
-            gx, gy = self.receiver.pixels.sample(r2_point(index, shift))
-        pixel, pixels_here = self.receiver.pixels.pixel_at(gx, gy, u)
+            gx, gy = self.receiver.pixels.sample(stratified_point(index, count, rng))
+        pixel, pixels_here = self.receiver.pixels.pixel_at(gx, gy, rng.next_float32())
         density = pixels_here / self.receiver.pixels.area
         if self.use_footprint:
             density = 0.5 * (density + self._footprint_density(gx, gy))

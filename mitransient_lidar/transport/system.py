@@ -8,6 +8,7 @@ from operator import or_
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitransient_lidar.transport.receiving import Receiver
 
@@ -95,6 +96,27 @@ class LidarScene:
             surfaces,
             max(variances, default=_UNKNOWN_SLOPE_VARIANCE),
         )
+
+    @property
+    def solids(self) -> list[mi.Shape]:
+        """All shapes that do not bound the water."""
+        return [shape for shape in self.scene.shapes() if not any(shape is surface for surface in self.surfaces)]
+
+    @property
+    def has_unmerged_solids(self) -> bool:
+        """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
+        lowest = min((float(surface.bbox().min.z) for surface in self.surfaces), default=0.0)
+        mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
+        return any(int(solid.bsdf().flags()) & mirror or float(solid.bbox().max.z) > lowest for solid in self.solids)
+
+    @property
+    def facet_size(self) -> float:
+        """Side of the squares of which the sea surface's triangles are halves, on average [m]."""
+        sizes = [
+            float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count())) if surface.is_mesh() else np.inf
+            for surface in self.surfaces
+        ]
+        return min(sizes, default=np.inf)
 
     @property
     def refractive_index(self) -> float:

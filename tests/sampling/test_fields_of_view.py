@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from mitransient_lidar.transport.fields import Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.pixels import LayoutPixels, ShapedPixels
 from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.streams import pass_streams
 
 MRAD = 1e-3
 SHAPES = {
@@ -126,7 +127,7 @@ def test_view_weights_add_up_to_the_solid_angle(view_mrad, shot_x):
     receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": view_mrad}).receiver
     transmitter = mi.load_dict({"type": "lidar_transmitter", "shot_x": shot_x})
     view = ViewSampler(receiver, transmitter)
-    start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, mi.UInt64(123456789), mi.Float(0.5))
+    start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(5, 0, COUNT))
     half = 0.5e-3 * view_mrad
     solid_angle = 2 * np.pi * (1 - 1 / np.sqrt(1 + half**2))
     collection = 0.025 * 0.9 * 0.9

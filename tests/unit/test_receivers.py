@@ -4,10 +4,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from mitransient_lidar.optics.water import C0
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.receiving import ViewSampler, r2_point
+from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.streams import pass_streams, stratified_point
 
 COUNT = 2**20
 COLLECTION = 0.025 * 0.9 * 0.9
@@ -94,8 +96,7 @@ def test_view_counts_every_overlapping_pixel_in_full():
     receiver = mi.load_dict({"type": "multipixel_receiver", **nested}).receiver
     view = ViewSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
     assert view.use_footprint
-    rng = mi.PCG32(COUNT, initstate=9)
-    start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, mi.UInt64(987654321), rng.next_float32())
+    start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(9, 0, COUNT))
     weight, pixel = np.array(start.weight, dtype=np.float64), np.array(start.pixel)
     for index, name in enumerate(receiver.pixels.names):
         samples = COUNT * weight * (pixel == index)
@@ -113,19 +114,24 @@ def test_view_leaves_a_footprint_alone_that_it_does_not_see():
     assert uses == [True, False]
 
 
-def test_view_points_cover_the_square_evenly_and_shifts_move_them():
-    """4096 points of the sequence in 64 x 16 cells: 4 a cell, half the spread of random points, which is 2."""
-    index = dr.arange(mi.UInt32, 4096)
-    points = [np.array(r2_point(index, mi.UInt64(shift))) for shift in (0, (123456789 << 32) + 987654321)]
-    for point in points:
-        assert point.min() >= 0
-        assert point.max() < 1
-        counts = np.histogram2d(*point, bins=(64, 16), range=((0, 1), (0, 1)))[0]
-        assert counts.std() < 1.2
-    # A rotation by the same amount everywhere, a different one along each axis.
-    moved = np.round((points[1] - points[0]) % 1, 5)
-    assert [len(np.unique(row % 1)) for row in moved] == [1, 1]
-    assert moved[0, 0] != moved[1, 0]
+@pytest.mark.parametrize("count", [4096, 5000])
+def test_stratified_points_cover_the_square_evenly(count):
+    """In 16 x 16 cells 4096 points fall 16 into each, and of 5000 nearly as many: random ones would spread by 4."""
+    points = np.array(stratified_point(dr.arange(mi.UInt32, count), count, pass_streams(1, 0, count)))
+    assert points.min() >= 0
+    assert points.max() < 1
+    counts = np.histogram2d(*points, bins=(16, 16), range=((0, 1), (0, 1)))[0]
+    assert np.abs(counts - count / 256).max() < 2 if count == 5000 else counts.std() == 0
+
+
+def test_stratified_points_are_uniform_in_their_strata():
+    """A thousand passes of four points, one in each quarter: uniform there along both axes (Kolmogorov-Smirnov)."""
+    passes = [stratified_point(dr.arange(mi.UInt32, 4), 4, pass_streams(seed, 0, 4)) for seed in range(1000)]
+    points = np.array([np.array(points) for points in passes])
+    corner = np.floor(2 * points[0])
+    assert np.array_equal(np.floor(2 * points), np.broadcast_to(corner, points.shape))
+    for coordinate in (2 * points - corner).transpose(1, 2, 0).reshape(8, -1):
+        assert kstest(coordinate, "uniform").pvalue > 1e-3
 
 
 def test_imager_rows_go_from_far_to_near_and_columns_from_right_to_left(lidar_scene, passes):
@@ -157,7 +163,7 @@ def film(**parameters):
 def test_bins_are_half_open():
     """Bins of 2 m of path from 0, so that edges are exact: an edge belongs to the later bin."""
     record = film(time_start_ns=0.0, bin_width_ns=2e9 / C0, bin_count=4)
-    record.prepare_pixels(2)
+    record.prepare_pixels(2, 2.0**26)
     below = np.nextafter(np.float32([2, 8]), np.float32(0))
     lengths = mi.Float([0, 2, 4, below[0], below[1], 8, -1e-3, np.nan, np.inf])
     energies = mi.Float([1, 10, 100, 1000, 1e4, 1e5, 1e5, 1e5, 1e5])
@@ -170,23 +176,54 @@ def test_bins_are_half_open():
 
 def test_inactive_paths_leave_no_trace():
     record = film(bin_count=3)
-    record.prepare_pixels(1)
+    record.prepare_pixels(1, 2.0**26)
     record.add_transient(mi.UInt32(0), mi.Float(1390.1e-9 * C0), mi.Float(1.0, 2.0), mi.Bool(False, True))
     np.testing.assert_array_equal(record.energy(), [[2, 0, 0]])
 
 
-def test_sums_are_kept_in_double_precision():
+def test_sums_are_exact():
     """2^25 ones: a float32 sum stops at 2^24."""
     record = film(bin_count=2)
-    record.prepare_pixels(1)
+    record.prepare_pixels(1, 2.0**26)
     count = 2**25
     record.add_transient(mi.UInt32(0), mi.Float(1390.1e-9 * C0), dr.ones(mi.Float, count), mi.Bool(True))
     assert record.energy()[0, 0] == count
 
 
+def test_sums_do_not_depend_on_their_order():
+    """A million energies over 14 decades, in two orders: the same bits, and right to single precision."""
+    energies = np.float32(10.0 ** np.random.default_rng(3).uniform(-14, 0, 2**20))
+    results = []
+    for order in (energies, energies[::-1]):
+        record = film(bin_count=2)
+        record.prepare_pixels(1, 1e6)
+        record.add_transient(mi.UInt32(0), mi.Float(1390.1e-9 * C0), mi.Float(order), mi.Bool(True))
+        results.append(record.energy()[0, 0])
+    assert results[0] == results[1]
+    assert results[0] == pytest.approx(energies.astype(np.float64).sum(), rel=1e-6)
+
+
+def test_small_and_large_energies_are_summed_without_bias():
+    """Energies far below the coarse unit would vanish in it, and a shift by half a unit would show."""
+    for emitted, energy in ((1.0, 1e-26), (1.0, 3e-19), (1.0, 1e-17), (1.0, 1e-6), (4.5e-3, 1e-22)):
+        record = film(bin_count=1)
+        record.prepare_pixels(1, emitted)
+        spread = np.float32(energy * np.random.default_rng(1).uniform(0.5, 1.5, 2**16))
+        record.add_transient(mi.UInt32(0), mi.Float(1390.1e-9 * C0), mi.Float(spread), mi.Bool(True))
+        assert record.energy()[0, 0] == pytest.approx(spread.astype(np.float64).sum(), rel=1e-5)
+
+
+def test_energy_that_is_not_finite_shows_in_its_bin():
+    record = film(bin_count=3)
+    record.prepare_pixels(2, 1.0)
+    times = mi.Float(1390.1e-9 * C0, 1390.1e-9 * C0, 1391.1e-9 * C0)
+    record.add_transient(mi.UInt32(1), times, mi.Float(np.nan, 0.5, np.inf), mi.Bool(True))
+    np.testing.assert_array_equal(record.energy(), [[0, 0, 0], [np.nan, 0, np.nan]])
+
+
 def test_film_develops_rows_and_columns():
     record = film(bin_count=5)
-    record.prepare_pixels(6, (2, 3))
+    record.prepare_pixels(6, 2.0**26, (2, 3))
     record.add_transient(mi.UInt32(4), mi.Float(1391.1e-9 * C0), mi.Float(3.0), mi.Bool(True))
     tensor = np.array(record.develop())
     assert tensor.shape == (2, 3, 5)
@@ -198,7 +235,7 @@ def test_film_develops_rows_and_columns():
 def test_film_that_would_not_fit_and_foreign_integrators_are_refused():
     record = film(bin_count=1_000_000)
     with pytest.raises(ValueError, match=r"bin_count = 1000000 times 300 pixels must not exceed 268435456"):
-        record.prepare_pixels(300)
+        record.prepare_pixels(300, 1.0)
     with pytest.raises(ValueError, match="use the integrator lidar_volpath"):
         record.create_block()
 

@@ -1,0 +1,69 @@
+"""Sampling of the laser's beam, where the receiver looks."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.transport.fields import Sector
+from mitransient_lidar.transport.receiving import Receiver
+from mitransient_lidar.transport.streams import stratified_point, unit_points
+
+#: The view is worth sampling when it holds less than this share of the beam.
+_SMALLEST_SHARE = 0.5
+
+#: Room around the field of view, from which light still scatters into it.
+_ROOM = 1.5
+
+
+class BeamSampler:
+    """Samples the beam by its energy; half of the samples over the field of view when that is much narrower.
+
+    Both halves are weighted by the balance heuristic. Samples are stratified.
+
+    Parameters
+    ----------
+    transmitter
+        The ``lidar_transmitter`` plugin.
+    receiver
+        Pose and pixels of the receiver.
+    """
+
+    def __init__(self, transmitter: mi.Emitter, receiver: Receiver) -> None:
+        self.transmitter = transmitter
+        spot = receiver.pose.ground_point()
+        self.centre = transmitter.pose.tangent_of_point(spot)
+        ranges = [float(np.linalg.norm(spot - pose.origin)) for pose in (receiver.pose, transmitter.pose)]
+        self.view = Sector(_ROOM * 0.5 * receiver.pixels.field_of_view * ranges[0] / ranges[1])
+        gx, gy = transmitter.sample_tangent(unit_points(4096))
+        share = dr.mean(dr.select(self._inside(gx, gy), mi.Float(1), 0))[0]
+        self.use_view = float(share) < _SMALLEST_SHARE
+
+    def _inside(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
+        return self.view.contains(gx - self.centre[0], gy - self.centre[1])
+
+    def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
+        """Return unit directions, and the energy [J] that each stands for.
+
+        Parameters
+        ----------
+        index
+            Number of the photon, 0 to count - 1.
+        count
+            Number of photons.
+        rng
+            Random numbers of the photons.
+        """
+        transmitter = self.transmitter
+        if not self.use_view:
+            gx, gy = transmitter.sample_tangent(stratified_point(index, count, rng))
+            return transmitter.pose.direction(gx, gy), mi.Float(transmitter.energy / count)
+        point = stratified_point(index >> 1, (count + 1) // 2, rng)
+        gx, gy = transmitter.sample_tangent(point)
+        vx, vy = self.view.sample(point)
+        of_view = (index & 1) == 1
+        gx, gy = dr.select(of_view, vx + self.centre[0], gx), dr.select(of_view, vy + self.centre[1], gy)
+        density = transmitter.tangent_density(gx, gy)
+        mixture = 0.5 * (density + dr.select(self._inside(gx, gy), mi.Float(1 / self.view.area), 0))
+        return transmitter.pose.direction(gx, gy), transmitter.energy / count * density / mixture

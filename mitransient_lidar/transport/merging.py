@@ -1,0 +1,116 @@
+"""Merging of light from the laser with paths from the receiver, in cells of water and on patches of solids."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.cells import SolidPatches, WaterCells
+from mitransient_lidar.transport.path import optical_length
+from mitransient_lidar.transport.photons import Photon, PhotonMap
+from mitransient_lidar.transport.system import LidarScene
+from mitransient_lidar.transport.tracks import TrackPoints, Tracks
+from mitransient_lidar.transport.walk import Action, WalkPath
+
+
+def store_points(tracks: Tracks, count: int, cells: WaterCells) -> PhotonMap | None:
+    """Store the `count` points of light paths by their cells; return None without any."""
+    if count == 0:
+        return None
+    index = dr.arange(mi.UInt32, count)
+    bucket, _, _ = cells.locate(tracks.points(index).point)
+    photons = PhotonMap(cells.grid.buckets, bucket)
+    # Worked out anew: reading the legs again costs less than keeping the points.
+    points = tracks.points(index)
+    _, tag, _ = cells.locate(points.point)
+    place = dr.dot(points.point, points.direction)
+    photons.fill(Photon(points.direction, points.length, points.weight, points.competition, place), tag)
+    return photons
+
+
+def merge_in_water(
+    system: LidarScene, points: TrackPoints, cells: WaterCells, photons: PhotonMap, lost: mi.Float64
+) -> None:
+    """Merge points of the receiver's paths with the light in their cells, into the film.
+
+    A point stands for a track of length s and throughput beta, a photon for one of length s' and energy w; with the
+    cell's volume V each pair adds beta s w s' / V times the scattering coefficient and the phase function, shared among
+    all merges that make the same path.
+    """
+    bucket, cell, volume = cells.locate(points.point)
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.p, mei.wi = points.point, -points.direction
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    layer = system.water.flight.layer_at(-points.point.z)
+    phase = system.water.phase_at(layer)
+    scattering = system.water.scattering_flight.attenuation(layer)
+    absorption = system.water.absorption_flight.attenuation(layer)
+    weight = points.weight / volume
+    first, end = photons.bucket(bucket, mi.Bool(True))
+
+    def merge(index: mi.UInt32) -> tuple[mi.UInt32]:
+        active = index < end
+        photon, tag = photons.photon(index, active)
+        active &= tag == cell
+        value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
+        shared = dr.rcp(dr.rcp(scattering * value[0]) + points.competition + photon.competition)
+        # The photon goes on to the plane across its direction through the point: times do not blur over the cell.
+        beyond = dr.dot(points.point, photon.direction) - photon.place
+        energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
+        length = points.length + photon.length + optical_length(system, beyond, True)
+        _add(system, lost, points.label, length, energy, points.weight, photon, active)
+        return (index + 1,)
+
+    dr.while_loop((first,), lambda index: index < end, merge, label="merge in the water")
+
+
+def merger_at_solids(
+    system: LidarScene,
+    patches: SolidPatches,
+    photons: PhotonMap | None,
+    pixel: mi.UInt32,
+    rng: mi.PCG32,
+    lost: mi.Float64,
+) -> Action:
+    """Return the action by which the receiver's paths, where they meet solids, are merged with the light there.
+
+    A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF.
+    """
+
+    def merge(path: WalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
+        if photons is None:
+            return
+        patch = patches.locate(si)
+        first, end = photons.bucket(patch.bucket, active)
+        weight = path.weight * patches.inverse_share(patch, si.shape, rng, active & (first < end)) / patch.area
+
+        def add(index: mi.UInt32) -> tuple[mi.UInt32]:
+            within = index < end
+            photon, tag = photons.photon(index, within)
+            within &= tag == patch.tag
+            outgoing = si.to_local(-photon.direction)
+            # Mitsuba's BSDFs hold the cosine, and photons have it already.
+            bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / dr.abs(outgoing.z)
+            energy = weight * photon.weight * bsdf
+            _add(system, lost, pixel, path.length + photon.length, energy, path.weight, photon, within & (bsdf > 0))
+            return (index + 1,)
+
+        dr.while_loop((first,), lambda index: index < end, add, label="merge at solids")
+
+    return merge
+
+
+def _add(
+    system: LidarScene,
+    lost: mi.Float64,
+    pixel: mi.UInt32,
+    length: mi.Float,
+    energy: mi.Float,
+    weight: mi.Float,
+    photon: Photon,
+    active: mi.Bool,
+) -> None:
+    """Add a merged path to the film, or to what is lost where one of its halves passed beside the surface."""
+    virtual = (weight < 0) | (photon.weight < 0)
+    system.film.add_transient(pixel, length, energy, active & ~virtual)
+    dr.scatter_add(lost, mi.Float64(dr.abs(energy)), mi.UInt32(0), active & virtual)

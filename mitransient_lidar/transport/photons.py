@@ -1,0 +1,121 @@
+"""Light from the laser, stored where it may meet paths from the receiver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.cells import Patch
+from mitransient_lidar.transport.walk import WalkPath
+
+#: Numbers a photon takes in memory.
+_RECORD = 8
+
+
+@dataclass(frozen=True)
+class Photon:
+    """Stored light.
+
+    Attributes
+    ----------
+    direction
+        Unit direction in which it travels.
+    length
+        Optical length of its path from the laser [m].
+    weight
+        Energy [J], in the water times track length [J m]; negative for virtual paths.
+    competition
+        Its path's, see :class:`~mitransient_lidar.transport.walk.WalkPath`.
+    place
+        Where it is, along its direction: scalar product of position and direction [m].
+    """
+
+    direction: mi.Vector3f
+    length: mi.Float
+    weight: mi.Float
+    competition: mi.Float
+    place: mi.Float
+
+
+class PhotonMap:
+    """Photons by bucket, sorted by counting.
+
+    Parameters
+    ----------
+    buckets
+        Number of buckets.
+    bucket
+        Bucket of each photon, shape (photons,).
+    """
+
+    def __init__(self, buckets: int, bucket: mi.UInt32) -> None:
+        self.count = dr.width(bucket)
+        counts = dr.zeros(mi.UInt32, buckets)
+        self._bucket = bucket
+        self._rank = dr.scatter_inc(counts, bucket, dr.full(mi.Bool, True, self.count))
+        dr.eval(self._rank, self._bucket, counts)
+        self._end = dr.cumsum(counts)
+        self._record = mi.Float()
+
+    def fill(self, photon: Photon, tag: mi.UInt32) -> None:
+        """Store the photons in the order of their buckets; within one only those of one tag belong together."""
+        place = dr.gather(mi.UInt32, self._end, self._bucket) - 1 - self._rank
+        self._record = dr.empty(mi.Float, _RECORD * self.count)
+        where = mi.Vector4f(photon.direction.x, photon.direction.y, photon.direction.z, photon.length)
+        worth = mi.Vector4f(photon.weight, photon.competition, dr.reinterpret_array(mi.Float, tag), photon.place)
+        dr.scatter(self._record, where, 2 * place)
+        dr.scatter(self._record, worth, 2 * place + 1)
+        dr.eval(self._record, self._end)
+        self._bucket, self._rank = mi.UInt32(), mi.UInt32()
+
+    def bucket(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        """Return first photon and end of a bucket; both 0 where inactive."""
+        end = dr.gather(mi.UInt32, self._end, bucket, active)
+        return dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0)), end
+
+    def photon(self, index: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
+        """Return a photon and its tag."""
+        x, y, z, length = dr.gather(mi.Vector4f, self._record, 2 * index, active)
+        weight, competition, tag, place = dr.gather(mi.Vector4f, self._record, 2 * index + 1, active)
+        return Photon(mi.Vector3f(x, y, z), length, weight, competition, place), dr.reinterpret_array(mi.UInt32, tag)
+
+
+class PhotonBuffer:
+    """Light on patches of solids, in any order.
+
+    Parameters
+    ----------
+    capacity
+        Number of photons for which there is room; more are counted, and left out.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._stored = dr.zeros(mi.UInt32, 1)
+        self._place = dr.empty(mi.UInt32, 2 * capacity)
+        self._record = dr.empty(mi.Float, 4 * capacity)
+        self._weight = dr.empty(mi.Float, capacity)
+
+    def add(self, path: WalkPath, patch: Patch, active: mi.Bool) -> None:
+        """Store light that has met patches of solids."""
+        slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
+        keep = active & (slot < self.capacity)
+        where = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
+        dr.scatter(self._place, mi.Point2u(patch.bucket, patch.tag), slot, keep)
+        dr.scatter(self._record, where, slot, keep)
+        dr.scatter(self._weight, path.weight, slot, keep)
+
+    def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
+        """Return the photons in a map, None without any, and how many there would have been with enough room."""
+        dr.eval(self._stored, self._place, self._record, self._weight)
+        wanted = int(self._stored[0])
+        if wanted == 0:
+            return None, 0
+        index = dr.arange(mi.UInt32, min(wanted, self.capacity))
+        bucket, tag = dr.gather(mi.Point2u, self._place, index)
+        x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
+        photons = PhotonMap(buckets, bucket)
+        photons.fill(Photon(mi.Vector3f(x, y, z), length, dr.gather(mi.Float, self._weight, index), mi.Float(0), mi.Float(0)), tag)
+        return photons, wanted

@@ -1,0 +1,348 @@
+"""The merging integrator against closed forms and against the unidirectional reference."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from mitransient_lidar.loading import load_scene
+from mitransient_lidar.optics.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
+from mitransient_lidar.optics.lidar_equation import LidarSystem
+from mitransient_lidar.optics.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
+from mitransient_lidar.optics.water import WaterColumn
+from mitransient_lidar.transport.cells import Region, SolidPatches, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.streams import pass_streams
+from mitransient_lidar.transport.system import LidarScene
+
+MERGING = {"type": "lidar_merging"}
+SIGMA = 5e-3
+LIDAR = LidarSystem(200.0, np.radians(20.0), 5e-3 * 0.81 * 0.9, 0.025, 1.34, 1.34)
+CLEAR = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0}
+#: Waves in the water that scatters most of the published scenes' light more than once.
+WAVES = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"}
+
+
+def quadrant(row, column, half=15e-3):
+    """Return the predicate of one pixel of the 2x2 receiver with a circular field of view."""
+    return lambda gx, gy: (gx**2 + gy**2 <= half**2) & ((gx > 0) == (row == 0)) & ((gy > 0) == (column == 1))
+
+
+FIELDS = [quadrant(0, 0), quadrant(0, 1), quadrant(1, 0), quadrant(1, 1)]
+
+
+def mean_and_error(samples):
+    """Return the mean over the passes (first axis) and its standard error."""
+    return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+
+
+def assert_same(first, second, *, limit=None, floor=0.0):
+    """Compare per bin two sets of passes by z-test with Sidak's correction; `floor` is a relative bias to allow."""
+    (a, da), (b, db) = mean_and_error(first), mean_and_error(second)
+    used = (db > 0) & (da > 0) & (b > 0)
+    z = (np.abs(a - b) - floor * b)[used] / np.hypot(da, db)[used]
+    # Standard errors from few passes are uncertain themselves: Student's t, taken as normal with its variance.
+    freedom = min(len(first), len(second)) - 1
+    z *= np.sqrt((freedom - 2) / freedom)
+    worst = norm.isf(0.5 * (1 - 0.999 ** (1 / used.sum()))) if limit is None else limit
+    assert used.sum() > 0
+    assert z.max() < worst, (z.max(), worst, np.argwhere(used)[z.argmax()])
+
+
+# Closed forms: single scattering and bottom, where the light has no other way.
+
+
+@pytest.mark.parametrize(
+    ("sea", "water"),
+    [({}, CLEAR), ({}, {"tops": "0, 2", "attenuation": "0.3, 0.05", "scattering": "0", "backscattering": "0"})],
+)
+def test_bottom_level(lidar_scene, passes, z_score, sea, water):
+    energy = passes(lidar_scene(integrator=MERGING, sea=sea, water=water, film={"time_start_ns": 1450.0}), 24).sum(-1)
+    column = WaterColumn.from_text(water.get("tops", 0), water["attenuation"], 0, 0)
+    expected = np.array([echo_energies(LIDAR, SIGMA, column, 0.0, 8.0, 0.1, (1e-4, 1e-4), f).bottom for f in FIELDS])
+    z, relative = z_score(np.column_stack([energy, energy.sum(1)]), np.append(expected, expected.sum()))
+    assert np.all(relative < 0.01)
+    assert np.all(np.abs(z) < 4), z
+
+
+def test_bottom_in_bins(lidar_scene, passes):
+    edges = 1484.0 + 2.0 * np.arange(10)
+    film = {"time_start_ns": edges[0], "bin_width_ns": 2.0, "bin_count": 9}
+    scene = lidar_scene(integrator=MERGING, film=film, sea={"slope_variance": "2e-5"}, water=CLEAR)
+    mean, error = mean_and_error(passes(scene, 24))
+    column = WaterColumn.from_text(0, 0.1, 0, 0)
+    expected = np.array([bottom_energy_per_bin(edges, LIDAR, SIGMA, column, 8.0, 0.1, f) for f in FIELDS])
+    strong = expected > 0.02 * expected.max()
+    assert np.all(np.abs(mean - expected)[strong] < (4.4 * error + 0.002 * expected.max())[strong])
+    assert np.all(error[strong] < 0.05 * mean[strong])
+
+
+@pytest.mark.parametrize("phase", ["fournier_forand", "hg"])
+def test_single_scattering_column(lidar_scene, passes, phase):
+    """So little scattering that nothing scatters twice; attenuation 0.3 /m is absorption."""
+    backward = {"fournier_forand": fournier_forand(np.pi, *fournier_forand_parameters(0.04))}
+    backward["hg"] = henyey_greenstein(np.pi, 0.924)
+    check_column(lidar_scene, passes, {"phase_function": phase}, 0.3, 1.5e-5, 6e-7, float(backward[phase]))
+
+
+def test_single_scattering_column_in_layers(lidar_scene, passes):
+    backward = [float(fournier_forand(np.pi, *fournier_forand_parameters(ratio))) for ratio in (0.02, 0.04)]
+    values = "0.5, 0.3", "2e-5, 2e-5", "4e-7, 8e-7"
+    check_column(lidar_scene, passes, {"tops": "0, 3"}, *values, backward)
+
+
+def check_column(lidar_scene, passes, water, attenuation, scattering, backscattering, backward):
+    edges = 1430.0 + 5.0 * np.arange(13)
+    coefficients = {"attenuation": attenuation, "scattering": scattering, "backscattering": backscattering}
+    film = {"time_start_ns": edges[0], "bin_width_ns": 5.0, "bin_count": 12}
+    scene = lidar_scene(integrator=MERGING, film=film, water={**water, **coefficients}, bottom=None)
+    energy = passes(scene, 24)
+    energy = np.concatenate([energy, energy.sum(axis=2, keepdims=True)], axis=2)
+    mean, error = mean_and_error(energy)
+    column = WaterColumn.from_text(water.get("tops", 0), attenuation, scattering, backscattering)
+    expected = np.array([column_energy_per_bin(edges, LIDAR, SIGMA, column, backward, 30.0, f) for f in FIELDS])
+    expected = np.concatenate([expected, expected.sum(axis=1, keepdims=True)], axis=1)
+    assert np.all(error < 0.02 * mean)
+    # 52 comparisons; the grid of the closed form adds 5e-4, the blur over cells 1e-3.
+    assert np.all(np.abs(mean / expected - 1) < 4.4 * error / mean + 1.5e-3), mean / expected
+
+
+def test_phase_function_counts_the_angle_between_the_directions(lidar_scene, passes):
+    """Receiver 150 m from the laser: light turns by 145 instead of 180 degrees, where HG 0.9 differs by 9 %."""
+    water = {"attenuation": 0.3, "scattering": 1e-5, "backscattering": 1e-6, "phase_function": "hg", "phase_g": 0.9}
+    scenes = [
+        lidar_scene(
+            integrator={"type": integrator, "paths_per_pass": 2**17},
+            tx={"off_nadir_deg": 0.0},
+            rx={"to_world": mi.ScalarTransform4f().look_at([150.0, 0, 200], [0, 0, 0], [0, 0, 1])},
+            film={"time_start_ns": 1500.0, "bin_count": 30, "bin_width_ns": 5.0},
+            water={**water, "scattering": scattering, "backscattering": 0.1 * scattering},
+            bottom=None,
+        )
+        for integrator, scattering in (("lidar_merging", 1e-3), ("lidar_volpath", 1e-3))
+    ]
+    merged, reference = (passes(scene, count) for scene, count in zip(scenes, (16, 24), strict=True))
+    assert_same(merged.sum(-1), reference.sum(-1), floor=1e-3)
+    assert np.all(mean_and_error(reference.sum((1, 2)))[1] < 0.03 * reference.sum((1, 2)).mean())
+
+
+# The other integrator: multiple scattering, waves, targets, layers.
+
+
+def plate(x, y, z, half, tilt=0.0, **bsdf):
+    to_world = mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 1, 0], tilt).scale(half)
+    diffuse = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.3}}
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf or diffuse}
+
+
+SPHERE = {"type": "sphere", "center": [0.3, 0.2, -5.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
+LAYERS = {"tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35", "backscattering": "0.014, 0.007"}
+CASES = {
+    "waves": {"sea": WAVES},
+    "layers": {"sea": WAVES, "water": LAYERS},
+    "plate": {"extra": {"target": plate(0.4, 0.3, -5.0, 0.6)}},
+    "tilted plate": {"extra": {"target": plate(0.4, 0.3, -5.0, 0.8, tilt=35.0)}},
+    "sphere": {"extra": {"target": SPHERE}},
+    "tilted bottom": {"bottom": None, "extra": {"target": plate(0.0, 0.0, -8.0, 200.0, tilt=12.0)}},
+    "partly transparent": {
+        "extra": {
+            "target": plate(
+                *(0.0, 0.0, -4.0, 1.0), type="mask", opacity=0.4, nested={"type": "diffuse"}
+            )
+        }
+    },
+    "mirror": {"extra": {"target": plate(0.0, 0.0, -5.0, 1.0, type="conductor")}},
+    "plate in the air": {"extra": {"target": plate(0.5, 0.5, 1.0, 0.7)}},
+    "through the surface": {"extra": {"target": plate(0.5, 0.5, 0.0, 0.7, tilt=80.0)}},
+    "receiver aside": {
+        "rx": {"to_world": mi.ScalarTransform4f().look_at([-40.0, 30.0, 200], [0, 0, 0], [0, 0, 1])},
+        "film": {"time_start_ns": 1370.0},
+    },
+    "turbid": {"water": {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016}, "bottom": 4.0},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_both_integrators_agree(lidar_scene, passes, case):
+    """Bins of 2 ns of the four pixels, a few hundred in all; the blur of cells under waves is allowed 0.5 %."""
+    film = {"time_start_ns": 1400.0, "bin_width_ns": 2.0, "bin_count": 70, **CASES[case].get("film", {})}
+    scenes = [
+        lidar_scene(integrator=integrator, **{"sea": {"slope_variance": "0.01"}, **CASES[case], "film": film})
+        for integrator in (MERGING, {"paths_per_pass": 2**19})
+    ]
+    merged, reference = (passes(scene, count) for scene, count in zip(scenes, (20, 30), strict=True))
+    assert_same(merged, reference, floor=0.005)
+    gates = merged.sum(axis=2), reference.sum(axis=2)
+    assert_same(*gates, floor=0.005)
+    total = reference.sum(axis=(1, 2))
+    assert mean_and_error(total)[1] < 0.02 * total.mean()
+
+
+@pytest.mark.slow
+def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
+    """Waves focus beam and view alike, and wide cells blur both: a deficit that small cells do not have."""
+    film = {"time_start_ns": 1420.0, "bin_width_ns": 30.0, "bin_count": 1}
+    reference = passes(lidar_scene(integrator={"paths_per_pass": 2**20}, sea=WAVES, film=film, bottom=None), 30)
+    level, error = mean_and_error(reference.sum(axis=(1, 2)))
+    bias = []
+    for width in (0.1, 0.03, 0.01):
+        merged = passes(lidar_scene(integrator={**MERGING, "cell_size": width}, sea=WAVES, film=film, bottom=None), 30)
+        mean, merged_error = mean_and_error(merged.sum(axis=(1, 2)))
+        bias.append(mean / level - 1)
+        assert np.hypot(error, merged_error) < 0.002 * level
+    assert bias[0] < bias[1] < bias[2] < 0.006
+    assert bias[0] < -0.012
+    assert bias[2] > -0.006
+
+
+def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
+    """Over a level sea without mirrors nothing is left; a mirror under water leaves what it shows."""
+    unmerged = {"unmerged": True, "paths_per_pass": 2**16}
+    assert passes(lidar_scene(integrator=unmerged), 2).sum() == 0
+    mirror = lidar_scene(integrator=unmerged, extra=CASES["mirror"]["extra"])
+    assert passes(mirror, 2).sum() > 0
+
+
+# Statistics.
+
+
+def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
+    four = passes(lidar_scene(integrator=MERGING, sea=WAVES), 2, 5)
+    again = passes(lidar_scene(integrator=MERGING, sea=WAVES), 2, 5)
+    np.testing.assert_array_equal(four, again)
+    single = passes(lidar_scene(integrator=MERGING, sea=WAVES, rx={"layout": "1x1"}), 2, 5)
+    np.testing.assert_allclose(four.sum(axis=1), single[:, 0], rtol=1e-12, atol=1e-30)
+    assert not np.array_equal(four[0], four[1])
+
+
+@pytest.mark.slow
+def test_standard_errors_are_honest():
+    """Over 100 seeds, intervals of 95 % from eight passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
+    from scipy.stats import t
+
+    scene, _, _ = load_scene("fig09_2x2", {"attenuation": "1.0", "scattering": "0.8", "backscattering": "0.016"})
+    engine = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13})
+    film = scene.sensors()[0].film()
+    energy = []
+    for seed in range(800):
+        engine.render(scene, 0, seed=seed, develop=False)
+        energy.append(film.energy()[:, 40:110])
+    energy = np.array(energy).reshape(100, 8, 4, 14, 5).sum(axis=-1)
+    mean, error = energy.mean(axis=1), energy.std(axis=1, ddof=1) / np.sqrt(8)
+    # The long-run mean holds the run itself: its own error is a tenth of a run's.
+    covered = np.abs(mean - energy.mean(axis=(0, 1))) < t.ppf(0.975, 7) * error
+    assert 0.93 < covered.mean() < 0.97, covered.mean()
+
+
+# Parts.
+
+
+@pytest.fixture
+def wavy_system(lidar_scene):
+    scene = lidar_scene(integrator=MERGING, sea=WAVES)
+    system = LidarScene.from_scene(scene, scene.sensors()[0])
+    region = Region.of_system(system, ViewSampler(system.receiver, system.transmitter))
+    return system, region
+
+
+def test_region_holds_beam_and_view_and_no_more_than_half_as_much_again(wavy_system):
+    """Field of view of 30 mrad at 212.8 m: 6.4 m across, and 1 / cos(20 deg) of that along x."""
+    _, region = wavy_system
+    for size, seen in zip(region.size, (6.39 / np.cos(np.radians(20)), 6.39), strict=True):
+        assert seen < size < 1.6 * seen
+
+
+def test_track_length_is_the_slanted_way_to_the_bottom(wavy_system):
+    system, region = wavy_system
+    slanted = 8.0 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
+    assert region.track_length(system) == pytest.approx(slanted, rel=0.05)
+
+
+def test_heights_are_those_of_the_mesh(wavy_system):
+    system, region = wavy_system
+    heights = SurfaceHeights(system, region)
+    rng = np.random.default_rng(2)
+    x, y = (rng.uniform(region.low[axis], region.high[axis], 4096) for axis in (0, 1))
+    down = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5), mi.Vector3f(0, 0, -1))
+    true = np.array(system.scene.ray_intersect(down).p.z)
+    assert true.std() > 0.03
+    assert np.abs(np.array(heights.at(mi.Float(x), mi.Float(y))) - true).max() < 0.01
+
+
+@pytest.mark.parametrize("shift", [[0.0, 0.0, 0.0], [0.3, 0.9, 0.99]])
+def test_points_fall_into_cells_by_their_volume(wavy_system, shift):
+    """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included."""
+    system, region = wavy_system
+    heights = SurfaceHeights(system, region)
+    cells = WaterCells(WaterGrid(system, heights, 0.5, 0.2, 0.25, 4.0), mi.Point3f(shift))
+    rng, count, depth = np.random.default_rng(7), 2**21, 1.5
+    lean = system.transmitter.pose.axis[0] / 1.34
+    lean /= np.sqrt(1 - lean**2)
+    below, y = rng.uniform(0, depth, count), rng.uniform(-2.0, 2.0, count)
+    x = rng.uniform(-2.0, 2.0, count)
+    z = np.array(heights.at(mi.Float(x), mi.Float(y))) - below
+    bucket, tag, volume = (np.array(a) for a in cells.locate(mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))))
+    _, index, inverse, number = np.unique(
+        bucket.astype(np.uint64) << 32 | tag, return_index=True, return_inverse=True, return_counts=True
+    )
+    # Cells that the sampled column does not cut: points of the cell stay clear of its faces.
+    u = x - lean * below
+    inner = np.ones(len(number), dtype=bool)
+    for value, low, high in ((u, -1.4, 1.4), (y, -1.4, 1.4), (below, -1.0, depth - 0.3)):
+        inside = (value > low) & (value < high)
+        inner &= np.bincount(inverse, ~inside, len(number)) == 0
+    expected = count * volume[index] / (depth * 16.0)
+    z = (number - expected)[inner] / np.sqrt(expected[inner])
+    assert inner.sum() > 50
+    assert np.abs(z).max() < 5
+    # The table of heights is made of small steps, with which uniform points are not quite uniform below it.
+    assert 0.8 < z.std() < 1.3
+
+
+def test_inverse_share_counts_edges_in_full(lidar_scene):
+    """Points uniform on a plate: the sum of (inverse share / patch area) is the number of patches it touches."""
+    half = 0.31
+    scene = lidar_scene(integrator=MERGING, extra={"target": plate(0.1, 0.05, -4.0, half)})
+    system = LidarScene.from_scene(scene, scene.sensors()[0])
+    region = Region.of_system(system, ViewSampler(system.receiver, system.transmitter))
+    width, count = 0.1, 2**18
+    patches = SolidPatches(system, region, width, mi.Point2f(0.37, 0.61))
+    rng = pass_streams(3, 0, count)
+    x, y = (half * (2 * rng.next_float32() - 1) for _ in range(2))
+    ray = mi.Ray3f(mi.Point3f(x + 0.1, y + 0.05, -3), mi.Vector3f(0, 0, -1))
+    si = scene.ray_intersect(ray)
+    patch = patches.locate(si)
+    share = patches.inverse_share(patch, si.shape, rng, si.is_valid())
+    values = np.array(share / patch.area, dtype=np.float64) * (2 * half) ** 2
+    touched = np.prod(
+        [np.floor((c + half) / width + s) - np.floor((c - half) / width + s) + 1 for c, s in ((0.1, 0.37), (0.05, 0.61))]
+    )
+    assert abs(values.mean() - touched) < 4 * values.std() / np.sqrt(count)
+    # Without it, edges would be missed.
+    assert np.array(1 / patch.area).mean() * (2 * half) ** 2 < 0.9 * touched
+
+
+def test_narrow_view_in_a_wide_beam_draws_light_where_it_looks(lidar_scene, passes):
+    """A tenth of the beam's width in view: the same mean as photons drawn by the beam alone, with less noise."""
+    scene = lidar_scene(
+        integrator={**MERGING, "cell_size": 0.02}, tx={"divergence_mrad": 40.0}, rx={"field_of_view_mrad": 6.0}
+    )
+    energy = passes(scene, 16).sum(axis=(1, 2))
+    engine = scene.integrator()
+    assert engine._beam.use_view
+    engine._beam.use_view = False
+    plain = passes(scene, 16).sum(axis=(1, 2))
+    assert_same(energy[:, None], plain[:, None])
+    assert energy.std() < 0.7 * plain.std()
+
+
+def test_crowded_passes_make_room_and_lose_nothing(lidar_scene, passes):
+    """Room for a tenth of what is needed: the pass is repeated with more, and gives the same bits."""
+    scene = lidar_scene(integrator={**MERGING, "paths_per_pass": 2**14, "photons_per_pass": 2**14})
+    whole = passes(scene, 1, 3)
+    engine = scene.integrator()
+    engine._room.light_legs = engine._room.view_legs = engine._room.hits = 0.1
+    np.testing.assert_array_equal(passes(scene, 1, 3), whole)
+    assert engine._room.light_legs > 1
+    dr.sync_thread()
