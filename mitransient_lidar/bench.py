@@ -37,7 +37,7 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
 #: Cases of ``--quick``.
 QUICK_CASES = ("flat", "clear")
 
-INTEGRATORS = ("lidar_volpath",)
+INTEGRATORS = ("lidar_merging", "lidar_volpath")
 
 #: Passes after the first one, which compiles.
 _QUICK_PASSES = 16

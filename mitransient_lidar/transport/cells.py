@@ -26,7 +26,7 @@ _RAYS = 4096
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 
 #: Logarithms to base 2 of the numbers of buckets of water cells and of patches, along one side.
-_WATER_BITS, _PATCH_BITS = 21, 9
+_WATER_BITS, _PATCH_BITS = 20, 9
 
 #: Height of the floors into which patches of bounded solids are cut, in widths of a patch.
 _FLOOR_WIDTHS = 8
