@@ -10,11 +10,17 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mitransient_lidar.errors import UserError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 #: Parameters that turn a shipped scene into each case: (scene, parameters).
 CASES: dict[str, tuple[str, dict[str, str]]] = {
@@ -31,8 +37,20 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
             "field_of_view_mrad": "35",
         },
     ),
+    "target": (
+        "fig09_2x2",
+        {"field_of_view_mrad": "35", "bottom_depth": "12", "bin_count": "190"},
+    ),
     "imager": ("fig09_2x2", {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}),
 }
+
+#: What the case ``target`` has beside its scene: a plate of 1.5 m x 1.5 m at 8 m depth.
+_TARGET = """
+    <shape type="rectangle" id="target">
+        <transform name="to_world"><scale value="0.75"/><translate z="-8"/></transform>
+        <bsdf type="diffuse"><spectrum name="reflectance" value="0.1"/></bsdf>
+    </shape>
+</scene>"""
 
 #: Cases of ``--quick``.
 QUICK_CASES = ("flat", "clear")
@@ -129,18 +147,17 @@ def measure(case: str, integrator: str, quick: bool, target_error: float | None)
     from mitransient_lidar import rendering, variants
 
     variants.set_variant()
-    scene, parameters = CASES[case]
     marks: list[tuple[float, float]] = []
 
     def progress(_: rendering.Progress) -> None:
         marks.append((time.perf_counter(), time.process_time()))
 
+    loaded = _load(case)
     passes = None if target_error else 1 + (_QUICK_PASSES if quick else _PASSES)
     start = time.perf_counter()
     engine = mi.load_dict({"type": integrator})
     result = rendering.render(
-        scene,
-        params=parameters,
+        loaded,
         integrator=engine,
         passes=passes,
         target_error=target_error,
@@ -159,7 +176,7 @@ def measure(case: str, integrator: str, quick: bool, target_error: float | None)
         "compile_s": float(marks[0][0] - start - statistics.median(steps)),
         "paths_per_s": engine.paths_per_pass * warm / float(wall),
         "rays_per_s": rays / float(wall),
-        "ray_rate_ratio": rays / float(wall) / _plain_ray_rate(scene, parameters),
+        "ray_rate_ratio": rays / float(wall) / _plain_ray_rate(loaded),
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "error_median": result.attrs["error_median"],
         "error_p95": result.attrs["error_p95"],
@@ -167,17 +184,29 @@ def measure(case: str, integrator: str, quick: bool, target_error: float | None)
     }
 
 
-def _plain_ray_rate(scene_name: str, parameters: dict[str, str]) -> float:
+def _load(case: str) -> mi.Scene:
+    """Load the scene of a case."""
+    from mitransient_lidar.loading import load_scene
+    from mitransient_lidar.resources import scene_text
+
+    name, parameters = CASES[case]
+    if case != "target":
+        return load_scene(name, parameters)[0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "target.xml"
+        path.write_text(scene_text(name).replace("</scene>", _TARGET))
+        return load_scene(path, parameters)[0]
+
+
+def _plain_ray_rate(scene: mi.Scene) -> float:
     """Return how many rays a second plain ``scene.ray_intersect`` traces from the receiver on the same scene."""
     import drjit as dr
     import mitsuba as mi
 
-    from mitransient_lidar.loading import load_scene
     from mitransient_lidar.transport.receiving import ViewSampler
     from mitransient_lidar.transport.streams import pass_streams
     from mitransient_lidar.transport.system import LidarScene
 
-    scene, _, _ = load_scene(scene_name, parameters)
     system = LidarScene.from_scene(scene, scene.sensors()[0])
     view = ViewSampler(system.receiver, system.transmitter)
     count, rates = 2**21, []

@@ -82,9 +82,7 @@ class LayeredWater(mi.Medium):
         self.flight = LayeredFlight(self.column)
         self.scattering_flight = LayeredFlight(replace(self.column, attenuation=self.column.scattering))
         none = np.zeros(self.column.count)
-        self.absorption_flight = LayeredFlight(
-            WaterColumn(self.column.tops, self.column.absorption, none, none)
-        )
+        self.absorption_flight = LayeredFlight(WaterColumn(self.column.tops, self.column.absorption, none, none))
         self._majorant = float(np.max(self.column.attenuation))
         self.m_is_homogeneous = self.column.count == 1
         self.m_has_spectral_extinction = False

@@ -11,8 +11,8 @@ import numpy as np
 from mitransient_lidar.optics.checks import non_negative, whole
 from mitransient_lidar.transport.beam import BeamSampler
 from mitransient_lidar.transport.cells import Region, SolidPatches, SurfaceHeights, WaterCells, WaterGrid
-from mitransient_lidar.transport.merging import merge_in_water, merger_at_solids, store_points
 from mitransient_lidar.transport.connection import laser_through
+from mitransient_lidar.transport.merging import merge_in_water, merger_at_solids, store_points
 from mitransient_lidar.transport.photons import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.streams import pass_streams
@@ -70,22 +70,22 @@ class LidarMerging(mi.CppADIntegrator):
                                  the depth that the record allows. Default: 0
     ==================  =======  =======================================================================================
 
-    Nearly every echo goes down, turns and comes up, and both legs are easy from their own ends. Light is traced from the
-    laser and paths from the receiver, both through waves and ripples into the water, scattering naturally to any order.
-    Along both, points are set at equal distances. Where a point of a light path and one of a receiver's path lie in the
-    same small cell, the two are merged into a whole path, with the phase function between their directions; likewise
-    where both meet the same small patch of the bottom or of a target, with the BSDF (photon mapping in a medium: Jensen
-    and Christensen 1998, doi:10.1145/280814.280925; points at equal distances instead of collisions: the track-length
-    estimator of Spanier 1966, doi:10.1137/0114057, at both ends).
+    Nearly every echo goes down, turns and comes up, and both legs are easy from their own ends. Light is traced
+    from the laser and paths from the receiver, both through waves and ripples into the water, scattering naturally
+    to any order. Along both, points are set at equal distances. Where a point of a light path and one of a
+    receiver's path lie in the same small cell, the two are merged into a whole path, with the phase function
+    between their directions; likewise where both meet the same small patch of the bottom or of a target, with the
+    BSDF (photon mapping in a medium: Jensen and Christensen 1998, doi:10.1145/280814.280925; points at equal
+    distances instead of collisions: the track-length estimator of Spanier 1966, doi:10.1137/0114057, at both ends).
 
-    A path with several scattering events can arise from a merge at each of them. The balance heuristic (Veach and Guibas
-    1995, doi:10.1145/218380.218498) shares it among them: with coefficient :math:`b_i` and phase function :math:`p_i` at
-    each event, the merge at event *k* counts
+    A path with several scattering events can arise from a merge at each of them. The balance heuristic (Veach and
+    Guibas 1995, doi:10.1145/218380.218498) shares it among them: with coefficient :math:`b_i` and phase function
+    :math:`p_i` at each event, the merge at event *k* counts
 
     .. math:: b_k\, p_k\, \frac{1 / (b_k p_k)}{\sum_i 1 / (b_i p_i)} = \Big(\sum_i \frac{1}{b_i p_i}\Big)^{-1},
 
-    which is bounded by the largest turn and keeps the forward peak from making noise. Paths that meet a solid are merged
-    at the first one seen from the receiver only.
+    which is bounded by the largest turn and keeps the forward peak from making noise. Paths that meet a solid are
+    merged at the first one seen from the receiver only.
 
     Echoes from the surface and from solids in the air are connected to the laser directly. What is left, such as light
     that meets the sea twice without scattering, mirrors under water, and solids in the air seen by reflection, comes

@@ -77,8 +77,8 @@ class LidarVolpath(mi.CppADIntegrator):
                                     Default: 0.4
     connection             string   How vertices under water reach the laser: ``combined``, or for checks only
                                     ``lobe`` or ``walk``. Default: ``combined``
-    unmerged               boolean  Whether to leave out what ``lidar_merging`` finds by merging: echoes of one vertex in
-                                    the air, all paths that scatter in the water and meet no solid, and those whose
+    unmerged               boolean  Whether to leave out what ``lidar_merging`` finds by merging: echoes of one vertex
+                                    in the air, all paths that scatter in the water and meet no solid, and those whose
                                     first solid is under water and not a mirror. Default: false
     =====================  =======  ====================================================================================
 
@@ -197,7 +197,13 @@ class LidarVolpath(mi.CppADIntegrator):
         self.rays = dr.sum(mi.Float64(path.rays))
 
     def _step(
-        self, system: LidarScene, lobe: SurfaceLobe, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float
+        self,
+        system: LidarScene,
+        lobe: SurfaceLobe,
+        path: ConnectedPath,
+        rng: mi.PCG32,
+        pixel: mi.UInt32,
+        weight: mi.Float,
     ) -> None:
         """Go to the next vertex, connect it to the laser, and choose the direction in which the path goes on."""
         # Advance to whichever comes first, a scattering event or a surface.

@@ -12,8 +12,8 @@ from mitransient_lidar.optics.water import C0
 #: More bins than this do not fit the memory of a laptop.
 _LARGEST_FILM = 2**28
 
-#: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below which
-#: energies are summed finely. Coarse sums hold 64 times what is emitted; fine ones 2^23 of the largest they take.
+#: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below
+#: which energies are summed finely. Coarse sums hold 64 times what is emitted; fine ones 2^23 of the largest they take.
 _COARSE_BITS, _FINE_BITS, _COARSEST_FINE = 57, 32, 2.0**8
 
 

@@ -58,7 +58,8 @@ class Region:
         ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
         low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
         margin = _REGION_MARGIN * (high - low)
-        return cls(tuple(map(float, low - margin)), tuple(map(float, high + margin)))
+        x, y = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)
+        return cls((x[0], y[0]), (x[1], y[1]))
 
     @property
     def size(self) -> tuple[float, float]:

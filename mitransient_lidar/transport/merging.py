@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -37,14 +39,15 @@ def merge_in_water(
     cell's volume V each pair adds beta s w s' / V times the scattering coefficient and the phase function, shared among
     all merges that make the same path.
     """
+    water: Any = system.water
     bucket, cell, volume = cells.locate(points.point)
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi = points.point, -points.direction
     mei.sh_frame = mi.Frame3f(mei.wi)
-    layer = system.water.flight.layer_at(-points.point.z)
-    phase = system.water.phase_at(layer)
-    scattering = system.water.scattering_flight.attenuation(layer)
-    absorption = system.water.absorption_flight.attenuation(layer)
+    layer = water.flight.layer_at(-points.point.z)
+    phase = water.phase_at(layer)
+    scattering = water.scattering_flight.attenuation(layer)
+    absorption = water.absorption_flight.attenuation(layer)
     weight = points.weight / volume
     first, end = photons.bucket(bucket, mi.Bool(True))
 

@@ -117,5 +117,8 @@ class PhotonBuffer:
         bucket, tag = dr.gather(mi.Point2u, self._place, index)
         x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
         photons = PhotonMap(buckets, bucket)
-        photons.fill(Photon(mi.Vector3f(x, y, z), length, dr.gather(mi.Float, self._weight, index), mi.Float(0), mi.Float(0)), tag)
+        photons.fill(
+            Photon(mi.Vector3f(x, y, z), length, dr.gather(mi.Float, self._weight, index), mi.Float(0), mi.Float(0)),
+            tag,
+        )
         return photons, wanted

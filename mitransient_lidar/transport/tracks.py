@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +59,7 @@ class Tracks:
 
     def __init__(self, system: LidarScene, spacing: float, capacity: int) -> None:
         self.system = system
+        self._water: Any = system.water
         self.spacing = spacing
         self.capacity = capacity
         self._stored = dr.zeros(mi.UInt32, 1)
@@ -97,7 +98,7 @@ class Tracks:
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
 
     def close(self) -> tuple[int, int]:
-        """Number the points; return how many there are, and how many legs there would have been with enough room."""
+        """Give all points their numbers; return how many there are, and how many legs were to be stored."""
         dr.eval(self._stored, self._number, self._label, self._start, self._course, self._worth)
         self._end = dr.cumsum(self._number)
         count = int(self._end[self.capacity - 1])
@@ -117,7 +118,7 @@ class Tracks:
         first = dr.gather(mi.UInt32, self._end, leg) - dr.gather(mi.UInt32, self._number, leg)
         along = dr.fma(mi.Float(index - first), self.spacing, offset)
         direction = mi.Vector3f(dx, dy, dz)
-        absorbed = self.system.water.absorption_flight.optical_depth(-z, -dz, along)
+        absorbed = self._water.absorption_flight.optical_depth(-z, -dz, along)
         return TrackPoints(
             mi.Point3f(x, y, z) + direction * along,
             direction,

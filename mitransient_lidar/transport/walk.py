@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,8 +28,8 @@ class WalkPath(Path):
     pristine
         Whether the path has met no solid yet.
     virtual
-        Whether it has passed beside the surface patch, and goes on as if the sea did not end there: such paths tell what
-        is lost.
+        Whether it has passed beside the surface patch, and goes on as if the sea did not end there: such paths tell
+        what is lost.
     offset
         Distance from the last vertex to the next point of the path's track [m].
     """
@@ -68,7 +69,7 @@ Action = Callable[[WalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
 
 def scattering_event(
     system: LidarScene, path: Path, scattered: mi.Bool
-) -> tuple[mi.MediumInteraction3f, mi.PhaseFunction | mi.PhaseFunctionPtr | None, mi.UInt32]:
+) -> tuple[mi.MediumInteraction3f, Any, mi.UInt32]:
     """Return the interaction, the phase function (None without water) and the layer where paths have scattered."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p = path.point
@@ -99,6 +100,7 @@ class Walk:
 
     def __init__(self, system: LidarScene, mode: mi.TransportMode, destination: Pose) -> None:
         self.system = system
+        self._water: Any = system.water
         self.context = mi.BSDFContext(mode)
         self.adjoint = mode == mi.TransportMode.Importance
         self.destination = mi.Point3f(destination.origin.tolist())
@@ -162,7 +164,7 @@ class Walk:
         si = self.system.scene.ray_intersect(path.ray(), path.active)
         path.rays += dr.select(path.active, mi.UInt32(1), 0)
         drawn = -dr.log(1 - rng.next_float32())
-        distance = self.system.water.scattering_flight.distance(path.depth, path.downward, drawn)
+        distance = self._water.scattering_flight.distance(path.depth, path.downward, drawn)
         scattered = wet & (distance < si.t)
         beside = path.active & first & (path.downward > 0)
         beside &= ~si.is_valid() | self.system.beside_surface(si.p.z, mi.Bool(False))
@@ -184,7 +186,7 @@ class Walk:
         self, path: WalkPath, si: mi.SurfaceInteraction3f, free: mi.Bool, length: mi.Float, wet: mi.Bool
     ) -> None:
         """Move the path to the end of its leg, which is `free` or on a surface, and absorb on the way."""
-        absorbed = self.system.water.absorption_flight.optical_depth(path.depth, path.downward, length)
+        absorbed = self._water.absorption_flight.optical_depth(path.depth, path.downward, length)
         path.throughput *= dr.select(wet, dr.exp(-absorbed), 1)
         advance(path, self.system, length, dr.select(free, path.point + path.direction * length, si.p))
         # Light that has passed beside the surface patch is lost.
@@ -206,7 +208,7 @@ class Walk:
         mei, phase, layer = scattering_event(self.system, path, scattered)
         natural, weight, pdf = phase.sample(mi.PhaseFunctionContext(), mei, pick, u, scattered)
         # The sum runs over what the film would see: scattering coefficient times value of the phase function.
-        likely = self.system.water.scattering_flight.attenuation(layer) * weight[0] * pdf
+        likely = self._water.scattering_flight.attenuation(layer) * weight[0] * pdf
         path.competition += dr.select(scattered, dr.rcp(likely), 0)
         path.scatterings += dr.select(scattered, mi.UInt32(1), 0)
         direction = dr.select(scattered, dr.normalize(natural), si.to_world(bs.wo))

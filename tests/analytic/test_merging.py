@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 from mitransient_lidar.loading import load_scene
 from mitransient_lidar.optics.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
@@ -40,11 +40,14 @@ def mean_and_error(samples):
 def assert_same(first, second, *, floor=0.0, largest=0.1):
     """Compare per bin two sets of passes by z-test with Sidak's correction; `floor` is a relative bias to allow.
 
+    The bias is blur, so it may also come from a neighbouring bin: at the steep beginning of the surface echo it does.
     Bins with a relative error above `largest` are left out: few large contributions make them, which are not normal.
     """
     (a, da), (b, db) = mean_and_error(first), mean_and_error(second)
     used = (da > 0) & (da < largest * a) & (db > 0) & (db < largest * b)
-    z = (np.abs(a - b) - floor * b)[used] / np.hypot(da, db)[used]
+    padded = np.pad(b, [(0, 0)] * (b.ndim - 1) + [(1, 1)])
+    around = np.maximum(np.maximum(padded[..., :-2], padded[..., 2:]), b)
+    z = (np.abs(a - b) - floor * around)[used] / np.hypot(da, db)[used]
     # Standard errors from few passes are uncertain themselves: Student's t, taken as normal with its variance.
     freedom = min(len(first), len(second)) - 1
     z *= np.sqrt((freedom - 2) / freedom)
@@ -149,11 +152,7 @@ CASES = {
     "sphere": {"extra": {"target": SPHERE}},
     "tilted bottom": {"bottom": None, "extra": {"target": plate(0.0, 0.0, -8.0, 200.0, tilt=12.0)}},
     "partly transparent": {
-        "extra": {
-            "target": plate(
-                *(0.0, 0.0, -4.0, 1.0), type="mask", opacity=0.4, nested={"type": "diffuse"}
-            )
-        }
+        "extra": {"target": plate(*(0.0, 0.0, -4.0, 1.0), type="mask", opacity=0.4, nested={"type": "diffuse"})}
     },
     "mirror": {"extra": {"target": plate(0.0, 0.0, -5.0, 1.0, type="conductor")}},
     "plate in the air": {"extra": {"target": plate(0.5, 0.5, 1.0, 0.7)}},
@@ -172,14 +171,14 @@ def test_both_integrators_agree(lidar_scene, passes, case):
     film = {"time_start_ns": 1400.0, "bin_width_ns": 2.0, "bin_count": 70, **CASES[case].get("film", {})}
     scenes = [
         lidar_scene(integrator=integrator, **{"sea": {"slope_variance": "0.01"}, **CASES[case], "film": film})
-        for integrator in (MERGING, {"paths_per_pass": 2**19})
+        for integrator in (MERGING, {"paths_per_pass": 2**18})
     ]
-    merged, reference = (passes(scene, count) for scene, count in zip(scenes, (20, 30), strict=True))
+    merged, reference = passes(scenes[0], 40), passes(scenes[1], 30, first_seed=1000)
     assert_same(merged, reference, floor=0.005)
     gates = merged.sum(axis=2), reference.sum(axis=2)
     assert_same(*gates, floor=0.005)
     total = reference.sum(axis=(1, 2))
-    assert mean_and_error(total)[1] < 0.02 * total.mean()
+    assert mean_and_error(total)[1] < 0.05 * total.mean()
 
 
 @pytest.mark.slow
@@ -221,9 +220,7 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
 
 @pytest.mark.slow
 def test_standard_errors_are_honest():
-    """Over 100 seeds, intervals of 95 % from eight passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
-    from scipy.stats import t
-
+    """Over 100 seeds, 95 % intervals of eight passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
     scene, _, _ = load_scene("fig09_2x2", {"attenuation": "1.0", "scattering": "0.8", "backscattering": "0.016"})
     engine = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13})
     film = scene.sensors()[0].film()
@@ -319,7 +316,10 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     share = patches.inverse_share(patch, si.shape, rng, si.is_valid())
     values = np.array(share / patch.area, dtype=np.float64) * (2 * half) ** 2
     touched = np.prod(
-        [np.floor((c + half) / width + s) - np.floor((c - half) / width + s) + 1 for c, s in ((0.1, 0.37), (0.05, 0.61))]
+        [
+            np.floor((c + half) / width + s) - np.floor((c - half) / width + s) + 1
+            for c, s in ((0.1, 0.37), (0.05, 0.61))
+        ]
     )
     assert abs(values.mean() - touched) < 4 * values.std() / np.sqrt(count)
     # Without it, edges would be missed.
