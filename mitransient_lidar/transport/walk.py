@@ -212,7 +212,7 @@ class Walk:
         path.competition += dr.select(scattered, dr.rcp(likely), 0)
         path.scatterings += dr.select(scattered, mi.UInt32(1), 0)
         direction = dr.select(scattered, dr.normalize(natural), si.to_world(bs.wo))
-        factor = dr.select(scattered, weight[0], bsdf_weight[0])
+        factor = dr.select(scattered, weight[0], dr.select(at_surface, bsdf_weight[0], 1))
         if self.adjoint:
             factor *= dr.select(at_surface, _shading_correction(si, path.direction, direction), 1)
         # At solids little light goes on: give its weight to a few.
@@ -223,7 +223,7 @@ class Walk:
         path.pristine &= ~(solid & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null))
         path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
         path.point = dr.select(at_surface, si.spawn_ray(direction).o, path.point)
-        path.direction = dr.select(path.active, direction, path.direction)
+        path.direction = dr.select(path.active & (at_surface | scattered), direction, path.direction)
 
     def _enter_beside(self, path: WalkPath, beside: mi.Bool) -> None:
         """Let paths that pass beside the surface patch enter still water, to learn what is lost there."""
