@@ -146,7 +146,7 @@ def test_plate_in_the_air_without_any_water(lidar_scene, passes):
 
 def test_bins_are_half_open_and_their_sum_is_the_energy():
     film = mi.load_dict({"type": "time_gated_film", "time_start_ns": 0.0, "bin_width_ns": 1.0, "bin_count": 4})
-    film.prepare_pixels(2, 100.0)
+    film.prepare_pixels(2, 128.0)
     metre = 299792458e-9  # optical length of 1 ns
     times = np.array([-0.001, 0.0, 0.999, 1.001, 2.5, 3.999, 4.001, np.nan])
     film.add_transient(mi.UInt32(1), mi.Float(times * metre), mi.Float(np.arange(1.0, 9.0)), mi.Bool(True))
