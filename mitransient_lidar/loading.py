@@ -64,7 +64,8 @@ def readable_errors(loading: bool = False) -> Iterator[None]:
     """Turn what plugins and Mitsuba's parser raise about a user's mistake into a UserError of one sentence.
 
     Mitsuba wraps the ``ValueError`` of a Python plugin in a traceback inside a ``RuntimeError``. While loading, any
-    RuntimeError is the parser's complaint about the scene; later only a wrapped ValueError is the user's.
+    RuntimeError is the parser's complaint about the scene; later only a wrapped ValueError is the user's. A Ctrl-C that
+    Mitsuba or Dr.Jit has wrapped comes out as what it was.
     """
     try:
         yield
@@ -74,6 +75,8 @@ def readable_errors(loading: bool = False) -> Iterator[None]:
         raise UserError(_sentence(str(error))) from error
     except RuntimeError as error:
         text = str(error)
+        if "KeyboardInterrupt" in text or isinstance(error.__cause__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
         wrapped = re.findall(r"(?:ValueError|UserError): (.*)", text)
         if wrapped:
             raise UserError(_sentence(wrapped[-1])) from error

@@ -14,6 +14,7 @@ import numpy as np
 from mitransient_lidar import results, variants
 from mitransient_lidar.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.errors import UserError
+from mitransient_lidar.interruption import InterruptAfterPass
 from mitransient_lidar.loading import load_scene, readable_errors
 from mitransient_lidar.optics.pulse import waveform
 
@@ -173,20 +174,23 @@ def render(
     interrupted = False
     median = p95 = None
     try:
-        while not goal.reached(energy.count, time.perf_counter() - start, p95):
-            with readable_errors():
-                engine.render(loaded, sensor, seed=_pass_seed(seed, energy.count), develop=False)
-            histogram = film.energy().reshape(system.receiver.pixels.count, film.bin_count)
-            energy.add(histogram)
-            power.add(waveform(histogram, film.bin_width_ns, kernel))
-            lost_energy += float(np.array(engine.lost).item())
-            if energy.count > 1:
-                errors = window.relative_errors(power.mean, power.stderr)
-                median, p95 = _percentiles(errors)
-            if progress is not None:
-                elapsed = time.perf_counter() - start
-                left = goal.remaining(energy.count, elapsed, p95)
-                progress(Progress(energy.count, goal.passes, elapsed, median, p95, goal.target_error, left))
+        with InterruptAfterPass() as interruption:
+            while not goal.reached(energy.count, time.perf_counter() - start, p95):
+                with readable_errors():
+                    engine.render(loaded, sensor, seed=_pass_seed(seed, energy.count), develop=False)
+                histogram = film.energy().reshape(system.receiver.pixels.count, film.bin_count)
+                energy.add(histogram)
+                power.add(waveform(histogram, film.bin_width_ns, kernel))
+                lost_energy += float(np.array(engine.lost).item())
+                if energy.count > 1:
+                    errors = window.relative_errors(power.mean, power.stderr)
+                    median, p95 = _percentiles(errors)
+                if progress is not None:
+                    elapsed = time.perf_counter() - start
+                    left = goal.remaining(energy.count, elapsed, p95)
+                    progress(Progress(energy.count, goal.passes, elapsed, median, p95, goal.target_error, left))
+                if energy.count > 1:
+                    interruption.check()
     except KeyboardInterrupt:
         if energy.count < 2:
             raise

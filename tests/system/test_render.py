@@ -1,5 +1,6 @@
 """Rendering as a user does it: shipped scenes, options, files, warnings and mistakes."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar import accuracy, loading, rendering, resources, results
 from mitransient_lidar.errors import UserError
+from mitransient_lidar.interruption import InterruptAfterPass
+from mitransient_lidar.transport.path import Path as LightPath
 
 SMALL = {"type": "lidar_volpath", "paths_per_pass": 2**14}
 
@@ -122,15 +125,73 @@ def test_interruption_keeps_what_was_rendered():
     assert (shot.attrs["interrupted"], shot.attrs["passes"]) == (1, 4)
 
 
+@pytest.fixture
+def default_ctrl_c():
+    """Python's own handler: a shell that starts the tests in the background leaves Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_in_the_midst_of_a_pass_keeps_what_was_rendered(default_ctrl_c, monkeypatch):
+    """Dr.Jit turns an exception inside a loop that it records into a RuntimeError."""
+    original, calls = LightPath.ray, []
+
+    def interrupted_ray(path):
+        calls.append(None)
+        if len(calls) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(path)
+
+    monkeypatch.setattr(LightPath, "ray", interrupted_ray)
+    shot = small(passes=100)
+    assert len(calls) > 0
+    assert (shot.attrs["interrupted"], shot.attrs["passes"]) == (1, 2)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_second_ctrl_c_acts_at_once(default_ctrl_c):
+    def press(times):
+        with InterruptAfterPass():
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.01)
+
+    press(1)
+    with pytest.raises(KeyboardInterrupt):
+        press(2)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_that_mitsuba_wraps_while_loading_is_no_mistake_of_the_users():
+    with pytest.raises(KeyboardInterrupt), loading.readable_errors(loading=True):
+        raise RuntimeError("could not instantiate plugin: KeyboardInterrupt: ")
+    with pytest.raises(KeyboardInterrupt), loading.readable_errors():
+        raise RuntimeError("while_loop(): encountered an exception") from KeyboardInterrupt()
+
+
+#: The command line, with Ctrl-C pressed when the third pass has been added.
+INTERRUPTED_COMMAND = """
+import os, signal
+from mitransient_lidar import accuracy, cli
+add = accuracy.PassStatistics.add
+def add_and_interrupt(statistics, values):
+    add(statistics, values)
+    if statistics.count == 3:
+        os.kill(os.getpid(), signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+accuracy.PassStatistics.add = add_and_interrupt
+cli.main()
+"""
+
+
 def test_ctrl_c_on_the_command_line_writes_the_files(tmp_path):
-    command = [sys.executable, "-m", "mitransient_lidar", "render", "table1", "--passes", "100000", "-o"]
-    process = subprocess.Popen([*command, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    time.sleep(8)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130, stderr
+    command = [sys.executable, "-c", INTERRUPTED_COMMAND, "render", "table1", "--passes", "100000", "-o", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130, done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["table1.exr", "table1.nc", "table1.png"]
-    assert mitransient_lidar.open(tmp_path / "table1.nc").attrs["interrupted"] == 1
+    attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
+    assert (attributes["interrupted"], attributes["passes"]) == (1, 3)
 
 
 def test_standard_error_is_that_of_the_mean():
