@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _WRONG_USE = 2
 _INTERRUPTED = 130  # what shells report after Ctrl-C
+_DIFFERENT = 1
 _LISTED_PIXELS = 12  # pixels with a line of their own in the summary
 
 app = typer.Typer(
@@ -136,6 +137,29 @@ def plot(
         target = output or file.with_suffix(".png")
         plot_waveforms(results.open(file), target, "both" if log == linear else "log" if log else "linear")
         typer.echo(target)
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
+    second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and time bins.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")] = None,
+) -> None:
+    """Say whether FILE and OTHER agree within their standard errors, and draw both; exit code 1 if they do not."""
+    with _sentences():
+        from mitransient_lidar import results
+        from mitransient_lidar.comparison import plot_comparison
+
+        target = output or second.with_name(f"{first.stem}_{second.stem}.png")
+        outcome = plot_comparison(results.open(first), results.open(second), target)
+        typer.echo(target)
+        typer.echo(
+            f"{'agree' if outcome.agrees else 'differ'}: {outcome.bin_count} bins, rms {outcome.rms:.2f} and largest "
+            f"{outcome.largest:.1f} standard errors (chance explains {outcome.limit:.1f}); energy x "
+            f"{outcome.energy_ratio:.4f} +- {outcome.energy_ratio_stderr:.4f}"
+        )
+    if not outcome.agrees:
+        raise typer.Exit(_DIFFERENT)
 
 
 @scenes_app.callback(invoke_without_command=True)

@@ -59,8 +59,8 @@ def plot_waveforms(dataset: xr.Dataset, path: str | os.PathLike[str] | None = No
     """
     if scale not in get_args(Scale):
         raise ValueError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}.")
-    if path is not None and Path(path).suffix.lower() not in _FORMATS:
-        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}.")
+    if path is not None:
+        check_format(Path(path))
 
     panels = ["linear", "log"] if scale == "both" else [scale]
     figure = Figure(figsize=(9.6, 4.3 if len(panels) == 1 else 6.0), layout="constrained")
@@ -72,20 +72,20 @@ def plot_waveforms(dataset: xr.Dataset, path: str | os.PathLike[str] | None = No
     side = figure.add_subplot(grid[:, 1])
 
     if is_image:
-        colours = _colours(1)
+        palette = colours(1)
         power = dataset["waveform"].sum(("row", "column")).values[np.newaxis]
         # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is not known.
         error = np.zeros_like(power)
         _draw_image(figure, side, dataset)
     else:
         names = [str(name) for name in dataset["pixel"].values]
-        colours = _colours(len(names))
+        palette = colours(len(names))
         power, error = dataset["waveform"].values, dataset["waveform_stderr"].values
-        _draw_pixels(side, dataset, names, colours)
+        _draw_pixels(side, dataset, names, palette)
 
-    limits = _time_limits(dataset)
+    limits = time_limits(dataset)
     for ax, panel in zip(axes, panels, strict=True):
-        _draw_waveforms(ax, dataset["time"].values, power, error, colours, limits, log=panel == "log")
+        _draw_waveforms(ax, dataset["time"].values, power, error, palette, limits, log=panel == "log")
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
     axes[-1].set_xlabel("time since the pulse left the transmitter (ns)")
@@ -96,6 +96,12 @@ def plot_waveforms(dataset: xr.Dataset, path: str | os.PathLike[str] | None = No
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=160)
     return figure
+
+
+def check_format(path: Path) -> None:
+    """Raise a UserError unless a file's suffix is that of a figure."""
+    if path.suffix.lower() not in _FORMATS:
+        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}.")
 
 
 def _draw_waveforms(
@@ -136,7 +142,7 @@ def _draw_waveforms(
     ax.spines["right"].set_visible(False)
 
 
-def _time_limits(dataset: xr.Dataset) -> tuple[float, float]:
+def time_limits(dataset: xr.Dataset) -> tuple[float, float]:
     """Return the window of the echoes with a margin, or all of the time axis where it is not known."""
     time, attributes = dataset["time"].values, dataset.attrs
     half = 0.5 * (_number(attributes, "bin_width_ns") or 1.0)
@@ -251,7 +257,8 @@ def _draw_image(figure: Figure, ax: Axes, dataset: xr.Dataset) -> None:
     figure.colorbar(image, cax=scale, orientation="horizontal", label=f"total energy ({prefix}J)")
 
 
-def _colours(count: int) -> list[Any]:
+def colours(count: int) -> list[Any]:
+    """Return a colour for each pixel; of four pixels those of the published figures."""
     if count == 1:
         return ["#111111"]
     if count == 4:
