@@ -16,6 +16,11 @@ from mitransient_lidar.errors import UserError
 #: Chance that two results of the same scene are said to differ.
 SIGNIFICANCE = 0.01
 
+#: Neighbouring bins over which relative errors are averaged. Over few passes of an estimator with rare large
+#: contributions a bin's own error is small where they are missing, just where its value is low: chance would look
+#: like a difference.
+_NEIGHBOURS = 5
+
 #: Bins known less well than this are left out: the spread of few passes says little about them.
 LARGEST_RELATIVE_ERROR = 0.3
 
@@ -98,8 +103,13 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     if not counted.any():
         raise UserError("the results share no bin that both know to 30 %: render more passes")
     difference = np.where(counted, values[1] - values[0], np.nan)
-    total = np.where(counted, variances[0] + variances[1], np.nan)
-    freedom = total**2 / sum(variance**2 / (count - 1) for variance, count in zip(variances, counts, strict=True))
+    relative = [pooled_relative_variance(value, variance) for value, variance in zip(values, variances, strict=True)]
+    # If the results agree, both have the errors that belong to their common mean.
+    weight = np.where(counted, relative[0] + relative[1], np.nan)
+    common = (relative[1] * values[0] + relative[0] * values[1]) / weight
+    parts = [part * common**2 for part in relative]
+    total = parts[0] + parts[1]
+    freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
     z = _as_normal(difference / np.sqrt(total), freedom)
     sums = [float(value[counted].sum()) for value in values]
     spread = float(np.sqrt(np.nansum(total))) / sums[0]
@@ -170,6 +180,23 @@ def plot_comparison(first: xr.Dataset, second: xr.Dataset, path: str | os.PathLi
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=160)
     return outcome
+
+
+def pooled_relative_variance(values: FloatArray, variances: FloatArray) -> FloatArray:
+    """Return the relative variance of each bin [1], shape (pixel, time), or that of a few bins about it if larger.
+
+    Parameters
+    ----------
+    values, variances
+        Means and the variances of the means, shape (pixel, time).
+    """
+    from scipy.ndimage import convolve1d
+
+    mean, variance = np.nan_to_num(values), np.nan_to_num(variances)
+    box = np.full(_NEIGHBOURS, 1 / _NEIGHBOURS)
+    around = convolve1d(variance, box, axis=1) / np.maximum(convolve1d(mean, box, axis=1), 1e-150) ** 2
+    # At the beginning of an echo a bin may be worse known than those about it.
+    return np.asarray(np.maximum(around, variance / np.maximum(mean, 1e-150) ** 2))
 
 
 def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
+from mitransient_lidar.comparison import pooled_relative_variance
 from mitransient_lidar.loading import load_scene
 from mitransient_lidar.optics.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
 from mitransient_lidar.optics.lidar_equation import LidarSystem
@@ -45,6 +46,9 @@ def assert_same(first, second, *, floor=0.0, largest=0.1):
     """
     (a, da), (b, db) = mean_and_error(first), mean_and_error(second)
     used = (da > 0) & (da < largest * a) & (db > 0) & (db < largest * b)
+    if a.ndim == 2:
+        # Over few passes a bin's own error is small where its large contributions are missing.
+        da, db = (a * np.sqrt(pooled_relative_variance(mean, error**2)) for mean, error in ((a, da), (b, db)))
     padded = np.pad(b, [(0, 0)] * (b.ndim - 1) + [(1, 1)])
     around = np.maximum(np.maximum(padded[..., :-2], padded[..., 2:]), b)
     z = (np.abs(a - b) - floor * around)[used] / np.hypot(da, db)[used]
@@ -173,7 +177,7 @@ def test_both_integrators_agree(lidar_scene, passes, case):
         lidar_scene(integrator=integrator, **{"sea": {"slope_variance": "0.01"}, **CASES[case], "film": film})
         for integrator in (MERGING, {"paths_per_pass": 2**18})
     ]
-    merged, reference = passes(scenes[0], 40), passes(scenes[1], 30, first_seed=1000)
+    merged, reference = passes(scenes[0], 24), passes(scenes[1], 16, first_seed=1000)
     assert_same(merged, reference, floor=0.005)
     gates = merged.sum(axis=2), reference.sum(axis=2)
     assert_same(*gates, floor=0.005)
@@ -185,11 +189,11 @@ def test_both_integrators_agree(lidar_scene, passes, case):
 def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
     """Waves focus beam and view alike, and wide cells blur both: a deficit that small cells do not have."""
     film = {"time_start_ns": 1420.0, "bin_width_ns": 30.0, "bin_count": 1}
-    reference = passes(lidar_scene(integrator={"paths_per_pass": 2**20}, sea=WAVES, film=film, bottom=None), 30)
+    reference = passes(lidar_scene(integrator={"paths_per_pass": 2**20}, sea=WAVES, film=film, bottom=None), 24)
     level, error = mean_and_error(reference.sum(axis=(1, 2)))
     bias = []
-    for width in (0.1, 0.03, 0.01):
-        merged = passes(lidar_scene(integrator={**MERGING, "cell_size": width}, sea=WAVES, film=film, bottom=None), 30)
+    for width in (0.1, 0.03, 0.0125):
+        merged = passes(lidar_scene(integrator={**MERGING, "cell_size": width}, sea=WAVES, film=film, bottom=None), 20)
         mean, merged_error = mean_and_error(merged.sum(axis=(1, 2)))
         bias.append(mean / level - 1)
         assert np.hypot(error, merged_error) < 0.002 * level
@@ -220,18 +224,18 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
 
 @pytest.mark.slow
 def test_standard_errors_are_honest():
-    """Over 100 seeds, 95 % intervals of eight passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
+    """Over 100 seeds, 95 % intervals of four passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
     scene, _, _ = load_scene("fig09_2x2", {"attenuation": "1.0", "scattering": "0.8", "backscattering": "0.016"})
     engine = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13})
     film = scene.sensors()[0].film()
     energy = []
-    for seed in range(800):
+    for seed in range(400):
         engine.render(scene, 0, seed=seed, develop=False)
         energy.append(film.energy()[:, 40:110])
-    energy = np.array(energy).reshape(100, 8, 4, 14, 5).sum(axis=-1)
-    mean, error = energy.mean(axis=1), energy.std(axis=1, ddof=1) / np.sqrt(8)
+    energy = np.array(energy).reshape(100, 4, 4, 14, 5).sum(axis=-1)
+    mean, error = energy.mean(axis=1), energy.std(axis=1, ddof=1) / np.sqrt(4)
     # The long-run mean holds the run itself: its own error is a tenth of a run's.
-    covered = np.abs(mean - energy.mean(axis=(0, 1))) < t.ppf(0.975, 7) * error
+    covered = np.abs(mean - energy.mean(axis=(0, 1))) < t.ppf(0.975, 3) * error
     assert 0.93 < covered.mean() < 0.97, covered.mean()
 
 

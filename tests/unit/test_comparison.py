@@ -36,7 +36,8 @@ def test_chance_alone_is_seldom_called_a_difference():
     # Binomial with chance 0.01: 4 +- 2; twice that is 6 standard deviations off.
     assert alarms <= 12
     rms = np.array([pair.rms for pair in pairs])
-    assert abs(rms.mean() - 1) < 0.02
+    # A bin's error is never taken smaller than its neighbours': a little more than it is.
+    assert 0.85 < rms.mean() < 1.02
 
 
 def test_a_difference_in_one_bin_or_in_all_is_found():
