@@ -74,7 +74,7 @@ def write(
     header[_EXACT] = json.dumps(exact)
     header["compression"] = OpenEXR.ZIP_COMPRESSION
     header["type"] = OpenEXR.scanlineimage
-    with _silent_library():
+    with silent_library():
         try:
             with OpenEXR.File(header, channels) as file:
                 file.write(os.fspath(path))
@@ -104,7 +104,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
     """
     damaged = f"{path} is damaged or truncated: its OpenEXR data cannot be read."
     foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
-    with _silent_library():
+    with silent_library():
         try:
             with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
                 # Closing the file empties its dictionaries and frees the pixels.
@@ -151,7 +151,7 @@ def _plain(value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _silent_library() -> Iterator[None]:
+def silent_library() -> Iterator[None]:
     """Keep OpenEXR's own messages off the terminal: its errors reach the user as one sentence.
 
     The library prints from C (file descriptor 2) and from Python (stdout), with no switch for either.

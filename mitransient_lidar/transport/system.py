@@ -111,10 +111,14 @@ class LidarScene:
 
     @property
     def facet_size(self) -> float:
-        """Side of the squares of which the sea surface's triangles are halves, on average [m]."""
+        """Side of the squares of which the sea surface's triangles are halves where the lidar looks [m].
+
+        Their average for a mesh that does not tell it.
+        """
         sizes = [
-            float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count())) if surface.is_mesh() else np.inf
+            getattr(surface, "cell_size", None) or float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
+            if surface.is_mesh()
         ]
         return min(sizes, default=np.inf)
 

@@ -4,9 +4,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.optics.sea import ElfouhailySpectrum, cox_munk
+from mitransient_lidar.optics.sea import cox_munk
+from mitransient_lidar.optics.spectra import ElfouhailySpectrum
 
 CELLS = 32
+#: A patch of one period, without surround.
+PATCH = {"size": 32.0, "extent": 32.0, "cell_size": 32.0 / CELLS}
 
 
 def surface(**parameters):
@@ -30,20 +33,23 @@ def facet_slopes(shape):
     return -normal[:, 0] / normal[:, 2], -normal[:, 1] / normal[:, 2]
 
 
-def test_inner_edges_join_two_facets():
+@pytest.mark.parametrize("extent", [32.0, 500.0])
+def test_inner_edges_join_two_facets(extent):
     """An edge with one facet, or with two of one sense, is a crack or a flipped facet through which light leaks."""
-    vertices, faces = buffers(surface(resolution=CELLS)[1])
-    assert len(vertices) == (CELLS + 1) ** 2
-    assert len(faces) == 2 * CELLS**2
+    vertices, faces = buffers(surface(**PATCH | {"extent": extent})[1])
+    side = round(np.sqrt(len(vertices))) - 1
+    assert (side == CELLS) == (extent == 32.0)
+    assert len(vertices) == (side + 1) ** 2
+    assert len(faces) == 2 * side**2
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     assert len(np.unique(directed, axis=0)) == len(directed)
     _, counts = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
     assert set(counts) == {1, 2}
-    assert np.sum(counts == 1) == 4 * CELLS
+    assert np.sum(counts == 1) == 4 * side
 
 
 def test_patch_is_periodic_and_centred():
-    vertices, _ = buffers(surface(resolution=CELLS, size=20.0)[1])
+    vertices, _ = buffers(surface(size=20.0, extent=20.0, period=20.0, cell_size=20.0 / CELLS)[1])
     grid = vertices.reshape(CELLS + 1, CELLS + 1, 3)
     np.testing.assert_array_equal(grid[0, :, 2], grid[-1, :, 2])
     np.testing.assert_array_equal(grid[:, 0, 2], grid[:, -1, 2])
@@ -56,7 +62,7 @@ def test_patch_is_periodic_and_centred():
 
 def test_rays_find_no_hole_and_facets_are_flat():
     """Interpolated normals would make other slopes than the facets', and lose energy."""
-    scene, shape = surface(resolution=CELLS, size=32.0)
+    scene, shape = surface(**PATCH)
     rng = np.random.default_rng(1)
     # Random points, and points on vertices and on edges of the grid.
     points = np.concatenate([rng.uniform(-15.9, 15.9, (100_000, 2)), rng.integers(-15, 15, (2000, 2))])
@@ -74,7 +80,7 @@ def test_rays_find_no_hole_and_facets_are_flat():
 @pytest.mark.parametrize("direction", [0.0, 30.0, 90.0, 200.0])
 def test_ripples_lie_along_the_wind(direction):
     """The roughness axis u is the texture's: without coordinates it is arbitrary from facet to facet."""
-    scene, _ = surface(wind_direction_deg=direction, resolution=CELLS)
+    scene, _ = surface(wind_direction_deg=direction, **PATCH)
     x, y = (mi.Float(p) for p in np.random.default_rng(2).uniform(-15, 15, (2, 1000)))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 50), mi.Vector3f(0, 0, -1)))
     along = np.array(si.sh_frame.s)
@@ -90,14 +96,16 @@ def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind(wind, d
     cos, sin = np.cos(np.radians(direction)), np.sin(np.radians(direction))
     variances = []
     for seed in range(64):
-        _, shape = surface(wind_speed=wind, wind_direction_deg=direction, surface_seed=seed, size=32.0, resolution=64)
+        _, shape = surface(
+            wind_speed=wind, wind_direction_deg=direction, surface_seed=seed, period=32.0, **PATCH | {"cell_size": 0.5}
+        )
         x, y = facet_slopes(shape)
         # The mean slope of a periodic patch is 0, so the mean square is the variance.
         variances.append((np.mean((cos * x + sin * y) ** 2), np.mean((cos * y - sin * x) ** 2)))
     variances = np.array(variances)
     error = variances.std(axis=0, ddof=1) / np.sqrt(len(variances))
     assert np.all(error < 0.03 * variances.mean(axis=0))
-    assert np.all(np.abs(variances.mean(axis=0) - shape.resolved_variance) < 4 * error)
+    assert np.all(np.abs(variances.mean(axis=0) - shape.sea.resolved_variance) < 4 * error)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +117,7 @@ def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind(wind, d
     ],
 )
 def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, total):
-    _, shape = surface(wind_speed=6.0, slope_variance=asked, resolution=64)
+    _, shape = surface(wind_speed=6.0, slope_variance=asked, **PATCH)
     assert shape.slope_variance == pytest.approx(total, rel=1e-9)
     assert min(shape.ripple_variance) > 1e-4
     parameters = mi.traverse(shape)
@@ -120,13 +128,115 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
 
 def test_a_mesh_rougher_than_asked_says_so():
     """All slopes are resolved at 1e-4: the ripples stop at their smallest, and the total is told as it is."""
-    _, shape = surface(wind_speed=6.0, slope_variance="1e-4", resolution=64)
+    _, shape = surface(wind_speed=6.0, slope_variance="1e-4", **PATCH)
     assert shape.ripple_variance == (1e-5, 1e-5)
-    assert shape.slope_variance == pytest.approx(sum(shape.resolved_variance) + 2e-5)
+    assert shape.slope_variance == pytest.approx(sum(shape.sea.resolved_variance) + 2e-5)
     assert shape.slope_variance > 0.005
 
 
 def test_seeds_are_different_seas():
-    heights = [buffers(surface(surface_seed=seed, resolution=CELLS)[1])[0][:, 2] for seed in (1, 2, 1)]
+    heights = [buffers(surface(surface_seed=seed, **PATCH)[1])[0][:, 2] for seed in (1, 2, 1)]
     np.testing.assert_array_equal(heights[0], heights[2])
     assert abs(np.corrcoef(heights[0], heights[1])[0, 1]) < 0.5
+
+
+# The patch and what surrounds it.
+
+
+def heights_by_position(shape):
+    vertices, _ = buffers(shape)
+    return {(round(4 * x), round(4 * y)): z for x, y, z in vertices}
+
+
+def test_the_sea_is_the_same_wherever_the_patch_lies():
+    """Sea of 64 m period: patches 20 m apart agree where they overlap, and a whole period apart everywhere."""
+    here, there, far = (
+        heights_by_position(surface(size=48.0, cell_size=0.25, centre_x=x, centre_y=y, period=64.0, extent=48.0)[1])
+        for x, y in ((0.0, 0.0), (20.1, -3.0), (64.0, -128.0))
+    )
+    shared = here.keys() & there.keys()
+    assert len(shared) > 10_000
+    assert all(here[place] == there[place] for place in shared)
+    np.testing.assert_array_equal(list(here.values()), list(far.values()))
+
+
+def test_cells_grow_outside_the_patch_up_to_the_extent():
+    vertices, faces = buffers(surface(size=32.0, cell_size=0.25)[1])
+    lines = np.unique(vertices[:, 0])
+    assert lines[0] <= -500
+    assert lines[-1] >= 500
+    lengths = np.diff(lines)
+    inside = np.abs(lines[:-1] + 0.5 * lengths) < 16
+    np.testing.assert_array_equal(lengths[inside], 0.25)
+    ratio = lengths[1:] / lengths[:-1]
+    # The last cell ends with the extent.
+    assert np.all(ratio[1:-1] < 2.001)
+    assert np.all(ratio[1:-1] > 1 / 2.001)
+    # All of 1 km^2 for twice the triangles of 32 m x 32 m.
+    assert len(faces) < 2 * 2 * 128**2
+
+
+def test_far_rays_meet_the_sea_from_above_and_below():
+    scene, _ = surface(size=32.0, cell_size=0.25, wind_speed=6.0)
+    rng = np.random.default_rng(3)
+    points = np.concatenate([rng.uniform(-499, 499, (50_000, 2)), rng.uniform(-30, 30, (50_000, 2))])
+    for height, down in ((20.0, -1.0), (-20.0, 1.0)):
+        for slant in (0.0, 0.5, 5.0):  # up to 79 degrees off nadir
+            start = points - slant * abs(height) * np.array([1.0, 0.0])
+            origin = mi.Point3f(*(mi.Float(p) for p in start.T), height)
+            direction = np.array([slant, 0, down]) / np.hypot(slant, 1)
+            si = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(direction.tolist())))
+            met = np.array(si.is_valid())
+            # One ray in 300 000 slips between two triangles.
+            assert met[np.abs(points[:, 0]) < 380].mean() > 1 - 5e-5
+
+
+def test_cells_are_chosen_by_footprint_and_range():
+    """A quarter of the beam's standard deviation: 1.06 m at 200 m and 20 degrees."""
+    lidar = {"altitude": 200.0, "off_nadir_deg": 20.0, "divergence_mrad": 10.0, "field_of_view_mrad": 30.0}
+    sea = surface(**lidar)[1].sea
+    assert 0.8 * 0.25 * 1.064 < sea.cell_size <= 0.25 * 1.064
+    assert 2 * 3.44 < sea.size < 32
+    near = surface(**lidar | {"altitude": 20.0})[1].sea
+    assert 0.8 * 0.25 * 0.1064 < near.cell_size <= 0.25 * 0.1064
+    mast = surface(**lidar | {"altitude": 10.0, "off_nadir_deg": 84.6, "field_of_view_mrad": 10.0})[1].sea
+    # The field of view reaches from 97 to 116 m, and 1.5 times the beam's divergence from 93 to 126 m.
+    assert 2 * 20 < mast.size < 80
+
+
+def test_height_maps_become_surfaces(tmp_path):
+    """A plane that rises by 0.1 along x: its slope is resolved, and the ripples are what is missing to the total."""
+    x = np.linspace(-10, 10, 81)
+    np.save(tmp_path / "plane.npy", np.tile(0.1 * x, (81, 1)))
+    scene, shape = surface(
+        spectrum="height_map", filename=str(tmp_path / "plane.npy"), map_size=20.0, slope_variance="0.02", extent=60.0
+    )
+    assert shape.sea.resolved_variance == pytest.approx((0.01, 0.0), abs=1e-6)
+    assert shape.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
+    x = np.random.default_rng(1).uniform(-28, 28, 1000)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(mi.Float(x), 3.3, 50.0), mi.Vector3f(0, 0, -1)))
+    np.testing.assert_allclose(np.array(si.p.z), 0.1 * np.clip(x, -10, 10), atol=0.03)
+
+
+def test_swell_and_wake_lie_on_the_sea():
+    flat = {"wind_speed": 0.0, "size": 32.0, "cell_size": 0.5, "extent": 200.0}
+    swell = surface(swell_height=0.8, swell_wavelength=20.0, period=512.0, **flat)[1]
+    grid = swell.sea.waves.heights
+    assert 4 * grid.std() == pytest.approx(0.8, rel=0.15)  # one sea of a narrow spectrum
+    wake = surface(spectrum="flat", wake_speed=5.0, wake_length=20.0, size=32.0, cell_size=0.5, extent=200.0)[1]
+    vertices, _ = buffers(wake)
+    behind, ahead = vertices[vertices[:, 0] < -15], vertices[vertices[:, 0] > 15]
+    assert np.abs(behind[:, 2]).max() > 0.02
+    assert np.abs(ahead[:, 2]).max() < 0.001
+    both = surface(wake_speed=5.0, wake_length=20.0, size=32.0, cell_size=0.5, extent=200.0)[1]
+    alone = surface(size=32.0, cell_size=0.5, extent=200.0)[1]
+    np.testing.assert_allclose(buffers(both)[0][:, 2] - buffers(alone)[0][:, 2], vertices[:, 2], atol=1e-6)
+
+
+def test_time_moves_the_sea_downwind():
+    """After 0.5 s waves of the peak have moved by 1.8 m: shifting the first sea by that fits better than not at all."""
+    seas = [surface(time=time, wind_speed=3.0, size=32.0, extent=32.0, cell_size=0.25)[1].sea for time in (0.0, 0.5)]
+    first, later = (sea.waves.heights for sea in seas)
+    correlation = [np.sum(later * np.roll(first, shift, axis=1)) for shift in range(-16, 17)]
+    moved = 0.25 * (np.argmax(correlation) - 16)
+    assert 1.0 < moved < 2.2

@@ -138,12 +138,12 @@ def test_mesh_has_the_slopes_that_it_says():
     """Facet slopes over 24 seas at 6 m/s: their variance is what the ripples are reduced by."""
     along, across = [], []
     for seed in range(24):
-        _, shape = surface(wind_speed=6.0, surface_seed=seed, size=64.0, resolution=128)
+        _, shape = surface(wind_speed=6.0, surface_seed=seed, size=64.0, cell_size=0.5, extent=64.0, period=64.0)
         normals = np.array(shape.face_normal(mi.UInt32(np.arange(shape.face_count()))))
         assert np.all(normals[2] > 0)
         along.append(np.var(normals[0] / normals[2]))
         across.append(np.var(normals[1] / normals[2]))
-    for measured, stated in zip((along, across), shape.resolved_variance, strict=True):
+    for measured, stated in zip((along, across), shape.sea.resolved_variance, strict=True):
         assert abs(np.mean(measured) - stated) < 4 * np.std(measured, ddof=1) / np.sqrt(24)
         assert np.std(measured) / np.sqrt(24) < 0.03 * stated
     # Waves and ripples together are the sea that Cox and Munk measured: 3.16e-3 W up- and 0.003 + 1.92e-3 W crosswind.
@@ -152,11 +152,11 @@ def test_mesh_has_the_slopes_that_it_says():
 
 def test_same_seed_is_the_same_sea_and_a_coarser_one_is_smoother():
     heights = {}
-    for resolution in (64, 128):
-        _, shape = surface(surface_seed=9, resolution=resolution)
-        heights[resolution] = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)[:, 2]
-    _, again = surface(surface_seed=9, resolution=128)
-    np.testing.assert_array_equal(np.array(mi.traverse(again)["vertex_positions"]).reshape(-1, 3)[:, 2], heights[128])
-    fine = heights[128].reshape(129, 129)[::2, ::2]
-    coarse = heights[64].reshape(65, 65)
+    for cell_size in (0.5, 0.25):
+        _, shape = surface(surface_seed=9, cell_size=cell_size, size=32.0, extent=32.0)
+        heights[cell_size] = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)[:, 2]
+    _, again = surface(surface_seed=9, cell_size=0.25, size=32.0, extent=32.0)
+    np.testing.assert_array_equal(np.array(mi.traverse(again)["vertex_positions"]).reshape(-1, 3)[:, 2], heights[0.25])
+    fine = heights[0.25].reshape(129, 129)[::2, ::2]
+    coarse = heights[0.5].reshape(65, 65)
     assert np.corrcoef(fine.ravel(), coarse.ravel())[0, 1] > 0.99

@@ -293,12 +293,12 @@ def test_command_line_mistake_is_exit_code_2_without_files(tmp_path):
 
 
 def test_small_patch_warns_of_the_light_that_it_loses(caplog):
-    small(params={"surface_size": 4, "surface_resolution": 16})
+    small(params={"surface_extent": 4, "surface_cell_size": 0.25})
     assert "smaller than the footprint" in caplog.text
     caplog.clear()
     # The field of view (1.6 m about the axis) meets the patch, but the water spreads light of the whole beam into it.
     scattering = {"field_of_view_mrad": 15, "attenuation": 1, "scattering": 0.9}
-    small(params={**scattering, "surface_size": 4, "surface_resolution": 16})
+    small(params={**scattering, "surface_extent": 4, "surface_cell_size": 0.25})
     assert "smaller than the footprint" not in caplog.text
     assert "smaller than the spread of the light in the water" in caplog.text
     caplog.clear()
@@ -314,7 +314,7 @@ def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lid
     for size in (4.0, 400.0):
         scene = lidar_scene(
             rx={"field_of_view_mrad": 15.0},
-            sea={"size": size, "slope_variance": "0.02"},
+            sea={"extent": size, "slope_variance": "0.02"},
             water=water,
             film={"bin_count": 250},
             integrator={"type": integrator, "paths_per_pass": 2**17},

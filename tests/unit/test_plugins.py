@@ -76,7 +76,20 @@ REFUSED = [
     ({"type": "ocean_surface", "spectrum": "swell"}, "spectrum = 'swell' must be one of"),
     ({"type": "ocean_surface", "slope_variance": "some"}, "slope_variance = 'some' must be"),
     ({"type": "ocean_surface", "slope_variance": "2"}, "slope_variance = 2 must lie between"),
-    ({"type": "ocean_surface", "resolution": 3}, "resolution = 3 must be an even"),
+    ({"type": "ocean_surface", "cell_size": "fine"}, "cell_size = 'fine' must be a number"),
+    ({"type": "ocean_surface", "cell_size": 0.001}, "cell_size = 0.001 with period = 32 needs 32000 cells a side"),
+    ({"type": "ocean_surface", "size": 2000.0}, "size = 2000 with cell_size = 0.25 needs 8000 cells a side"),
+    ({"type": "ocean_surface", "extent": -1.0}, "extent = -1 must be greater than 0"),
+    ({"type": "ocean_surface", "spectrum": "jonswap"}, "fetch is missing: the spectrum 'jonswap' needs it"),
+    ({"type": "ocean_surface", "fetch": 1e4, "inverse_wave_age": 2.0}, "say the same thing"),
+    ({"type": "ocean_surface", "inverse_wave_age": 9.0}, "inverse_wave_age = 9 must lie between"),
+    ({"type": "ocean_surface", "spectrum": "flat", "swell_height": 1.0}, "needs a spectrum of waves, not 'flat'"),
+    ({"type": "ocean_surface", "spectrum": "height_map"}, "filename is missing"),
+    ({"type": "ocean_surface", "spectrum": "table", "filename": "none.npz"}, "must be an .npz file with arrays kx"),
+    ({"type": "ocean_surface", "water_depth": 0.0}, "water_depth = 0 must be greater than 0"),
+    ({"type": "ocean_surface", "current_speed": 11.0}, "current_speed = 11 must lie between 0 and 10"),
+    ({"type": "ocean_surface", "wake_speed": -2.0}, "wake_speed = -2 must lie between 0 and 40"),
+    ({"type": "ocean_surface", "time": float("nan")}, "time = nan must be finite"),
     ({"type": "ocean_surface", "size": 0.0}, "size = 0 must be greater than 0"),
     ({"type": "lidar_volpath", "connection": "best"}, "connection = 'best' must be one of"),
     ({"type": "lidar_volpath", "paths_per_pass": 3}, "paths_per_pass = 3 must lie between 1024"),
@@ -191,7 +204,7 @@ def test_no_wind_is_a_flat_sea():
     (surface,) = (s for s in scene(sea={"type": "ocean_surface", "wind_speed": 0.0,
                   "interior": {"type": "layered_water"}}).shapes() if hasattr(s, "ripple_variance"))  # fmt: skip
     assert surface.bbox().max.z == surface.bbox().min.z == 0
-    assert surface.spectrum == "flat"
+    assert surface.sea.spectrum == "flat"
 
 
 def test_other_integrators_see_the_layers():
