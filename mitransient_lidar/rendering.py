@@ -166,6 +166,7 @@ def render(
     probe = probe_echoes(system, view)
     window = _error_window(system, probe)
     _check_record(system, probe)
+    _check_solids(probe)
     film, pulse = system.film, system.transmitter.pulse
     kernel = pulse.kernel(film.bin_width_ns, system.receiver.optics.response_time_ns)
     energy, power = PassStatistics(), PassStatistics()
@@ -292,6 +293,17 @@ def _check_record(system: LidarScene, probe: EchoProbe) -> None:
         )
 
 
+def _check_solids(probe: EchoProbe) -> None:
+    """Refuse a bottom that rises through the sea where the receiver looks; tell of a target that does."""
+    for solid, is_bottom in probe.pierced:
+        if is_bottom:
+            raise UserError(
+                f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
+                "receiver looks: a bottom must lie below the waves"
+            )
+        logger.warning("shape %r rises through the sea surface: part of it is seen in the air", solid.id())
+
+
 def _warn_of_losses(system: LidarScene, probe: EchoProbe, lost: float) -> None:
     """Warn when the surface patch is smaller than the footprint or than the spread of the light in the water."""
     if not system.surfaces:
@@ -299,13 +311,13 @@ def _warn_of_losses(system: LidarScene, probe: EchoProbe, lost: float) -> None:
     if probe.missed_beam > _TOLERATED_LOSS:
         logger.warning(
             "the surface patch is smaller than the footprint: %.2g %% of the beam in the field of view "
-            "passes beside it; enlarge the surface's size",
+            "passes beside it; enlarge the surface's extent",
             100 * probe.missed_beam,
         )
     if lost > _TOLERATED_LOSS:
         logger.warning(
             "the surface patch is smaller than the spread of the light in the water: about %.2g %% of the received "
-            "energy is lost at its border; enlarge the surface's size",
+            "energy is lost at its border; enlarge the surface's extent",
             100 * lost,
         )
 

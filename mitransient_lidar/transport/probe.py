@@ -32,11 +32,14 @@ class EchoProbe:
         Mean and latest arrival of the echo from the first solid under water [ns], shape (pixels, 2); NaN without.
     missed_beam
         Share of the beam inside the field of view that passes beside the surface.
+    pierced
+        Solids that the receiver sees both in the air and through the sea, and whether each is larger than what it sees.
     """
 
     surface_ns: NDArray[np.float64]
     bottom_ns: NDArray[np.float64]
     missed_beam: float
+    pierced: list[tuple[mi.Shape, bool]]
 
 
 def probe_echoes(system: LidarScene, view: ViewSampler) -> EchoProbe:
@@ -68,7 +71,30 @@ def probe_echoes(system: LidarScene, view: ViewSampler) -> EchoProbe:
         _quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)),
         _quantiles(np.array(air + water) * per_ns, weight * bottom, pixel, count, (None, 1 - _TAIL)),
         float(weight[beside].sum() / total) if total > 0 else 1.0,
+        _pierced(system, first, below, at_sea, solid),
     )
+
+
+def _pierced(
+    system: LidarScene,
+    first: mi.SurfaceInteraction3f,
+    below: mi.SurfaceInteraction3f,
+    at_sea: mi.Bool,
+    under_water: mi.Bool,
+) -> list[tuple[mi.Shape, bool]]:
+    """Return the solids that rise through the sea where the receiver looks, and whether each is larger than that."""
+    wet = np.array(first.p)[:2, np.array(at_sea)]
+    pierced = []
+    # What is seen beside a small patch lies lower.
+    lowest = min((float(surface.bbox().min.z) for surface in system.surfaces), default=0.0)
+    in_air = first.is_valid() & (first.p.z > lowest)
+    for solid in system.solids if wet.size else []:
+        pointer = mi.ShapePtr(solid)
+        if dr.any(in_air & (first.shape == pointer)) and dr.any(under_water & (below.shape == pointer)):
+            box = solid.bbox()
+            low, high = np.array(box.min)[:2], np.array(box.max)[:2]
+            pierced.append((solid, bool(np.all(low < wet.min(axis=1)) and np.all(high > wet.max(axis=1)))))
+    return pierced
 
 
 def _quantiles(

@@ -86,6 +86,7 @@ class LidarScene:
             raise ValueError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
         if sensor.receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
             raise ValueError("altitude: transmitter and receiver must be above the mean sea level z = 0")
+        _check_cells(surfaces, transmitters[0])
         variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
         return cls(
             scene,
@@ -144,3 +145,16 @@ class LidarScene:
     def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a shape bounds the water."""
         return reduce(or_, (shape == mi.ShapePtr(surface) for surface in self.surfaces), mi.Bool(False))
+
+
+def _check_cells(surfaces: list[mi.Shape], transmitter: mi.Emitter) -> None:
+    """Refuse waves in cells longer than the beam is wide: a shot would see a single slope."""
+    spot = transmitter.pose.ground_point()
+    footprint = 2 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    for surface in surfaces:
+        cell = getattr(surface, "cell_size", np.inf)
+        if np.isfinite(cell) and cell > footprint:
+            raise ValueError(
+                f"cell_size = {cell:.3g} m is coarser than the beam's footprint on the sea, {footprint:.3g} m: "
+                "it must be finer, or 'auto'"
+            )

@@ -238,6 +238,7 @@ MISTAKES = [
     ({"scene": "tabel1"}, "did you mean table1"),
     ({"params": {"wind_sped": 3}}, "wind_sped.*did you mean wind_speed"),
     ({"params": {"wind_speed": -3}}, "wind_speed = -3"),
+    ({"params": {"surface_cell_size": 4}}, "cell_size = 4 m is coarser than the beam's footprint on the sea, 2.13 m"),
     ({"params": {"attenuation": -0.1}}, "attenuation = -0.1 must not be negative"),
     ({"params": {"attenuation": "nan"}}, "attenuation"),
     ({"params": {"scattering": 0.4}}, "scattering = 0.4 must not exceed attenuation = 0.3"),
@@ -290,6 +291,21 @@ def test_command_line_mistake_is_exit_code_2_without_files(tmp_path):
     assert "wind_speed = 40 must lie between 0 and 30" in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.rglob("*.*"))
+
+
+def test_bottom_through_the_waves_is_refused_and_a_target_is_told(caplog):
+    """Wind 6 m/s has waves of half a metre; a pile of 0.6 m across stands in the beam."""
+    with pytest.raises(UserError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
+        small(params={"wind_speed": 6, "bottom_depth": 0.1})
+    pile = {"type": "cylinder", "p0": [0, 0, -2.0], "p1": [0, 0, 1.0], "radius": 0.3, "bsdf": {"type": "diffuse"}}
+    scene = {
+        "tx": {"type": "lidar_transmitter"},
+        "rx": {"type": "multipixel_receiver", "film": {"type": "time_gated_film", "time_start_ns": 1390.0}},
+        "sea": {"type": "ocean_surface", "interior": {"type": "layered_water"}},
+        "pile": pile,
+    }
+    mitransient_lidar.render(scene, integrator=SMALL, passes=2)
+    assert "shape 'pile' rises through the sea surface" in caplog.text
 
 
 def test_small_patch_warns_of_the_light_that_it_loses(caplog):
