@@ -140,6 +140,40 @@ def plot(
 
 
 @app.command()
+def shots(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    at: Annotated[
+        list[str] | None, typer.Option("--at", metavar="X,Y", help="A place [m] instead of a search.")
+    ] = None,
+    steepness: Annotated[float, typer.Option(help="Slopes to find, in standard deviations.")] = 2.0,
+    count: Annotated[int, typer.Option(help="Places of each kind.")] = 1,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to draw.")] = None,
+    waveforms: Annotated[bool, typer.Option("--waveforms/--no-waveforms", help="Render the shots, too.")] = True,
+) -> None:
+    """List places on the sea by the slope the beam meets there (towards, level, away, sideways), and draw them."""
+    with _sentences():
+        _require(_positive(steepness), "--steepness", steepness, "above 0")
+        _require(1 <= count <= 100, "--count", count, "1 to 100")
+        params = _parameters(define or [])
+        places = [_place(text) for text in at or []]
+
+        from mitransient_lidar import shots as finder
+
+        if places:
+            found = finder.shots_at(scene, places, params)
+        else:
+            found = finder.find_shots(scene, params, steepness=steepness, count=count)
+        typer.echo(f"{'kind':<10}{'shot_x':>10}{'shot_y':>10}{'along (deg)':>13}{'across (deg)':>14}")
+        for shot in found:
+            along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
+            typer.echo(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
+        if output is not None:
+            finder.plot_shots(scene, found, output, params, waveforms=waveforms)
+            typer.echo(output)
+
+
+@app.command()
 def compare(
     first: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
     second: Annotated[Path, typer.Argument(metavar="OTHER", help="A result with the same pixels and time bins.")],
@@ -265,6 +299,14 @@ def _parameters(definitions: list[str]) -> dict[str, str]:
             raise UserError(f"-D {definition} is not of the form name=value.")
         params[name.strip()] = value.strip()
     return params
+
+
+def _place(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UserError(f"--at {text} is not of the form x,y in metres.") from None
+    return x, y
 
 
 def _require_writable(folder: Path, targets: list[Path]) -> None:
