@@ -1,4 +1,4 @@
-"""The command line: ``mitransient-lidar render | plot | scenes | info | bench``.
+"""The command line: ``mitransient-lidar render | plot | compare | shots | survey | scenes | info | bench``.
 
 Mistakes of the user's end with one sentence on stderr and exit code 2, interruptions with exit code 130. Results go to
 stdout, everything else to stderr. Modules that take long to import are imported by the commands that need them.
@@ -171,6 +171,42 @@ def shots(
         if output is not None:
             finder.plot_shots(scene, found, output, params, waveforms=waveforms)
             typer.echo(output)
+
+
+@app.command()
+def survey(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    count: Annotated[int, typer.Option(help="Number of shots.")] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of their places.")] = 1,
+    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")] = Path(
+        "survey.png"
+    ),
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the paths and errors.")] = False,
+) -> None:
+    """Render shots at random places of the sea and show how their echoes go with the slope they meet."""
+    with _sentences():
+        _require(2 <= count <= 100_000, "--count", count, "2 to 100000")
+        _require(seed >= 0, "--seed", seed, "0 or above")
+        params = _parameters(define or [])
+        targets = [output, output.with_suffix(".nc")]
+        _require_writable(output.parent, targets)
+
+        from mitransient_lidar import results
+        from mitransient_lidar import survey as surveying
+        from mitransient_lidar.plotting import check_format
+
+        check_format(output)
+        with _counting(quiet, "shot") as progress:
+            shots = surveying.survey(scene, params, count=count, seed=seed, progress=progress)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        correlations = surveying.plot_survey(shots, output)
+        with results.replacing(targets[1]) as temporary:
+            shots.to_netcdf(temporary, engine="h5netcdf")
+        for target in targets:
+            typer.echo(target)
+        for name, value in correlations.items():
+            typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
 
 
 @app.command()
@@ -354,6 +390,21 @@ def _reporting(quiet: bool) -> Iterator[Callable[[Any], None] | None]:
             yield show
     finally:
         logger.removeHandler(handler)
+
+
+@contextlib.contextmanager
+def _counting(quiet: bool, what: str) -> Iterator[Callable[[int, int], None] | None]:
+    """Show a progress bar on stderr; yield the function that takes what is done and planned."""
+    if quiet:
+        yield None
+        return
+
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_console(), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, planned: bar.update(task, completed=done, total=planned)
 
 
 def _describe(state: Any) -> str:

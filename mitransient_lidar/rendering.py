@@ -196,6 +196,8 @@ def render(
         if energy.count < 2:
             raise
         interrupted = True
+    finally:
+        engine.release()
     elapsed = time.perf_counter() - start
     received = float(np.nansum(energy.mean)) * energy.count
     lost = lost_energy / (lost_energy + received) if lost_energy > 0 else 0.0

@@ -13,6 +13,7 @@ from mitransient_lidar.transport.beam import BeamSampler
 from mitransient_lidar.transport.cells import Region, SolidPatches, SurfaceHeights, WaterCells, WaterGrid
 from mitransient_lidar.transport.connection import laser_through
 from mitransient_lidar.transport.merging import merge_in_water, merger_at_solids, store_points
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.photons import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.streams import pass_streams
@@ -133,6 +134,11 @@ class LidarMerging(mi.CppADIntegrator):
             self._prepared = scene, sensor, system, view
         return self._prepared[2], self._prepared[3]
 
+    def release(self) -> None:
+        """Forget the scene, which holds this integrator and could otherwise never be freed."""
+        self._prepared = None
+        self._whole.release()
+
     def _lay_out(self, system: LidarScene, view: ViewSampler) -> None:
         """Choose points and cells for a scene."""
         self._beam = BeamSampler(system.transmitter, system.receiver)
@@ -150,7 +156,8 @@ class LidarMerging(mi.CppADIntegrator):
         self._patch_width = _PATCH_PER_CELL * width
         growth = width * (_GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min()))
         self._grid = WaterGrid(system, SurfaceHeights(system, self._region), width, growth, thickness, reach)
-        events = 1.5 * (1 + scattering * reach)
+        # Rounded, so that the next shot has the same kernels.
+        events = 0.5 * np.ceil(3 * (1 + scattering * reach))
         self._room = _Capacity(events + 1, events + 1)
 
     def render(
@@ -207,7 +214,7 @@ class LidarMerging(mi.CppADIntegrator):
         tracks = Tracks(system, self._spacing, int(room.light_legs * count))
         hits = PhotonBuffer(int(room.hits * count))
         direction, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
-        path = start_walk(system.transmitter.pose, direction, energy, self._spacing * rng.next_float32())
+        path = start_walk(system.transmitter.pose, direction, energy, opaque(self._spacing) * rng.next_float32())
         walk = Walk(system, mi.TransportMode.Importance, system.receiver.pose)
 
         def store(path: WalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
@@ -239,7 +246,8 @@ class LidarMerging(mi.CppADIntegrator):
         rng = pass_streams(seed, _VIEW_STREAM, count)
         start = view.sample(dr.arange(mi.UInt32, count), count, rng)
         tracks = Tracks(system, self._spacing, int(self._room.view_legs * count))
-        path = start_walk(system.receiver.pose, start.direction, start.weight, self._spacing * rng.next_float32())
+        offset = opaque(self._spacing) * rng.next_float32()
+        path = start_walk(system.receiver.pose, start.direction, start.weight, offset)
         walk = Walk(system, mi.TransportMode.Radiance, system.transmitter.pose)
 
         def see(path: WalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.optics.checks import in_range, whole
 from mitransient_lidar.transport.connection import LaserDirection, SurfaceLobe, laser_through
+from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path, advance, optical_length
 from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.receiving import ViewSampler
@@ -128,6 +129,10 @@ class LidarVolpath(mi.CppADIntegrator):
             self._prepared = scene, sensor, system, ViewSampler(system.receiver, system.transmitter)
         return self._prepared[2], self._prepared[3]
 
+    def release(self) -> None:
+        """Forget the scene, which holds this integrator and could otherwise never be freed."""
+        self._prepared = None
+
     def render(
         self,
         scene: mi.Scene,
@@ -176,7 +181,7 @@ class LidarVolpath(mi.CppADIntegrator):
         rng = pass_streams(seed, _STREAM, count)
         start = view.sample(dr.arange(mi.UInt32, count), count, rng)
         path = ConnectedPath(
-            point=mi.Point3f(system.receiver.pose.origin.tolist()),
+            point=opaque_point(system.receiver.pose.origin),
             direction=start.direction,
             in_water=mi.Bool(False),
             length=mi.Float(0),
@@ -345,7 +350,7 @@ class LidarVolpath(mi.CppADIntegrator):
 
         Where a connection misses the surface its light is taken as if it had crossed a flat one at normal incidence.
         """
-        offset = mi.Point3f(system.transmitter.pose.origin.tolist()) - crossing
+        offset = opaque_point(system.transmitter.pose.origin) - crossing
         index = float(system.refractive_index)
         transmittance = 4 * index / (1 + index) ** 2
         through = transmittance * laser.in_air.z / laser.in_water.z

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.fields import Sector
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.receiving import Receiver
 from mitransient_lidar.transport.streams import stratified_point, unit_points
 
@@ -33,7 +34,7 @@ class BeamSampler:
     def __init__(self, transmitter: mi.Emitter, receiver: Receiver) -> None:
         self.transmitter = transmitter
         spot = receiver.pose.ground_point()
-        self.centre = transmitter.pose.tangent_of_point(spot)
+        self.centre = [opaque(angle) for angle in transmitter.pose.tangent_of_point(spot)]
         ranges = [float(np.linalg.norm(spot - pose.origin)) for pose in (receiver.pose, transmitter.pose)]
         self.view = Sector(_ROOM * 0.5 * receiver.pixels.field_of_view * ranges[0] / ranges[1])
         gx, gy = transmitter.sample_tangent(unit_points(4096))

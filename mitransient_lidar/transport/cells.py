@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.opaque import is_one_of, opaque
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.streams import pass_streams, unit_points
@@ -78,10 +77,11 @@ class Region:
         air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
         longest = (system.film.path_end - air) / (2 * system.group_index)
         u = unit_points(_RAYS)
-        x = dr.lerp(self.low[0], self.high[0], u.x)
-        y = dr.lerp(self.low[1], self.high[1], u.y)
+        x, y = (
+            dr.lerp(opaque(low), opaque(high), part) for low, high, part in zip(self.low, self.high, u, strict=True)
+        )
         lowest = min(float(surface.bbox().min.z) for surface in system.surfaces)
-        si = system.scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, lowest - 1e-3), mi.Vector3f(down.tolist())))
+        si = system.scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, opaque(lowest - 1e-3)), mi.Vector3f(down.tolist())))
         length = dr.mean(dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), max(longest, 0.1)))
         return float(length[0])
 
@@ -105,12 +105,12 @@ class SurfaceHeights:
 
     def __init__(self, system: LidarScene, region: Region) -> None:
         n = _HEIGHT_TEXELS
-        self._low = region.low
-        self._per_metre = (n / region.size[0], n / region.size[1])
+        self._low = [opaque(low) for low in region.low]
+        self._per_metre = [opaque(n / size) for size in region.size]
         index = dr.arange(mi.UInt32, n * n)
         x = (mi.Float(index % n) + 0.5) / self._per_metre[0] + self._low[0]
         y = (mi.Float(index // n) + 0.5) / self._per_metre[1] + self._low[1]
-        top = max(float(surface.bbox().max.z) for surface in system.surfaces) + 1.0
+        top = opaque(max(float(surface.bbox().max.z) for surface in system.surfaces) + 1.0)
 
         def look_down(ray: mi.Ray3f, height: mi.Float, active: mi.Bool) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
             si = system.scene.ray_intersect(ray, active)
@@ -166,9 +166,7 @@ class WaterGrid:
         depth: float,
     ) -> None:
         self.heights = heights
-        self.width = width
-        self.growth = growth
-        self.thickness = thickness
+        self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)
         sine = system.transmitter.pose.axis[:2] / system.refractive_index
         self.lean = (sine / np.sqrt(1 - sine @ sine)).tolist()
         self.bits_z = int(np.clip(math.ceil(math.log2(depth / thickness + 1)), 2, 8))
@@ -260,7 +258,7 @@ class SolidPatches:
 
     def __init__(self, system: LidarScene, region: Region, width: float, shift: mi.Point2f) -> None:
         self.system = system
-        self.width = width
+        self.width = opaque(width)
         self._shift = shift
         self._bounded = [solid for solid in system.solids if not region.within(solid.bbox())]
 
@@ -289,7 +287,7 @@ class SolidPatches:
             | (_low_bits(floor, 8) << 12)
             | (side << 20)
             | (_low_bits(shape, 9) << 23),
-            area=self.width**2 / dr.abs(normal),
+            area=self.width * self.width / dr.abs(normal),
             corner=mi.Point3f((cu - self._shift.x) * self.width, (cv - self._shift.y) * self.width, w),
             axis=axis,
             faces=dr.sign(normal),
@@ -297,7 +295,7 @@ class SolidPatches:
 
     def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a solid may end inside the region."""
-        return reduce(or_, (shape == mi.ShapePtr(solid) for solid in self._bounded), mi.Bool(False))
+        return is_one_of(shape, self._bounded)
 
     def inverse_share(self, patch: Patch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
         """Return an estimate of 1 / (share of the patch's square that the solid fills): edges cut some patches.

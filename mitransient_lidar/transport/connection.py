@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import optical_length
 from mitransient_lidar.transport.system import LidarScene
 
@@ -47,7 +48,7 @@ class SurfaceLobe:
     """
 
     def __init__(self, system: LidarScene) -> None:
-        self.laser = mi.Point3f(system.transmitter.pose.origin.tolist())
+        self.laser = opaque_point(system.transmitter.pose.origin)
         self.index = float(system.refractive_index)
         self.slope_variance = float(system.slope_variance)
 
@@ -131,7 +132,7 @@ def laser_through(system: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bo
     length
         Optical length of the line [m].
     """
-    laser = mi.Point3f(system.transmitter.pose.origin.tolist())
+    laser = opaque_point(system.transmitter.pose.origin)
     offset = laser - si.p
     distance = dr.norm(offset)
     direction = offset / distance

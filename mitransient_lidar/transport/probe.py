@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.optics.water import C0
+from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import optical_length
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.streams import pass_streams
@@ -46,8 +47,8 @@ def probe_echoes(system: LidarScene, view: ViewSampler) -> EchoProbe:
     """Trace rays through the facets of the surface, without ripples and scattering, and time where they get to."""
     start = view.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
     beam = start.weight * system.transmitter.intensity(start.direction)
-    laser = mi.Point3f(system.transmitter.pose.origin.tolist())
-    ray = mi.Ray3f(mi.Point3f(system.receiver.pose.origin.tolist()), start.direction)
+    laser = opaque_point(system.transmitter.pose.origin)
+    ray = mi.Ray3f(opaque_point(system.receiver.pose.origin), start.direction)
     first = system.scene.ray_intersect(ray, start.weight > 0)
     at_sea = first.is_valid() & system.is_surface(first.shape)
     air = first.t + dr.norm(laser - first.p)

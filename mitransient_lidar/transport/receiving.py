@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.optics.checks import in_range, non_negative, positive
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pixels import PixelArray
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.streams import stratified_point, unit_points
@@ -113,9 +114,9 @@ class ViewSampler:
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
         self.receiver = receiver
         spot = transmitter.pose.ground_point()
-        self.centre = receiver.pose.tangent_of_point(spot)
+        self.centre = [opaque(angle) for angle in receiver.pose.tangent_of_point(spot)]
         ranges = (np.linalg.norm(spot - pose.origin) for pose in (transmitter.pose, receiver.pose))
-        self.sigma = transmitter.angular_spread * float(next(ranges)) / float(next(ranges))
+        self.sigma = opaque(transmitter.angular_spread * float(next(ranges)) / float(next(ranges)))
         self.use_footprint = self._footprint_share() > _SMALLEST_FOOTPRINT_SHARE
 
     def _footprint_share(self) -> float:
@@ -131,7 +132,7 @@ class ViewSampler:
 
     def _footprint_density(self, gx: mi.Float, gy: mi.Float) -> mi.Float:
         x, y = (gx - self.centre[0]) / self.sigma, (gy - self.centre[1]) / self.sigma
-        return dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * self.sigma**2)
+        return dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * self.sigma * self.sigma)
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> View:
         """Sample one view for each path.

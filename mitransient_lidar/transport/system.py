@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.opaque import is_one_of, opaque
 from mitransient_lidar.transport.receiving import Receiver
 
 #: Total slope variance assumed for a surface that does not tell its own: a broad lobe serves any sea.
@@ -140,11 +139,11 @@ class LidarScene:
         boxes = [surface.bbox() for surface in self.surfaces]
         lowest, highest = min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)
         # A millimetre of room for points that lie on the surface to rounding.
-        return dr.select(in_water, z > highest + 1e-3, z < lowest - 1e-3)
+        return dr.select(in_water, z > opaque(highest + 1e-3), z < opaque(lowest - 1e-3))
 
     def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a shape bounds the water."""
-        return reduce(or_, (shape == mi.ShapePtr(surface) for surface in self.surfaces), mi.Bool(False))
+        return is_one_of(shape, self.surfaces)
 
 
 def _check_cells(surfaces: list[mi.Shape], transmitter: mi.Emitter) -> None:

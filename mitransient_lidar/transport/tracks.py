@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import optical_length
 from mitransient_lidar.transport.system import LidarScene
 
@@ -60,7 +61,7 @@ class Tracks:
     def __init__(self, system: LidarScene, spacing: float, capacity: int) -> None:
         self.system = system
         self._water: Any = system.water
-        self.spacing = spacing
+        self.spacing = opaque(spacing)
         self.capacity = capacity
         self._stored = dr.zeros(mi.UInt32, 1)
         self._number = dr.zeros(mi.UInt32, capacity)

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path, advance
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.system import LidarScene
@@ -48,7 +49,7 @@ class WalkPath(Path):
 def start_walk(pose: Pose, direction: mi.Vector3f, throughput: mi.Float, offset: mi.Float) -> WalkPath:
     """Return paths at their start in the air: directions, throughputs (0: none) and offsets of their first points."""
     return WalkPath(
-        point=mi.Point3f(pose.origin.tolist()),
+        point=opaque_point(pose.origin),
         direction=direction,
         in_water=mi.Bool(False),
         length=mi.Float(0),
@@ -103,7 +104,7 @@ class Walk:
         self._water: Any = system.water
         self.context = mi.BSDFContext(mode)
         self.adjoint = mode == mi.TransportMode.Importance
-        self.destination = mi.Point3f(destination.origin.tolist())
+        self.destination = opaque_point(destination.origin)
 
     def run(
         self,

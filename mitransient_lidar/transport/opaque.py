@@ -1,0 +1,34 @@
+"""Numbers of a scene that a kernel reads instead of holding: the next shot or sea then needs no new kernel.
+
+Dr.Jit writes Python numbers into the kernels that it compiles. Where they differ from shot to shot, each shot would
+wait a second for the compiler.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+
+def opaque(value: float) -> mi.Float:
+    """Return a number."""
+    return dr.opaque(mi.Float, float(value))
+
+
+def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
+    """Return a point, shape (3,)."""
+    return mi.Point3f(*(opaque(value) for value in values))
+
+
+def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
+    """Return whether a pointer is that of one of some shapes."""
+    number = dr.reinterpret_array(mi.UInt32, pointer)
+    found = mi.Bool(False)
+    for shape in shapes:
+        wanted = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+        found |= number == dr.opaque(mi.UInt32, int(wanted[0]))
+    return found
