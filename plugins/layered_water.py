@@ -11,6 +11,8 @@ import numpy as np
 from mitransient_lidar.optics.checks import in_range
 from mitransient_lidar.optics.water import WaterColumn
 from mitransient_lidar.transport.flight import LayeredFlight
+from mitransient_lidar.transport.path import Path
+from mitransient_lidar.transport.plume import BubblePlume
 
 _PHASES = ("fournier_forand", "petzold", "hg")
 
@@ -18,21 +20,30 @@ _PHASES = ("fournier_forand", "petzold", "hg")
 class LayeredWater(mi.Medium):
     r"""Water in horizontal layers (``layered_water``).
 
-    ===================  ======  =======================================================================================
-    Parameter            Type    Meaning
-    ===================  ======  =======================================================================================
-    tops                 string  Depth of each layer's upper edge [m], first 0, increasing: ``0, 3``. Default: ``0``
-    attenuation          string  Beam attenuation c of each layer [1/m], or one value for all. Default: 0.3
-    scattering           string  Scattering b [1/m], at most c. Default: 0.15
-    backscattering       string  Backscattering bb [1/m], at most b. Default: 0.006
-    phase_function       string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``.
-                                 Default: ``fournier_forand``
-    phase_g              float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
-    (nested)             phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
-                                 ``phase_1``, ... from the top
-    refractive_index     float   Phase index, bends rays, 1.0001 to 2. Default: 1.34
-    group_index          float   Group index, times them, 1 to 2. Default: 1.364 (sea water at 532 nm)
-    ===================  ======  =======================================================================================
+    =======================  ======  ===================================================================================
+    Parameter                Type    Meaning
+    =======================  ======  ===================================================================================
+    tops                     string  Depth of each layer's upper edge [m], first 0, increasing: ``0, 3``. Default: ``0``
+    attenuation              string  Beam attenuation c of each layer [1/m], or one value for all. Default: 0.3
+    scattering               string  Scattering b [1/m], at most c. Default: 0.15
+    backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
+    phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``.
+                                     Default: ``fournier_forand``
+    phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
+    (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
+                                     ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
+    refractive_index         float   Phase index, bends rays, 1.0001 to 2. Default: 1.34
+    group_index              float   Group index, times them, 1 to 2. Default: 1.364 (sea water at 532 nm)
+    plume_scattering         float   What the bubbles behind a ship add to the scattering [1/m]. Default: 0, no bubbles
+    plume_x, plume_y         float   Where the bubbles begin, at the stern [m]. Default: 0
+    plume_bearing_deg        float   Where the ship goes, from +x to +y [deg]. Default: 0
+    plume_length             float   How far the bubbles reach astern [m]. Default: 200
+    plume_width              float   How wide [m]. Default: 8
+    plume_depth              float   How deep below the mean sea level [m], 0.01 to 100. Default: 2
+    plume_backscatter_ratio  float   Their bb/b for a Fournier-Forand function, 0.0001 to 0.4. Default: 0.02, between
+                                     clean bubbles and such with a film (Zhang, Lewis and Johnson 1998,
+                                     doi:10.1364/AO.37.006525)
+    =======================  ======  ===================================================================================
 
     The first layer also fills the wave crests above z = 0, the last goes down without end. With ``petzold``, ``hg`` or
     a nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -69,10 +80,18 @@ class LayeredWater(mi.Medium):
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
         if kind not in _PHASES:
             raise ValueError(f"phase_function = {kind!r} must be one of {', '.join(_PHASES)}")
+        #: Bubbles, if there are any, and their phase function.
+        self.plume = BubblePlume.from_properties(props)
+        ratio = in_range("plume_backscatter_ratio", props.get("plume_backscatter_ratio", 0.02), 1e-4, 0.4)
+        bubbles = phases.pop("plume_phase", None)
+        if bubbles is not None:
+            del props["plume_phase"]
         # Mitsuba's own media hold one phase function; the others are this plugin's.
         for name in list(phases)[1:]:
             del props[name]
         self.phases = _phases_of_layers(self.column, phases, kind, phase_g)
+        if self.plume is not None:
+            self.plume_phase = bubbles or mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
         if not phases:
             # For Mitsuba's own integrators, which would take an isotropic function where none is nested.
             props["phase_0"] = self.phases[0]
@@ -83,16 +102,55 @@ class LayeredWater(mi.Medium):
         self.scattering_flight = LayeredFlight(replace(self.column, attenuation=self.column.scattering))
         none = np.zeros(self.column.count)
         self.absorption_flight = LayeredFlight(WaterColumn(self.column.tops, self.column.absorption, none, none))
-        self._majorant = float(np.max(self.column.attenuation))
-        self.m_is_homogeneous = self.column.count == 1
+        self._majorant = float(np.max(self.column.attenuation)) + (self.plume.scattering if self.plume else 0)
+        self.m_is_homogeneous = self.column.count == 1 and self.plume is None
         self.m_has_spectral_extinction = False
 
+    def free_flight(self, flight: LayeredFlight, path: Path, rng: mi.PCG32) -> mi.Float:
+        """Draw how far light goes until it meets what `flight` counts, or a bubble [m]."""
+        distance = flight.distance(path.depth, path.downward, -dr.log(1 - rng.next_float32()))
+        if self.plume is None:
+            return distance
+        return dr.minimum(distance, self.plume.distance(path.point, path.direction, -dr.log(1 - rng.next_float32())))
+
+    def optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float) -> mi.Float:
+        """Return the optical depth of a segment [1], bubbles included."""
+        through = self.flight.optical_depth(-point.z, -direction.z, length)
+        return through if self.plume is None else through + self.plume.optical_depth(point, direction, length)
+
+    def scatterer_at(self, flight: LayeredFlight, point: mi.Point3f, rng: mi.PCG32) -> mi.UInt32:
+        """Draw what a flight has met: the number of the layer, or the number of layers for a bubble."""
+        layer = flight.layer_at(-point.z)
+        if self.plume is None:
+            return layer
+        bubbles = dr.select(self.plume.holds(point), mi.Float(self.plume.scattering), 0)
+        is_bubble = rng.next_float32() * (bubbles + flight.attenuation(layer)) < bubbles
+        return dr.select(is_bubble, mi.UInt32(self.column.count), layer)
+
+    def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32) -> mi.Float:
+        """Return what `flight` counts of a scatterer [1/m]."""
+        if self.plume is None:
+            return flight.attenuation(scatterer)
+        layer = dr.minimum(scatterer, self.column.count - 1)
+        return dr.select(scatterer == self.column.count, mi.Float(self.plume.scattering), flight.attenuation(layer))
+
+    def albedo(self, scatterer: mi.UInt32) -> mi.Float:
+        """Return the single-scattering albedo of a scatterer; bubbles absorb nothing."""
+        if self.plume is None:
+            return self.flight.albedo(scatterer)
+        layer = dr.minimum(scatterer, self.column.count - 1)
+        return dr.select(scatterer == self.column.count, mi.Float(1), self.flight.albedo(layer))
+
     def phase_at(self, layer: mi.UInt32) -> mi.PhaseFunction | mi.PhaseFunctionPtr:
-        """Return the phase function of a layer: the object itself when all layers have the same, else pointers."""
-        if self._same_phase:
+        """Return the phase function of a layer: the object itself when all layers have the same, else pointers.
+
+        The number of layers stands for bubbles.
+        """
+        if self._same_phase and self.plume is None:
             return self.phases[0]
-        pointers = mi.PhaseFunctionPtr(self.phases[0])
-        for index, phase in enumerate(self.phases[1:], start=1):
+        phases = self.phases if self.plume is None else [*self.phases, self.plume_phase]
+        pointers = mi.PhaseFunctionPtr(phases[0])
+        for index, phase in enumerate(phases[1:], start=1):
             pointers = dr.select(layer == index, mi.PhaseFunctionPtr(phase), pointers)
         return pointers
 
@@ -106,8 +164,12 @@ class LayeredWater(mi.Medium):
         """Return scattering, null and total coefficient [1/m], for Mitsuba's own integrators."""
         layer = self.flight.layer_at(-mei.p.z)
         attenuation = self.flight.attenuation(layer)
+        scattering = self.flight.albedo(layer) * attenuation
+        if self.plume is not None:
+            bubbles = dr.select(self.plume.holds(mei.p), mi.Float(self.plume.scattering), 0)
+            scattering, attenuation = scattering + bubbles, attenuation + bubbles
         return (
-            mi.UnpolarizedSpectrum(self.flight.albedo(layer) * attenuation),
+            mi.UnpolarizedSpectrum(scattering),
             mi.UnpolarizedSpectrum(self._majorant - attenuation),
             mi.UnpolarizedSpectrum(attenuation),
         )

@@ -229,9 +229,10 @@ class LidarVolpath(mi.CppADIntegrator):
         hit = path.active & ~scattered
         at_sea = hit & system.is_surface(si.shape)
         submerged = scattered | (hit & in_leg & ~at_sea)
-        mei, phase, layer = scattering_event(system, path, scattered)
+        flight = system.water.flight if system.water is not None else None
+        mei, phase, scatterer = scattering_event(system, path, flight, scattered, rng)
         if system.water is not None:
-            path.throughput *= dr.select(scattered, system.water.flight.albedo(layer), 1)
+            path.throughput *= dr.select(scattered, system.water.albedo(scatterer), 1)
         merged = self._merged(path, first, scattered, hit, submerged, at_sea)
 
         # Connect: from under water through the surface, from the surface and from solids in the air directly.
@@ -244,7 +245,7 @@ class LidarVolpath(mi.CppADIntegrator):
         # Where the surface patch has ended, a flat sea stands in for it in the account of what is lost.
         lost = tried & ~above.is_valid() & (up.z > 0)
         leg = dr.select(lost, dr.maximum(path.depth, 0) / up.z, above.t)
-        clear = dr.exp(-self._optical_depth(system, path.depth, -up.z, leg, met | lost))
+        clear = dr.exp(-self._optical_depth(system, path.point, up, leg, met | lost))
         combined = lobe_pdf + (turn.pdf * clear if self.connection == "combined" else 0)
         factor = dr.select(met, turn.value * clear / combined, self._walk_weight(path, transmittance))
         crossing = dr.select(met, above, si)
@@ -285,22 +286,20 @@ class LidarVolpath(mi.CppADIntegrator):
         """Return whether the path scatters before the surface, how far it goes, and the leg's transmittance."""
         if system.water is None:
             return mi.Bool(False), si.t, mi.Float(1)
-        drawn = -dr.log(1 - rng.next_float32())
-        flight = system.water.flight
         wet = path.active & path.in_water
-        distance = flight.distance(path.depth, path.downward, drawn)
+        distance = system.water.free_flight(system.water.flight, path, rng)
         scattered = wet & (distance < si.t)
-        to_surface = self._optical_depth(system, path.depth, path.downward, si.t, wet & si.is_valid())
+        to_surface = self._optical_depth(system, path.point, path.direction, si.t, wet & si.is_valid())
         return scattered, dr.select(scattered, distance, si.t), dr.exp(-to_surface)
 
     @staticmethod
     def _optical_depth(
-        system: LidarScene, depth: mi.Float, downward: mi.Float, length: mi.Float, active: mi.Bool
+        system: LidarScene, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool
     ) -> mi.Float:
         """Return the optical depth of a leg in water, 0 for inactive lanes."""
         if system.water is None:
             return mi.Float(0)
-        return dr.select(active, system.water.flight.optical_depth(depth, downward, length), 0)
+        return dr.select(active, system.water.optical_depth(point, direction, length), 0)
 
     def _turn(
         self,

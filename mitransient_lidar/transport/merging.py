@@ -37,7 +37,7 @@ def merge_in_water(
 
     A point stands for a track of length s and throughput beta, a photon for one of length s' and energy w; with the
     cell's volume V each pair adds beta s w s' / V times the scattering coefficient and the phase function, shared among
-    all merges that make the same path.
+    all merges that make the same path. Water and bubbles make different paths.
     """
     water: Any = system.water
     bucket, cell, volume = cells.locate(points.point)
@@ -46,7 +46,10 @@ def merge_in_water(
     mei.sh_frame = mi.Frame3f(mei.wi)
     layer = water.flight.layer_at(-points.point.z)
     phase = water.phase_at(layer)
-    scattering = water.scattering_flight.attenuation(layer)
+    scatterers = [(phase, water.scattering_flight.attenuation(layer))]
+    if water.plume is not None:
+        bubbles = dr.select(water.plume.holds(points.point), mi.Float(water.plume.scattering), 0)
+        scatterers.append((water.plume_phase, bubbles))
     absorption = water.absorption_flight.attenuation(layer)
     weight = points.weight / volume
     first, end = photons.bucket(bucket, mi.Bool(True))
@@ -55,8 +58,10 @@ def merge_in_water(
         active = index < end
         photon, tag = photons.photon(index, active)
         active &= tag == cell
-        value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
-        shared = dr.rcp(dr.rcp(scattering * value[0]) + points.competition + photon.competition)
+        shared = mi.Float(0)
+        for phase, scattering in scatterers:
+            value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
+            shared += dr.rcp(dr.rcp(scattering * value[0]) + points.competition + photon.competition)
         # The photon goes on to the plane across its direction through the point: times do not blur over the cell.
         beyond = dr.dot(points.point, photon.direction) - photon.place
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)

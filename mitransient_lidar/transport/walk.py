@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.flight import LayeredFlight
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path, advance
 from mitransient_lidar.transport.pose import Pose
@@ -69,9 +70,12 @@ Action = Callable[[WalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
 
 
 def scattering_event(
-    system: LidarScene, path: Path, scattered: mi.Bool
+    system: LidarScene, path: Path, flight: LayeredFlight | None, scattered: mi.Bool, rng: mi.PCG32
 ) -> tuple[mi.MediumInteraction3f, Any, mi.UInt32]:
-    """Return the interaction, the phase function (None without water) and the layer where paths have scattered."""
+    """Return the interaction, the phase function (None without water) and the scatterer that paths have met.
+
+    `flight` is what their flights were drawn from.
+    """
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p = path.point
     mei.wi = -path.direction
@@ -79,8 +83,8 @@ def scattering_event(
     mei.t = dr.select(scattered, mi.Float(1), dr.inf)
     if system.water is None:
         return mei, None, mi.UInt32(0)
-    layer = system.water.flight.layer_at(path.depth)
-    return mei, system.water.phase_at(layer), layer
+    scatterer = system.water.scatterer_at(flight, path.point, rng)
+    return mei, system.water.phase_at(scatterer), scatterer
 
 
 class Walk:
@@ -164,8 +168,7 @@ class Walk:
         """Return what the path would meet, whether it scatters before or passes beside the sea, and how far it goes."""
         si = self.system.scene.ray_intersect(path.ray(), path.active)
         path.rays += dr.select(path.active, mi.UInt32(1), 0)
-        drawn = -dr.log(1 - rng.next_float32())
-        distance = self._water.scattering_flight.distance(path.depth, path.downward, drawn)
+        distance = self._water.free_flight(self._water.scattering_flight, path, rng)
         scattered = wet & (distance < si.t)
         beside = path.active & first & (path.downward > 0)
         beside &= ~si.is_valid() | self.system.beside_surface(si.p.z, mi.Bool(False))
@@ -206,10 +209,11 @@ class Walk:
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at_surface = at_sea | solid
         bs, bsdf_weight = si.bsdf().sample(self.context, si, pick, u, at_surface)
-        mei, phase, layer = scattering_event(self.system, path, scattered)
+        flight = self._water.scattering_flight
+        mei, phase, scatterer = scattering_event(self.system, path, flight, scattered, rng)
         natural, weight, pdf = phase.sample(mi.PhaseFunctionContext(), mei, pick, u, scattered)
         # The sum runs over what the film would see: scattering coefficient times value of the phase function.
-        likely = self._water.scattering_flight.attenuation(layer) * weight[0] * pdf
+        likely = self._water.coefficient(flight, scatterer) * weight[0] * pdf
         path.competition += dr.select(scattered, dr.rcp(likely), 0)
         path.scatterings += dr.select(scattered, mi.UInt32(1), 0)
         direction = dr.select(scattered, dr.normalize(natural), si.to_world(bs.wo))

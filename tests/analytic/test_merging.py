@@ -148,8 +148,10 @@ def plate(x, y, z, half, tilt=0.0, **bsdf):
 
 SPHERE = {"type": "sphere", "center": [0.3, 0.2, -5.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
 LAYERS = {"tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35", "backscattering": "0.014, 0.007"}
+BUBBLES = {"plume_scattering": 1.5, "plume_width": 3.0, "plume_depth": 2.0, "plume_bearing_deg": 60.0, "plume_x": 1.0}
 CASES = {
     "waves": {"sea": WAVES},
+    "bubbles": {"sea": WAVES, "water": BUBBLES},
     "layers": {"sea": WAVES, "water": LAYERS},
     "plate": {"extra": {"target": plate(0.4, 0.3, -5.0, 0.6)}},
     "tilted plate": {"extra": {"target": plate(0.4, 0.3, -5.0, 0.8, tilt=35.0)}},
