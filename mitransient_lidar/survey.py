@@ -75,7 +75,7 @@ def survey(
         row: dict[str, Any] = {"shot_x": x, "shot_y": y}
         row["slope_along"], row["slope_across"] = sea.slope_at(x, y)
         for name, middle, half in _gates(shot):
-            row[f"{name}_peak"], row[f"{name}_time"] = _peaks(shot, middle - half, middle + half)
+            row[f"{name}_peak"], row[f"{name}_time"] = highest_points(shot, middle - half, middle + half)
         rows.append(row)
         if progress is not None:
             progress(number + 1, count)
@@ -102,8 +102,26 @@ def _gates(shot: xr.Dataset) -> list[tuple[str, float, float]]:
     return [("surface", surface, _SURFACE_GATE_NS), ("bottom", bottom, _BOTTOM_GATE_NS)]
 
 
-def _peaks(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArray, FloatArray]:
-    """Return height [W] and time [ns] of the highest point of each pixel's waveform in a gate, by a parabola."""
+def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArray, FloatArray]:
+    """Find the highest point of each pixel's waveform in a gate, by a parabola through three bins.
+
+    Parameters
+    ----------
+    shot
+        A result with waveforms.
+    start, end
+        Gate [ns].
+
+    Returns
+    -------
+    height, time
+        Power [W] and time [ns], shape (pixels,); NaN where the highest bin lies on the gate's border.
+
+    Raises
+    ------
+    UserError
+        When the record does not hold the gate.
+    """
     time = shot["time"].values
     inside = np.flatnonzero((time >= start) & (time <= end))
     if len(inside) < 3 or inside[0] == 0 or inside[-1] == len(time) - 1:

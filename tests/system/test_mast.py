@@ -1,0 +1,64 @@
+"""A lidar on a mast: 5.4 degrees grazing, waves that hide each other, and a square metre 1 m below the surface."""
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar import loading
+from mitransient_lidar.optics.water import C0
+
+GRAZING = math.radians(5.4)
+IN_WATER = math.asin(math.cos(GRAZING) / 1.34)
+
+
+@pytest.mark.parametrize("height", [5.0, 15.0, 30.0])
+def test_target_echoes_at_its_distance_and_no_light_leaks_beside_the_sea(height):
+    """A level sea tells when: 2 H / sin(5.4 deg) of air and 1 m / cos(48 deg) of water, there and back."""
+    due = 2e9 / C0 * (height / math.sin(GRAZING) + 1.34 / math.cos(IN_WATER))
+    change = {"altitude": height, "time_start_ns": due - 80, "bin_count": 160}
+    with_target, without = (
+        mitransient_lidar.render("fig04_mast", params={**change, "target_reflectivity": value}, passes=16)
+        for value in (0.3, 0.001)
+    )
+    for shot in (with_target, without):
+        assert shot.attrs["lost_at_surface_border"] < 1e-3
+        assert shot.attrs["beam_beside_surface"] < 1e-3
+    echo = (with_target - without).waveform.sum("pixel")
+    found = float(echo.idxmax("time"))
+    # A wave of 0.1 m under the beam is 1 m nearer along the ray.
+    assert abs(found - due) < 8
+    around = {"time": slice(found - 4, found + 4)}
+    assert float(with_target.waveform.sel(around).sum()) > 3 * float(without.waveform.sel(around).sum())
+
+
+def test_waves_hide_what_geometry_says():
+    """Rays from the sea to the mast against the horizon of height profiles in plain NumPy, towards -x."""
+    scene, _, _ = loading.load_scene("fig04_mast", {"wind_speed": 6})
+    sea = next(shape.sea for shape in scene.shapes() if hasattr(shape, "sea"))
+    mast = scene.sensors()[0].receiver.pose.origin
+    rows = np.arange(-20, 20) * 4 * sea.cell_size
+    columns = np.arange(-int(18 / sea.cell_size), int(10 / sea.cell_size)) * sea.cell_size
+    heights = sea.heights(columns, rows)
+    # Slope of the ray to the mast against the steepest slope to what stands in between.
+    places = range(len(columns) // 2, len(columns))
+    hidden = np.zeros((len(rows), len(places)), dtype=bool)
+    for index, place in enumerate(places):
+        away = columns[place] - columns[:place]
+        steepest = np.max((heights[:, :place] - heights[:, [place]]) / away, axis=1)
+        hidden[:, index] = steepest > (mast[2] - heights[:, place]) / (columns[place] - mast[0])
+    x, y = np.meshgrid(columns[len(columns) // 2 :], rows)
+    z = heights[:, len(columns) // 2 :]
+    point = np.stack([x, y, z + 1e-3], axis=-1).reshape(-1, 3)
+    towards = mast - point
+    towards[:, 1] = 0  # in the plane of the profile
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    ray = mi.Ray3f(mi.Point3f(point.T.copy()), mi.Vector3f(towards.T.copy()))
+    ray.maxt = 14.0
+    blocked = np.array(scene.ray_test(ray)).reshape(hidden.shape)
+    assert 0.02 < hidden.mean() < 0.9
+    # Facets hang a little below and above the profile's points between them.
+    assert abs(blocked.mean() - hidden.mean()) < 0.03
+    assert (blocked == hidden).mean() > 0.95
