@@ -240,3 +240,41 @@ def test_time_moves_the_sea_downwind():
     correlation = [np.sum(later * np.roll(first, shift, axis=1)) for shift in range(-16, 17)]
     moved = 0.25 * (np.argmax(correlation) - 16)
     assert 1.0 < moved < 2.2
+
+
+def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
+    """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
+    sea = {"spectrum": "elfouhaily", "slope_variance": "cox_munk", "size": 16.0, "cell_size": 0.25, "extent": 100.0}
+    own = lidar_scene(sea=sea, integrator={"paths_per_pass": 2**14})
+    shape = next(shape for shape in own.shapes() if hasattr(shape, "sea"))
+    shape.write_ply(str(tmp_path / "sea.ply"))
+    alpha = np.sqrt(2 * np.array(shape.ripple_variance))
+    ripples = {"type": "roughdielectric", "distribution": "beckmann", "int_ior": 1.34, "ext_ior": 1.0}
+    read = {
+        "type": "ply",
+        "filename": str(tmp_path / "sea.ply"),
+        "face_normals": True,
+        "bsdf": {**ripples, "alpha_u": float(alpha[0]), "alpha_v": float(alpha[1])},
+        "interior": {"type": "layered_water", "refractive_index": 1.34, "group_index": 1.34},
+    }
+    other = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "lidar_volpath", "paths_per_pass": 2**14},
+            "tx": {"type": "lidar_transmitter"},
+            "rx": {
+                "type": "multipixel_receiver",
+                "film": {"type": "time_gated_film", "time_start_ns": 1390.0, "bin_width_ns": 1.0, "bin_count": 160},
+            },
+            "sea": read,
+            "bottom": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, -8.0]).scale(500),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.1}},
+            },
+        }
+    )
+    first, second = passes(own, 8).sum(axis=(1, 2)), passes(other, 8, first_seed=50).sum(axis=(1, 2))
+    error = np.hypot(first.std(ddof=1), second.std(ddof=1)) / np.sqrt(8)
+    assert abs(first.mean() - second.mean()) < 5 * error
+    assert error < 0.05 * first.mean()
