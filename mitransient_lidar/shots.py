@@ -30,7 +30,7 @@ KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sidew
 #: Longest side of the sea that is searched [m].
 _LARGEST_SEARCH = 512.0
 
-_PASSES = 24
+_PASSES = 12
 
 
 @dataclass(frozen=True)
