@@ -1,4 +1,4 @@
-"""The command line: ``mitransient-lidar render | plot | compare | shots | survey | scenes | info | bench``.
+"""The command line: ``mitransient-lidar render | plot | compare | shots | survey | water | scenes | info | bench``.
 
 Mistakes of the user's end with one sentence on stderr and exit code 2, interruptions with exit code 130. Results go to
 stdout, everything else to stderr. Modules that take long to import are imported by the commands that need them.
@@ -207,6 +207,25 @@ def survey(
             typer.echo(target)
         for name, value in correlations.items():
             typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
+
+
+@app.command()
+def water(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="jerlov, chlorophyll, kd, secchi or pure.")],
+    value: Annotated[
+        str | None,
+        typer.Argument(metavar="VALUE", help="Jerlov type, chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m]."),
+    ] = None,
+    wavelength: Annotated[float, typer.Option(help="Wavelength in nm.")] = 532.0,
+    temperature: Annotated[float, typer.Option(help="Temperature in degrees Celsius, for the indices.")] = 20.0,
+    salinity: Annotated[float, typer.Option(help="Salinity in per mille, for the indices.")] = 35.0,
+) -> None:
+    """Print the optical properties that a way of knowing a water stands for, and how to render with them."""
+    with _sentences():
+        from mitransient_lidar.water_kinds import describe_water
+
+        for line in describe_water(kind, value, wavelength, temperature, salinity):
+            typer.echo(line)
 
 
 @app.command()
