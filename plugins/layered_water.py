@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import drjit as dr
@@ -10,9 +11,16 @@ import numpy as np
 
 from mitransient_lidar.optics.checks import in_range
 from mitransient_lidar.optics.water import WaterColumn
+from mitransient_lidar.profiles import read_profile
 from mitransient_lidar.transport.flight import LayeredFlight
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.plume import BubblePlume
+
+#: Upper edges [m], attenuation, scattering and backscattering [1/m] unless they are given.
+_DEFAULTS = ("0", 0.3, 0.15, 0.006)
+
+#: Layers with more different bb/b than this share functions whose bb/b differ by as much at most.
+_MOST_FUNCTIONS, _RATIO_STEP = 16, 0.02
 
 _PHASES = ("fournier_forand", "petzold", "hg")
 
@@ -27,6 +35,10 @@ class LayeredWater(mi.Medium):
     attenuation              string  Beam attenuation c of each layer [1/m], or one value for all. Default: 0.3
     scattering               string  Scattering b [1/m], at most c. Default: 0.15
     backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
+    profile                  string  A file instead of the four above: .csv or .nc with ``depth`` [m], two of ``a``,
+                                     ``b``, ``c``, ``omega``, and ``bb`` or ``bb_ratio`` (`mitransient_lidar.profiles`)
+    profile_tolerance        float   How far the layers that stand for the profile may be from it, relative, 1e-5 to
+                                     0.5. Default: 0.01
     phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``.
                                      Default: ``fournier_forand``
     phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
@@ -68,12 +80,7 @@ class LayeredWater(mi.Medium):
 
     def __init__(self, props: mi.Properties) -> None:
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
-        self.column = WaterColumn.from_text(
-            props.get("tops", "0"),
-            props.get("attenuation", 0.3),
-            props.get("scattering", 0.15),
-            props.get("backscattering", 0.006),
-        )
+        self.column = _column(props)
         self.refractive_index = in_range("refractive_index", props.get("refractive_index", 1.34), 1.0001, 2.0)
         self.group_index = in_range("group_index", props.get("group_index", 1.364), 1.0, 2.0)
         kind = props.get("phase_function", "fournier_forand")
@@ -96,7 +103,8 @@ class LayeredWater(mi.Medium):
             # For Mitsuba's own integrators, which would take an isotropic function where none is nested.
             props["phase_0"] = self.phases[0]
         super().__init__(props)
-        # One pointer a layer; layers that share a function share the pointer, and the call.
+        # One number a layer; layers that share a function share the number, and the call.
+        self._pointers: mi.UInt32 | None = None
         self._same_phase = all(phase is self.phases[0] for phase in self.phases)
         self.flight = LayeredFlight(self.column)
         self.scattering_flight = LayeredFlight(replace(self.column, attenuation=self.column.scattering))
@@ -149,10 +157,10 @@ class LayeredWater(mi.Medium):
         if self._same_phase and self.plume is None:
             return self.phases[0]
         phases = self.phases if self.plume is None else [*self.phases, self.plume_phase]
-        pointers = mi.PhaseFunctionPtr(phases[0])
-        for index, phase in enumerate(phases[1:], start=1):
-            pointers = dr.select(layer == index, mi.PhaseFunctionPtr(phase), pointers)
-        return pointers
+        if self._pointers is None:
+            numbers = {id(phase): dr.reinterpret_array(mi.UInt32, mi.PhaseFunctionPtr(phase))[0] for phase in phases}
+            self._pointers = mi.UInt32([numbers[id(phase)] for phase in phases])
+        return dr.reinterpret_array(mi.PhaseFunctionPtr, dr.gather(mi.UInt32, self._pointers, layer))
 
     def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
         """Return the largest attenuation [1/m], for Mitsuba's own integrators."""
@@ -188,6 +196,19 @@ class LayeredWater(mi.Medium):
         )
 
 
+def _column(props: mi.Properties) -> WaterColumn:
+    """Return the layers that the parameters describe, or those of a profile."""
+    path = props.get("profile", "")
+    tolerance = props.get("profile_tolerance", 0.01)
+    names = ("tops", "attenuation", "scattering", "backscattering")
+    if not path:
+        return WaterColumn.from_text(*(props.get(name, value) for name, value in zip(names, _DEFAULTS, strict=True)))
+    given = [name for name in names if name in props]
+    if given:
+        raise ValueError(f"profile = {path!r} says {', '.join(given)}, too: give either")
+    return read_profile(path).layers(tolerance)
+
+
 def _phases_of_layers(
     column: WaterColumn, nested: dict[str, mi.PhaseFunction], kind: str, phase_g: float
 ) -> list[mi.PhaseFunction]:
@@ -206,13 +227,14 @@ def _phases_of_layers(
         return [mi.load_dict({"type": "petzold"})] * column.count
     if kind == "hg":
         return [mi.load_dict({"type": "hg", "g": phase_g})] * column.count
-    made: dict[float, mi.PhaseFunction] = {}
-    for ratio in column.backscatter_ratio:
-        # Rounded so that layers whose bb/b differ by rounding share a function; without scattering any will do.
-        key = round(float(ratio), 12) or 0.0183
-        if key not in made:
-            made[key] = mi.load_dict({"type": "fournier_forand", "backscatter_ratio": key})
-    return [made[round(float(ratio), 12) or 0.0183] for ratio in column.backscatter_ratio]
+    # Rounded so that layers whose bb/b differ by rounding share a function; without scattering any will do.
+    ratios = [round(float(ratio), 12) or 0.0183 for ratio in column.backscatter_ratio]
+    if len(set(ratios)) > _MOST_FUNCTIONS:
+        ratios = [math.exp(_RATIO_STEP * round(math.log(ratio) / _RATIO_STEP)) for ratio in ratios]
+    made = {
+        ratio: mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio}) for ratio in dict.fromkeys(ratios)
+    }
+    return [made[ratio] for ratio in ratios]
 
 
 mi.register_medium("layered_water", lambda props: LayeredWater(props))

@@ -128,3 +128,40 @@ def test_column_follows_the_phase_function_at_180_degrees(lidar_scene, passes, p
     assert np.all(error < 0.02)
     # Light that comes back within 0.1 degree of 180 adds less than 1e-4.
     assert np.all(np.abs(ratio / (backward * 4 * np.pi * 1.5**2 / 0.5) - 1) < 4 * error)
+
+
+def test_profile_file_is_its_layers(lidar_scene, passes, tmp_path):
+    """Two nodes of one water: the same bits as that water; a gradient: the energies of many thin layers by hand."""
+    path = tmp_path / "even.csv"
+    path.write_text("depth, c, b, bb\n0, 0.3, 0.15, 0.006\n9, 0.3, 0.15, 0.006\n")
+    even, own = (passes(lidar_scene(water=water), 1) for water in ({"profile": str(path)}, {}))
+    np.testing.assert_array_equal(even, own)
+    path = tmp_path / "gradient.csv"
+    path.write_text("depth, c, b, bb_ratio\n0, 0.2, 0.1, 0.02\n8, 0.6, 0.3, 0.04\n")
+    depth = 0.05 + 0.1 * np.arange(80)
+    c, b, bb = 0.2 + 0.05 * depth, 0.1 + 0.025 * depth, 0.002 + 0.00125 * depth
+    layers = {
+        "tops": ", ".join(f"{top:.2f}" for top in 0.1 * np.arange(80)),
+        "attenuation": ", ".join(f"{value:.6f}" for value in c),
+        "scattering": ", ".join(f"{value:.6f}" for value in b),
+        "backscattering": ", ".join(f"{value:.8f}" for value in bb),
+    }
+    film = {"time_start_ns": 1410.0, "bin_width_ns": 16.0, "bin_count": 5}
+    energy = [
+        passes(lidar_scene(integrator={"type": "lidar_merging"}, water=water, film=film), 10, seed).sum(axis=1)
+        for seed, water in ((0, {"profile": str(path)}), (100, layers))
+    ]
+    error = np.hypot(*(part.std(axis=0, ddof=1) / np.sqrt(10) for part in energy))
+    mean = [part.mean(axis=0) for part in energy]
+    # A bb/b that differs by the step of 2 % within which functions are shared.
+    assert np.all(np.abs(mean[0] - mean[1]) < 4 * error + 0.01 * mean[1])
+    assert np.all(error < 0.03 * mean[1])
+
+
+def test_profile_is_given_alone_and_exists(tmp_path):
+    path = tmp_path / "water.csv"
+    path.write_text("depth, c, b\n0, 0.3, 0.15\n9, 0.3, 0.15\n")
+    with pytest.raises(RuntimeError, match="says attenuation, too: give either"):
+        mi.load_dict({"type": "layered_water", "profile": str(path), "attenuation": 0.4})
+    with pytest.raises(RuntimeError, match="none.csv"):
+        mi.load_dict({"type": "layered_water", "profile": str(tmp_path / "none.csv")})
