@@ -23,6 +23,7 @@ _LLVM_WHEEL = "karellen-llvm-core"
 _PLUGIN_MODULES = (
     "fournier_forand",
     "petzold",
+    "measured_phase",
     "two_term_henyey_greenstein",
     "layered_water",
     "ocean_surface",

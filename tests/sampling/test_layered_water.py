@@ -163,5 +163,5 @@ def test_profile_is_given_alone_and_exists(tmp_path):
     path.write_text("depth, c, b\n0, 0.3, 0.15\n9, 0.3, 0.15\n")
     with pytest.raises(RuntimeError, match="says attenuation, too: give either"):
         mi.load_dict({"type": "layered_water", "profile": str(path), "attenuation": 0.4})
-    with pytest.raises(RuntimeError, match="none.csv"):
+    with pytest.raises(RuntimeError, match=r"none\.csv"):
         mi.load_dict({"type": "layered_water", "profile": str(tmp_path / "none.csv")})
