@@ -140,7 +140,10 @@ def test_look_at_agrees_with_altitude_and_angle():
 
 
 @pytest.mark.parametrize("module", variants._PLUGIN_MODULES)
-def test_examples_in_the_manual_load(module):
+def test_examples_in_the_manual_load(module, tmp_path, monkeypatch):
+    # The file that an example reads: an isotropic phase function.
+    (tmp_path / "harbour.csv").write_text("".join(f"{angle}, 0.0796\n" for angle in range(0, 181, 10)))
+    monkeypatch.chdir(tmp_path)
     classes = vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
     (manual,) = (c.__doc__ for c in classes if isinstance(c, type) and "code-block:: xml" in (c.__doc__ or ""))
     assert f"(``{module}``)" in manual
