@@ -21,6 +21,7 @@ OLDEST_USABLE_LLVM = 17
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
 _PLUGIN_MODULES = (
+    "tabulated",  # first: others derive from it
     "fournier_forand",
     "petzold",
     "measured_phase",

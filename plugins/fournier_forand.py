@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
+from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
 
 from mitransient_lidar.optics.checks import in_range
 from mitransient_lidar.optics.phase import fournier_forand_backscatter_ratio, fournier_forand_parameters
 from mitransient_lidar.optics.phase_table import PowerLawTable
-from mitransient_lidar.transport.phase import TabulatedPhase, deflect, half_angle
 
 
-class FournierForand(mi.PhaseFunction):
+class FournierForand(TabulatedPhaseFunction):
     r"""Fournier-Forand phase function (``fournier_forand``).
 
     ====================  =====  =======================================================================================
@@ -41,7 +40,6 @@ class FournierForand(mi.PhaseFunction):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
         if "refractive_index" in props or "junge_slope" in props:
             if "backscatter_ratio" in props or not ("refractive_index" in props and "junge_slope" in props):
                 raise ValueError("fournier_forand: give backscatter_ratio, or both refractive_index and junge_slope")
@@ -50,32 +48,8 @@ class FournierForand(mi.PhaseFunction):
         else:
             ratio = props.get("backscatter_ratio", 0.0183)
             self.refractive_index, self.junge_slope = fournier_forand_parameters(ratio)
-        self.tabulated = TabulatedPhase(PowerLawTable.fournier_forand(self.refractive_index, self.junge_slope))
+        super().__init__(props, PowerLawTable.fournier_forand(self.refractive_index, self.junge_slope))
         self.backscatter_ratio = fournier_forand_backscatter_ratio(self.refractive_index, self.junge_slope)
-        self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
-
-    def eval_pdf(
-        self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-    ) -> tuple[mi.Spectrum, mi.Float]:
-        """Return the phase function [1/sr] of a direction, which is its density, too."""
-        value = self.tabulated.eval(half_angle(-mei.wi, wo))
-        return mi.Spectrum(value), value
-
-    def sample(
-        self,
-        ctx: mi.PhaseFunctionContext,
-        mei: mi.MediumInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
-        """Sample a direction distributed as the phase function."""
-        s = self.tabulated.sample(sample1, sample2.x)
-        wo = deflect(mi.Frame3f(-mei.wi), s, dr.two_pi * sample2.y)
-        return wo, mi.Spectrum(1), self.tabulated.eval(s)
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed phase function is loaded anew."""
 
     def to_string(self) -> str:
         """Return a description."""

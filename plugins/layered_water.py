@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import in_range
+from mitransient_lidar.optics.checks import finite_array, in_range
 from mitransient_lidar.optics.water import WaterColumn
 from mitransient_lidar.profiles import read_profile
 from mitransient_lidar.transport.flight import LayeredFlight
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.plume import BubblePlume
+from mitransient_lidar.transport.water_phases import KINDS, ScattererPhases, phases_of_layers
 
 #: Upper edges [m], attenuation, scattering and backscattering [1/m] unless they are given.
 _DEFAULTS = ("0", 0.3, 0.15, 0.006)
-
-#: Layers with more different bb/b than this share functions whose bb/b differ by as much at most.
-_MOST_FUNCTIONS, _RATIO_STEP = 16, 0.02
-
-_PHASES = ("fournier_forand", "petzold", "hg")
 
 
 class LayeredWater(mi.Medium):
@@ -42,6 +37,8 @@ class LayeredWater(mi.Medium):
     phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``.
                                      Default: ``fournier_forand``
     phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
+    water_scattering         string  What the water itself scatters, part of b [1/m], each layer or all; mixed with the
+                                     particles. 0.0022 is sea water at 532 nm. Default: 0, in the phase function already
     (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
                                      ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
     refractive_index         float   Phase index, bends rays, 1.0001 to 2. Default: 1.34
@@ -85,8 +82,8 @@ class LayeredWater(mi.Medium):
         self.group_index = in_range("group_index", props.get("group_index", 1.364), 1.0, 2.0)
         kind = props.get("phase_function", "fournier_forand")
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
-        if kind not in _PHASES:
-            raise ValueError(f"phase_function = {kind!r} must be one of {', '.join(_PHASES)}")
+        if kind not in KINDS:
+            raise ValueError(f"phase_function = {kind!r} must be one of {', '.join(KINDS)}")
         #: Bubbles, if there are any, and their phase function.
         self.plume = BubblePlume.from_properties(props)
         ratio = in_range("plume_backscatter_ratio", props.get("plume_backscatter_ratio", 0.02), 1e-4, 0.4)
@@ -96,16 +93,17 @@ class LayeredWater(mi.Medium):
         # Mitsuba's own media hold one phase function; the others are this plugin's.
         for name in list(phases)[1:]:
             del props[name]
-        self.phases = _phases_of_layers(self.column, phases, kind, phase_g)
+        water_scattering = _water_scattering(props.get("water_scattering", 0.0), self.column)
+        of_layers = phases_of_layers(self.column, phases, kind, phase_g, water_scattering)
         if self.plume is not None:
             self.plume_phase = bubbles or mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
+            of_layers.append(self.plume_phase)
+        #: Phase functions of the layers, and last of the bubbles.
+        self.phases = ScattererPhases(of_layers)
         if not phases:
             # For Mitsuba's own integrators, which would take an isotropic function where none is nested.
-            props["phase_0"] = self.phases[0]
+            props["phase_0"] = of_layers[0]
         super().__init__(props)
-        # One number a layer; layers that share a function share the number, and the call.
-        self._pointers: mi.UInt32 | None = None
-        self._same_phase = all(phase is self.phases[0] for phase in self.phases)
         self.flight = LayeredFlight(self.column)
         self.scattering_flight = LayeredFlight(replace(self.column, attenuation=self.column.scattering))
         none = np.zeros(self.column.count)
@@ -148,19 +146,6 @@ class LayeredWater(mi.Medium):
             return self.flight.albedo(scatterer)
         layer = dr.minimum(scatterer, self.column.count - 1)
         return dr.select(scatterer == self.column.count, mi.Float(1), self.flight.albedo(layer))
-
-    def phase_at(self, layer: mi.UInt32) -> mi.PhaseFunction | mi.PhaseFunctionPtr:
-        """Return the phase function of a layer: the object itself when all layers have the same, else pointers.
-
-        The number of layers stands for bubbles.
-        """
-        if self._same_phase and self.plume is None:
-            return self.phases[0]
-        phases = self.phases if self.plume is None else [*self.phases, self.plume_phase]
-        if self._pointers is None:
-            numbers = {id(phase): dr.reinterpret_array(mi.UInt32, mi.PhaseFunctionPtr(phase))[0] for phase in phases}
-            self._pointers = mi.UInt32([numbers[id(phase)] for phase in phases])
-        return dr.reinterpret_array(mi.PhaseFunctionPtr, dr.gather(mi.UInt32, self._pointers, layer))
 
     def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
         """Return the largest attenuation [1/m], for Mitsuba's own integrators."""
@@ -209,32 +194,20 @@ def _column(props: mi.Properties) -> WaterColumn:
     return read_profile(path).layers(tolerance)
 
 
-def _phases_of_layers(
-    column: WaterColumn, nested: dict[str, mi.PhaseFunction], kind: str, phase_g: float
-) -> list[mi.PhaseFunction]:
-    """Return one phase function for each layer, the same object where layers share it."""
-    if len(nested) == 1:
-        return list(nested.values()) * column.count
-    if nested:
-        wanted = [f"phase_{layer}" for layer in range(column.count)]
-        if sorted(nested) != sorted(wanted):
-            raise ValueError(
-                f"layered_water: nested phase functions are named {', '.join(sorted(nested))}; "
-                f"allowed is one of any name, or one a layer: {', '.join(wanted)}"
-            )
-        return [nested[name] for name in wanted]
-    if kind == "petzold":
-        return [mi.load_dict({"type": "petzold"})] * column.count
-    if kind == "hg":
-        return [mi.load_dict({"type": "hg", "g": phase_g})] * column.count
-    # Rounded so that layers whose bb/b differ by rounding share a function; without scattering any will do.
-    ratios = [round(float(ratio), 12) or 0.0183 for ratio in column.backscatter_ratio]
-    if len(set(ratios)) > _MOST_FUNCTIONS:
-        ratios = [math.exp(_RATIO_STEP * round(math.log(ratio) / _RATIO_STEP)) for ratio in ratios]
-    made = {
-        ratio: mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio}) for ratio in dict.fromkeys(ratios)
-    }
-    return [made[ratio] for ratio in ratios]
+def _water_scattering(text: float | str, column: WaterColumn) -> np.ndarray:
+    """Return what the water itself scatters [1/m], one value a layer."""
+    values = np.atleast_1d(
+        finite_array("water_scattering", text.replace(",", " ").split() if isinstance(text, str) else text)
+    )
+    if values.size not in (1, column.count):
+        raise ValueError(f"water_scattering has {values.size} values but must have 1 or {column.count}, one a layer")
+    water = np.broadcast_to(values, column.count)
+    for layer in np.flatnonzero((water < 0) | (water > column.scattering))[:1]:
+        raise ValueError(
+            f"water_scattering = {water[layer]:g} must be at least 0 and at most scattering = "
+            f"{column.scattering[layer]:g}, in layer {layer}"
+        )
+    return water
 
 
 mi.register_medium("layered_water", lambda props: LayeredWater(props))

@@ -7,12 +7,12 @@ cos(theta) = 1 - 2 s and the solid angle between two cones is 4 pi ds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import resources
 
 import numpy as np
 import numpy.typing as npt
 
 from .checks import FloatArray, finite, in_range
+from .petzold_waters import log_log_phase, read_columns
 
 FFBB_SLOPE_RANGE = (3.0001, 4.9999)
 """Junge slopes mu that the one-parameter Fournier-Forand family covers."""
@@ -199,24 +199,8 @@ def petzold_average_particle() -> Callable[[npt.ArrayLike], FloatArray]:
     72-78. The raw table integrates to 0.9929 under this interpolation and is divided by that. It then has a mean cosine
     of 0.9241 and bb/b = 0.01826; interpolating p linearly, as the paper does, integrates to 1.0200 instead.
     """
-    text = resources.files("mitransient_lidar.optics").joinpath("petzold_average_particle.csv").read_text("utf-8")
-    degrees, values = np.loadtxt(text.splitlines(), delimiter=",", unpack=True)
-    log_theta, log_p = np.log(np.radians(degrees)), np.log(values)
-
-    def raw(theta: npt.ArrayLike) -> FloatArray:
-        with np.errstate(divide="ignore"):
-            x = np.log(np.asarray(theta, dtype=np.float64))
-        below = np.minimum(x - log_theta[0], 0)
-        return np.asarray(np.exp(np.interp(x, log_theta, log_p) - 1.346 * below))
-
-    # Gauss-Legendre between the nodes in ln(theta), plus the power law's own integral below the first
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    half = np.diff(log_theta)[:, None] / 2
-    theta = np.exp(log_theta[:-1, None] + half * (1 + nodes))
-    total = np.sum(2 * np.pi * raw(theta) * np.sin(theta) * theta * weights * half)
-    first = np.radians(degrees[0])
-    total += 2 * np.pi * values[0] * first**2 / (2 - 1.346)
-    return lambda theta: np.asarray(raw(theta) / total)
+    degrees, values = read_columns("petzold_average_particle.csv")
+    return log_log_phase(degrees, values, power=-1.346)
 
 
 def _half_angle(theta: npt.ArrayLike) -> FloatArray:

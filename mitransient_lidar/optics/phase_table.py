@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ class PowerLawTable:
     within 2e-4 of the closed form. Narrow backward peaks need more nodes: with a weak backward Henyey-Greenstein
     lobe the error at 180 degrees is 3e-4 for g = 0.3, 2e-3 for 0.5 and 2e-2 for 0.7, or 2e-3 for 0.7 with 8192 nodes.
 
-    Build one with `from_function`, `from_values` or `fournier_forand`.
+    Build one with `from_function`, `from_values`, `fournier_forand` or `mixture`.
 
     Parameters
     ----------
@@ -121,6 +121,37 @@ class PowerLawTable:
         """Build a Fournier-Forand function, its cap taken from the closed-form cumulative distribution."""
         cap = fournier_forand_cdf(_angle(np.exp(DEFAULT_LOG_S0)), n, mu)
         return cls.from_function(lambda theta: fournier_forand(theta, n, mu), count, cap_probability=float(cap))
+
+    @classmethod
+    def mixture(cls, tables: Sequence[PowerLawTable], weights: npt.ArrayLike) -> PowerLawTable:
+        """Build the sum of phase functions, each with its share of the scattering.
+
+        Parameters
+        ----------
+        tables : sequence of PowerLawTable
+            The functions; the result has the nodes of the one with the most.
+        weights : array_like
+            Their shares, at least 0 and together above 0; scattering coefficients serve.
+
+        Returns
+        -------
+        PowerLawTable
+
+        Raises
+        ------
+        ValueError
+            If a weight is negative, all are 0, or their number is not that of the tables.
+        """
+        shares = finite_array("weights", weights)
+        if shares.shape != (len(tables),):
+            raise ValueError(f"weights of shape {shares.shape} must have one number for each of {len(tables)} tables")
+        if np.any(shares < 0) or not np.any(shares > 0):
+            raise ValueError(f"weights = {shares.tolist()} must be at least 0, and not all of them 0")
+        finest = max(tables, key=lambda table: table.count)
+        s = finest._nodes()
+        values = np.sum([share * table.eval_s(s) for share, table in zip(shares, tables, strict=True)], axis=0)
+        below = [share * table.cdf_s(s[0]) for share, table in zip(shares, tables, strict=True)]
+        return cls.from_values(values, finest.log_s0, float(np.sum(below)))
 
     @property
     def count(self) -> int:

@@ -45,7 +45,7 @@ def merge_in_water(
     mei.p, mei.wi = points.point, -points.direction
     mei.sh_frame = mi.Frame3f(mei.wi)
     layer = water.flight.layer_at(-points.point.z)
-    phase = water.phase_at(layer)
+    phase = water.phases.at(layer)
     scatterers = [(phase, water.scattering_flight.attenuation(layer))]
     if water.plume is not None:
         bubbles = dr.select(water.plume.holds(points.point), mi.Float(water.plume.scattering), 0)

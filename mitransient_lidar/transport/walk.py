@@ -84,7 +84,7 @@ def scattering_event(
     if system.water is None:
         return mei, None, mi.UInt32(0)
     scatterer = system.water.scatterer_at(flight, path.point, rng)
-    return mei, system.water.phase_at(scatterer), scatterer
+    return mei, system.water.phases.at(scatterer), scatterer
 
 
 class Walk:
