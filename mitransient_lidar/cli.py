@@ -211,20 +211,32 @@ def survey(
 
 @app.command()
 def water(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="jerlov, chlorophyll, kd, secchi or pure.")],
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="jerlov, chlorophyll, kd, secchi, petzold, profile or pure.")
+    ],
     value: Annotated[
         str | None,
-        typer.Argument(metavar="VALUE", help="Jerlov type, chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m]."),
+        typer.Argument(
+            metavar="VALUE",
+            help="Jerlov type, chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m], Petzold's clear, coastal or turbid, "
+            "or a profile's .csv or .nc file.",
+        ),
     ] = None,
     wavelength: Annotated[float, typer.Option(help="Wavelength in nm.")] = 532.0,
     temperature: Annotated[float, typer.Option(help="Temperature in degrees Celsius, for the indices.")] = 20.0,
     salinity: Annotated[float, typer.Option(help="Salinity in per mille, for the indices.")] = 35.0,
+    tolerance: Annotated[float, typer.Option(help="How far a profile's layers may be from it, relative.")] = 0.01,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to draw.")] = None,
 ) -> None:
     """Print the optical properties that a way of knowing a water stands for, and how to render with them."""
     with _sentences():
-        from mitransient_lidar.water_kinds import describe_water
+        from mitransient_lidar import water_kinds
 
-        for line in describe_water(kind, value, wavelength, temperature, salinity):
+        lines = water_kinds.describe_water(kind, value, wavelength, temperature, salinity, tolerance)
+        if output is not None:
+            water_kinds.plot_water(kind, value, wavelength, temperature, salinity, tolerance, output)
+            lines.append(str(output))
+        for line in lines:
             typer.echo(line)
 
 

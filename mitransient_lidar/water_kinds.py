@@ -1,11 +1,24 @@
-"""Ways in which people know their water, as optical properties and as parameters of a scene."""
+"""Ways in which people know their water, as optical properties, as parameters of a scene, and as figures."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
 from mitransient_lidar.errors import UserError
 from mitransient_lidar.optics import known_waters, seawater
+from mitransient_lidar.optics.checks import FloatArray
+from mitransient_lidar.optics.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.optics.phase_table import PowerLawTable
+from mitransient_lidar.profiles import Profile, read_profile
 
-KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "pure")
+KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
+
+DEFAULT_TOLERANCE = 0.01
+"""What the medium ``layered_water`` lets the layers of a profile deviate from it, relative."""
 
 #: How well each kind is known to stand for the water's own properties.
 _CAUTION = {
@@ -13,8 +26,25 @@ _CAUTION = {
     "chlorophyll": "single waters scatter twice or half as much",
     "kd": "a Kd leaves the scattering open by a factor of 2",
     "secchi": "a Secchi depth is a rough way in: a factor of 2",
+    "petzold": "measured at 514 to 530 nm; what is rendered is a Fournier-Forand function of the same bb/b",
     "pure": "natural waters hold particles, which scatter more",
 }
+
+#: How each kind is called above a figure.
+_TITLES = {
+    "jerlov": "Jerlov's water type {}",
+    "chlorophyll": "chlorophyll {} mg/m³",
+    "kd": "Kd {} 1/m",
+    "secchi": "Secchi depth {} m",
+    "petzold": "Petzold's {} water",
+    "pure": "pure sea water",
+}
+
+#: Wavelengths [nm] at which Petzold's waters stand for themselves: from his filter's middle to the usual laser.
+_PETZOLD_RANGE = (514.0, known_waters.GREEN_RANGE[1])
+
+#: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
+_NODES = 32768
 
 
 def water_of(
@@ -25,9 +55,10 @@ def water_of(
     Parameters
     ----------
     kind
-        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi`` or ``pure``.
+        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``.
     value
-        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m] or Secchi depth [m]; None for pure sea water.
+        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
+        ``coastal`` or ``turbid``; None for pure sea water.
     wavelength_nm, temperature, salinity
         Wavelength [nm], temperature [deg C] and salinity [per mille].
 
@@ -38,20 +69,21 @@ def water_of(
     ValueError
         When a value is out of range.
     """
-    if kind not in KINDS:
-        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+    if kind not in _CAUTION:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(_CAUTION)}")
     if kind == "pure":
         if value is not None:
             raise UserError(f"value = {value!r} must be left out for pure sea water")
         return known_waters.pure_seawater(wavelength_nm, temperature, salinity)
-    if value is None:
-        raise UserError(f"value is missing: {kind} needs one")
+    text = _given(kind, value)
     if kind == "jerlov":
-        return known_waters.jerlov(value, wavelength_nm)
+        return known_waters.jerlov(text, wavelength_nm)
+    if kind == "petzold":
+        return _petzold(text, wavelength_nm)
     try:
-        number = float(value)
+        number = float(text)
     except ValueError:
-        raise UserError(f"value = {value!r} must be a number for {kind}") from None
+        raise UserError(f"value = {text!r} must be a number for {kind}") from None
     if kind == "chlorophyll":
         return known_waters.chlorophyll(number, wavelength_nm)
     if wavelength_nm != 532.0:
@@ -60,18 +92,34 @@ def water_of(
 
 
 def describe_water(
-    kind: str, value: str | None, wavelength_nm: float, temperature: float, salinity: float
+    kind: str,
+    value: str | None,
+    wavelength_nm: float,
+    temperature: float,
+    salinity: float,
+    tolerance: float = DEFAULT_TOLERANCE,
 ) -> list[str]:
-    """Return lines that tell the properties of a water and the scene parameters that make it.
+    """Return lines that tell the properties of a water and what to render it with.
 
-    Parameters and errors are those of `water_of`, with a UserError for a value out of range, too.
+    Parameters
+    ----------
+    kind, value, wavelength_nm, temperature, salinity
+        As for `water_of`; or the kind ``profile`` and the path of a file for `profiles.read_profile`.
+    tolerance
+        Largest relative deviation of a profile's layers, 1e-5 to 0.5.
+
+    Raises
+    ------
+    UserError
+        As `water_of`, for a value out of range, too; or when the file cannot be read.
     """
-    try:
-        found = water_of(kind, value, wavelength_nm, temperature, salinity)
+    _require_kind(kind)
+    with _sentences():
         index = float(seawater.refractive_index(wavelength_nm, temperature, salinity))
         group = float(seawater.group_index(wavelength_nm, temperature, salinity))
-    except ValueError as error:
-        raise UserError(str(error)) from error
+        if kind == "profile":
+            return _describe_profile(_given(kind, value), tolerance, index, group)
+        found = water_of(kind, value, wavelength_nm, temperature, salinity)
     rows = {
         "absorption a (1/m)": found.absorption,
         "scattering b (1/m)": found.scattering,
@@ -90,8 +138,132 @@ def describe_water(
         "refractive_index": index,
         "group_index": group,
     }
+    scene, lines = "table1", [f"Note: {_CAUTION[kind]}."]
+    if kind == "pure":
+        # No Fournier-Forand function scatters half of the light backwards.
+        scene = "table1.xml"
+        lines.append("Put into the medium of a copied scene (mitransient-lidar scenes copy table1):")
+        lines.append('<phase type="rayleigh"/>')
+    options = " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items())
     return [
         *(f"{name:<30}{number:.5g}" for name, number in rows.items()),
-        f"Note: {_CAUTION[kind]}.",
-        "mitransient-lidar render table1 " + " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items()),
+        *lines,
+        f"mitransient-lidar render {scene} {options}",
     ]
+
+
+def plot_water(
+    kind: str,
+    value: str | None,
+    wavelength_nm: float,
+    temperature: float,
+    salinity: float,
+    tolerance: float,
+    path: str | os.PathLike[str],
+) -> None:
+    """Draw the phase function of a water, or a profile with its layers.
+
+    Parameters
+    ----------
+    kind, value, wavelength_nm, temperature, salinity, tolerance
+        As for `describe_water`.
+    path
+        File to write, ending in ``.png``, ``.pdf`` or ``.svg``.
+
+    Raises
+    ------
+    UserError
+        As `describe_water`; or when the file has another suffix or cannot be written.
+    """
+    from mitransient_lidar import water_plots
+
+    _require_kind(kind)
+    if kind == "profile":
+        file = _given(kind, value)
+        with _sentences():
+            profile = read_profile(file)
+            layers = profile.layers(tolerance)
+        water_plots.plot_profile(profile, layers, Path(file).name, path)
+        return
+    with _sentences():
+        found = water_of(kind, value, wavelength_nm, temperature, salinity)
+    ratio = f"bb/b = {found.backscatter_ratio:.3g}"
+    phase: water_plots.PhaseFunction
+    if kind == "pure":
+        phase, label = seawater.water_phase_function, f"pure sea water, {ratio}"
+    elif kind == "petzold":
+        phase, label = petzold_water(_given(kind, value)), f"as measured, {ratio}"
+    else:
+        phase, label = water_plots.fournier_forand_of(found.backscatter_ratio), f"Fournier-Forand of {ratio}"
+    properties = f"a = {found.absorption:.3g}, b = {found.scattering:.3g}, bb = {found.backscattering:.3g} 1/m"
+    water_plots.plot_phase_function(phase, label, f"{_TITLES[kind].format(value)}  ·  {properties}", path)
+
+
+def _describe_profile(file: str, tolerance: float, index: float, group: float) -> list[str]:
+    profile = read_profile(file)
+    layers = profile.layers(tolerance)
+    bottom = float(profile.depth[-1])
+    rows = {
+        "depth (m)": _span(profile.depth),
+        "absorption a (1/m)": _span(profile.absorption),
+        "scattering b (1/m)": _span(profile.scattering),
+        "attenuation c (1/m)": _span(profile.attenuation),
+        "bb/b": _ratio_span(profile),
+        f"optical depth to {bottom:.5g} m": f"{float(layers.cumulative(bottom)):.5g}",
+        f"layers within {100 * tolerance:.3g} %": str(layers.count),
+        "refractive index": f"{index:.5g}",
+        "group index": f"{group:.5g}",
+    }
+    # A scene may be rendered from another folder.
+    element = f'<string name="profile" value={quoteattr(str(Path(file).absolute()))}/>'
+    if tolerance != DEFAULT_TOLERANCE:
+        element += f' <float name="profile_tolerance" value="{tolerance:g}"/>'
+    return [
+        *(f"{name:<30}{text}" for name, text in rows.items()),
+        "Put into the medium of a scene instead of tops, attenuation, scattering and backscattering:",
+        element,
+    ]
+
+
+def _span(values: FloatArray) -> str:
+    low, high = f"{values.min():.5g}", f"{values.max():.5g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _ratio_span(profile: Profile) -> str:
+    """Return the range of bb/b, whose extremes lie at nodes, where there is scattering."""
+    scatters = profile.scattering > 0
+    if not scatters.any():
+        return "none, nothing scatters"
+    return _span(profile.backscattering[scatters] / profile.scattering[scatters])
+
+
+def _petzold(name: str, wavelength_nm: float) -> known_waters.InherentProperties:
+    if name not in PETZOLD_WATERS:
+        raise UserError(f"value = {name!r} must be one of {', '.join(PETZOLD_WATERS)} for petzold")
+    low, high = _PETZOLD_RANGE
+    if not low <= wavelength_nm <= high:
+        raise UserError(f"wavelength = {wavelength_nm:g} must lie between {low:g} and {high:g} nm for petzold")
+    a, b = PETZOLD_WATERS[name]
+    share = PowerLawTable.from_function(petzold_water(name), _NODES).backscatter_ratio
+    return known_waters.InherentProperties(a, b, b * share)
+
+
+def _require_kind(kind: str) -> None:
+    if kind not in KINDS:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+
+
+def _given(kind: str, value: str | None) -> str:
+    if value is None:
+        raise UserError(f"value is missing: {kind} needs one")
+    return value
+
+
+@contextlib.contextmanager
+def _sentences() -> Iterator[None]:
+    """Make values out of range mistakes of the user's."""
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(str(error)) from error

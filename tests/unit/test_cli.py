@@ -206,6 +206,19 @@ def test_scenes(scene, tmp_path):
     assert_sentence(run("scenes", "copy", "fig09", tmp_path), "exists already")
 
 
+def test_water(tmp_path):
+    plain = run("water", "secchi", 6)
+    assert plain.exit_code == 0, plain.output
+    assert plain.stdout.splitlines()[-1].startswith("mitransient-lidar render table1 -D attenuation=")
+    drawn = run("water", "secchi", 6, "-o", tmp_path / "a.svg")
+    assert drawn.stdout == f"{plain.stdout}{tmp_path / 'a.svg'}\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
+    assert_sentence(run("water", "secchi", 6, "-o", tmp_path / "a.jpg"), "must end in .png, .pdf or .svg")
+    assert_sentence(run("water", "mud"), "kind = 'mud'", "petzold, profile, pure")
+    for word in ("petzold", "profile", "--tolerance", "--output"):
+        assert word in run("water", "--help").stdout
+
+
 def test_info_and_bench(monkeypatch):
     variants, bench, seen = ModuleType("variants"), ModuleType("bench"), []
     variants.describe = lambda: {"mitsuba": "3.9.1", "LLVM": "none"}
