@@ -14,6 +14,7 @@ from mitransient_lidar.profiles import read_profile
 from mitransient_lidar.transport.flight import LayeredFlight
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.plume import BubblePlume
+from mitransient_lidar.transport.strata import Strata
 from mitransient_lidar.transport.water_phases import KINDS, ScattererPhases, phases_of_layers
 
 #: Upper edges [m], attenuation, scattering and backscattering [1/m] unless they are given.
@@ -41,8 +42,8 @@ class LayeredWater(mi.Medium):
                                      particles. 0.0022 is sea water at 532 nm. Default: 0, in the phase function already
     (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
                                      ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
-    refractive_index         float   Phase index, bends rays, 1.0001 to 2. Default: 1.34
-    group_index              float   Group index, times them, 1 to 2. Default: 1.364 (sea water at 532 nm)
+    refractive_index         string  Phase index, bends rays, 1.0001 to 2, of each layer or all. Default: 1.34
+    group_index              string  Group index, times them, 1 to 2, likewise. Default: 1.364 (sea water at 532 nm)
     plume_scattering         float   What the bubbles behind a ship add to the scattering [1/m]. Default: 0, no bubbles
     plume_x, plume_y         float   Where the bubbles begin, at the stern [m]. Default: 0
     plume_bearing_deg        float   Where the ship goes, from +x to +y [deg]. Default: 0
@@ -57,9 +58,13 @@ class LayeredWater(mi.Medium):
     The first layer also fills the wave crests above z = 0, the last goes down without end. With ``petzold``, ``hg`` or
     a nested phase function, bb follows from that function and ``backscattering`` is only checked.
 
+    Between layers of different refractive index light is refracted, or reflected totally; the partial reflection (5e-6
+    between fresh and sea water at vertical incidence) is left out. Such layers begin below the troughs of the waves, at
+    most 16 of them.
+
     The lidar integrators sample free flights and transmittances through all layers in closed form. Mitsuba's own
     volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
-    phase function in all layers.
+    phase function and index in all layers.
 
     .. code-block:: xml
 
@@ -78,8 +83,19 @@ class LayeredWater(mi.Medium):
     def __init__(self, props: mi.Properties) -> None:
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         self.column = _column(props)
-        self.refractive_index = in_range("refractive_index", props.get("refractive_index", 1.34), 1.0001, 2.0)
-        self.group_index = in_range("group_index", props.get("group_index", 1.364), 1.0, 2.0)
+        #: Whether the layers stand for a profile from a file.
+        self.from_profile = bool(props.get("profile", ""))
+        indices = [
+            _per_layer(name, props.get(name, default), self.column.count)
+            for name, default in (("refractive_index", 1.34), ("group_index", 1.364))
+        ]
+        for name, values, low in zip(("refractive_index", "group_index"), indices, (1.0001, 1.0), strict=True):
+            for value in values:
+                in_range(name, value, low, 2.0)
+        #: Runs of layers of one refractive and one group index.
+        self.strata = Strata(self.column.tops, *indices)
+        #: Indices of the uppermost layer, where the sea surface is.
+        self.refractive_index, self.group_index = (float(values[0]) for values in indices)
         kind = props.get("phase_function", "fournier_forand")
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
         if kind not in KINDS:
@@ -194,14 +210,17 @@ def _column(props: mi.Properties) -> WaterColumn:
     return read_profile(path).layers(tolerance)
 
 
-def _water_scattering(text: float | str, column: WaterColumn) -> np.ndarray:
+def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
+    """Return one value a layer of what is given for all or for each."""
+    values = np.atleast_1d(finite_array(name, given.replace(",", " ").split() if isinstance(given, str) else given))
+    if values.size not in (1, count):
+        raise ValueError(f"{name} has {values.size} values but must have 1 or {count}, one a layer")
+    return np.broadcast_to(values, count)
+
+
+def _water_scattering(given: float | str, column: WaterColumn) -> np.ndarray:
     """Return what the water itself scatters [1/m], one value a layer."""
-    values = np.atleast_1d(
-        finite_array("water_scattering", text.replace(",", " ").split() if isinstance(text, str) else text)
-    )
-    if values.size not in (1, column.count):
-        raise ValueError(f"water_scattering has {values.size} values but must have 1 or {column.count}, one a layer")
-    water = np.broadcast_to(values, column.count)
+    water = _per_layer("water_scattering", given, column.count)
     for layer in np.flatnonzero((water < 0) | (water > column.scattering))[:1]:
         raise ValueError(
             f"water_scattering = {water[layer]:g} must be at least 0 and at most scattering = "

@@ -11,9 +11,10 @@ import numpy as np
 from mitransient_lidar.optics.checks import in_range, whole
 from mitransient_lidar.transport.connection import LaserDirection, SurfaceLobe, laser_through
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.path import Path, advance, optical_length
+from mitransient_lidar.transport.path import Path, advance, count_turns, optical_length
 from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.strata import ascend
 from mitransient_lidar.transport.streams import pass_streams
 from mitransient_lidar.transport.system import LidarScene
 from mitransient_lidar.transport.walk import scattering_event
@@ -187,6 +188,8 @@ class LidarVolpath(mi.CppADIntegrator):
             length=mi.Float(0),
             throughput=mi.Float(1),
             scatterings=mi.UInt32(0),
+            turns=mi.UInt32(0),
+            stratum=mi.UInt32(0),
             rays=mi.UInt32(0),
             active=start.weight > 0,
             lobe_ratio=mi.Float(0),
@@ -214,10 +217,11 @@ class LidarVolpath(mi.CppADIntegrator):
         # Advance to whichever comes first, a scattering event or a surface.
         first = path.length == 0
         si = system.scene.ray_intersect(path.ray(), path.active)
-        scattered, distance, transmittance = self._fly(system, path, si, rng)
-        path.active &= scattered | si.is_valid()
+        scattered, at_edge, distance, transmittance = self._fly(system, path, si, rng)
+        path.active &= scattered | at_edge | si.is_valid()
         in_leg = mi.Bool(path.in_water)
-        advance(path, system, distance, dr.select(scattered, path.point + path.direction * distance, si.p))
+        free = scattered | at_edge
+        advance(path, system, distance, dr.select(free, path.point + path.direction * distance, si.p))
         # Light that has passed beside the surface patch is lost.
         path.active &= ~system.beside_surface(path.point.z, in_leg)
         path.scatterings += dr.select(scattered, mi.UInt32(1), 0)
@@ -226,7 +230,8 @@ class LidarVolpath(mi.CppADIntegrator):
 
         # What happens here: scattering, a solid, or the sea surface.
         scattered &= path.active
-        hit = path.active & ~scattered
+        at_edge &= path.active
+        hit = path.active & ~(scattered | at_edge)
         at_sea = hit & system.is_surface(si.shape)
         submerged = scattered | (hit & in_leg & ~at_sea)
         flight = system.water.flight if system.water is not None else None
@@ -238,31 +243,39 @@ class LidarVolpath(mi.CppADIntegrator):
         # Connect: from under water through the surface, from the surface and from solids in the air directly.
         laser = lobe.towards_laser(path.point)
         up, lobe_pdf = lobe.sample(laser, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        up, lobe_pdf = lobe.below(up, lobe_pdf, path.stratum)
         tried = submerged & (lobe_pdf > 0) if self.connection != "walk" else mi.Bool(False)
         turn = self._turn(laser, si, mei, phase, scattered, tried, up)
-        above = system.scene.ray_intersect(dr.select(scattered, mi.Ray3f(path.point, up), si.spawn_ray(up)), tried)
-        met = tried & above.is_valid() & system.is_surface(above.shape)
+        ascent = ascend(system, dr.select(scattered, mi.Ray3f(path.point, up), si.spawn_ray(up)), path.stratum, tried)
+        above = system.scene.ray_intersect(ascent.ray, tried)
+        risen = tried & (ascent.factor > 0)
+        met = risen & above.is_valid() & system.is_surface(above.shape)
         # Where the surface patch has ended, a flat sea stands in for it in the account of what is lost.
-        lost = tried & ~above.is_valid() & (up.z > 0)
-        leg = dr.select(lost, dr.maximum(path.depth, 0) / up.z, above.t)
-        clear = dr.exp(-self._optical_depth(system, path.point, up, leg, met | lost))
+        lost = risen & ~above.is_valid() & (ascent.ray.d.z > 0)
+        leg = dr.select(lost, dr.maximum(-ascent.ray.o.z, 0) / ascent.ray.d.z, above.t)
+        crossed = ascent.optical_depth + self._optical_depth(system, ascent.ray.o, ascent.ray.d, leg, met | lost)
+        clear = dr.exp(-crossed)
         combined = lobe_pdf + (turn.pdf * clear if self.connection == "combined" else 0)
-        factor = dr.select(met, turn.value * clear / combined, self._walk_weight(path, transmittance))
+        connected = turn.value * clear / combined * ascent.factor
+        factor = dr.select(met, connected, self._walk_weight(path, transmittance))
         crossing = dr.select(met, above, si)
         direct = hit & (at_sea | ~in_leg)
         radiance, air_length = laser_through(system, crossing, met | direct)
-        water_length = dr.select(met, optical_length(system, above.t, True), 0)
+        water_length = dr.select(met, ascent.optical_length + optical_length(system, above.t, True), 0)
         energy = dr.select(merged, 0, weight * path.throughput * factor * radiance)
         # One ray along the path, one up to the surface, one to the laser.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(tried, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
         system.film.add_transient(pixel, path.length + water_length + air_length, energy, radiance > 0)
         # The lobe's own density stands for the surface's in what is lost.
-        lobe_share = weight * path.throughput * turn.value * clear / combined * lobe_pdf
-        self._account(system, laser, dr.select(lost, lobe_share, 0), path.point + up * leg)
+        lobe_share = weight * path.throughput * connected * lobe_pdf
+        self._account(system, laser, dr.select(lost, lobe_share, 0), ascent.ray(leg))
 
         # Choose the next direction; beyond the film's end nothing can arrive any more.
-        self._turn_path(system, lobe, laser, path, si, mei, phase, scattered, submerged, at_sea, rng)
+        self._turn_path(system, lobe, laser, path, si, mei, phase, scattered, submerged, at_sea, hit & ~at_sea, rng)
+        if system.strata is not None and system.strata.count > 1:
+            path.lobe_ratio = dr.select(at_edge, path.lobe_ratio / transmittance, path.lobe_ratio)
+            system.strata.bend(path, at_edge & path.active, radiance=True)
         path.active &= path.length + dr.norm(lobe.laser - path.point) < system.film.path_end
         self._roulette(path, rng)
 
@@ -282,15 +295,24 @@ class LidarVolpath(mi.CppADIntegrator):
 
     def _fly(
         self, system: LidarScene, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32
-    ) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Return whether the path scatters before the surface, how far it goes, and the leg's transmittance."""
+    ) -> tuple[mi.Bool, mi.Bool, mi.Float, mi.Float]:
+        """Return how far the path goes, and the transmittance of that leg to the next surface or edge.
+
+        Before these: whether it scatters before, and whether it comes to the edge of its stratum.
+        """
         if system.water is None:
-            return mi.Bool(False), si.t, mi.Float(1)
+            return mi.Bool(False), mi.Bool(False), si.t, mi.Float(1)
         wet = path.active & path.in_water
         distance = system.water.free_flight(system.water.flight, path, rng)
-        scattered = wet & (distance < si.t)
-        to_surface = self._optical_depth(system, path.point, path.direction, si.t, wet & si.is_valid())
-        return scattered, dr.select(scattered, distance, si.t), dr.exp(-to_surface)
+        longest = mi.Float(si.t)
+        at_edge = mi.Bool(False)
+        if system.strata.count > 1:
+            to_edge = system.strata.to_edge(path, wet)
+            at_edge = to_edge < longest
+            longest = dr.minimum(longest, to_edge)
+        scattered = wet & (distance < longest)
+        to_end = self._optical_depth(system, path.point, path.direction, longest, wet & (si.is_valid() | at_edge))
+        return scattered, at_edge & ~scattered, dr.select(scattered, distance, longest), dr.exp(-to_end)
 
     @staticmethod
     def _optical_depth(
@@ -368,11 +390,12 @@ class LidarVolpath(mi.CppADIntegrator):
         scattered: mi.Bool,
         submerged: mi.Bool,
         at_sea: mi.Bool,
+        solid: mi.Bool,
         rng: mi.PCG32,
     ) -> None:
         """Draw the direction in which the path goes on, and update throughput, medium and lobe ratio."""
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        at_surface = path.active & ~scattered
+        at_surface = at_sea | solid
         # Scattering events and rough solids under water: a share of the directions is drawn towards the laser.
         mixed = scattered | (submerged & at_surface & self._is_rough(si))
         broadly = pick < self.turn_share
@@ -380,7 +403,7 @@ class LidarVolpath(mi.CppADIntegrator):
         rest = dr.clip((pick - self.turn_share) / (1 - self.turn_share), 0, 1)
         bs, bsdf_weight = si.bsdf().sample(mi.BSDFContext(), si, dr.select(mixed, rest, pick), u, at_surface)
         direction, pdf = si.to_world(bs.wo), bs.pdf
-        factor = bsdf_weight[0]
+        factor = dr.select(at_surface, bsdf_weight[0], 1)
         if phase is not None:
             natural, _, _ = phase.sample(mi.PhaseFunctionContext(), mei, rest, u, scattered)
             natural = dr.select(scattered, natural, direction)
@@ -399,12 +422,15 @@ class LidarVolpath(mi.CppADIntegrator):
             if not system.has_unmerged_solids:
                 path.active &= ~(path.pristine & scattered)
         path.pristine &= ~met
-        path.lobe_ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf(laser, direction) / pdf, 0)
+        ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf_below(laser, direction, path.stratum) / pdf, 0)
+        path.lobe_ratio = dr.select(at_surface | scattered, ratio, path.lobe_ratio)
         path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
         path.throughput *= dr.select(path.active, factor, 1)
         path.active &= path.throughput > 0
         path.point = dr.select(at_surface, si.spawn_ray(direction).o, path.point)
-        path.direction = dr.select(path.active, direction, path.direction)
+        before = mi.Float(path.direction.z)
+        path.direction = dr.select(path.active & (at_surface | scattered), direction, path.direction)
+        count_turns(path, before)
 
     def _roulette(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths of little throughput at random, and give their share to the ones that go on."""

@@ -51,6 +51,7 @@ class SurfaceLobe:
         self.laser = opaque_point(system.transmitter.pose.origin)
         self.index = float(system.refractive_index)
         self.slope_variance = float(system.slope_variance)
+        self._strata = system.strata
 
     def towards_laser(self, point: mi.Point3f) -> LaserDirection:
         """Return the laser's direction in the air and, refracted, in the water.
@@ -110,6 +111,17 @@ class SurfaceLobe:
         valid = (normal.z > 0) & (cos_water > 0) & (dr.dot(laser.in_air, normal) > 0)
         cos3 = normal.z * normal.z * normal.z
         return dr.select(valid, slopes / cos3 * jacobian, 0)
+
+    def below(self, direction: mi.Vector3f, density: mi.Float, stratum: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """Return a sampled direction and its density [1/sr] as they are in the stratum of the point."""
+        return (direction, density) if self._strata is None else self._strata.from_first(direction, density, stratum)
+
+    def pdf_below(self, laser: LaserDirection, direction: mi.Vector3f, stratum: mi.UInt32) -> mi.Float:
+        """Return the density [1/sr] of a direction in the stratum of the point."""
+        if self._strata is None:
+            return self.pdf(laser, direction)
+        first, factor = self._strata.to_first(direction, stratum)
+        return self.pdf(laser, first) * factor
 
 
 def laser_through(system: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:

@@ -51,6 +51,7 @@ def merge_in_water(
         bubbles = dr.select(water.plume.holds(points.point), mi.Float(water.plume.scattering), 0)
         scatterers.append((water.plume_phase, bubbles))
     absorption = water.absorption_flight.attenuation(layer)
+    stratum = water.strata.at(-points.point.z)
     weight = points.weight / volume
     first, end = photons.bucket(bucket, mi.Bool(True))
 
@@ -65,7 +66,7 @@ def merge_in_water(
         # The photon goes on to the plane across its direction through the point: times do not blur over the cell.
         beyond = dr.dot(points.point, photon.direction) - photon.place
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
-        length = points.length + photon.length + optical_length(system, beyond, True)
+        length = points.length + photon.length + optical_length(system, beyond, True, stratum)
         _add(system, lost, points.label, length, energy, points.weight, photon, active)
         return (index + 1,)
 

@@ -26,6 +26,10 @@ class Path:
         Product of the path's factors since the receiver.
     scatterings
         Number of scattering events in the water so far.
+    turns
+        How often the path has changed between going down and going up.
+    stratum
+        Stratum of the water in which the next leg runs, if it runs in water.
     rays
         Number of rays traced so far, for the bench.
     active
@@ -38,6 +42,8 @@ class Path:
     length: mi.Float
     throughput: mi.Float
     scatterings: mi.UInt32
+    turns: mi.UInt32
+    stratum: mi.UInt32
     rays: mi.UInt32
     active: mi.Bool
 
@@ -56,9 +62,20 @@ class Path:
         return mi.Ray3f(self.point, self.direction)
 
 
-def optical_length(system: LidarScene, distance: mi.Float, in_water: mi.Bool | bool) -> mi.Float:
-    """Return the optical length [m] of a leg: its distance times the group index of the medium that it crosses."""
-    return distance * dr.select(mi.Bool(in_water), mi.Float(system.group_index), 1)
+def optical_length(
+    system: LidarScene, distance: mi.Float, in_water: mi.Bool | bool, stratum: mi.UInt32 | None = None
+) -> mi.Float:
+    """Return the optical length [m] of a leg: its distance times the group index of the medium that it crosses.
+
+    In water that is the index of a stratum, by default of the first.
+    """
+    group = system.group_index if stratum is None or system.strata is None else system.strata.group(stratum)
+    return distance * dr.select(mi.Bool(in_water), mi.Float(group), 1)
+
+
+def count_turns(path: Path, before: mi.Float) -> None:
+    """Count a turn where the vertical component of the direction, `before` the last vertex, has changed its sign."""
+    path.turns += dr.select(path.active & (before * path.direction.z < 0), mi.UInt32(1), 0)
 
 
 def advance(path: Path, system: LidarScene, distance: mi.Float, point: mi.Point3f) -> None:
@@ -75,5 +92,6 @@ def advance(path: Path, system: LidarScene, distance: mi.Float, point: mi.Point3
     point
         The vertex at its end [m]. On surfaces the intersection is more accurate than distance times direction.
     """
-    path.length = dr.select(path.active, path.length + optical_length(system, distance, path.in_water), path.length)
+    leg = optical_length(system, distance, path.in_water, path.stratum)
+    path.length = dr.select(path.active, path.length + leg, path.length)
     path.point = dr.select(path.active, point, path.point)

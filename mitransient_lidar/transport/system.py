@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.transport.opaque import is_one_of, opaque
 from mitransient_lidar.transport.receiving import Receiver
+from mitransient_lidar.transport.strata import Strata
 
 #: Total slope variance assumed for a surface that does not tell its own: a broad lobe serves any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
@@ -86,6 +87,8 @@ class LidarScene:
         if sensor.receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
             raise ValueError("altitude: transmitter and receiver must be above the mean sea level z = 0")
         _check_cells(surfaces, transmitters[0])
+        if waters:
+            _check_layers(scene, surfaces, waters[0])
         variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
         return cls(
             scene,
@@ -124,12 +127,17 @@ class LidarScene:
 
     @property
     def refractive_index(self) -> float:
-        """Refractive index of the water, 1 without water."""
+        """Refractive index of the water, of its first stratum, 1 without water."""
         return self.water.refractive_index if self.water is not None else 1.0
 
     @property
+    def strata(self) -> Strata | None:
+        """Strata of the water, None without water."""
+        return self.water.strata if self.water is not None else None
+
+    @property
     def group_index(self) -> float:
-        """Group index of the water, 1 without water."""
+        """Group index of the water, of its first stratum, 1 without water."""
         return self.water.group_index if self.water is not None else 1.0
 
     def beside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
@@ -156,4 +164,20 @@ def _check_cells(surfaces: list[mi.Shape], transmitter: mi.Emitter) -> None:
             raise ValueError(
                 f"cell_size = {cell:.3g} m is coarser than the beam's footprint on the sea, {footprint:.3g} m: "
                 "it must be finer, or 'auto'"
+            )
+
+
+def _check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: mi.Medium) -> None:
+    """Refuse layers below all solids, and strata that begin within the waves."""
+    solids = [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
+    lowest = min((float(solid.bbox().min.z) for solid in solids), default=-np.inf)
+    deepest = float(water.column.tops[-1])
+    if not water.from_profile and -deepest <= lowest:
+        raise ValueError(f"tops = {deepest:g} m is a layer below the bottom: it must be less than {-lowest:g} m")
+    trough = min(float(surface.bbox().min.z) for surface in surfaces)
+    for edge in water.strata.edges[:1]:
+        if -edge >= trough:
+            raise ValueError(
+                f"refractive_index changes at {edge:g} m, within the waves: "
+                f"it must do so below their troughs, {-trough:.3g} m"
             )

@@ -120,10 +120,12 @@ class Tracks:
         along = dr.fma(mi.Float(index - first), self.spacing, offset)
         direction = mi.Vector3f(dx, dy, dz)
         absorbed = self._water.absorption_flight.optical_depth(-z, -dz, along)
+        # A leg runs in one stratum, and may begin on its edge.
+        stratum = self._water.strata.at(-z - 0.5 * dz * along)
         return TrackPoints(
             mi.Point3f(x, y, z) + direction * along,
             direction,
-            length + optical_length(self.system, along, True),
+            length + optical_length(self.system, along, True, stratum),
             throughput * dr.exp(-absorbed) * self.spacing,
             competition,
             dr.gather(mi.UInt32, self._label, leg),

@@ -11,8 +11,9 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.flight import LayeredFlight
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.path import Path, advance
+from mitransient_lidar.transport.path import Path, advance, count_turns
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.strata import Strata
 from mitransient_lidar.transport.system import LidarScene
 from mitransient_lidar.transport.tracks import Tracks
 
@@ -56,6 +57,8 @@ def start_walk(pose: Pose, direction: mi.Vector3f, throughput: mi.Float, offset:
         length=mi.Float(0),
         throughput=throughput,
         scatterings=mi.UInt32(0),
+        turns=mi.UInt32(0),
+        stratum=mi.UInt32(0),
         rays=mi.UInt32(0),
         active=(throughput > 0) & dr.full(mi.Bool, True, dr.width(direction)),
         competition=mi.Float(0),
@@ -106,6 +109,7 @@ class Walk:
     def __init__(self, system: LidarScene, mode: mi.TransportMode, destination: Pose) -> None:
         self.system = system
         self._water: Any = system.water
+        self._strata: Strata = self._water.strata
         self.context = mi.BSDFContext(mode)
         self.adjoint = mode == mi.TransportMode.Importance
         self.destination = opaque_point(destination.origin)
@@ -141,18 +145,20 @@ class Walk:
 
         def body(path: WalkPath, rng: mi.PCG32) -> tuple[WalkPath, mi.PCG32]:
             first, wet = path.length == 0, path.active & path.in_water
-            si, scattered, beside, length = self._fly(path, rng, first, wet)
+            si, scattered, beside, at_edge, length = self._fly(path, rng, first, wet)
             useful = dr.minimum(length, self._longest(path))
             path.offset = tracks.add(path, useful, label, wet & path.active & path.pristine)
-            self._arrive(path, si, scattered | beside, length, wet)
+            self._arrive(path, si, scattered | beside | at_edge, length, wet)
             if at_first is not None:
                 at_first(path, si, first & path.active & ~beside)
-            met = path.active & ~(scattered | beside)
+            met = path.active & ~(scattered | beside | at_edge)
             at_sea = met & self.system.is_surface(si.shape)
             solid = met & ~at_sea
             at_solid(path, si, solid & wet)
             self._turn(path, rng, si, scattered & path.active, at_sea, solid)
             self._enter_beside(path, beside)
+            if self._strata.count > 1:
+                self._strata.bend(path, at_edge & path.active, radiance=not self.adjoint)
             if not past_solids:
                 path.active &= path.pristine
             away = dr.norm(self.destination - path.point)
@@ -164,17 +170,27 @@ class Walk:
 
     def _fly(
         self, path: WalkPath, rng: mi.PCG32, first: mi.Bool, wet: mi.Bool
-    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool, mi.Bool, mi.Float]:
-        """Return what the path would meet, whether it scatters before or passes beside the sea, and how far it goes."""
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool, mi.Bool, mi.Bool, mi.Float]:
+        """Return what the path would meet, and how far it goes.
+
+        Between these: whether it scatters before, passes beside the sea, or comes to the edge of its stratum.
+        """
         si = self.system.scene.ray_intersect(path.ray(), path.active)
         path.rays += dr.select(path.active, mi.UInt32(1), 0)
         distance = self._water.free_flight(self._water.scattering_flight, path, rng)
         scattered = wet & (distance < si.t)
+        at_edge = mi.Bool(False)
+        if self._strata.count > 1:
+            to_edge = self._strata.to_edge(path, wet)
+            at_edge = to_edge < dr.minimum(distance, si.t)
+            scattered &= ~at_edge
         beside = path.active & first & (path.downward > 0)
         beside &= ~si.is_valid() | self.system.beside_surface(si.p.z, mi.Bool(False))
-        path.active &= scattered | beside | si.is_valid()
-        length = dr.select(beside, -path.depth / path.downward, si.t)
-        return si, scattered & path.active, beside, dr.select(scattered, distance, length)
+        path.active &= scattered | beside | at_edge | si.is_valid()
+        length = dr.select(beside, -path.depth / path.downward, dr.select(scattered, distance, si.t))
+        if self._strata.count > 1:
+            length = dr.select(at_edge, to_edge, length)
+        return si, scattered & path.active, beside, at_edge, length
 
     def _longest(self, path: WalkPath) -> mi.Float:
         """Return how far the next leg in water can go before its light comes too late for the record [m].
@@ -184,7 +200,7 @@ class Walk:
         away = self.destination - path.point
         distance = dr.norm(away)
         spare = self.system.film.path_end - path.length - distance
-        return spare / (self.system.group_index - dr.dot(away, path.direction) / distance)
+        return spare / (self._strata.group(path.stratum) - dr.dot(away, path.direction) / distance)
 
     def _arrive(
         self, path: WalkPath, si: mi.SurfaceInteraction3f, free: mi.Bool, length: mi.Float, wet: mi.Bool
@@ -228,7 +244,9 @@ class Walk:
         path.pristine &= ~(solid & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null))
         path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
         path.point = dr.select(at_surface, si.spawn_ray(direction).o, path.point)
+        before = mi.Float(path.direction.z)
         path.direction = dr.select(path.active & (at_surface | scattered), direction, path.direction)
+        count_turns(path, before)
 
     def _enter_beside(self, path: WalkPath, beside: mi.Bool) -> None:
         """Let paths that pass beside the surface patch enter still water, to learn what is lost there."""
