@@ -157,8 +157,8 @@ def render(
     goal = Goal.from_options(target_error, max_time, passes)
     variants.set_variant(variant)
     loaded, name, parameters = load_scene(scene, params)
-    engine = _integrator(loaded, integrator)
-    sensor = _first_sensor(loaded)
+    engine = choose_integrator(loaded, integrator)
+    sensor = first_sensor(loaded)
     with readable_errors():
         system, view = engine.prepare(loaded, sensor)
     from mitransient_lidar.transport.probe import probe_echoes
@@ -178,7 +178,7 @@ def render(
         with InterruptAfterPass() as interruption:
             while not goal.reached(energy.count, time.perf_counter() - start, p95):
                 with readable_errors():
-                    engine.render(loaded, sensor, seed=_pass_seed(seed, energy.count), develop=False)
+                    engine.render(loaded, sensor, seed=pass_seed(seed, energy.count), develop=False)
                 histogram = film.energy().reshape(system.receiver.pixels.count, film.bin_count)
                 energy.add(histogram)
                 power.add(waveform(histogram, film.bin_width_ns, kernel))
@@ -232,7 +232,7 @@ def render(
     )
 
 
-def _integrator(scene: mi.Scene, wanted: Any) -> Any:
+def choose_integrator(scene: mi.Scene, wanted: Any) -> Any:
     """Return the integrator to use: the caller's choice or the scene's own."""
     import mitsuba as mi
 
@@ -248,14 +248,14 @@ def _integrator(scene: mi.Scene, wanted: Any) -> Any:
     return engine
 
 
-def _first_sensor(scene: mi.Scene) -> mi.Sensor:
+def first_sensor(scene: mi.Scene) -> mi.Sensor:
     sensors = scene.sensors()
     if not sensors:
         raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")
     return sensors[0]
 
 
-def _pass_seed(seed: int, number: int) -> int:
+def pass_seed(seed: int, number: int) -> int:
     """Return a seed for one pass, unlike that of any other pass of any other seed."""
     sequence = np.random.SeedSequence([int(seed) & 0xFFFFFFFFFFFFFFFF, number])
     return int(sequence.generate_state(1, np.uint64)[0])

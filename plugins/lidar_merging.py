@@ -16,6 +16,7 @@ from mitransient_lidar.transport.merging import merge_in_water, merger_at_solids
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.photons import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.sorting import MOST_ORDERS, receive
 from mitransient_lidar.transport.streams import pass_streams
 from mitransient_lidar.transport.system import LidarScene
 from mitransient_lidar.transport.tracks import Tracks
@@ -116,6 +117,8 @@ class LidarMerging(mi.CppADIntegrator):
         self.photons_per_pass = whole("photons_per_pass", props.get("photons_per_pass", 2**15), 1024, 2**28)
         self.cell_size = non_negative("cell_size", props.get("cell_size", 0.0))
         self.point_spacing = non_negative("point_spacing", props.get("point_spacing", 0.0))
+        #: Orders of scattering that are told apart, 0 for none.
+        self.orders = 0
         #: Energy [J] that the last pass would have received, had the surface patch not ended.
         self.lost = mi.Float64(0)
         #: Number of rays that the last pass traced.
@@ -127,7 +130,7 @@ class LidarMerging(mi.CppADIntegrator):
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[LidarScene, ViewSampler]:
         """Find and check the parts of a scene, and lay out cells; done once for a scene and sensor."""
         if self._prepared is None or self._prepared[0] is not scene or self._prepared[1] is not sensor:
-            system = LidarScene.from_scene(scene, sensor)
+            system = LidarScene.from_scene(scene, sensor, self.orders)
             view = ViewSampler(system.receiver, system.transmitter)
             if system.water is not None:
                 self._lay_out(system, view)
@@ -138,6 +141,13 @@ class LidarMerging(mi.CppADIntegrator):
         """Forget the scene, which holds this integrator and could otherwise never be freed."""
         self._prepared = None
         self._whole.release()
+
+    def sort_by_order(self, orders: int) -> None:
+        """Tell this many orders of scattering apart, 0 to 62 (0: none): see `scattering_orders`."""
+        self._prepared = None
+        self.orders = whole("orders", orders, 0, MOST_ORDERS)
+        self._remainder.sort_by_order(orders)
+        self._whole.sort_by_order(orders)
 
     def _lay_out(self, system: LidarScene, view: ViewSampler) -> None:
         """Choose points and cells for a scene."""
@@ -182,7 +192,7 @@ class LidarMerging(mi.CppADIntegrator):
                 self._whole.render(scene, sensor, number, spp, develop=False)
                 self.lost, self.rays = self._whole.lost, self._whole.rays
             else:
-                film.prepare_pixels(pixels.count, system.transmitter.energy, pixels.grid)
+                system.prepare_film()
                 while not self._sample(system, view, count, number):
                     film.clear()
         if evaluate:
@@ -212,7 +222,7 @@ class LidarMerging(mi.CppADIntegrator):
         count, room = self.photons_per_pass, self._room
         rng = pass_streams(seed, _LIGHT_STREAM, count)
         tracks = Tracks(system, self._spacing, int(room.light_legs * count))
-        hits = PhotonBuffer(int(room.hits * count))
+        hits = PhotonBuffer(int(room.hits * count), system.sorting)
         direction, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
         path = start_walk(system.transmitter.pose, direction, energy, opaque(self._spacing) * rng.next_float32())
         walk = Walk(system, mi.TransportMode.Importance, system.receiver.pose)
@@ -253,7 +263,10 @@ class LidarMerging(mi.CppADIntegrator):
         def see(path: WalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             radiance, air = laser_through(system, si, active)
             path.rays += dr.select(active, mi.UInt32(1), 0)
-            system.film.add_transient(start.pixel, path.length + air, path.throughput * radiance, radiance > 0)
+            # Seen by its first leg: no event, and the one turn that brings it back.
+            none, one = mi.UInt32(0), mi.UInt32(1)
+            energy = path.throughput * radiance
+            receive(system, start.pixel, none, one, path.length + air, energy, radiance > 0)
 
         merge = merger_at_solids(system, patches, on_patches, start.pixel, rng, self.lost)
         path = walk.run(path, rng, start.pixel, tracks, at_solid=merge, at_first=see, past_solids=False)

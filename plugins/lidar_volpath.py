@@ -14,6 +14,7 @@ from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path, advance, count_turns, optical_length
 from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.receiving import ViewSampler
+from mitransient_lidar.transport.sorting import MOST_ORDERS, receive
 from mitransient_lidar.transport.strata import ascend
 from mitransient_lidar.transport.streams import pass_streams
 from mitransient_lidar.transport.system import LidarScene
@@ -116,6 +117,8 @@ class LidarVolpath(mi.CppADIntegrator):
         self.connection = props.get("connection", "combined")
         if self.connection not in _CONNECTIONS:
             raise ValueError(f"connection = {self.connection!r} must be one of {', '.join(_CONNECTIONS)}")
+        #: Orders of scattering that are told apart, 0 for none.
+        self.orders = 0
         self.unmerged = bool(props.get("unmerged", False))
         #: Energy [J] that the last pass would have received, had the surface patch not ended.
         self.lost = mi.Float64(0)
@@ -126,9 +129,14 @@ class LidarVolpath(mi.CppADIntegrator):
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[LidarScene, ViewSampler]:
         """Find and check the parts of a scene; done once for a scene and sensor."""
         if self._prepared is None or self._prepared[0] is not scene or self._prepared[1] is not sensor:
-            system = LidarScene.from_scene(scene, sensor)
+            system = LidarScene.from_scene(scene, sensor, self.orders)
             self._prepared = scene, sensor, system, ViewSampler(system.receiver, system.transmitter)
         return self._prepared[2], self._prepared[3]
+
+    def sort_by_order(self, orders: int) -> None:
+        """Tell this many orders of scattering apart, 0 to 62 (0: none): see `scattering_orders`."""
+        self._prepared = None
+        self.orders = whole("orders", orders, 0, MOST_ORDERS)
 
     def release(self) -> None:
         """Forget the scene, which holds this integrator and could otherwise never be freed."""
@@ -167,8 +175,7 @@ class LidarVolpath(mi.CppADIntegrator):
             sensor = scene.sensors()[sensor]
         system, view = self.prepare(scene, sensor)
         count = spp * system.receiver.pixels.count if spp > 0 else self.paths_per_pass
-        pixels, emitted = system.receiver.pixels, system.transmitter.energy
-        system.film.prepare_pixels(pixels.count, emitted, pixels.grid)
+        system.prepare_film()
         self.lost = dr.zeros(mi.Float64, 1)
         with dr.suspend_grad():
             self.sample(system, view, count, int(np.array(seed).item()))
@@ -266,7 +273,10 @@ class LidarVolpath(mi.CppADIntegrator):
         # One ray along the path, one up to the surface, one to the laser.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(tried, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
-        system.film.add_transient(pixel, path.length + water_length + air_length, energy, radiance > 0)
+        # On to the laser the path goes up: from a vertex where it came down it turns.
+        turns = path.turns + dr.select(path.downward > 0, mi.UInt32(1), 0)
+        length = path.length + water_length + air_length
+        receive(system, pixel, path.scatterings, turns, length, energy, radiance > 0)
         # The lobe's own density stands for the surface's in what is lost.
         lobe_share = weight * path.throughput * connected * lobe_pdf
         self._account(system, laser, dr.select(lost, lobe_share, 0), ascent.ray(leg))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -10,6 +11,7 @@ import mitsuba as mi
 from mitransient_lidar.transport.cells import SolidPatches, WaterCells
 from mitransient_lidar.transport.path import optical_length
 from mitransient_lidar.transport.photons import Photon, PhotonMap
+from mitransient_lidar.transport.sorting import receive
 from mitransient_lidar.transport.system import LidarScene
 from mitransient_lidar.transport.tracks import TrackPoints, Tracks
 from mitransient_lidar.transport.walk import Action, WalkPath
@@ -21,12 +23,12 @@ def store_points(tracks: Tracks, count: int, cells: WaterCells) -> PhotonMap | N
         return None
     index = dr.arange(mi.UInt32, count)
     bucket, _, _ = cells.locate(tracks.points(index).point)
-    photons = PhotonMap(cells.grid.buckets, bucket)
+    photons = PhotonMap(cells.grid.buckets, bucket, tracks.system.sorting is not None)
     # Worked out anew: reading the legs again costs less than keeping the points.
     points = tracks.points(index)
     _, tag, _ = cells.locate(points.point)
     place = dr.dot(points.point, points.direction)
-    photons.fill(Photon(points.direction, points.length, points.weight, points.competition, place), tag)
+    photons.fill(Photon(points.direction, points.length, points.weight, points.competition, place, points.label), tag)
     return photons
 
 
@@ -52,6 +54,7 @@ def merge_in_water(
         scatterers.append((water.plume_phase, bubbles))
     absorption = water.absorption_flight.attenuation(layer)
     stratum = water.strata.at(-points.point.z)
+    half = _Half.of_points(system, points)
     weight = points.weight / volume
     first, end = photons.bucket(bucket, mi.Bool(True))
 
@@ -67,7 +70,7 @@ def merge_in_water(
         beyond = dr.dot(points.point, photon.direction) - photon.place
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + optical_length(system, beyond, True, stratum)
-        _add(system, lost, points.label, length, energy, points.weight, photon, active)
+        _add(system, lost, half, photon, 1, length, energy, active)
         return (index + 1,)
 
     dr.while_loop((first,), lambda index: index < end, merge, label="merge in the water")
@@ -91,6 +94,7 @@ def merger_at_solids(
             return
         patch = patches.locate(si)
         first, end = photons.bucket(patch.bucket, active)
+        half = _Half(pixel, path.scatterings, path.turns, path.direction, path.weight)
         weight = path.weight * patches.inverse_share(patch, si.shape, rng, active & (first < end)) / patch.area
 
         def add(index: mi.UInt32) -> tuple[mi.UInt32]:
@@ -101,7 +105,7 @@ def merger_at_solids(
             # Mitsuba's BSDFs hold the cosine, and photons have it already.
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / dr.abs(outgoing.z)
             energy = weight * photon.weight * bsdf
-            _add(system, lost, pixel, path.length + photon.length, energy, path.weight, photon, within & (bsdf > 0))
+            _add(system, lost, half, photon, 0, path.length + photon.length, energy, within & (bsdf > 0))
             return (index + 1,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge at solids")
@@ -109,17 +113,44 @@ def merger_at_solids(
     return merge
 
 
+@dataclass(frozen=True)
+class _Half:
+    """The receiver's half of paths that are merged: pixel, events and turns so far, direction and weight."""
+
+    pixel: mi.UInt32
+    scatterings: mi.UInt32
+    turns: mi.UInt32
+    direction: mi.Vector3f
+    weight: mi.Float
+
+    @classmethod
+    def of_points(cls, system: LidarScene, points: TrackPoints) -> _Half:
+        """Return the halves that end at points of tracks."""
+        none = mi.UInt32(0)
+        label = system.sorting.unpack(points.label) if system.sorting is not None else (points.label, none, none)
+        return cls(*label, points.direction, points.weight)
+
+
 def _add(
     system: LidarScene,
     lost: mi.Float64,
-    pixel: mi.UInt32,
+    half: _Half,
+    photon: Photon,
+    events: int,
     length: mi.Float,
     energy: mi.Float,
-    weight: mi.Float,
-    photon: Photon,
     active: mi.Bool,
 ) -> None:
-    """Add a merged path to the film, or to what is lost where one of its halves passed beside the surface."""
-    virtual = (weight < 0) | (photon.weight < 0)
-    system.film.add_transient(pixel, length, energy, active & ~virtual)
+    """Add a merged path, with 0 or 1 scattering `events` at the merge, to the film.
+
+    Where one of its halves passed beside the surface it goes to what is lost instead.
+    """
+    virtual = (half.weight < 0) | (photon.weight < 0)
+    order, turns = half.scatterings, half.turns
+    if system.sorting is not None:
+        _, before, turned = system.sorting.unpack(photon.label)
+        # Light that comes down goes on against the half's direction: it turns where both point down, or both up.
+        turns = turns + turned + dr.select(photon.direction.z * half.direction.z > 0, mi.UInt32(1), 0)
+        order = order + before + events
+    receive(system, half.pixel, order, turns, length, energy, active & ~virtual)
     dr.scatter_add(lost, mi.Float64(dr.abs(energy)), mi.UInt32(0), active & virtual)

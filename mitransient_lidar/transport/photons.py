@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.cells import Patch
+from mitransient_lidar.transport.sorting import Sorting
 from mitransient_lidar.transport.walk import WalkPath
 
 #: Numbers a photon takes in memory.
@@ -30,6 +31,8 @@ class Photon:
         Its path's, see :class:`~mitransient_lidar.transport.walk.WalkPath`.
     place
         Where it is, along its direction: scalar product of position and direction [m].
+    label
+        Its path's events and turns (`sorting.Sorting.pack`), 0 where light is not sorted.
     """
 
     direction: mi.Vector3f
@@ -37,6 +40,7 @@ class Photon:
     weight: mi.Float
     competition: mi.Float
     place: mi.Float
+    label: mi.UInt32
 
 
 class PhotonMap:
@@ -48,9 +52,11 @@ class PhotonMap:
         Number of buckets.
     bucket
         Bucket of each photon, shape (photons,).
+    labelled
+        Whether to keep labels.
     """
 
-    def __init__(self, buckets: int, bucket: mi.UInt32) -> None:
+    def __init__(self, buckets: int, bucket: mi.UInt32, labelled: bool) -> None:
         self.count = dr.width(bucket)
         counts = dr.zeros(mi.UInt32, buckets)
         self._bucket = bucket
@@ -58,6 +64,7 @@ class PhotonMap:
         dr.eval(self._rank, self._bucket, counts)
         self._end = dr.cumsum(counts)
         self._record = mi.Float()
+        self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
 
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
         """Store the photons in the order of their buckets; within one only those of one tag belong together."""
@@ -67,7 +74,9 @@ class PhotonMap:
         worth = mi.Vector4f(photon.weight, photon.competition, dr.reinterpret_array(mi.Float, tag), photon.place)
         dr.scatter(self._record, where, 2 * place)
         dr.scatter(self._record, worth, 2 * place + 1)
-        dr.eval(self._record, self._end)
+        if self._label is not None:
+            dr.scatter(self._label, photon.label, place)
+        dr.eval(self._record, self._end, self._label)
         self._bucket, self._rank = mi.UInt32(), mi.UInt32()
 
     def bucket(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
@@ -79,7 +88,9 @@ class PhotonMap:
         """Return a photon and its tag."""
         x, y, z, length = dr.gather(mi.Vector4f, self._record, 2 * index, active)
         weight, competition, tag, place = dr.gather(mi.Vector4f, self._record, 2 * index + 1, active)
-        return Photon(mi.Vector3f(x, y, z), length, weight, competition, place), dr.reinterpret_array(mi.UInt32, tag)
+        label = mi.UInt32(0) if self._label is None else dr.gather(mi.UInt32, self._label, index, active)
+        photon = Photon(mi.Vector3f(x, y, z), length, weight, competition, place, label)
+        return photon, dr.reinterpret_array(mi.UInt32, tag)
 
 
 class PhotonBuffer:
@@ -89,12 +100,16 @@ class PhotonBuffer:
     ----------
     capacity
         Number of photons for which there is room; more are counted, and left out.
+    sorting
+        How their labels are made, or None.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, sorting: Sorting | None) -> None:
         self.capacity = capacity
+        self._sorting = sorting
         self._stored = dr.zeros(mi.UInt32, 1)
         self._place = dr.empty(mi.UInt32, 2 * capacity)
+        self._label = dr.empty(mi.UInt32, capacity if sorting is not None else 1)
         self._record = dr.empty(mi.Float, 4 * capacity)
         self._weight = dr.empty(mi.Float, capacity)
 
@@ -106,19 +121,20 @@ class PhotonBuffer:
         dr.scatter(self._place, mi.Point2u(patch.bucket, patch.tag), slot, keep)
         dr.scatter(self._record, where, slot, keep)
         dr.scatter(self._weight, path.weight, slot, keep)
+        if self._sorting is not None:
+            dr.scatter(self._label, self._sorting.pack(mi.UInt32(0), path), slot, keep)
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, None without any, and how many there would have been with enough room."""
-        dr.eval(self._stored, self._place, self._record, self._weight)
+        dr.eval(self._stored, self._place, self._record, self._weight, self._label)
         wanted = int(self._stored[0])
         if wanted == 0:
             return None, 0
         index = dr.arange(mi.UInt32, min(wanted, self.capacity))
         bucket, tag = dr.gather(mi.Point2u, self._place, index)
         x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
-        photons = PhotonMap(buckets, bucket)
-        photons.fill(
-            Photon(mi.Vector3f(x, y, z), length, dr.gather(mi.Float, self._weight, index), mi.Float(0), mi.Float(0)),
-            tag,
-        )
+        photons = PhotonMap(buckets, bucket, self._sorting is not None)
+        label = mi.UInt32(0) if self._sorting is None else dr.gather(mi.UInt32, self._label, index)
+        weight = dr.gather(mi.Float, self._weight, index)
+        photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, mi.Float(0), mi.Float(0), label), tag)
         return photons, wanted

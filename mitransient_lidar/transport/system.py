@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.transport.opaque import is_one_of, opaque
 from mitransient_lidar.transport.receiving import Receiver
+from mitransient_lidar.transport.sorting import Sorting
 from mitransient_lidar.transport.strata import Strata
 
 #: Total slope variance assumed for a surface that does not tell its own: a broad lobe serves any sea.
@@ -36,6 +37,8 @@ class LidarScene:
         Shapes that have the water as interior medium.
     slope_variance
         Total slope variance of the sea, which shapes the proposals of the surface connection.
+    sorting
+        Classes by which the received light is told apart, or None.
     """
 
     scene: mi.Scene
@@ -45,10 +48,11 @@ class LidarScene:
     water: mi.Medium | None
     surfaces: list[mi.Shape]
     slope_variance: float
+    sorting: Sorting | None = None
 
     @classmethod
-    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor) -> LidarScene:
-        """Find the parts in a loaded scene.
+    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor, orders: int = 0) -> LidarScene:
+        """Find the parts in a loaded scene; `orders` of scattering are told apart, 0 for none.
 
         Raises
         ------
@@ -98,7 +102,16 @@ class LidarScene:
             waters[0] if waters else None,
             surfaces,
             max(variances, default=_UNKNOWN_SLOPE_VARIANCE),
+            Sorting(orders) if orders > 0 else None,
         )
+
+    def prepare_film(self) -> None:
+        """Clear the film and make room for the pixels, or for their classes."""
+        pixels, energy = self.receiver.pixels, self.transmitter.energy
+        if self.sorting is None:
+            self.film.prepare_pixels(pixels.count, energy, pixels.grid)
+        else:
+            self.film.prepare_pixels(pixels.count * self.sorting.classes, energy)
 
     @property
     def solids(self) -> list[mi.Shape]:

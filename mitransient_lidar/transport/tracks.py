@@ -34,7 +34,7 @@ class TrackPoints:
     competition
         The path's, see :class:`~mitransient_lidar.transport.walk.WalkPath`.
     label
-        The path's: its pixel.
+        The path's: its pixel, and where light is sorted its events and turns so far (`sorting.Sorting.pack`).
     """
 
     point: mi.Point3f
@@ -91,6 +91,8 @@ class Tracks:
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
         keep = (number > 0) & (slot < self.capacity)
         dr.scatter(self._number, number, slot, keep)
+        if self.system.sorting is not None:
+            label = self.system.sorting.pack(label, path)
         dr.scatter(self._label, label, slot, keep)
         dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.offset), slot, keep)
         course = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
