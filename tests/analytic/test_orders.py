@@ -1,0 +1,63 @@
+"""Received light by order of scattering and by turns: sums, closed form, and both integrators."""
+
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar.scattering_orders import scattering_orders, shares
+
+PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_extent": 200}
+
+
+@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+def test_parts_sum_to_the_whole(integrator):
+    """The classes split the same paths: same seed, same energy in every bin but for rounding of the sums."""
+    parts = scattering_orders("fig09_2x2", PARAMS, orders=3, passes=2, seed=4, integrator=integrator)
+    whole = mitransient_lidar.render("fig09_2x2", params=PARAMS, passes=2, seed=4, integrator=integrator)
+    total = parts["impulse_response"].sum(("turns", "order")).values
+    np.testing.assert_allclose(total, whole["impulse_response"].values, rtol=1e-6, atol=1e-6 * total.max())
+
+
+def test_integrators_agree_by_order_and_turns():
+    """A scattering event or a turn counted at the wrong end of a path would move light between the classes."""
+    results = [
+        scattering_orders("fig09_2x2", PARAMS, orders=6, passes=16, seed=seed, integrator=integrator)
+        for seed, integrator in enumerate(["lidar_merging", "lidar_volpath"])
+    ]
+    energy, variance = (
+        [function(result).sum(("pixel", "time")).values for result in results]
+        for function in (lambda r: r["impulse_response"], lambda r: r["impulse_response_stderr"] ** 2)
+    )
+    # Bins of one pass share paths: their errors add up at worst, in fact to twice what independent bins would give.
+    error = 2 * np.sqrt(variance[0] + variance[1])
+    known = error > 0
+    z = (energy[0] - energy[1])[known] / error[known]
+    assert np.all(np.abs(z) < 3), z
+    assert np.all(error[0, 1:6] < 0.05 * energy[0][0, 1:6])
+    several = shares(results[0])[-1][3]
+    assert 0.001 < several < 0.004
+
+
+def test_unscattered_light_turns_once():
+    parts = scattering_orders("fig09_2x2", PARAMS, orders=2, passes=2)
+    direct = parts["impulse_response"].sel(order=0).sum(("pixel", "time"))
+    assert direct.sel(turns="several") < 1e-3 * direct.sel(turns="one")
+
+
+def test_single_scattering_is_that_of_paths_with_one_event(lidar_scene, passes):
+    """`lidar_volpath` with max_scatterings stops the paths instead of sorting them."""
+    one = {"layout": "1x1"}
+    scene = lidar_scene(integrator={"type": "lidar_volpath"}, rx=one)
+    engine = scene.integrator()
+    engine.sort_by_order(3)
+    sorted_energy = passes(scene, 2).reshape(2, 2, 4, -1)
+    for most in (0, 1, 2):
+        limited = passes(lidar_scene(integrator={"type": "lidar_volpath", "max_scatterings": most}, rx=one), 2)[:, 0]
+        kept = sorted_energy[:, :, : most + 1].sum(axis=(1, 2))
+        np.testing.assert_allclose(kept.sum(axis=1), limited.sum(axis=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "value"), [("orders", 0), ("orders", 63), ("passes", 1)])
+def test_options_out_of_range(name, value):
+    with pytest.raises(ValueError, match=f"{name} = {value} must lie between"):
+        scattering_orders("fig09_2x2", **{name: value})
