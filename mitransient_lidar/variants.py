@@ -24,6 +24,7 @@ _PLUGIN_MODULES = (
     "tabulated",  # first: others derive from it
     "fournier_forand",
     "petzold",
+    "sea_water",
     "measured_phase",
     "two_term_henyey_greenstein",
     "layered_water",

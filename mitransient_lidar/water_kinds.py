@@ -138,17 +138,13 @@ def describe_water(
         "refractive_index": index,
         "group_index": group,
     }
-    scene, lines = "table1", [f"Note: {_CAUTION[kind]}."]
     if kind == "pure":
-        # No Fournier-Forand function scatters half of the light backwards.
-        scene = "table1.xml"
-        lines.append("Put into the medium of a copied scene (mitransient-lidar scenes copy table1):")
-        lines.append('<phase type="rayleigh"/>')
+        parameters["water_scattering"] = found.scattering
     options = " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items())
     return [
         *(f"{name:<30}{number:.5g}" for name, number in rows.items()),
-        *lines,
-        f"mitransient-lidar render {scene} {options}",
+        f"Note: {_CAUTION[kind]}.",
+        f"mitransient-lidar render table1 {options}",
     ]
 
 

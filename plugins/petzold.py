@@ -1,36 +1,53 @@
-"""Phase-function plugin ``petzold``: measured average phase function of ocean particles."""
+"""Phase-function plugin ``petzold``: measured phase functions of natural waters."""
 
 from __future__ import annotations
 
 import mitsuba as mi
-from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
 
+from mitransient_lidar.optics.petzold_waters import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.optics.phase import petzold_average_particle
 from mitransient_lidar.optics.phase_table import PowerLawTable
+from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
+
+_AVERAGE = "average_particle"
 
 
 class Petzold(TabulatedPhaseFunction):
-    r"""Petzold's average-particle phase function (``petzold``).
+    r"""Petzold's measured phase functions (``petzold``).
 
-    The table of Mobley et al. (1993), doi:10.1364/AO.32.007484, after Petzold's (1972) measurements, interpolated in
-    log-log and normalised; below 0.1 degrees it goes on as :math:`\theta^{-1.346}`. Backscatter ratio 0.0183, mean
-    cosine 0.924. The plugin has no parameters.
+    =========  ======  =================================================================================================
+    Parameter  Type    Meaning
+    =========  ======  =================================================================================================
+    water      string  ``average_particle``, or one of the measured waters ``clear`` (ocean off the Bahamas, bb/b
+                       0.044), ``coastal`` (off California, 0.013) and ``turbid`` (San Diego harbour, 0.020).
+                       Default: ``average_particle``
+    =========  ======  =================================================================================================
+
+    Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised; below 0.1 degrees they go on as
+    powers of the angle. The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a
+    backscatter ratio of 0.0183 and a mean cosine of 0.924. The three waters hold the scattering of the water itself.
 
     .. code-block:: xml
 
-        <phase type="petzold"/>
+        <phase type="petzold">
+            <string name="water" value="coastal"/>
+        </phase>
 
     .. code-block:: python
 
-        {'type': 'petzold'}
+        {'type': 'petzold', 'water': 'coastal'}
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props, PowerLawTable.from_function(petzold_average_particle()))
+        self.water = props.get("water", _AVERAGE)
+        if self.water != _AVERAGE and self.water not in PETZOLD_WATERS:
+            raise ValueError(f"water = {self.water!r} must be one of {', '.join([_AVERAGE, *PETZOLD_WATERS])}")
+        measured = petzold_average_particle() if self.water == _AVERAGE else petzold_water(self.water)
+        super().__init__(props, PowerLawTable.from_function(measured))
 
     def to_string(self) -> str:
         """Return a description."""
-        return "Petzold[]"
+        return f"Petzold[water={self.water}]"
 
 
 mi.register_phase("petzold", lambda props: Petzold(props))

@@ -12,6 +12,8 @@ PLUGINS = {
     "fournier_forand": {"type": "fournier_forand", "backscatter_ratio": 0.04},
     "fournier_forand_forward": {"type": "fournier_forand", "backscatter_ratio": 0.0183},
     "petzold": {"type": "petzold"},
+    "petzold_coastal": {"type": "petzold", "water": "coastal"},
+    "sea_water": {"type": "sea_water"},
     "two_term": {"type": "two_term_henyey_greenstein", "weight": 0.95, "g_forward": 0.9, "g_backward": 0.3},
     "hg": {"type": "hg", "g": 0.924},
 }
@@ -20,6 +22,8 @@ MOMENTS = {
     "fournier_forand": (0.86658, 0.0400),
     "fournier_forand_forward": (0.93000, 0.0183),
     "petzold": (0.9241, 0.01826),
+    "petzold_coastal": (0.947, 0.0134),
+    "sea_water": (0.0, 0.5),
     "two_term": (0.95 * 0.9 - 0.05 * 0.3, None),
     "hg": (0.924, 0.016989),
 }
@@ -47,7 +51,7 @@ def sample_angles(name, count=1_000_000):
     return plugin, 2 * np.arcsin(half), wo, np.array(pdf)
 
 
-@pytest.mark.parametrize("name", ["two_term", "hg"])
+@pytest.mark.parametrize("name", ["two_term", "hg", "sea_water"])
 def test_samples_follow_the_density(name):
     sample, density = adapter(mi.load_dict(PLUGINS[name]))
     assert chi_squared(sample, density).run()
@@ -145,6 +149,7 @@ def test_value_is_density_and_sampling_reports_it(name):
     [
         ("fournier_forand", lambda t: closed_form.fournier_forand(t, *closed_form.fournier_forand_parameters(0.04))),
         ("petzold", lambda t: closed_form.petzold_average_particle()(t)),
+        ("sea_water", lambda t: 3 / (4 * np.pi * (3 + 0.925)) * (1 + 0.925 * np.cos(t) ** 2)),
         ("two_term", lambda t: closed_form.two_term_henyey_greenstein(t, 0.95, 0.9, 0.3)),
         ("hg", lambda t: closed_form.henyey_greenstein(t, 0.924)),
     ],

@@ -1,0 +1,129 @@
+"""Phase functions of layers: water and particles mixed, and many functions in one table."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitransient_lidar.optics import phase as closed_form
+from mitransient_lidar.optics.phase_table import PowerLawTable
+from mitransient_lidar.optics.seawater import water_phase_function
+from mitransient_lidar.transport.phase import NumberedPhase
+
+THETA = np.radians([0.1, 1.0, 5.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0])
+
+
+def values(phase, theta=THETA):
+    mei = dr.zeros(mi.MediumInteraction3f, len(theta))
+    mei.wi = mi.Vector3f(0, 0, -1)
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    wo = mi.Vector3f(mi.Float(np.sin(theta)), 0, mi.Float(np.cos(theta)))
+    return np.array(phase.eval_pdf(mi.PhaseFunctionContext(), mei, wo)[1])
+
+
+def particles(ratio):
+    return closed_form.fournier_forand(THETA, *closed_form.fournier_forand_parameters(ratio))
+
+
+def test_water_and_particles_are_mixed_by_their_scattering():
+    """A share taken of the backscattering, or water added to b instead of being part of it, would show at 90 degrees."""
+    water = mi.load_dict(
+        {"type": "layered_water", "scattering": 0.05, "backscattering": 0.0016, "water_scattering": 0.002}
+    )
+    expected = (0.048 * particles(0.0006 / 0.048) + 0.002 * water_phase_function(THETA)) / 0.05
+    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("nested", [{"type": "hg", "g": 0.9}, {"type": "petzold"}])
+def test_any_phase_function_is_mixed_with_the_water(nested):
+    plain = values(mi.load_dict(nested))
+    water = mi.load_dict({"type": "layered_water", "scattering": 0.1, "water_scattering": 0.02, "phase": nested})
+    expected = 0.8 * plain + 0.2 * water_phase_function(THETA)
+    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
+
+
+def test_water_without_particles_scatters_as_water():
+    pure = {"scattering": 0.002, "backscattering": 0.001, "water_scattering": 0.002}
+    water = mi.load_dict({"type": "layered_water", **pure})
+    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), water_phase_function(THETA), rtol=1e-3)
+
+
+def test_each_layer_has_its_function_in_the_table():
+    water = mi.load_dict({"type": "layered_water", "tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"})
+    many = water.phases.at(mi.UInt32([0, 1, 2]))
+    assert isinstance(many, NumberedPhase)
+    assert many.functions.count == 2
+    for layer, ratio in enumerate((0.04, 0.02, 0.04)):
+        one = water.phases.at(mi.UInt32([layer] * len(THETA)))
+        np.testing.assert_allclose(values(one), particles(ratio), rtol=2e-3)
+
+
+def test_samples_of_the_table_follow_each_function():
+    """Backscatter ratio and value by z-test: a wrong offset into the table would take a neighbour's segments."""
+    ratios = (0.04, 0.01, 0.02)
+    backscattering = ", ".join(str(0.15 * ratio) for ratio in ratios)
+    water = mi.load_dict({"type": "layered_water", "tops": "0, 1, 2", "backscattering": backscattering})
+    count = 2**20
+    for layer, ratio in enumerate(ratios):
+        rng = mi.PCG32(count, initstate=3)
+        mei = dr.zeros(mi.MediumInteraction3f, count)
+        mei.wi = mi.Vector3f(0, 0, -1)
+        phase = water.phases.at(dr.full(mi.UInt32, layer, count))
+        pair = mi.Point2f(rng.next_float32(), rng.next_float32())
+        wo, _, pdf = phase.sample(mi.PhaseFunctionContext(), mei, rng.next_float32(), pair)
+        back = np.mean(np.array(wo.z) < 0)
+        assert abs(back - ratio) < 4 * np.sqrt(ratio / count)
+        # The mean of 1 / density over a hemisphere's samples is its solid angle.
+        inverse = np.where(np.array(wo.z) < 0, 1 / np.array(pdf), 0)
+        assert abs(inverse.mean() - 2 * np.pi) < 4 * inverse.std() / np.sqrt(count)
+
+
+def test_functions_without_a_common_table_are_called_by_pointer():
+    water = mi.load_dict(
+        {
+            "type": "layered_water",
+            "tops": "0, 1",
+            "phase_0": {"type": "hg", "g": 0.9},
+            "phase_1": {"type": "petzold"},
+        }
+    )
+    theta = np.radians([1.0, 90.0])
+    found = values(water.phases.at(mi.UInt32([0, 1])), theta)
+    expected = closed_form.henyey_greenstein(theta[0], 0.9), closed_form.petzold_average_particle()(theta[1])
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_layers_with_many_ratios_share_functions_within_two_percent():
+    ratios = np.geomspace(0.005, 0.05, 500)
+    text = ", ".join(f"{0.15 * ratio:.8f}" for ratio in ratios)
+    tops = ", ".join(f"{0.01 * layer:.2f}" for layer in range(500))
+    water = mi.load_dict({"type": "layered_water", "tops": tops, "backscattering": text, "water_scattering": 0.001})
+    assert len({id(phase) for phase in water.phases.phases}) < 500
+    share = 0.001 / 0.15
+    for layer in (0, 250, 499):
+        wanted = ratios[layer]
+        assert water.phases.phases[layer].backscatter_ratio == pytest.approx(wanted, rel=0.02 + 0.02 * share / wanted)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"water_scattering": 0.2}, "water_scattering = 0.2 must be at least 0 and at most scattering = 0.15"),
+        ({"water_scattering": "0.1, 0.1"}, "water_scattering has 2 values but must have 1 or 1"),
+        ({"water_scattering": 0.0022, "backscattering": 0.001}, "backscattering = 0.001 must be at least half of"),
+        ({"backscattering": 0.0}, "backscatter_ratio = 0 must lie between"),
+        ({"refractive_index": "1.3, 1.4"}, "refractive_index has 2 values but must have 1 or 1"),
+        ({"refractive_index": 2.5}, "refractive_index = 2.5 must lie between 1.0001 and 2"),
+        ({"group_index": 0.9}, "group_index = 0.9 must lie between 1 and 2"),
+    ],
+)
+def test_errors(parameters, message):
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "layered_water", **parameters})
+
+
+def test_mixtures_of_tables_refuse_weights_that_are_none():
+    table = PowerLawTable.from_function(water_phase_function)
+    for weights, message in (([0, 0], "not all of them 0"), ([1], "one number for each"), ([-1, 2], "at least 0")):
+        with pytest.raises(ValueError, match=message):
+            PowerLawTable.mixture([table, table], weights)
