@@ -1,4 +1,4 @@
-"""The command line: ``mitransient-lidar render | plot | compare | shots | survey | water | scenes | info | bench``.
+"""The command line ``mitransient-lidar``: render, plot, compare, shots, survey, spread, water, scenes, info, bench.
 
 Mistakes of the user's end with one sentence on stderr and exit code 2, interruptions with exit code 130. Results go to
 stdout, everything else to stderr. Modules that take long to import are imported by the commands that need them.
@@ -210,6 +210,130 @@ def survey(
 
 
 @app.command()
+def spread(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    depths: Annotated[str, typer.Option(metavar="D1,D2,...", help="Depths below the mean sea level [m].")],
+    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    passes: Annotated[int, typer.Option(help="Number of independent passes.")] = 8,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
+    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")] = Path(
+        "spread.png"
+    ),
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the paths and errors.")] = False,
+) -> None:
+    """Show how far the laser's light has spread at depths, sideways and in time, and what share the receiver sees."""
+    with _sentences():
+        _require(2 <= passes <= 10_000, "--passes", passes, "2 to 10000")
+        _require(seed >= 0, "--seed", seed, "0 or above")
+        params = _parameters(define or [])
+        wanted = _numbers("--depths", depths)
+        targets = [output, output.with_suffix(".nc")]
+        _require_writable(output.parent, targets)
+
+        from mitransient_lidar import beam_spread, results
+        from mitransient_lidar.beam_spread_plots import plot_beam_spread
+        from mitransient_lidar.plotting import check_format
+
+        check_format(output)
+        with _counting(quiet, "pass") as progress:
+            found = beam_spread.beam_spread(scene, wanted, params, passes=passes, seed=seed, progress=progress)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        plot_beam_spread(found, output)
+        with results.replacing(targets[1]) as temporary:
+            found.to_netcdf(temporary, engine="h5netcdf")
+        for target in targets:
+            typer.echo(target)
+        if not quiet:
+            for line in beam_spread.describe_spread(found):
+                typer.echo(line)
+
+
+@app.command()
+def orders(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    count: Annotated[int, typer.Option("--orders", help="Orders to tell apart.")] = 8,
+    passes: Annotated[int, typer.Option(help="Number of passes.")] = 32,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc beside it.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")] = False,
+) -> None:
+    """Tell how often the received light was scattered, and how much of it turned more than once."""
+    with _sentences():
+        _require(1 <= count <= 62, "--orders", count, "1 to 62")
+        _require(2 <= passes <= 100_000, "--passes", passes, "2 to 100000")
+        _require(seed >= 0, "--seed", seed, "0 or above")
+        params = _parameters(define or [])
+        targets = [output, output.with_suffix(".nc")] if output is not None else []
+        if output is not None:
+            from mitransient_lidar.plotting import check_format
+
+            check_format(output)
+            _require_writable(output.parent, targets)
+
+        from mitransient_lidar import results, scattering_orders
+
+        with _counting(quiet, "pass") as progress:
+            found = scattering_orders.scattering_orders(
+                scene, params, orders=count, passes=passes, seed=seed, progress=progress
+            )
+        if output is not None:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            scattering_orders.plot_orders(found, output)
+            with results.replacing(targets[1]) as temporary:
+                found.to_netcdf(temporary, engine="h5netcdf")
+            for target in targets:
+                typer.echo(target)
+        typer.echo(f"{'order':<8}{'energy (J)':>12}{'share (%)':>12}{'several turns (%)':>20}")
+        for name, energy, share, several in scattering_orders.shares(found):
+            typer.echo(f"{name:<8}{energy:>12.4g}{100 * share:>12.3f}{100 * several:>20.3f}")
+
+
+@app.command()
+def views(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    fields: Annotated[
+        str, typer.Option(metavar="F1,F2,...", help="Full angles of the fields of view in mrad.")
+    ] = "2,5,10,20,50,100",
+    from_depth: Annotated[float, typer.Option("--from", help="Depth in m from which the slope is measured.")] = 1.0,
+    to_depth: Annotated[float, typer.Option("--to", help="Depth in m to which it is measured.")] = 5.0,
+    passes: Annotated[int, typer.Option(help="Number of independent passes for each field.")] = 48,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
+    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")] = Path(
+        "views.png"
+    ),
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")] = False,
+) -> None:
+    """Show how the slope of the column signal goes with the field of view, between c and a."""
+    with _sentences():
+        _require(4 <= passes <= 10_000, "--passes", passes, "4 to 10000")
+        _require(seed >= 0, "--seed", seed, "0 or above")
+        params = _parameters(define or [])
+        wanted = _numbers("--fields", fields)
+        targets = [output, output.with_suffix(".nc")]
+        _require_writable(output.parent, targets)
+
+        from mitransient_lidar import column_views, results
+        from mitransient_lidar.plotting import check_format
+
+        check_format(output)
+        depths = {"from_depth": from_depth, "to_depth": to_depth}
+        with _counting(quiet, "pass") as progress:
+            found = column_views.views(scene, wanted, params, **depths, passes=passes, seed=seed, progress=progress)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        column_views.plot_views(found, output)
+        with results.replacing(targets[1]) as temporary:
+            found.to_netcdf(temporary, engine="h5netcdf")
+        for target in targets:
+            typer.echo(target)
+        for line in column_views.describe_views(found):
+            typer.echo(line)
+
+
+@app.command()
 def water(
     kind: Annotated[
         str, typer.Argument(metavar="KIND", help="jerlov, chlorophyll, kd, secchi, petzold, profile or pure.")
@@ -374,6 +498,13 @@ def _place(text: str) -> tuple[float, float]:
     except ValueError:
         raise UserError(f"--at {text} is not of the form x,y in metres.") from None
     return x, y
+
+
+def _numbers(option: str, text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise UserError(f"{option} {text} is not of the form 2,5,8.") from None
 
 
 def _require_writable(folder: Path, targets: list[Path]) -> None:
