@@ -277,7 +277,9 @@ class LidarMerging(mi.CppADIntegrator):
             self._room.view_legs = max(self._room.view_legs, _ROOM * legs / count)
             return False
         if in_water is not None and points > 0:
-            merge_in_water(system, tracks.points(dr.arange(mi.UInt32, points)), cells, in_water, self.lost)
+            index = dr.arange(mi.UInt32, points)
+            choice = mi.sample_tea_float32(index, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
+            merge_in_water(system, tracks.points(index), cells, in_water, choice, self.lost)
         return True
 
     def to_string(self) -> str:

@@ -33,13 +33,19 @@ def store_points(tracks: Tracks, count: int, cells: WaterCells) -> PhotonMap | N
 
 
 def merge_in_water(
-    system: LidarScene, points: TrackPoints, cells: WaterCells, photons: PhotonMap, lost: mi.Float64
+    system: LidarScene,
+    points: TrackPoints,
+    cells: WaterCells,
+    photons: PhotonMap,
+    choice: mi.Float,
+    lost: mi.Float64,
 ) -> None:
     """Merge points of the receiver's paths with the light in their cells, into the film.
 
     A point stands for a track of length s and throughput beta, a photon for one of length s' and energy w; with the
     cell's volume V each pair adds beta s w s' / V times the scattering coefficient and the phase function, shared among
-    all merges that make the same path. Water and bubbles make different paths.
+    all merges that make the same path. Water and bubbles make different paths. `choice`, a uniform random number for
+    each point, picks the photons of cells that hold too many.
     """
     water: Any = system.water
     bucket, cell, volume = cells.locate(points.point)
@@ -55,8 +61,8 @@ def merge_in_water(
     absorption = water.absorption_flight.attenuation(layer)
     stratum = water.strata.at(-points.point.z)
     half = _Half.of_points(system, points)
-    weight = points.weight / volume
-    first, end = photons.bucket(bucket, mi.Bool(True))
+    first, end, step = photons.sample(bucket, choice, mi.Bool(True))
+    weight = points.weight / volume * mi.Float(step)
 
     def merge(index: mi.UInt32) -> tuple[mi.UInt32]:
         active = index < end
@@ -71,7 +77,7 @@ def merge_in_water(
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + optical_length(system, beyond, True, stratum)
         _add(system, lost, half, photon, 1, length, energy, active)
-        return (index + 1,)
+        return (index + step,)
 
     dr.while_loop((first,), lambda index: index < end, merge, label="merge in the water")
 
@@ -93,9 +99,10 @@ def merger_at_solids(
         if photons is None:
             return
         patch = patches.locate(si)
-        first, end = photons.bucket(patch.bucket, active)
+        first, end, step = photons.sample(patch.bucket, rng.next_float32(), active)
         half = _Half(pixel, path.scatterings, path.turns, path.direction, path.weight)
         weight = path.weight * patches.inverse_share(patch, si.shape, rng, active & (first < end)) / patch.area
+        weight *= mi.Float(step)
 
         def add(index: mi.UInt32) -> tuple[mi.UInt32]:
             within = index < end
@@ -106,7 +113,7 @@ def merger_at_solids(
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / dr.abs(outgoing.z)
             energy = weight * photon.weight * bsdf
             _add(system, lost, half, photon, 0, path.length + photon.length, energy, within & (bsdf > 0))
-            return (index + 1,)
+            return (index + step,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge at solids")
 

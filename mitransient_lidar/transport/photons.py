@@ -14,6 +14,10 @@ from mitransient_lidar.transport.walk import WalkPath
 #: Numbers a photon takes in memory.
 _RECORD = 8
 
+#: Photons of a bucket that are used for one point. Where a beam or view is no wider than a cell there are thousands,
+#: which would take minutes and tell little more; in usual scenes the fullest buckets hold fifteen.
+_MOST_PHOTONS = 32
+
 
 @dataclass(frozen=True)
 class Photon:
@@ -83,6 +87,15 @@ class PhotonMap:
         """Return first photon and end of a bucket; both 0 where inactive."""
         end = dr.gather(mi.UInt32, self._end, bucket, active)
         return dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0)), end
+
+    def sample(self, bucket: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Return first photon, end, and step through a bucket that holds too many for all to be used.
+
+        Every photon is then used with a probability of one over the step, chosen by the uniform number `u`.
+        """
+        first, end = self.bucket(bucket, active)
+        step = (end - first) // (_MOST_PHOTONS + 1) + 1
+        return first + dr.minimum(mi.UInt32(u * mi.Float(step)), step - 1), end, step
 
     def photon(self, index: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
         """Return a photon and its tag."""
