@@ -92,10 +92,6 @@ class LayeredWater(mi.Medium):
         for name, values, low in zip(("refractive_index", "group_index"), indices, (1.0001, 1.0), strict=True):
             for value in values:
                 in_range(name, value, low, 2.0)
-        #: Runs of layers of one refractive and one group index.
-        self.strata = Strata(self.column.tops, *indices)
-        #: Indices of the uppermost layer, where the sea surface is.
-        self.refractive_index, self.group_index = (float(values[0]) for values in indices)
         kind = props.get("phase_function", "fournier_forand")
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
         if kind not in KINDS:
@@ -111,6 +107,12 @@ class LayeredWater(mi.Medium):
             del props[name]
         water_scattering = _water_scattering(props.get("water_scattering", 0.0), self.column)
         of_layers = phases_of_layers(self.column, phases, kind, phase_g, water_scattering)
+        self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
+        of_layers = [of_layers[layer] for layer in kept]
+        #: Runs of layers of one refractive and one group index.
+        self.strata = Strata(self.column.tops, *(values[kept] for values in indices))
+        #: Indices of the uppermost layer, where the sea surface is.
+        self.refractive_index, self.group_index = (float(values[0]) for values in indices)
         if self.plume is not None:
             self.plume_phase = bubbles or mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
             of_layers.append(self.plume_phase)
@@ -208,6 +210,17 @@ def _column(props: mi.Properties) -> WaterColumn:
     if given:
         raise ValueError(f"profile = {path!r} says {', '.join(given)}, too: give either")
     return read_profile(path).layers(tolerance)
+
+
+def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn, np.ndarray]:
+    """Return the column with neighbouring layers of equal properties joined, and the first layer of each.
+
+    Joined, they give what one layer does in every bit.
+    """
+    rows = np.array([column.attenuation, column.scattering, column.backscattering, *others])
+    kept = np.append(0, 1 + np.flatnonzero(np.any(np.diff(rows, axis=1) != 0, axis=0)))
+    coefficients = (column.attenuation, column.scattering, column.backscattering)
+    return WaterColumn(column.tops[kept], *(values[kept] for values in coefficients)), kept
 
 
 def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
