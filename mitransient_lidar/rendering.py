@@ -249,6 +249,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any) -> Any:
 
 
 def first_sensor(scene: mi.Scene) -> mi.Sensor:
+    """Return the scene's first sensor."""
     sensors = scene.sensors()
     if not sensors:
         raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")

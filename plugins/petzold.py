@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import mitsuba as mi
+from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
 
 from mitransient_lidar.optics.petzold_waters import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.optics.phase import petzold_average_particle
 from mitransient_lidar.optics.phase_table import PowerLawTable
-from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
 
 _AVERAGE = "average_particle"
 

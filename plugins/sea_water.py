@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 import mitsuba as mi
+from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
 
 from mitransient_lidar.optics.checks import in_range
 from mitransient_lidar.optics.phase_table import PowerLawTable
 from mitransient_lidar.optics.seawater import DEPOLARISATION, water_phase_function
-from mitransient_lidar.plugins.tabulated import TabulatedPhaseFunction
 
 
 class SeaWater(TabulatedPhaseFunction):

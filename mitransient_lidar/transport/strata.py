@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -133,15 +133,17 @@ class Ascent:
 def ascend(system: LidarScene, ray: mi.Ray3f, stratum: mi.UInt32, active: mi.Bool) -> Ascent:
     """Trace rays from under water up to the first stratum."""
     strata = system.strata
-    count = strata.count if strata is not None else 1
     ascent = Ascent(ray, mi.Float(0), mi.Float(0), mi.Float(1))
-    for number in range(count - 1, 0, -1):
+    if strata is None:
+        return ascent
+    water: Any = system.water
+    for number in range(strata.count - 1, 0, -1):
         here = active & (stratum == number) & (ascent.ray.d.z > 0)
         leg = mi.Ray3f(ascent.ray.o, ascent.ray.d)
         distance = dr.maximum((-leg.o.z - float(strata.edges[number - 1])) / leg.d.z, 0)
         leg.maxt = distance
         blocked = system.scene.ray_test(leg, here)
-        through = system.water.optical_depth(leg.o, leg.d, distance)
+        through = water.optical_depth(leg.o, leg.d, distance)
         above = mi.UInt32(number - 1)
         direction, ratio, passes = strata.refract(leg.d, mi.UInt32(number), above)
         ascent.optical_length += dr.select(here, distance * float(strata.group_index[number]), 0)

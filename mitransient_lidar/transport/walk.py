@@ -108,8 +108,9 @@ class Walk:
 
     def __init__(self, system: LidarScene, mode: mi.TransportMode, destination: Pose) -> None:
         self.system = system
-        self._water: Any = system.water
-        self._strata: Strata = self._water.strata
+        water: Any = system.water
+        self._water = water
+        self._strata: Strata = water.strata
         self.context = mi.BSDFContext(mode)
         self.adjoint = mode == mi.TransportMode.Importance
         self.destination = opaque_point(destination.origin)

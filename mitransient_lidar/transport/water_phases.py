@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,8 +27,6 @@ _ANY_RATIO = 0.0183
 #: Share of the scattering below which that of the water itself is left out.
 _SMALLEST_SHARE = 1e-4
 
-PhaseLike = mi.PhaseFunction | NumberedPhase | mi.PhaseFunctionPtr
-
 
 class ScattererPhases:
     """Phase functions by the number of the scatterer: layers from the top, then bubbles.
@@ -48,12 +47,12 @@ class ScattererPhases:
         numbers = {key: number for number, key in enumerate(different)}
         self._of_scatterer = [numbers[id(phase)] for phase in self.phases]
         self._different = list(different.values())
-        tables = [getattr(phase, "tabulated", None) for phase in self._different]
-        alike = all(table is not None and _nodes(table) == _nodes(tables[0]) for table in tables)
-        self._stack = TabulatedPhase(*(table.table for table in tables)) if alike and not self._single else None
+        tables = [phase.tabulated.table for phase in self._different if hasattr(phase, "tabulated")]
+        alike = len(tables) == len(self._different) and len({(table.count, table.log_s0) for table in tables}) == 1
+        self._stack = TabulatedPhase(*tables) if alike and self._single is None else None
         self._numbers: mi.UInt32 | None = None
 
-    def at(self, scatterer: mi.UInt32) -> PhaseLike:
+    def at(self, scatterer: mi.UInt32) -> Any:
         """Return the phase function of a scatterer; what it is has Mitsuba's ``eval_pdf`` and ``sample``."""
         if self._single is not None:
             return self._single
@@ -168,7 +167,3 @@ def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
     mei.wi = mi.Vector3f(0, 0, -1)
     value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, deflect(mi.Frame3f(-mei.wi), mi.Float(s), mi.Float(0)))
     return PowerLawTable.from_values(np.array(value[0], dtype=np.float64))
-
-
-def _nodes(tabulated: TabulatedPhase) -> tuple[int, float]:
-    return tabulated.table.count, tabulated.table.log_s0

@@ -26,7 +26,7 @@ def particles(ratio):
 
 
 def test_water_and_particles_are_mixed_by_their_scattering():
-    """A share taken of the backscattering, or water added to b instead of being part of it, would show at 90 degrees."""
+    """A share taken of the backscattering, or water added to b instead of being part of it, shows at 90 degrees."""
     water = mi.load_dict(
         {"type": "layered_water", "scattering": 0.05, "backscattering": 0.0016, "water_scattering": 0.002}
     )

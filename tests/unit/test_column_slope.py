@@ -116,7 +116,12 @@ SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_s
             r"to_depth = 7.9 m must be at most 7\.2.* 'bottom' can begin",
         ),
         ([10], {"to_depth": 7.0}, {"bin_count": 60}, "the record must hold"),
-        ([10], {}, {"layer_tops": "0, 3"}, "the water has 2 layers from from_depth = 1 m to to_depth = 5 m"),
+        (
+            [10],
+            {},
+            {"layer_tops": "0, 3", "attenuation": "0.3, 0.4"},
+            "the water has 2 layers from from_depth = 1 m to to_depth = 5 m",
+        ),
         ([10], {}, {"attenuation": 0.1, "scattering": 0, "backscattering": 0}, "the column has no signal"),
         ([10], {}, {"bottom": 5}, "parameter 'bottom' is not one of scene table1"),
     ],
