@@ -1,0 +1,124 @@
+"""Both integrators against Chandrasekhar's exact solution: a half-space that scatters isotropically, index matched.
+
+Light returned to a far receiver along the beam is single scattering, omega / (8 pi) of what is sent per solid angle,
+times H(mu)^2 (Chandrasekhar 1960, Radiative Transfer). The attenuation is 1 /m, so that metres are mean free paths;
+from 20 km the whole layer that takes part is at one distance. A wide beam and a narrower view stand for a pencil and
+a wide view, which are their exchange (reciprocity is tested on its own): no light is lost sideways.
+"""
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.optics.half_space import chandrasekhar_h
+from mitransient_lidar.optics.water import C0
+
+HEIGHT = 2e4
+ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # J m^2
+ALBEDOS, DEGREES = [0.5, 0.9, 0.99], [0.0, 20.0, 40.0, 60.0]
+#: What the lowest index that water may have, 1.0001, does (n^2 and refraction, 5e-4 at 60 degrees), and the step of
+#: about 1e-4 m by which rays start off the surface.
+NOT_MATCHED = 1e-3
+
+
+def single_scattering(degrees, albedo):
+    """Return the energy received from light scattered once [J]."""
+    return ENERGY * albedo / (8 * np.pi) * (np.cos(np.radians(degrees)) / HEIGHT) ** 2
+
+
+def orders_of_scattering(mu, count):
+    """Return coefficients s_k of H(mu)^2 = sum of omega^k s_k: light scattered k + 1 times over light scattered once.
+
+    From Chandrasekhar's integral equation, H = 1 + omega mu/2 H(mu) int_0^1 H(m)/(mu + m) dm, power by power.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    # m = u^3 takes the logarithm at m = 0 out of the quadrature's way.
+    u = (1 + nodes) / 2
+    m, dm = np.append(u**3, mu), np.append(1.5 * u**2 * weights, 0)
+    kernel = m[:, None] / 2 * dm / (m[:, None] + m)
+    h = [np.ones_like(m)]
+    for n in range(1, count):
+        h.append(sum(h[j] * (kernel @ h[n - 1 - j]) for j in range(n)))
+    return np.array([sum(h[j][-1] * h[n - j][-1] for j in range(n + 1)) for n in range(count)])
+
+
+def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator):
+    """Return the energy [J] of `count` passes, for a view and a beam of these radii [m] at the surface."""
+    slant = HEIGHT / np.cos(np.radians(degrees))
+    pose = {"altitude": HEIGHT, "off_nadir_deg": degrees}
+    # Light that comes later has been absorbed, but for exp(-8) of the little that stays in the water so long. The far
+    # edge of a slanted view is seen later than its middle.
+    longest = 8 / (1 - albedo) + 2 * view * np.tan(np.radians(degrees))
+    scene = lidar_scene(
+        integrator=integrator,
+        tx={**pose, "beam_profile": "top_hat", "divergence_mrad": 2e3 * beam / slant},
+        rx={**pose, "field_of_view_mrad": 2e3 * view / slant, "layout": "1x1"},
+        film={"time_start_ns": 0.0, "bin_width_ns": 1e9 / C0 * (2 * slant + longest), "bin_count": 1},
+        # From so far some rays would fall through the seam of the sea's two triangles; it runs through the centre.
+        sea={"slope_variance": "1e-3", "centre_x": 10.0},
+        water={
+            **{"attenuation": 1.0, "scattering": albedo, "backscattering": albedo / 2},
+            **{"phase_function": "hg", "phase_g": 0.0, "refractive_index": 1.0001, "group_index": 1.0},
+        },
+        bottom=None,
+    )
+    # Energies go with the solid angle that is seen.
+    return passes(scene, count)[:, 0, 0] * (beam / view) ** 2
+
+
+@pytest.mark.parametrize("degrees", DEGREES)
+@pytest.mark.parametrize("albedo", ALBEDOS)
+def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
+    """Light of up to hundreds of scatterings; at albedo 0.99 it is 3 to 6 times the single scattering."""
+    # No direction is drawn towards the laser: each such draw costs variance, and here are hundreds.
+    walk = {"paths_per_pass": 2**15, "turn_share": 0.0, "roulette_threshold": 0.5}
+    beam = {0.5: 20.0, 0.9: 40.0, 0.99: 100.0}[albedo]
+    energy = returned(lidar_scene, passes, 24, degrees, albedo, 0.1, beam, walk)
+    expected = single_scattering(degrees, albedo) * chandrasekhar_h(np.cos(np.radians(degrees)), albedo) ** 2
+    z, relative = z_score(energy, expected)
+    assert relative < 1.2e-3
+    assert abs(z) < 4 + NOT_MATCHED / relative, energy.mean() / expected
+    assert abs(energy.mean() / expected - 1) < 5e-3
+
+
+@pytest.mark.parametrize("degrees", DEGREES)
+@pytest.mark.parametrize("albedo", [0.5, 0.9, pytest.param(0.99, marks=pytest.mark.slow)])
+def test_merging_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
+    """With cells that are small against the mean free path, over which the light falls.
+
+    A photon's absorption is carried on to the receiver's point, sideways, too: cells as wide as a mean free path return
+    2 % too much at albedo 0.5 and 60 degrees.
+    """
+    view, beam, spacing, count = {0.5: (4, 14, 0.3, 8), 0.9: (5, 22, 0.3, 12), 0.99: (10, 45, 0.25, 24)}[albedo]
+    fine = {"type": "lidar_merging", "paths_per_pass": 2**15, "photons_per_pass": 2**15}
+    # Cells are a third as thick as the spacing; slanted light falls faster with depth.
+    fine |= {"cell_size": 0.2, "point_spacing": spacing * float(np.cos(np.radians(degrees)))}
+    energy = returned(lidar_scene, passes, count, degrees, albedo, view, beam, fine)
+    expected = single_scattering(degrees, albedo) * chandrasekhar_h(np.cos(np.radians(degrees)), albedo) ** 2
+    _, relative = z_score(energy, expected)
+    assert relative < 2e-3
+    assert abs(energy.mean() / expected - 1) < 5e-3
+
+
+@pytest.mark.parametrize("degrees", DEGREES)
+def test_every_order_of_scattering_returns_its_share(lidar_scene, passes, z_score, degrees):
+    """Light scattered once, twice, three and four times, each alone: a share given to another order would show."""
+    albedo, orders = 0.9, 4
+    expected = single_scattering(degrees, albedo)
+    expected *= albedo ** np.arange(orders) * orders_of_scattering(np.cos(np.radians(degrees)), orders)
+    # The same seeds: paths are only cut shorter, so a difference is the light of one order.
+    up_to = [
+        returned(lidar_scene, passes, 32, degrees, albedo, 0.1, 40.0, {"paths_per_pass": 2**15, "max_scatterings": n})
+        for n in range(1, orders + 1)
+    ]
+    z, relative = z_score(np.diff(up_to, axis=0, prepend=0).T, expected)
+    assert np.all(relative < [1e-3, 2e-3, 3e-3, 4e-3])
+    assert np.all(np.abs(z) < 4 + NOT_MATCHED / relative), z
+
+
+@pytest.mark.parametrize("degrees", DEGREES)
+def test_orders_of_scattering_sum_to_h_squared(degrees):
+    """The series by the integral equation against the closed form of H; 40 orders leave 1e-12 at albedo 0.5."""
+    mu = np.cos(np.radians(degrees))
+    series = orders_of_scattering(mu, 40)
+    assert series[1] == pytest.approx(mu * np.log((1 + mu) / mu), rel=1e-8)
+    assert np.sum(0.5 ** np.arange(40) * series) == pytest.approx(chandrasekhar_h(mu, 0.5) ** 2, rel=1e-8)
