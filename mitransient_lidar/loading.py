@@ -44,7 +44,7 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
     if isinstance(scene, Mapping):
         _no_parameters(params, "a dict")
         with readable_errors(loading=True):
-            return mi.load_dict({"type": "scene", **scene}), "scene", {}
+            return mi.load_dict({"type": "scene", **scene}, optimize=False), "scene", {}
     if not isinstance(scene, (str, os.PathLike)):
         raise UserError(f"scene = {scene!r} must be a shipped name, a path, a dict or a loaded scene")
     path = resources.scene_path(scene)
@@ -56,7 +56,8 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
             raise UserError(f"parameter {name!r} is not one of scene {path.stem}: {hint}")
         parameters[name] = _text(value)
     with readable_errors(loading=True):
-        return mi.load_file(str(path), **parameters), path.stem, parameters
+        # Not optimised: that would make one shape without a name of a bottom and a target of the same material.
+        return mi.load_file(str(path), optimize=False, **parameters), path.stem, parameters
 
 
 @contextlib.contextmanager

@@ -10,7 +10,14 @@ import numpy as np
 
 from mitransient_lidar.optics.checks import non_negative, whole
 from mitransient_lidar.transport.beam import BeamSampler
-from mitransient_lidar.transport.cells import Region, SolidPatches, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.cells import (
+    Region,
+    SolidPatches,
+    SurfaceHeights,
+    WaterCells,
+    WaterGrid,
+    solids_of_several_levels,
+)
 from mitransient_lidar.transport.connection import laser_through
 from mitransient_lidar.transport.merging import merge_in_water, merger_at_solids, store_points
 from mitransient_lidar.transport.opaque import opaque
@@ -119,6 +126,10 @@ class LidarMerging(mi.CppADIntegrator):
         self.point_spacing = non_negative("point_spacing", props.get("point_spacing", 0.0))
         #: Orders of scattering that are told apart, 0 for none.
         self.orders = 0
+        #: Whether points and cells stay as they are for the next scene: the same seeds then make the same paths in
+        #: scenes that differ by a target.
+        self.keep_layout = False
+        self._laid_out = False
         #: Energy [J] that the last pass would have received, had the surface patch not ended.
         self.lost = mi.Float64(0)
         #: Number of rays that the last pass traced.
@@ -132,7 +143,7 @@ class LidarMerging(mi.CppADIntegrator):
         if self._prepared is None or self._prepared[0] is not scene or self._prepared[1] is not sensor:
             system = LidarScene.from_scene(scene, sensor, self.orders)
             view = ViewSampler(system.receiver, system.transmitter)
-            if system.water is not None:
+            if system.water is not None and not (self.keep_layout and self._laid_out):
                 self._lay_out(system, view)
             self._prepared = scene, sensor, system, view
         return self._prepared[2], self._prepared[3]
@@ -151,8 +162,10 @@ class LidarMerging(mi.CppADIntegrator):
 
     def _lay_out(self, system: LidarScene, view: ViewSampler) -> None:
         """Choose points and cells for a scene."""
+        self._laid_out = True
         self._beam = BeamSampler(system.transmitter, system.receiver)
         self._region = Region.of_system(system, view)
+        self._uneven = solids_of_several_levels(system, self._region)
         reach = self._region.track_length(system)
         self._spacing = self.point_spacing or reach / _POINTS_PER_PATH
         column = system.water.column
@@ -205,7 +218,7 @@ class LidarMerging(mi.CppADIntegrator):
         common = np.random.default_rng([seed, _COMMON_STREAM]).random(5, np.float32)
         shifts = [dr.opaque(mi.Float, float(shift)) for shift in common]
         cells = WaterCells(self._grid, mi.Point3f(shifts[:3]))
-        patches = SolidPatches(system, self._region, self._patch_width, mi.Point2f(shifts[3:]))
+        patches = SolidPatches(system, self._region, self._patch_width, mi.Point2f(shifts[3:]), self._uneven)
         self.lost = dr.zeros(mi.Float64, 1)
         light = self._trace_light(system, seed, cells, patches)
         if light is None or not self._trace_view(system, view, count, seed, cells, patches, *light):

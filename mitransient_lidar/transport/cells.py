@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -29,6 +30,9 @@ _WATER_BITS, _PATCH_BITS = 20, 9
 
 #: Height of the floors into which patches of bounded solids are cut, in widths of a patch.
 _FLOOR_WIDTHS = 8
+
+#: Surfaces that a vertical ray may meet where levels of one solid are looked for.
+_MOST_LEVELS = 8
 
 #: A patch that is filled less than once in this many tries is a sliver that rounding may hide for ever.
 _MOST_TRIES = 1000
@@ -238,6 +242,25 @@ class Patch:
     faces: mi.Float
 
 
+def solids_of_several_levels(system: LidarScene, region: Region) -> list[mi.Shape]:
+    """Return solids of which one part lies above another somewhere in the region, found with vertical rays."""
+    u = unit_points(_RAYS)
+    x, y = (
+        dr.lerp(opaque(low), opaque(high), part) for low, high, part in zip(region.low, region.high, u, strict=True)
+    )
+    top = max((float(shape.bbox().max.z) for shape in system.scene.shapes()), default=0.0)
+    ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
+    looking = dr.full(mi.Bool, True, _RAYS)
+    met = [mi.UInt32(0) for _ in system.solids]
+    for _ in range(_MOST_LEVELS):
+        si = system.scene.ray_intersect(ray, looking)
+        looking &= si.is_valid()
+        for i, solid in enumerate(system.solids):
+            met[i] += dr.select(looking & (si.shape == mi.ShapePtr(solid)), mi.UInt32(1), 0)
+        ray = si.spawn_ray(ray.d)
+    return [solid for solid, count in zip(system.solids, met, strict=True) if bool(dr.any(count > 1)[0])]
+
+
 class SolidPatches:
     """The patches of one pass: squares seen along the axis that is nearest to the normal, shifted at random.
 
@@ -251,16 +274,29 @@ class SolidPatches:
         Side of a square [m].
     shift
         Two uniform random numbers.
+    uneven
+        What `solids_of_several_levels` has found.
     """
 
     #: Number of buckets.
     buckets = 1 << (2 * _PATCH_BITS)
 
-    def __init__(self, system: LidarScene, region: Region, width: float, shift: mi.Point2f) -> None:
+    def __init__(
+        self,
+        system: LidarScene,
+        region: Region,
+        width: float,
+        shift: mi.Point2f,
+        uneven: Sequence[mi.Shape] = (),
+    ) -> None:
         self.system = system
         self.width = opaque(width)
         self._shift = shift
-        self._bounded = [solid for solid in system.solids if not region.within(solid.bbox())]
+        self._bounded = [
+            solid
+            for solid in system.solids
+            if not region.within(solid.bbox()) or any(solid is other for other in uneven)
+        ]
 
     def locate(self, si: mi.SurfaceInteraction3f) -> Patch:
         """Return the patch that holds a point of a solid."""

@@ -12,7 +12,14 @@ from mitransient_lidar.optics.beam_average import bottom_energy_per_bin, column_
 from mitransient_lidar.optics.lidar_equation import LidarSystem
 from mitransient_lidar.optics.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
 from mitransient_lidar.optics.water import WaterColumn
-from mitransient_lidar.transport.cells import Region, SolidPatches, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.cells import (
+    Region,
+    SolidPatches,
+    SurfaceHeights,
+    WaterCells,
+    WaterGrid,
+    solids_of_several_levels,
+)
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.streams import pass_streams
 from mitransient_lidar.transport.system import LidarScene
@@ -355,3 +362,36 @@ def test_crowded_passes_make_room_and_lose_nothing(lidar_scene, passes):
     np.testing.assert_array_equal(passes(scene, 1, 3), whole)
     assert engine._room.light_legs > 1
     dr.sync_thread()
+
+
+@pytest.fixture
+def two_levels(tmp_path):
+    """Mesh of a wide bottom at 8 m and, 3 m above it, a plate of 4 m."""
+    square = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    corners = [f"v {half * x} {half * y} {z}" for half, z in ((500, -8), (2, -5)) for x, y in square]
+    lines = [*corners, "f 1 2 3", "f 1 3 4", "f 5 6 7", "f 5 7 8"]
+    path = tmp_path / "levels.obj"
+    path.write_text("\n".join(lines))
+    return {"type": "obj", "filename": str(path), "bsdf": {"type": "twosided", "inner": {"type": "diffuse"}}}
+
+
+def test_levels_of_one_mesh_are_told_apart(lidar_scene, two_levels):
+    flat = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(500)}
+    scene = lidar_scene(integrator=MERGING, bottom=None, extra={"levels": two_levels, "flat": flat})
+    system = LidarScene.from_scene(scene, scene.sensors()[0])
+    region = Region.of_system(system, ViewSampler(system.receiver, system.transmitter))
+    assert [shape.id() for shape in solids_of_several_levels(system, region)] == ["levels"]
+
+
+def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, two_levels):
+    """Light on the bottom under the plate would be seen on the plate, and late: 28 ns after the plate's echo."""
+    water = {"attenuation": 0.1, "scattering": 0.05, "backscattering": 0.002}
+    means, errors = [], []
+    for kind in ("lidar_merging", "lidar_volpath"):
+        scene = lidar_scene(integrator={"type": kind}, bottom=None, water=water, extra={"levels": two_levels})
+        energy = passes(scene, 12).sum(axis=1)[:, 50:130:1].reshape(12, 16, 5).sum(axis=-1)
+        means.append(energy.mean(axis=0))
+        errors.append(energy.std(axis=0, ddof=1) / np.sqrt(12))
+    z = (means[0] - means[1]) / np.hypot(*errors)
+    assert np.all(np.abs(z) < 4), z
+    assert np.median(errors[1] / means[1]) < 0.02

@@ -15,7 +15,8 @@ from mitransient_lidar.transport.pose import Pose
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
     transmitter = SimpleNamespace(pose=Pose.from_angles(altitude, angle))
-    return SurfaceLobe(SimpleNamespace(transmitter=transmitter, refractive_index=1.34, slope_variance=slope_variance))
+    parts = {"transmitter": transmitter, "refractive_index": 1.34, "slope_variance": slope_variance, "strata": None}
+    return SurfaceLobe(SimpleNamespace(**parts))
 
 
 def chi_squared(sample, density):

@@ -17,7 +17,8 @@ COUNT = 2**20
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
     transmitter = SimpleNamespace(pose=Pose.from_angles(altitude, angle))
-    return SurfaceLobe(SimpleNamespace(transmitter=transmitter, refractive_index=1.34, slope_variance=slope_variance))
+    parts = {"transmitter": transmitter, "refractive_index": 1.34, "slope_variance": slope_variance, "strata": None}
+    return SurfaceLobe(SimpleNamespace(**parts))
 
 
 def random_points(seed):
