@@ -187,7 +187,7 @@ def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
     """Return the depths of the planes [m]; refuse such as lie below a bottom, which light cannot get to."""
     transmitter = system.transmitter
     spot = transmitter.pose.ground_point()
-    reach = 3 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    reach = 3 * transmitter.widest_angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
     bottoms = []
     for solid in system.solids:
         box = solid.bbox()

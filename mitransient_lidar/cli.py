@@ -22,6 +22,7 @@ from mitransient_lidar.cli_support import (
     sentences,
     summarise,
 )
+from mitransient_lidar.errors import UserError
 
 _INTERRUPTED = 130  # what shells report after Ctrl-C
 _DIFFERENT = 1
@@ -127,14 +128,27 @@ def plot(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")] = None,
     log: Annotated[bool, typer.Option("--log", help="Logarithmic power axis only.")] = False,
     linear: Annotated[bool, typer.Option("--linear", help="Linear power axis only.")] = False,
+    layout: Annotated[
+        bool, typer.Option("--layout", help="Draw pixels, beam and targets on the sea instead, to FILE_layout.png.")
+    ] = False,
 ) -> None:
     """Draw the waveforms of FILE, beside it unless -o says otherwise, and print the path."""
     with sentences():
-        from mitransient_lidar import results
-        from mitransient_lidar.plotting import plot_waveforms
+        if layout and (log or linear):
+            raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
 
-        target = output or file.with_suffix(".png")
-        plot_waveforms(results.open(file), target, "both" if log == linear else "log" if log else "linear")
+        from mitransient_lidar import results
+
+        if layout:
+            from mitransient_lidar.layout_plot import plot_layout
+
+            target = output or file.with_name(f"{file.stem}_layout.png")
+            plot_layout(results.open(file), target)
+        else:
+            from mitransient_lidar.plotting import plot_waveforms
+
+            target = output or file.with_suffix(".png")
+            plot_waveforms(results.open(file), target, "both" if log == linear else "log" if log else "linear")
         typer.echo(target)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -209,6 +209,58 @@ def views(
             typer.echo(line)
 
 
+def target(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    shape: Annotated[str, typer.Option("--id", help="The id of the shape that is the target.")] = "target",
+    grid: Annotated[int, typer.Option(help="Places along each axis to move the target to, 1 to 15.")] = 1,
+    reach: Annotated[float, typer.Option(help="How far the outermost places are from the middle [m].")] = 2.0,
+    passes: Annotated[int, typer.Option(help="Number of passes of each render.")] = 64,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc beside it.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")] = False,
+) -> None:
+    """Measure a target's own signal: with and without it on the same random numbers, by pixel and best combined."""
+    with sentences():
+        require(1 <= grid <= 15, "--grid", grid, "1 to 15")
+        require(positive(reach), "--reach", reach, "above 0")
+        require(16 <= passes <= 100_000, "--passes", passes, "16 to 100000")
+        require(seed >= 0, "--seed", seed, "0 or above")
+        params = parameters(define or [])
+        targets = [output, output.with_suffix(".nc")] if output is not None else []
+        if output is not None:
+            from mitransient_lidar.plotting import check_format
+
+            check_format(output)
+            require_writable(output.parent, targets)
+
+        from mitransient_lidar import results, target_plots, target_signal
+
+        options: dict[str, Any] = {"target": shape, "passes": passes, "seed": seed}
+        lines: list[str]
+        draw: Any
+        if grid > 1:
+            offsets = [reach * (2 * i / (grid - 1) - 1) for i in range(grid)]
+            with counting(quiet, "place") as progress:
+                found = target_signal.target_map(scene, params, x=offsets, y=offsets, progress=progress, **options)
+            lines, draw = target_signal.describe_map(found), target_plots.plot_map
+        else:
+            with counting(quiet, "pass") as progress:
+                found = target_signal.target_signal(scene, params, progress=progress, **options)
+            lines, draw = target_signal.describe_target(found), target_plots.plot_target
+        if output is not None:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            draw(found, output)
+            with results.replacing(targets[1]) as temporary:
+                found.to_netcdf(temporary, engine="h5netcdf")
+            for written in targets:
+                typer.echo(written)
+        for line in lines:
+            typer.echo(line)
+
+
 def water(
     kind: Annotated[
         str, typer.Argument(metavar="KIND", help="jerlov, chlorophyll, kd, secchi, petzold, profile or pure.")
@@ -240,4 +292,4 @@ def water(
 
 
 #: In the order in which the help lists them.
-COMMANDS = (shots, survey, spread, orders, views, water)
+COMMANDS = (shots, survey, target, spread, orders, views, water)

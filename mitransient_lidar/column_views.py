@@ -123,7 +123,7 @@ def views(
     mean, stderr = energy.mean(axis=1), energy.std(axis=1, ddof=1) / math.sqrt(passes)
     slopes = [slope_and_error(column, energy[field][:, column.inside]) for field in range(fields.size)]
     radius = 0.5e-3 * fields * geometry.slant_range
-    beam = 2 * system.transmitter.angular_spread * geometry.slant_range
+    beam = 2 * system.transmitter.widest_angular_spread * geometry.slant_range
     per_field = {
         "effective_attenuation": ([slope for slope, _ in slopes], "1/m", "attenuation coefficient of the column"),
         "effective_attenuation_stderr": ([error for _, error in slopes], "1/m", "standard error of the attenuation"),
@@ -268,7 +268,7 @@ def _geometry(system: LidarScene, half_view: float) -> LidarGeometry:
         raise UserError(
             f"fields_of_view_mrad = {2e3 * half_view:g} must be less than {widest:.4g}: it would reach the horizon"
         )
-    edge = min(BEAM_EDGE * system.transmitter.angular_spread, half_view)
+    edge = min(BEAM_EDGE * system.transmitter.widest_angular_spread, half_view)
     return LidarGeometry(float(pose.origin[2]), off_nadir, system.refractive_index, system.group_index, edge)
 
 

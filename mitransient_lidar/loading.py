@@ -78,6 +78,8 @@ def readable_errors(loading: bool = False) -> Iterator[None]:
         text = str(error)
         if "KeyboardInterrupt" in text or isinstance(error.__cause__, KeyboardInterrupt):
             raise KeyboardInterrupt from error
+        if empty := re.search(r'failed to instantiate shape plugin of type "(\w+)": jit_var', text):
+            raise UserError(f"a shape of type {empty[1]} has no faces: its mesh must have at least one") from error
         wrapped = re.findall(r"(?:ValueError|UserError): (.*)", text)
         if wrapped:
             raise UserError(_sentence(wrapped[-1])) from error

@@ -119,7 +119,7 @@ def _draw_waveforms(
     # A logarithmic axis ends where the signal sinks into its own error.
     significant = shown[np.isfinite(shown) & (shown > 0) & ~(shown < 3.0 * error[:, inside])]
     top = float(significant.max()) if significant.size else 1.0
-    factor, prefix = _si_prefix(top)
+    factor, prefix = si_prefix(top)
     floor = top * 1e-3
     if significant.size:
         floor = max(0.5 * float(np.quantile(significant, 0.01)), top * 10.0**-_DECADES)
@@ -145,10 +145,10 @@ def _draw_waveforms(
 def time_limits(dataset: xr.Dataset) -> tuple[float, float]:
     """Return the window of the echoes with a margin, or all of the time axis where it is not known."""
     time, attributes = dataset["time"].values, dataset.attrs
-    half = 0.5 * (_number(attributes, "bin_width_ns") or 1.0)
+    half = 0.5 * (number(attributes, "bin_width_ns") or 1.0)
     first, last = float(time[0]) - half, float(time[-1]) + half
-    start = _number(attributes, "window_start_ns")
-    end = _number(attributes, "window_end_ns")
+    start = number(attributes, "window_start_ns")
+    end = number(attributes, "window_end_ns")
     if start is None or end is None or not first < end or not start < last or not start < end:
         return first, last
     margin = 0.06 * (end - start)
@@ -157,7 +157,7 @@ def time_limits(dataset: xr.Dataset) -> tuple[float, float]:
 
 def _add_depth_axis(ax: Axes, attributes: dict[str, Any]) -> None:
     needed = ("surface_time_ns", "refractive_index", "group_index", "off_nadir_deg")
-    surface_ns, refractive_index, group_index, off_nadir_deg = (_number(attributes, name) for name in needed)
+    surface_ns, refractive_index, group_index, off_nadir_deg = (number(attributes, name) for name in needed)
     if surface_ns is None or refractive_index is None or group_index is None or off_nadir_deg is None:
         return
     # Snell's law for the axis of the receiver, from air into water.
@@ -191,7 +191,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, names: Sequence[str], colours: S
         legend.set_in_layout(False)  # it stands in the room that the square axes leave free
     ax.set_anchor("N")
     gx, gy = dataset["gx"].values, dataset["gy"].values
-    width = _number(attributes, "field_of_view_mrad")
+    width = number(attributes, "field_of_view_mrad")
     if width is None or width <= 0:
         if len(names) > 1:
             ax.scatter(gy, gx, c=list(colours), s=24)
@@ -244,7 +244,7 @@ def _draw_image(figure: Figure, ax: Axes, dataset: xr.Dataset) -> None:
     energy = dataset["impulse_response"].sum("time").values
     gx, gy = dataset["gx"].values, dataset["gy"].values
     finite = energy[np.isfinite(energy)]
-    factor, prefix = _si_prefix(float(finite.max()) if finite.size else 0.0)
+    factor, prefix = si_prefix(float(finite.max()) if finite.size else 0.0)
     half_row = 0.5 * (abs(gx[0, 0] - gx[-1, 0]) / (gx.shape[0] - 1) if gx.shape[0] > 1 else 1.0)
     half_column = 0.5 * (abs(gy[0, -1] - gy[0, 0]) / (gy.shape[1] - 1) if gy.shape[1] > 1 else 1.0)
     extent = (gy.min() - half_column, gy.max() + half_column, gx.min() - half_row, gx.max() + half_row)
@@ -268,20 +268,21 @@ def colours(count: int) -> list[Any]:
     return list(matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, count)))
 
 
-def _si_prefix(largest: float) -> tuple[float, str]:
+def si_prefix(largest: float) -> tuple[float, str]:
     """Return the power of a thousand, and its prefix, that brings a number between 1 and 1000."""
     exponent = 3 * math.floor(math.log10(largest) / 3) if largest > 0 else 0
     exponent = min(max(exponent, min(_PREFIXES)), max(_PREFIXES))
     return 10.0**exponent, _PREFIXES[exponent]
 
 
-def _number(attributes: dict[str, Any], name: str) -> float | None:
+def number(attributes: dict[str, Any], name: str) -> float | None:
+    """Return an attribute that is a finite number, else None."""
     value = attributes.get(name)
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
 def _title(attributes: dict[str, Any]) -> str:
     scene = Path(str(attributes.get("scene", ""))).stem
-    error = _number(attributes, "error_median")
+    error = number(attributes, "error_median")
     accuracy = f"median standard error {100 * error:.2g} %" if error is not None else ""
     return "  ·  ".join(part for part in (scene or "received power", accuracy) if part)

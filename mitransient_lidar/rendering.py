@@ -166,7 +166,7 @@ def render(
     probe = probe_echoes(system, view)
     window = _error_window(system, probe)
     _check_record(system, probe)
-    _check_solids(probe)
+    _check_solids(system, probe)
     film, pulse = system.film, system.transmitter.pulse
     kernel = pulse.kernel(film.bin_width_ns, system.receiver.optics.response_time_ns)
     energy, power = PassStatistics(), PassStatistics()
@@ -296,8 +296,22 @@ def _check_record(system: LidarScene, probe: EchoProbe) -> None:
         )
 
 
-def _check_solids(probe: EchoProbe) -> None:
-    """Refuse a bottom that rises through the sea where the receiver looks; tell of a target that does."""
+def _check_solids(system: LidarScene, probe: EchoProbe) -> None:
+    """Refuse a bottom that rises through the sea where the receiver looks, and a target below the bottom.
+
+    Tell of a target that rises through the sea, or lies above it.
+    """
+    bottom = max(system.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
+    highest = max((float(surface.bbox().max.z) for surface in system.surfaces), default=np.inf)
+    for solid in system.solids:
+        low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
+        if solid is not bottom and high < float(bottom.bbox().min.z):
+            raise UserError(
+                f"shape {solid.id()!r} lies below the bottom {bottom.id()!r}, up to z = {high:.3g} m: "
+                f"it must lie above {float(bottom.bbox().min.z):.3g} m"
+            )
+        if low > highest:
+            logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
     for solid, is_bottom in probe.pierced:
         if is_bottom:
             raise UserError(
@@ -327,6 +341,8 @@ def _warn_of_losses(system: LidarScene, probe: EchoProbe, lost: float) -> None:
 
 def _describe(system: LidarScene, probe: EchoProbe, window: ErrorWindow) -> dict[str, Any]:
     """Return the attributes of the result that readers and plots need."""
+    from mitransient_lidar.layout_plot import describe_layout
+
     transmitter, receiver = system.transmitter, system.receiver
     axis = transmitter.pose.axis
     described = {
@@ -334,10 +350,14 @@ def _describe(system: LidarScene, probe: EchoProbe, window: ErrorWindow) -> dict
         "field_of_view_mrad": 1e3 * receiver.pixels.field_of_view,
         "field_of_view_shape": receiver.pixels.field_of_view_shape,
         "aperture_area": receiver.optics.aperture_area,
+        "obscuration": receiver.optics.obscuration,
         "response_time_ns": receiver.optics.response_time_ns,
         "pulse_energy_mj": 1e3 * transmitter.pulse_energy,
         "pulse_fwhm_ns": transmitter.pulse.fwhm_ns,
-        "divergence_mrad": 1e3 * transmitter.divergence,
+        "beam_profile": transmitter.beam_profile,
+        "divergence_mrad": 1e3 * transmitter.profile.divergence[0],
+        "divergence_across_mrad": 1e3 * transmitter.profile.divergence[1],
+        "ellipse_deg": float(np.degrees(transmitter.profile.turn)),
         "wavelength_nm": transmitter.wavelength_nm,
         "altitude": float(transmitter.pose.origin[2]),
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(-axis[2], -1, 1)))),
@@ -346,6 +366,7 @@ def _describe(system: LidarScene, probe: EchoProbe, window: ErrorWindow) -> dict
         "surface_slope_variance": float(system.slope_variance),
         "window_start_ns": float(window.start_ns.min()),
         "window_end_ns": float(window.end_ns.max()),
+        **describe_layout(system),
     }
     # The mean arrival over all pixels is the zero of the depth axis.
     surface = probe.surface_ns[:, 1]

@@ -305,7 +305,7 @@ def _transmitter(scene: mi.Scene) -> mi.Emitter:
 def _footprint(transmitter: mi.Emitter) -> tuple[float, float, float]:
     """Return the beam's azimuth [rad], and its spread on the mean sea level along and across it [m]."""
     pose: Pose = transmitter.pose
-    across = transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
+    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
     cosine = max(-float(pose.axis[2]), 1e-3)
     azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
     return azimuth, across / cosine, across

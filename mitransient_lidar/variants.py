@@ -29,6 +29,8 @@ _PLUGIN_MODULES = (
     "two_term_henyey_greenstein",
     "layered_water",
     "ocean_surface",
+    "seabed",
+    "retroreflector",
     "lidar_transmitter",
     "pixel_fov",
     "multipixel_receiver",

@@ -6,10 +6,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import in_range, positive
+from mitransient_lidar.optics.checks import finite, in_range, positive
 from mitransient_lidar.optics.pulse import Pulse
-from mitransient_lidar.transport.fields import Sector
+from mitransient_lidar.transport.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
+from mitransient_lidar.transport.images import read_image
 from mitransient_lidar.transport.pose import Pose
+
+#: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian.
+_WIDTHS = {
+    "divergence_mrad": 1.0,
+    "divergence_fwhm_mrad": float(np.sqrt(2 * np.log(2))),
+    "divergence_1e2_mrad": 2.0,
+}
+
+_PROFILES = ("gaussian", "top_hat", "image")
 
 
 class LidarTransmitter(mi.Emitter):
@@ -24,12 +34,20 @@ class LidarTransmitter(mi.Emitter):
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], positive. Default: 5
     optical_efficiency      float      Share of that energy which leaves the optics, above 0 to 1. Default: 0.9
-    beam_profile            string     ``gaussian`` or ``top_hat``. Default: ``gaussian``
+    beam_profile            string     ``gaussian``, ``top_hat`` or ``image``. Default: ``gaussian``
     divergence_mrad         float      Full angle [mrad] between the points where the irradiance of a Gaussian beam has
                                        fallen to e^-1/2 of its peak (its sigma is half of it); the full angle of a
                                        top-hat beam. Positive. Default: 10
     divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak
     divergence_1e2_mrad                (Gaussian only); give one of the three
+    divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along gx,
+                                       this the one along gy. Positive. Default: ``divergence_mrad``
+    ellipse_deg             float      Turns the ellipse: azimuth of the axis of ``divergence_mrad``, from +gx (far)
+                                       towards +gy [deg]. Default: 0
+    profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
+                                       image. Row 0 is the far edge (+gx), column 0 the -gy edge, the middle the axis
+    profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
+                                       positive; its cells are squares
     wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; kept with the result. Default: 532
     pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], positive. Default: 5
     pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit)
@@ -39,8 +57,10 @@ class LidarTransmitter(mi.Emitter):
 
     .. math:: g(g_x, g_y) = \exp(-(g_x^2 + g_y^2) / 2\sigma^2) / (2 \pi \sigma^2)
 
-    and the radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\, dg_y`, so that the
-    beam's energy is exactly the pulse's. The pulse's shape enters when waveforms are formed, not in the transport.
+    (+gx is away from nadir, +gy along +y), with a sigma for each axis when it is elliptic; that of an image is even
+    within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\, dg_y`,
+    so that the beam's energy is exactly the pulse's. The pulse's shape enters when waveforms are formed, not in the
+    transport.
 
     .. code-block:: xml
 
@@ -62,9 +82,7 @@ class LidarTransmitter(mi.Emitter):
         self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
         self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)
         self.beam_profile = props.get("beam_profile", "gaussian")
-        if self.beam_profile not in ("gaussian", "top_hat"):
-            raise ValueError(f"beam_profile = {self.beam_profile!r} must be 'gaussian' or 'top_hat'")
-        self.divergence = _divergence(props, self.beam_profile)
+        self.profile = _profile(props, self.beam_profile)
         if "pulse_file" in props:
             try:
                 self.pulse = Pulse.from_file(props["pulse_file"])
@@ -81,10 +99,22 @@ class LidarTransmitter(mi.Emitter):
         return self.pulse_energy * self.optical_efficiency
 
     @property
+    def divergence(self) -> float:
+        """Full angle of the beam [rad] as ``divergence_mrad`` defines it; of an image twice its widest rms angle."""
+        return self.profile.divergence[0]
+
+    @property
     def angular_spread(self) -> float:
-        """Root-mean-square angle of the beam along each transverse axis [rad]."""
-        half = 0.5 * self.divergence
-        return half if self.beam_profile == "gaussian" else half / 2
+        """Root-mean-square angle of the beam along its narrowest transverse axis [rad].
+
+        What must resolve the beam goes by it: cells in the water and on the sea.
+        """
+        return min(self.profile.spreads)
+
+    @property
+    def widest_angular_spread(self) -> float:
+        """Root-mean-square angle of the beam along its widest transverse axis [rad], for what must cover the beam."""
+        return max(self.profile.spreads)
 
     def intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Return the radiant intensity [J/sr] in a unit direction of the world."""
@@ -95,20 +125,11 @@ class LidarTransmitter(mi.Emitter):
 
     def tangent_density(self, gx: mi.Float, gy: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
-        half = 0.5 * self.divergence
-        if self.beam_profile == "top_hat":
-            return dr.select(gx * gx + gy * gy <= half**2, mi.Float(1 / (np.pi * half**2)), 0)
-        return dr.exp(-(gx * gx + gy * gy) / (2 * half**2)) / (2 * np.pi * half**2)
+        return self.profile.density(gx, gy)
 
     def sample_tangent(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers in the unit square to tangent-plane points distributed as the beam's energy."""
-        half = 0.5 * self.divergence
-        if self.beam_profile == "top_hat":
-            return Sector(outer=half).sample(u)
-        # 1 - u lies in (0, 1], so that the logarithm is finite.
-        radius = half * dr.sqrt(-2 * dr.log(1 - u.x))
-        sin, cos = dr.sincos(dr.two_pi * u.y)
-        return radius * cos, radius * sin
+        return self.profile.sample(u)
 
     def sample_ray(
         self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
@@ -161,22 +182,45 @@ class LidarTransmitter(mi.Emitter):
         )
 
 
+def _profile(props: mi.Properties, kind: str) -> BeamProfile:
+    """Build the beam's shape from the plugin's parameters."""
+    if kind not in _PROFILES:
+        raise ValueError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
+    ellipse = [*_WIDTHS, "divergence_across_mrad", "ellipse_deg"]
+    for name in ellipse if kind == "image" else ("profile_file", "profile_mrad"):
+        if name in props:
+            raise ValueError(f"{name} does not go with beam_profile = {kind!r}")
+    if kind == "image":
+        for name in ("profile_file", "profile_mrad"):
+            if name not in props:
+                raise ValueError(f"{name} is missing: beam_profile = 'image' needs it")
+        image = read_image("profile_file", props["profile_file"])
+        return ImageBeam(image, 1e-3 * _angle("profile_mrad", props["profile_mrad"]))
+    along = across = 0.5 * _divergence(props, kind)
+    if "divergence_across_mrad" in props:
+        if any(name in props for name in _WIDTHS if name != "divergence_mrad"):
+            raise ValueError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
+        across = 0.5e-3 * _angle("divergence_across_mrad", props["divergence_across_mrad"])
+    elif "ellipse_deg" in props:
+        raise ValueError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
+    turn = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
+    return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, turn)
+
+
 def _divergence(props: mi.Properties, profile: str) -> float:
     """Return the beam's divergence [rad] as the project defines it, from whichever definition was given."""
-    # Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian.
-    widths = {
-        "divergence_mrad": 1.0,
-        "divergence_fwhm_mrad": np.sqrt(2 * np.log(2)),
-        "divergence_1e2_mrad": 2.0,
-    }
-    given = [name for name in widths if name in props]
+    given = [name for name in _WIDTHS if name in props]
     if len(given) > 1:
         raise ValueError(f"lidar_transmitter: give one of {' and '.join(given)}, not both")
     name = given[0] if given else "divergence_mrad"
     if profile == "top_hat" and name != "divergence_mrad":
         raise ValueError(f"{name} describes a Gaussian beam; a top-hat beam takes divergence_mrad, its full angle")
-    value = positive(name, props.get(name, 10.0))
-    return 1e-3 * in_range(name, value, 0.0, 1000.0) / float(widths[name])
+    return 1e-3 * _angle(name, props.get(name, 10.0)) / _WIDTHS[name]
+
+
+def _angle(name: str, value: float) -> float:
+    """Return an angle [mrad] if it is positive and at most a radian."""
+    return in_range(name, positive(name, value), 0.0, 1000.0)
 
 
 mi.register_emitter("lidar_transmitter", lambda props: LidarTransmitter(props))

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitransient_lidar.optics.checks import positive
+from mitransient_lidar.optics.checks import in_range, positive
+from mitransient_lidar.transport.blur import Blur
+from mitransient_lidar.transport.hexagons import HexagonPixels
+from mitransient_lidar.transport.pixel_maps import MappedPixels
 from mitransient_lidar.transport.pixels import LayoutPixels, PixelArray, ShapedPixels
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.receiving import Receiver, ReceiverOptics
@@ -19,14 +22,31 @@ class MultipixelReceiver(mi.Sensor):
     layout                              string     ``1x1``, ``2x2``, ``1x4`` or ``RxC``: the field of view cut into
                                                    R rows along range (row 0 is the far edge) and C columns (column 0
                                                    is the -gy edge). ``1x4`` is the published receiver of four strips
-                                                   across range, the same as ``4x1``. Default: ``2x2``
+                                                   across range, the same as ``4x1``. ``hexN``, with N = 1, 7, 19,
+                                                   37, ... up to 2^20: a hexagon and whole rings of hexagons around it,
+                                                   in rows along gy. Default: ``2x2``
+    fill_factor                         float      Share of each cell or hexagon of a layout that receives light, 0.01
+                                                   to 1; the gaps receive none. Default: 1
     imager                              boolean    Keep rows and columns apart in the result, (row, column, time)
-                                                   instead of (pixel, time). Default: true above 16 pixels
-    field_of_view_mrad                  float      Full angle of the field of view (diameter or side) [mrad], positive.
-                                                   Default: 30
-    field_of_view_shape                 string     ``circle`` or ``square``. Default: ``circle``
+                                                   instead of (pixel, time). Default: true above 16 pixels of ``RxC``
+    pixel_map                           string     Instead of layout: image file (.png, .npy or .exr, one channel) of
+                                                   labels over a square field of view, whole numbers from 0 to 2^24.
+                                                   Row 0 is the far edge, column 0 the -gy edge. Each label is a pixel,
+                                                   in the order of labels and named ``label1``, ...; 0 is no pixel
+    field_of_view_mrad                  float      Full angle of the field of view [mrad], positive: diameter, side, or
+                                                   diameter of the circle that just holds the hexagons. Default: 30
+    field_of_view_shape                 string     ``circle`` or ``square``, for ``RxC``. Default: ``circle``
     (nested)                            sensor     ``pixel_fov`` sensors instead of layout and field of view
+    blur_mrad                           float      Optical blur: standard deviation along each axis of a Gaussian
+                                                   point-spread function [mrad], 0 (sharp) to 1000. Default: 0
+    blur_file                           string     Instead: image file (as for ``pixel_map``) of a measured point-spread
+                                                   function in any unit, not negative; its middle is where sharp optics
+                                                   focus. Values are constant in each cell, and normalised
+    blur_file_mrad                      float      Angle over which that image reaches along its columns (gy) [mrad],
+                                                   above 0 to 1000; its cells are squares
     aperture_area                       float      Area of the aperture [m^2], positive. Default: 0.025
+    obscuration                         float      Share of that area which is blocked, as by a secondary mirror, 0 to
+                                                   0.999. Default: 0
     optical_efficiency                  float      Share of light that the optics pass, above 0 to 1. Default: 0.9
     two_way_atmospheric_transmittance   float      Share of light that survives the air, both ways. Default: 0.9
     response_time_ns                    float      Time constant of the exponential response [ns]. Default: 0
@@ -39,7 +59,15 @@ class MultipixelReceiver(mi.Sensor):
     of a circular field of view that lie outside the circle exist and stay dark.
 
     Paths are drawn over the whole field of view and then given to the pixel that they fall into, so more pixels cost
-    nothing and the pixels of a layout sum to the single pixel of the same field of view path by path.
+    nothing and the pixels of a layout sum to the single pixel of the same field of view path by path. So do those of a
+    pixel map, to the map with a single label in their place. Hexagons do not fill their circle: N of them have 82.7 %
+    of its area, whatever N is.
+
+    With a fill factor each cell of ``RxC`` shrinks about its centre, sides by the square root of the factor, and a
+    circular field of view cuts the shrunk cells as a field stop does.
+
+    Blur moves light on the detector: what comes from the direction (gx, gy) is spread around that place by the
+    point-spread function, the same one all over the field of view, and what leaves the pixels is lost.
 
     .. code-block:: xml
 
@@ -58,30 +86,18 @@ class MultipixelReceiver(mi.Sensor):
     def __init__(self, props: mi.Properties) -> None:
         nested = [child for _, child in props.objects() if isinstance(child, mi.Sensor)]
         super().__init__(props)
-        if nested:
-            for name in ("layout", "field_of_view_mrad"):
-                if name in props:
-                    raise ValueError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
-            if not all(hasattr(pixel, "field") for pixel in nested):
-                raise ValueError("multipixel_receiver: nested sensors must be pixel_fov")
-            names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
-            pixels: PixelArray = ShapedPixels([pixel.field for pixel in nested], names)
-        else:
-            pixels = LayoutPixels(
-                str(props.get("layout", "2x2")),
-                1e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0)),
-                props.get("field_of_view_shape", "circle"),
-                props.get("imager", None),
-            )
-        self.receiver = Receiver(Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels)
+        pixels = _nested_pixels(props, nested) if nested else _own_pixels(props)
+        self.receiver = Receiver(
+            Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels, Blur.from_properties(props)
+        )
         self.m_needs_sample_2 = True
-        self.m_needs_sample_3 = False
+        self.m_needs_sample_3 = self.receiver.blur is not None
 
     def sample_ray(
         self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Sample a ray uniformly over the field of view, for Mitsuba's own integrators."""
-        return self.receiver.sensor_ray(time, sample2, active)
+        return self.receiver.sensor_ray(time, sample2, sample3, active)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the sensor does not extend the scene."""
@@ -96,6 +112,42 @@ class MultipixelReceiver(mi.Sensor):
             f"MultipixelReceiver[origin={self.receiver.pose.origin.tolist()}, layout={self.receiver.pixels.layout}, "
             f"pixels={self.receiver.pixels.count}, field_of_view={1e3 * self.receiver.pixels.field_of_view:g} mrad]"
         )
+
+
+#: Parameters of pixels that are not nested.
+_OWN = ("layout", "pixel_map", "field_of_view_mrad", "field_of_view_shape", "fill_factor", "imager")
+
+
+def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
+    """Build the pixels from nested sensors."""
+    for name in _OWN:
+        if name in props:
+            raise ValueError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
+    if not all(hasattr(pixel, "field") for pixel in nested):
+        raise ValueError("multipixel_receiver: nested sensors must be pixel_fov")
+    names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
+    return ShapedPixels([pixel.field for pixel in nested], names)
+
+
+def _own_pixels(props: mi.Properties) -> PixelArray:
+    """Build the pixels from a layout or a map."""
+
+    def only_for(kind: str, *names: str) -> None:
+        for name in names:
+            if name in props:
+                raise ValueError(f"{name} = {props[name]!r} is for {kind}: leave it out")
+
+    field_of_view = 1e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+    if "pixel_map" in props:
+        only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager")
+        return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
+    layout = str(props.get("layout", "2x2"))
+    fill_factor = in_range("fill_factor", props.get("fill_factor", 1.0), 0.01, 1.0)
+    if layout.startswith("hex"):
+        only_for("layouts of rows x columns", "field_of_view_shape", "imager")
+        return HexagonPixels(layout, field_of_view, fill_factor)
+    shape = props.get("field_of_view_shape", "circle")
+    return LayoutPixels(layout, field_of_view, shape, props.get("imager", None), fill_factor)
 
 
 mi.register_sensor("multipixel_receiver", lambda props: MultipixelReceiver(props))

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.optics.checks import finite, finite_array, in_range, positive
+from mitransient_lidar.transport.blur import Blur
 from mitransient_lidar.transport.fields import Field, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.pixels import ShapedPixels
 from mitransient_lidar.transport.pose import Pose
@@ -30,13 +31,15 @@ class PixelFov(mi.Sensor):
     gx_min_mrad,          float     strip: the part of the circle between these gx [mrad]
     gx_max_mrad
     gx_mrad, gy_mrad      float     circle, ring, sector, rectangle: centre [mrad]. Default: 0
-    vertices_mrad         string    polygon: corners ``gx gy, gx gy, ...`` [mrad], at least three, edges not crossing
+    vertices_mrad         string    polygon: corners ``gx gy, gx gy, ...`` [mrad], at least three; its edges must not
+                                    cross, touch or overlap
     pixel_name            string    Name in the result. Default: ``pixel`` (numbered by ``multipixel_receiver``)
     altitude, off_nadir_deg, ...    As for ``lidar_transmitter``, when used alone
-    aperture_area, ...              As for ``multipixel_receiver``, when used alone
+    aperture_area, obscuration,     As for ``multipixel_receiver``, when used alone
+    blur_mrad, ...
     ====================  ========  ==================================================================================
 
-    Nested in ``multipixel_receiver`` only the shape and the name are used: pose, aperture and losses are the
+    Nested in ``multipixel_receiver`` only the shape and the name are used: pose, aperture, losses and blur are the
     receiver's. As the only sensor of a scene it is a receiver with one pixel.
 
     .. code-block:: xml
@@ -59,15 +62,17 @@ class PixelFov(mi.Sensor):
         self.field = _field(props)
         self.pixel_name = str(props.get("pixel_name", ""))
         pixels = ShapedPixels([self.field], [self.pixel_name or "pixel"])
-        self.receiver = Receiver(Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels)
+        self.receiver = Receiver(
+            Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels, Blur.from_properties(props)
+        )
         self.m_needs_sample_2 = True
-        self.m_needs_sample_3 = False
+        self.m_needs_sample_3 = self.receiver.blur is not None
 
     def sample_ray(
         self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Sample a ray uniformly over the field of view, for Mitsuba's own integrators."""
-        return self.receiver.sensor_ray(time, sample2, active)
+        return self.receiver.sensor_ray(time, sample2, sample3, active)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return an invalid box: the sensor does not extend the scene."""

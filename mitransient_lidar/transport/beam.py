@@ -67,4 +67,6 @@ class BeamSampler:
         gx, gy = dr.select(of_view, vx + self.centre[0], gx), dr.select(of_view, vy + self.centre[1], gy)
         density = transmitter.tangent_density(gx, gy)
         mixture = 0.5 * (density + dr.select(self._inside(gx, gy), mi.Float(1 / self.view.area), 0))
-        return transmitter.pose.direction(gx, gy), transmitter.energy / count * density / mixture
+        # A sample of the beam's rim may lie outside both by rounding.
+        share = dr.select(density > 0, density / mixture, 0)
+        return transmitter.pose.direction(gx, gy), transmitter.energy / count * share

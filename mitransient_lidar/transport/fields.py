@@ -12,11 +12,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mitransient_lidar.optics.checks import finite, in_range, positive
 
 #: Bisection steps that bring an inverted distribution function to float32 accuracy.
 _BISECTION_STEPS = 25
+
+_NOT_SIMPLE = "polygon: its edges must not cross each other, nor touch or overlap"
 
 
 class Field(ABC):
@@ -35,6 +38,13 @@ class Field(ABC):
     @abstractmethod
     def bounds(self) -> tuple[float, float, float, float]:
         """Return (gx_min, gx_max, gy_min, gy_max)."""
+
+    def comes_near(self, gx: NDArray[np.float64], gy: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        gx_min, gx_max, gy_min, gy_max = self.bounds()
+        return np.asarray(
+            (gx >= gx_min - reach) & (gx <= gx_max + reach) & (gy >= gy_min - reach) & (gy <= gy_max + reach)
+        )
 
     def centroid(self) -> tuple[float, float]:
         """Return the centre of gravity (gx, gy) in radians, within a hundredth of the extent."""
@@ -100,6 +110,17 @@ class Sector(Field):
         """Return (gx_min, gx_max, gy_min, gy_max) of the whole circle."""
         (x, y), r = self.centre, self.outer
         return x - r, x + r, y - r, y + r
+
+    def comes_near(self, gx: NDArray[np.float64], gy: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        x, y = gx - self.centre[0], gy - self.centre[1]
+        r = np.hypot(x, y)
+        near = (r <= self.outer + reach) & (r >= self.inner - reach)
+        # Seen from the centre, the surroundings of a point are this wide to either side; all round when it is in them.
+        width = np.where(r > reach, np.arcsin(np.minimum(1, reach / np.maximum(r, reach))), np.pi)
+        off_middle = np.arctan2(y, x) - self.start - 0.5 * self.extent
+        off_middle = np.abs(off_middle - 2 * np.pi * np.round(off_middle / (2 * np.pi)))
+        return np.asarray(near & (off_middle <= 0.5 * self.extent + width))
 
 
 @dataclass(frozen=True)
@@ -196,6 +217,10 @@ class Strip(Field):
         low, high = self._limits()
         return low, high, -self.radius, self.radius
 
+    def comes_near(self, gx: NDArray[np.float64], gy: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        return super().comes_near(gx, gy, reach) & (np.hypot(gx, gy) <= self.radius + reach)
+
 
 class Polygon(Field):
     """Simple polygon, convex or not.
@@ -203,32 +228,37 @@ class Polygon(Field):
     Parameters
     ----------
     vertices
-        Corners (gx, gy) [rad] in order, shape (n, 2), at least three, not all on one line.
+        Corners (gx, gy) [rad] in order, shape (n, 2), at least three, not all on one line. The first one may be
+        repeated at the end.
     """
 
-    def __init__(self, vertices: Sequence[tuple[float, float]]) -> None:
+    def __init__(self, vertices: Sequence[tuple[float, float]] | NDArray[np.float64]) -> None:
         points = np.asarray(vertices, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
             raise ValueError(f"polygon: needs at least three corners (gx, gy), got an array of shape {points.shape}")
         for value in points.ravel():
             finite("polygon corner", float(value))
-        if _crosses_itself(points):
-            raise ValueError("polygon: its edges must not cross each other")
+        if len(points) > 3 and np.array_equal(points[0], points[-1]):
+            points = points[:-1]
         x, y = points.T
         signed = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
-        if abs(signed) < 1e-18:
+        if np.linalg.matrix_rank(points - points[0], tol=1e-9) < 2:
             raise ValueError("polygon: its corners lie on one line, the field of view must have an area")
+        if _meets_itself(points):
+            raise ValueError(_NOT_SIMPLE)
         self.vertices = points if signed > 0 else points[::-1].copy()
         self.area = abs(signed)
         triangles = _triangulate(self.vertices)
-        areas = np.array([0.5 * abs(_cross(*self.vertices[list(t)])) for t in triangles])
         self._corners = self.vertices[np.array(triangles)]
+        areas = 0.5 * np.abs(_cross(*self._corners.swapaxes(0, 1)))
         self._cdf = np.cumsum(areas) / areas.sum()
 
     def contains(self, gx: mi.Float, gy: mi.Float) -> mi.Bool:
         """Return whether points lie inside: an odd number of edges is crossed on the way to gx = infinity."""
         inside = mi.Bool(False)
-        for (x0, y0), (x1, y1) in zip(self.vertices, np.roll(self.vertices, -1, axis=0), strict=True):
+        # NumPy's numbers would turn Dr.Jit arrays into NumPy ones.
+        ends = self.vertices.tolist(), np.roll(self.vertices, -1, axis=0).tolist()
+        for (x0, y0), (x1, y1) in zip(*ends, strict=True):
             if y0 == y1:
                 continue
             crosses = (gy < y0) != (gy < y1)
@@ -256,21 +286,42 @@ class Polygon(Field):
         (x0, y0), (x1, y1) = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return float(x0), float(x1), float(y0), float(y1)
 
+    def comes_near(self, gx: NDArray[np.float64], gy: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        near, inside = np.zeros(gx.shape, dtype=bool), np.zeros(gx.shape, dtype=bool)
+        for (x0, y0), (x1, y1) in zip(self.vertices, np.roll(self.vertices, -1, axis=0), strict=True):
+            x, y, along_x, along_y = gx - x0, gy - y0, x1 - x0, y1 - y0
+            share = np.clip((x * along_x + y * along_y) / (along_x**2 + along_y**2), 0, 1)
+            near |= np.hypot(x - share * along_x, y - share * along_y) <= reach
+            if y0 != y1:
+                inside ^= ((gy < y0) != (gy < y1)) & (gx < x0 + y * (along_x / along_y))
+        return near | inside
 
-def _cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
-    """Twice the signed area of a triangle, positive when its corners turn left."""
-    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+def _cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Twice the signed area of triangles, positive where their corners turn left; corners in the last axis.
+
+    It is 0 where rounding would decide whether the corners lie on one line.
+    """
+    ab, ac = b - a, c - a
+    area = ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
+    sides = np.linalg.norm(ab, axis=-1) * np.linalg.norm(ac, axis=-1)
+    return np.asarray(np.where(np.abs(area) > 1e-12 * sides, area, 0))
 
 
-def _crosses_itself(points: np.ndarray) -> bool:
-    """Return whether two edges of a polygon that share no corner cross."""
-    count = len(points)
-    for i in range(count):
-        a, b = points[i], points[(i + 1) % count]
-        for j in range(i + 2, count - (i == 0)):
-            c, d = points[j], points[(j + 1) % count]
-            if _cross(a, b, c) * _cross(a, b, d) < 0 and _cross(c, d, a) * _cross(c, d, b) < 0:
-                return True
+def _meets_itself(points: np.ndarray) -> bool:
+    """Return whether a polygon's edges cross, touch or overlap, apart from the corners that neighbours share."""
+    start, end, after = points, np.roll(points, -1, axis=0), np.roll(points, -2, axis=0)
+    runs_back = (_cross(start, end, after) == 0) & (np.sum((end - start) * (after - end), axis=1) <= 0)
+    if runs_back.any():
+        return True
+    for i, (a, b) in enumerate(zip(start, end, strict=True)):
+        c, d = (corners[i + 2 : len(points) - (i == 0)] for corners in (start, end))
+        # Edges along one line pass the second test wherever they are, and the first one only if they touch.
+        beside = (np.maximum(a, b) < np.minimum(c, d)) | (np.maximum(c, d) < np.minimum(a, b))
+        meets = (_cross(a, b, c) * _cross(a, b, d) <= 0) & (_cross(c, d, a) * _cross(c, d, b) <= 0)
+        if (meets & ~beside.any(axis=1)).any():
+            return True
     return False
 
 
@@ -289,5 +340,5 @@ def _triangulate(points: np.ndarray) -> list[tuple[int, int, int]]:
                 del rest[k]
                 break
         else:
-            raise ValueError("polygon: its edges must not cross each other")
+            raise ValueError(_NOT_SIMPLE)
     return [*triangles, (rest[0], rest[1], rest[2])]

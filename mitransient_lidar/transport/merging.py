@@ -109,8 +109,10 @@ def merger_at_solids(
             photon, tag = photons.photon(index, within)
             within &= tag == patch.tag
             outgoing = si.to_local(-photon.direction)
-            # Mitsuba's BSDFs hold the cosine, and photons have it already.
-            bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / dr.abs(outgoing.z)
+            # Mitsuba's BSDFs hold the cosine of the shading normal, which stays. A photon's energy on an area is that
+            # of its radiance times the cosine of the true surface, which goes.
+            cosine = dr.abs(dr.dot(si.n, photon.direction))
+            bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
             energy = weight * photon.weight * bsdf
             _add(system, lost, half, photon, 0, path.length + photon.length, energy, within & (bsdf > 0))
             return (index + step,)

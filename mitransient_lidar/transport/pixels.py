@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -13,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.transport.fields import Field, Rectangle, Sector
+from mitransient_lidar.transport.pixel_lookup import FieldLookup
+from mitransient_lidar.transport.streams import unit_points
 
 logger = logging.getLogger(__name__)
 
@@ -21,6 +24,12 @@ PUBLISHED_NAMES = ("red", "green", "blue", "black")
 
 #: Layouts of more pixels than this are imagers unless the scene says otherwise.
 _LARGEST_LAYOUT = 16
+
+#: A receiver has no more pixels than this.
+MOST_PIXELS = 2**20
+
+#: Points in each pixel that find overlaps.
+_OVERLAP_POINTS = 4096
 
 FIELD_SHAPES = ("circle", "square")
 
@@ -33,13 +42,13 @@ class PixelArray(ABC):
     names
         One name a pixel.
     layout
-        ``RxC``, or ``nested``.
+        ``RxC``, ``hexN``, ``map`` or ``nested``.
     grid
         (rows, columns) of an imager, else None.
     area
         Area in which `sample` is uniform, counted once a pixel where pixels overlap [rad^2].
     field_of_view
-        Full angle that holds all pixels [rad].
+        Full angle that holds all pixels [rad]: diameter or side about the axis.
     field_of_view_shape
         ``circle``, ``square`` or ``nested``.
     """
@@ -58,7 +67,7 @@ class PixelArray(ABC):
 
     @abstractmethod
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to points (gx, gy) of density `count_at` / `area`."""
+        """Map uniform numbers to points (gx, gy): their density in pixels is the number of these over `area`."""
 
     @abstractmethod
     def pixel_at(self, gx: mi.Float, gy: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -89,9 +98,14 @@ class LayoutPixels(PixelArray):
         ``circle`` or ``square``.
     imager
         Whether rows and columns stay apart in the result; None decides by the number of pixels.
+    fill_factor
+        Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre. The circle cuts
+        what lies outside it, as a field stop does.
     """
 
-    def __init__(self, layout: str, field_of_view: float, shape: str, imager: bool | None = None) -> None:
+    def __init__(
+        self, layout: str, field_of_view: float, shape: str, imager: bool | None = None, fill_factor: float = 1.0
+    ) -> None:
         rows, columns = parse_layout(layout)
         half = 0.5 * field_of_view
         if shape not in FIELD_SHAPES:
@@ -100,7 +114,9 @@ class LayoutPixels(PixelArray):
         self.layout = layout
         self.field_of_view = field_of_view
         self.field_of_view_shape = shape
-        self.area = self.field.area
+        # Of cells that leave gaps the whole ones are sampled, though the circle cuts some.
+        self._shrink = math.sqrt(fill_factor)
+        self.area = fill_factor * field_of_view**2 if fill_factor < 1 else self.field.area
         self._rows, self._columns = rows, columns
         self.grid = (rows, columns) if (rows * columns > _LARGEST_LAYOUT if imager is None else imager) else None
         if (rows, columns) in ((2, 2), (4, 1)):
@@ -111,15 +127,25 @@ class LayoutPixels(PixelArray):
             self.names = [f"r{row}c{column}" for row in range(rows) for column in range(columns)]
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to uniform points of the field of view."""
-        return self.field.sample(u)
+        """Map uniform numbers to uniform points of the field of view, or of its cells when they leave gaps."""
+        if self._shrink == 1:
+            return self.field.sample(u)
+        half, full = 0.5 * self.field_of_view, self.field_of_view
+        row, column = u.x * self._rows, u.y * self._columns
+        row, column = (dr.lerp(dr.floor(g) + 0.5, g, self._shrink) for g in (row, column))
+        return half - row * (full / self._rows), column * (full / self._columns) - half
 
     def pixel_at(self, gx: mi.Float, gy: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether the field of view holds it (1 or 0)."""
         half, full = 0.5 * self.field_of_view, self.field_of_view
-        row = dr.clip(mi.Int32(dr.floor((half - gx) * (self._rows / full))), 0, self._rows - 1)
-        column = dr.clip(mi.Int32(dr.floor((gy + half) * (self._columns / full))), 0, self._columns - 1)
-        return mi.UInt32(row * self._columns + column), dr.select(self.field.contains(gx, gy), mi.Float(1), 0)
+        down, across = (half - gx) * (self._rows / full), (gy + half) * (self._columns / full)
+        row = dr.clip(mi.Int32(dr.floor(down)), 0, self._rows - 1)
+        column = dr.clip(mi.Int32(dr.floor(across)), 0, self._columns - 1)
+        inside = self.field.contains(gx, gy)
+        if self._shrink < 1:
+            off_centre = dr.maximum(dr.abs(down - row - 0.5), dr.abs(across - column - 0.5))
+            inside &= off_centre <= 0.5 * self._shrink
+        return mi.UInt32(row * self._columns + column), dr.select(inside, mi.Float(1), 0)
 
     def centres(self) -> NDArray[np.float64]:
         """Return centres of gravity (gx, gy) [rad], shape (pixels, 2); of the uncut cells in imagers."""
@@ -159,47 +185,49 @@ class ShapedPixels(PixelArray):
         self.grid = None
         areas = np.array([field.area for field in fields])
         self.area = float(areas.sum())
-        self._cdf = np.cumsum(areas) / self.area
+        ends = np.cumsum(areas) / self.area
+        self._starts, self._per_share = mi.Float(np.append(0, ends[:-1])), mi.Float(1 / np.diff(ends, prepend=0))
         self.field_of_view = 2 * float(np.abs([field.bounds() for field in fields]).max())
         self.field_of_view_shape = "nested"
+        self._lookup = FieldLookup(fields)
         for first, second in self._overlaps():
             logger.warning("pixels %r and %r overlap: light in both is counted in each", first, second)
 
     def _overlaps(self) -> list[tuple[str, str]]:
         """Return the names of pixels that overlap, found with 4096 points in each."""
-        index = dr.arange(mi.Float, 4096)
-        golden = index * 0.6180339887
-        points = mi.Point2f((index + 0.5) / 4096, golden - dr.floor(golden))
+        neighbours = self._lookup.neighbours.tolist()
+        if not neighbours:
+            return []
+        points = unit_points(_OVERLAP_POINTS)
+        lane = dr.arange(mi.UInt32, _OVERLAP_POINTS * self.count)
+        pixel = lane // _OVERLAP_POINTS
+        gx, gy = self._sample_in(pixel, dr.gather(mi.Point2f, points, lane % _OVERLAP_POINTS))
+        _, held = self._lookup.find(gx, gy, mi.Float(0))
+        # Neighbours may share an edge to rounding: one point in 4096 is not an overlap.
+        shared = np.bincount(np.array(pixel)[np.array(held) > 1], minlength=self.count) > 1
         found = []
-        for i, field in enumerate(self.fields[:-1]):
-            gx, gy = field.sample(points)
-            for j in range(i + 1, len(self.fields)):
-                # Neighbours may share an edge to rounding: one point in 4096 is not an overlap.
-                if dr.count(self.fields[j].contains(gx, gy))[0] > 1:
-                    found.append((self.names[i], self.names[j]))
+        for i, j in neighbours:
+            if shared[i] and dr.count(self.fields[j].contains(*self.fields[i].sample(points)))[0] > 1:
+                found.append((self.names[i], self.names[j]))
         return found
+
+    def _sample_in(self, pixel: mi.UInt32, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points of the given pixels."""
+        gx, gy = dr.switch(pixel, [field.sample for field in self.fields], u)
+        return gx, gy
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to points: a pixel by its area, then uniform in it."""
-        gx, gy = mi.Float(0), mi.Float(0)
-        low = 0.0
-        for field, high in zip(self.fields, self._cdf, strict=True):
-            chosen = u.x >= low
-            x, y = field.sample(mi.Point2f(dr.clip((u.x - low) / (float(high) - low), 0, 1), u.y))
-            gx, gy = dr.select(chosen, x, gx), dr.select(chosen, y, gy)
-            low = float(high)
-        return gx, gy
+        last = len(self.fields) - 1
+        pixel = dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self._starts, i + 1) <= u.x)
+        start, per_share = (dr.gather(mi.Float, table, pixel) for table in (self._starts, self._per_share))
+        point = mi.Point2f(dr.clip((u.x - start) * per_share, 0, 1), u.y)
+        return self._sample_in(mi.UInt32(pixel), point)
 
     def pixel_at(self, gx: mi.Float, gy: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return one pixel at a point and how many pixels hold it."""
-        held = [field.contains(gx, gy) for field in self.fields]
-        count = sum((dr.select(inside, mi.UInt32(1), 0) for inside in held), mi.UInt32(0))
-        rank = dr.minimum(mi.UInt32(u * mi.Float(count)), dr.maximum(count, 1) - 1)
-        chosen, seen = mi.UInt32(0), mi.UInt32(0)
-        for index, inside in enumerate(held):
-            chosen = dr.select(inside & (seen == rank), mi.UInt32(index), chosen)
-            seen += dr.select(inside, mi.UInt32(1), 0)
-        return chosen, mi.Float(count)
+        pixel, count = self._lookup.find(gx, gy, u)
+        return pixel, mi.Float(count)
 
     def centres(self) -> NDArray[np.float64]:
         """Return centres of gravity (gx, gy) [rad], shape (pixels, 2)."""
@@ -216,8 +244,8 @@ def parse_layout(layout: str) -> tuple[int, int]:
     """
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", layout)
     if not match:
-        raise ValueError(f"layout = {layout!r} must be rows x columns, such as 1x1, 2x2, 1x4 or 128x128")
+        raise ValueError(f"layout = {layout!r} must be rows x columns, such as 1x1, 2x2, 1x4 or 128x128, or hex7")
     rows, columns = int(match.group(1)), int(match.group(2))
-    if rows * columns > 2**20:
-        raise ValueError(f"layout = {layout!r} has {rows * columns} pixels; allowed are at most {2**20}")
+    if rows * columns > MOST_PIXELS:
+        raise ValueError(f"layout = {layout!r} has {rows * columns} pixels; allowed are at most {MOST_PIXELS}")
     return (4, 1) if (rows, columns) == (1, 4) else (rows, columns)

@@ -7,9 +7,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from mitransient_lidar.transport.fields import Polygon, Rectangle, Sector, Strip
+from mitransient_lidar.transport.hexagons import HexagonPixels
+from mitransient_lidar.transport.pixel_lookup import FieldLookup
+from mitransient_lidar.transport.pixel_maps import MappedPixels
 from mitransient_lidar.transport.pixels import LayoutPixels, ShapedPixels
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.streams import pass_streams
@@ -118,6 +122,173 @@ def test_overlapping_pixels_each_get_their_whole_field(caplog):
 def test_neighbours_are_no_overlap(caplog):
     ShapedPixels([Strip(5 * MRAD, -5 * MRAD, 0.0), Strip(5 * MRAD, 0.0, 5 * MRAD)], ["near", "far"])
     assert caplog.text == ""
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("reach", [0.1 * MRAD, 3 * MRAD])
+def test_no_point_of_a_field_is_out_of_its_reach(name, reach):
+    """Points up to `reach` from points of the field are near it, and few of those twice as far from all of them are."""
+    field = SHAPES[name]
+    rng = np.random.default_rng(8)
+    inside = np.stack([np.array(g, dtype=np.float64) for g in field.sample(random_points(count=2**14))], axis=1)
+    angle = rng.uniform(0, 2 * np.pi, len(inside))
+    moved = inside + 0.999 * reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert field.comes_near(*moved.T, reach).all()
+    apart = rng.uniform(-25 * MRAD, 25 * MRAD, (4000, 2))
+    distance, _ = cKDTree(inside).query(apart)
+    # The surroundings of an edge, and of a corner, are taken wider by less than the reach.
+    assert field.comes_near(*apart.T, reach)[distance > 2.5 * reach + 0.5 * MRAD].mean() < 0.02
+
+
+def many_fields():
+    """Return 60 fields of all kinds, which overlap."""
+    rng = np.random.default_rng(3)
+    fields = []
+    for kind in range(60):
+        x, y = rng.uniform(-12, 12, 2) * MRAD
+        if kind % 4 == 0:
+            fields.append(Sector(rng.uniform(2, 5) * MRAD, 1 * MRAD, rng.uniform(-4, 4), rng.uniform(1, 6), (x, y)))
+        elif kind % 4 == 1:
+            fields.append(Rectangle(x, x + 3 * MRAD, y, y + 5 * MRAD))
+        elif kind % 4 == 2:
+            corners = np.sort(rng.uniform(0, 2 * np.pi, 7))
+            radii = rng.uniform(1, 6, 7) * MRAD
+            fields.append(Polygon(np.stack([x + radii * np.cos(corners), y + radii * np.sin(corners)], axis=1)))
+        else:
+            fields.append(Strip(15 * MRAD, x, x + 2 * MRAD))
+    return fields
+
+
+@pytest.mark.parametrize("symbolic", [True, False])
+def test_the_lookup_finds_what_the_fields_themselves_say(symbolic):
+    fields = many_fields()
+    lookup = FieldLookup(fields)
+    rng = np.random.default_rng(5)
+    gx, gy = (mi.Float(rng.uniform(-20, 20, 2**14) * MRAD) for _ in range(2))
+    u = mi.Float(rng.uniform(0, 1, 2**14))
+    flags = dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicCalls
+    with dr.scoped_set_flag(flags[0], symbolic), dr.scoped_set_flag(flags[1], symbolic):
+        chosen, count = (np.array(a) for a in lookup.find(gx, gy, u))
+    holds = np.array([np.array(field.contains(gx, gy)) for field in fields])
+    np.testing.assert_array_equal(count, holds.sum(axis=0))
+    assert count.max() > 5
+    held = count > 0
+    assert holds[chosen[held], np.flatnonzero(held)].all()
+    # Number floor(u * count) of the fields that hold the point, in their order.
+    rank = np.minimum((np.array(u) * count).astype(int), count - 1)[held]
+    before = np.array(
+        [holds[:index, lane].sum() for lane, index in zip(np.flatnonzero(held), chosen[held], strict=True)]
+    )
+    np.testing.assert_array_equal(before, rank)
+    pairs = {tuple(pair) for pair in lookup.neighbours.tolist()}
+    together = np.argwhere(np.triu(holds.astype(int) @ holds.T.astype(int), 1))
+    assert {tuple(pair) for pair in together.tolist()} <= pairs
+
+
+def hexagon_outline(centre, side):
+    """Return the corners of a hexagon with two of them along gx."""
+    angles = np.radians(60 * np.arange(6))
+    return [(centre[0] + side * np.cos(a), centre[1] + side * np.sin(a)) for a in angles]
+
+
+@pytest.mark.parametrize("fill_factor", [1.0, 0.4])
+def test_hexagons_are_those_of_a_drawing(fill_factor):
+    """Each of 19 against a polygon with its corners; alike in area, uniform inside."""
+    pixels = HexagonPixels("hex19", 30 * MRAD, fill_factor)
+    side = 15 * MRAD / np.sqrt(19) * np.sqrt(fill_factor)
+    gx, gy = pixels.sample(random_points())
+    pixel, count = (np.array(a) for a in pixels.pixel_at(gx, gy, mi.Float(0)))
+    assert np.mean(count == 1) > 1 - 1e-5
+    shares = np.bincount(pixel, minlength=19)
+    assert chi2.sf(np.sum((shares - COUNT / 19) ** 2 / (COUNT / 19)), 18) > 1e-4
+    # Random points of the whole square fall into the hexagon that they are drawn in, or into none.
+    rng = mi.PCG32(COUNT, initstate=9)
+    x, y = (30 * MRAD * (rng.next_float32() - 0.5) for _ in range(2))
+    pixel, count = (np.array(a) for a in pixels.pixel_at(x, y, mi.Float(0)))
+    drawn = np.full(COUNT, -1)
+    for index, centre in enumerate(pixels.centres()):
+        polygon = Polygon(hexagon_outline(centre, side))
+        assert polygon.area * 19 == pytest.approx(pixels.area, rel=1e-6)
+        drawn[np.array(polygon.contains(x, y))] = index
+        # Uniform: quarters of the hexagon, and its middle.
+        inside = np.array(polygon.contains(gx, gy))
+        here = np.stack([np.array(gx)[inside] - centre[0], np.array(gy)[inside] - centre[1]], axis=1)
+        parts = [np.mean(here[:, 0] > 0), np.mean(here[:, 1] > 0), np.mean(np.abs(here[:, 0]) < 0.5 * side)]
+        assert np.abs(np.array(parts) - [0.5, 0.5, 2 / 3]).max() < 5 * 0.5 / np.sqrt(inside.sum())
+    assert np.mean(drawn != np.where(count > 0, pixel.astype(int), -1)) < 1e-5
+
+
+@pytest.mark.parametrize("layout", ["hex1", "hex7", "hex1027"])
+def test_hexagons_fill_the_same_share_of_their_circle_whatever_their_number(layout):
+    """3 sqrt(3) / (2 pi) of it, and the farthest corners lie on the circle."""
+    pixels = HexagonPixels(layout, 30 * MRAD)
+    assert pixels.area == pytest.approx(1.5 * np.sqrt(3) * (15 * MRAD) ** 2)
+    gx, gy = (np.array(g, dtype=np.float64) for g in pixels.sample(random_points()))
+    assert 14.9 * MRAD < np.hypot(gx, gy).max() <= 15.0001 * MRAD
+    centres = pixels.centres()
+    pixel, count = pixels.pixel_at(*(mi.Float(g) for g in centres.T), mi.Float(0))
+    np.testing.assert_array_equal(np.array(pixel), np.arange(pixels.count))
+    assert np.all(np.array(count) == 1)
+    # Rows from far to near, and in a row from -gy to +gy.
+    order = np.lexsort((np.round(centres[:, 1], 9), -np.round(centres[:, 0], 9)))
+    np.testing.assert_array_equal(order, np.arange(pixels.count))
+
+
+@pytest.mark.parametrize("shape", ["square", "circle"])
+@pytest.mark.parametrize("layout", ["1x1", "3x5", "2x2"])
+def test_cells_that_leave_gaps_are_smaller_about_the_same_centre(layout, shape):
+    """Light is received uniformly in the shrunk rectangles, as far as the circle does not cut them."""
+    fill_factor = 0.36
+    pixels = LayoutPixels(layout, 30 * MRAD, shape, False, fill_factor)
+    rows, columns = (int(n) for n in layout.split("x"))
+    ticks = (np.arange(1500) + 0.5) / 1500
+    x, y = ticks * rows, ticks * columns
+    inside = (np.abs(x % 1 - 0.5) < 0.3)[:, None] & (np.abs(y % 1 - 0.5) < 0.3)
+    gx, gy = np.meshgrid(15 * MRAD * (1 - 2 * ticks), 15 * MRAD * (2 * ticks - 1), indexing="ij")
+    if shape == "circle":
+        inside &= np.hypot(gx, gy) <= 15 * MRAD
+    number = (x.astype(int)[:, None] * columns + y.astype(int)).ravel()
+    pixel, count = pixels.pixel_at(mi.Float(gx.ravel()), mi.Float(gy.ravel()), mi.Float(0))
+    pixel, count = np.array(pixel), np.array(count).reshape(inside.shape) > 0
+    assert np.mean(inside != count) < 1e-4
+    assert np.all((pixel == number)[inside.ravel()])
+    # Area of each pixel by samples, against the raster.
+    areas = np.bincount(number, inside.ravel(), rows * columns) * (30 * MRAD / 1500) ** 2
+    sx, sy = pixels.sample(random_points())
+    pixel, held = (np.array(a) for a in pixels.pixel_at(sx, sy, mi.Float(0)))
+    shares = np.bincount(pixel, held, rows * columns) / COUNT
+    error = np.sqrt(shares / COUNT)
+    assert np.all(np.abs(shares - areas / pixels.area) < 4 * error + 2e-3 * shares)
+    if shape == "square":
+        assert pixels.area == pytest.approx(fill_factor * (30 * MRAD) ** 2)
+        assert held.mean() > 1 - 1e-5
+    # Of each pixel the centre of gravity, which the circle moves.
+    for index, centre in enumerate(pixels.centres()):
+        here = inside.ravel() & (number == index)
+        np.testing.assert_allclose([gx.ravel()[here].mean(), gy.ravel()[here].mean()], centre, atol=0.05 * MRAD)
+
+
+def test_a_map_has_a_pixel_for_each_label():
+    """Labels 2, 5 and 9 in cells of 10 mrad x 7.5 mrad: row 0 is far, column 0 on the -gy side."""
+    labels = np.array([[5, 5, 0, 2], [0, 9, 0, 2], [9, 9, 0, 0]])
+    pixels = MappedPixels(labels, 30 * MRAD)
+    assert pixels.names == ["label2", "label5", "label9"]
+    assert pixels.area == pytest.approx(7 * 75 * MRAD**2)
+    centres = [[5, 11.25], [10, -7.5], [-10 + 10 / 3, -3.75 - 2.5]]
+    np.testing.assert_allclose(pixels.centres(), np.array(centres) * MRAD, atol=1e-12)
+    gx, gy = pixels.sample(random_points())
+    pixel, count = (np.array(a) for a in pixels.pixel_at(gx, gy, mi.Float(0)))
+    assert np.mean(count == 1) > 1 - 1e-5
+    edges = np.linspace(-15, 15, 7) * MRAD, np.linspace(-15, 15, 9) * MRAD
+    counts = np.histogram2d(np.array(gx), np.array(gy), bins=edges)[0]
+    expected = COUNT / 28 * np.repeat(np.repeat(labels[::-1] > 0, 2, axis=0), 2, axis=1)
+    lit = expected > 0
+    assert counts[~lit].sum() <= 1e-5 * COUNT
+    assert chi2.sf(np.sum((counts - expected)[lit] ** 2 / expected[lit]), 27) > 1e-4
+    shares = np.bincount(pixel, count) / COUNT
+    assert np.all(np.abs(shares - np.array([2, 2, 3]) / 7) < 4 * np.sqrt(0.25 / COUNT))
+    outside = pixels.pixel_at(mi.Float(0.0151, -0.0151, 0.0, 0.0), mi.Float(0.0, 0.0, 0.0151, -0.0151), mi.Float(0))
+    assert np.all(np.array(outside[1]) == 0)
 
 
 @pytest.mark.parametrize("view_mrad", [2.0, 15.0, 30.0, 60.0])

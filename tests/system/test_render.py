@@ -54,7 +54,15 @@ def test_parameters_have_the_same_names_in_every_scene():
 @pytest.mark.parametrize("phase", ["fournier_forand", "petzold", "hg"])
 def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(phase):
     scene, _, parameters = loading.load_scene(
-        "table1", {"phase": phase, "phase_g": 0.8, "spectrum": "flat", "slope_variance": 0.02, "layer_tops": [0, 3]}
+        "table1",
+        {
+            "phase": phase,
+            "phase_g": 0.8,
+            "spectrum": "flat",
+            "slope_variance": 0.02,
+            "layer_tops": [0, 3],
+            "attenuation": [0.3, 0.4],
+        },
     )
     (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
     assert surface.slope_variance == pytest.approx(0.02)
@@ -347,3 +355,23 @@ def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lid
     error = missing.std(ddof=1) / np.sqrt(len(missing))
     assert missing.mean() > 10 * error  # otherwise nothing is shown
     assert lost / (lost + received) == pytest.approx(missing.mean(), abs=0.25 * missing.mean() + 4 * error)
+
+
+def test_target_below_the_bottom_is_refused():
+    with pytest.raises(UserError, match="shape 'target' lies below the bottom 'bottom', up to z = -13 m"):
+        rendering.render("fig13_2x2", params={"target_depth": 13}, passes=2)
+
+
+def test_target_above_the_sea_is_told(lidar_scene, caplog):
+    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([5, 0, 3])}
+    rendering.render(lidar_scene(extra={"plate": plate}), passes=2)
+    assert "shape 'plate' lies above the sea, from z = 3 m" in caplog.text
+
+
+def test_mesh_without_faces_is_refused(tmp_path):
+    header = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    faces = ["element face 0", "property list uchar int vertex_indices", "end_header"]
+    path = tmp_path / "empty.ply"
+    path.write_text("\n".join([*header, *faces, "0 0 0", "1 0 0", "0 1 0", ""]))
+    with pytest.raises(UserError, match="a shape of type ply has no faces"):
+        loading.load_scene({"target": {"type": "ply", "filename": str(path)}})

@@ -1,0 +1,104 @@
+"""A target's own signal: with and without it on common random numbers."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitransient_lidar.errors import UserError
+from mitransient_lidar.target_signal import describe_map, describe_target, target_map, target_signal
+
+NEAR = {"surface_extent": 200, "bin_count": 170}
+
+
+@pytest.fixture(scope="module")
+def squares():
+    return target_signal("fig13_2x2", NEAR, passes=16)
+
+
+@pytest.fixture(scope="module")
+def strips():
+    return target_signal("fig14_1x4", NEAR, passes=32)
+
+
+@pytest.fixture(params=["squares", "strips"])
+def published(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_common_random_numbers_know_the_target_better_than_the_records(published):
+    """Where the target's echo is not, both records are of the same paths, so that their difference is known to be 0."""
+    before = published.sel(time=slice(1420, 1470))
+    assert np.all(np.abs(before["difference"]) < 1e-9 * before["waveform"].max())
+    lit = published["difference_stderr"].sel(time=slice(1480, 1500)).mean()
+    assert lit < published["waveform_stderr"].sel(time=slice(1480, 1500)).mean()
+
+
+def test_near_pixels_hold_the_published_target(published):
+    """FOI-R--2074--SE, figures 13 and 14: blue and black contain the largest part of the target's echo."""
+    share = published["echo"] / published["echo"].sum()
+    assert share.sel(pixel=["blue", "black"]).sum() > 0.9
+
+
+def test_best_weights_are_no_worse_than_the_sum_or_any_pixel(published):
+    snr = published["combined_detectability"].sel(combination="best")
+    assert snr >= published["combined_detectability"].sel(combination="whole")
+    assert snr >= published["detectability"].max()
+
+
+def test_strips_show_the_target_best_in_black(strips):
+    """Figure 14: black's echo is within 25 % of blue's, though its field of view and backscatter are smaller."""
+    blue, black = (strips.sel(pixel=name) for name in ("blue", "black"))
+    error = float(np.hypot(blue["echo_stderr"], black["echo_stderr"]) / blue["echo"])
+    assert abs(float(black["echo"] / blue["echo"]) - 1) < 0.25 + 3 * error
+    assert error < 0.06
+    assert black["backscatter"] < 0.5 * blue["backscatter"]
+    assert black["contrast"] > 3 * blue["contrast"]
+    # Above the target the outer strips see far less water than the middle ones.
+    column = strips["background"].sel(time=slice(1440, 1475)).mean("time")
+    assert column.sel(pixel=["red", "black"]).max() < 0.5 * column.sel(pixel=["green", "blue"]).min()
+
+
+def test_target_shades_the_bottom_behind_it(published):
+    assert float(published["shadow"].sum()) < -5 * float(published["shadow_stderr"].sum())
+
+
+def test_map_moves_the_target():
+    maps = target_map("fig13_2x2", NEAR, x=(0.0, 2.0), y=(-1.0, 1.0), passes=16)
+    far = maps["echo"].sel(pixel=["red", "green"]).sum("pixel") / maps["combined_echo"].sel(combination="whole")
+    # Farther away it is seen by the far pixels, and to one side by the pixels of that side.
+    assert np.all(far.sel(target_x=2.0) > far.sel(target_x=0.0) + 0.2)
+    left = maps["echo"].sel(pixel=["red", "blue"]).sum("pixel") / maps["combined_echo"].sel(combination="whole")
+    assert np.all(left.sel(target_y=-1.0) > left.sel(target_y=1.0) + 0.3)
+    assert len(describe_map(maps)) == 5
+
+
+def test_table_tells_pixels_and_combinations(published):
+    lines = describe_target(published)
+    assert [line.split()[0] for line in lines[2:]] == ["red", "green", "blue", "black", "whole", "best"]
+    assert lines[-2].split()[4] == "100.0"
+
+
+@pytest.mark.parametrize(
+    ("scene", "params", "options", "message"),
+    [
+        ("fig13_2x2", {}, {"target": "mine"}, "target = 'mine' must be the id of a shape of the scene: .*bottom"),
+        ("fig13_2x2", {}, {"target": "surface"}, "target = 'surface' must not be the sea surface"),
+        ("fig13_2x2", {"target_depth": 13}, {}, "target 'target' lies below the bottom, up to z = -13 m"),
+        ("fig13_2x2", {"target_reflectivity": 0}, {}, "it returns no light"),
+        ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
+    ],
+)
+def test_mistakes_are_told(scene, params, options, message):
+    with pytest.raises(UserError, match=message):
+        target_signal(scene, {**NEAR, **params}, passes=16, **options)
+
+
+def test_target_above_the_sea_is_refused(lidar_scene):
+    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])}
+    with pytest.raises(UserError, match="target 'target' lies above the sea, from z = 3 m"):
+        target_signal(lidar_scene(extra={"target": plate}), passes=16)
+
+
+def test_map_needs_a_target_that_can_be_moved():
+    with pytest.raises(UserError, match="has no parameter target_x"):
+        target_map("fig09_2x2", passes=16)

@@ -1,0 +1,219 @@
+"""Elliptic and measured beams in the tangent plane: samples, density, widths, files."""
+
+import drjit as dr
+import matplotlib.image
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+from scipy.stats import chi2
+
+from mitransient_lidar.transport.beam import BeamSampler
+from mitransient_lidar.transport.beam_profiles import GaussianBeam, ImageBeam, TopHatBeam
+from mitransient_lidar.transport.streams import pass_streams
+
+MRAD = 1e-3
+COUNT = 2**20
+IMAGE = np.array([[0, 7, 1, 0], [0, 0, 0, 0], [2, 3, 0, 12]], dtype=float)
+
+#: Half angles of 6 and 1.5 mrad, the long axis 30 degrees from +gx towards +gy.
+TURN = np.radians(30)
+PROFILES = {
+    "gaussian": lambda: GaussianBeam(6 * MRAD, 1.5 * MRAD, TURN),
+    "top_hat": lambda: TopHatBeam(6 * MRAD, 1.5 * MRAD, TURN),
+    "image": lambda: ImageBeam(IMAGE, 16 * MRAD),
+}
+
+
+def tangent_samples(profile, count=COUNT):
+    rng = mi.PCG32(count, initstate=3)
+    gx, gy = profile.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    return np.array(gx, dtype=np.float64), np.array(gy, dtype=np.float64)
+
+
+def laser(**parameters):
+    return mi.load_dict({"type": "lidar_transmitter", **parameters})
+
+
+def image_file(folder, image=IMAGE, suffix=".npy"):
+    path = folder / f"beam{suffix}"
+    if suffix == ".npy":
+        np.save(path, image)
+    elif suffix == ".png":
+        from PIL import Image
+
+        Image.fromarray(np.round(image * 20).astype(np.uint8)).save(path)
+    else:
+        with OpenEXR.File({}, {"Y": image.astype(np.float32)}) as file:
+            file.write(str(path))
+    return str(path)
+
+
+@pytest.mark.parametrize("kind", PROFILES)
+def test_samples_follow_the_density(kind):
+    profile = PROFILES[kind]()
+    gx, gy = tangent_samples(profile)
+    edges = np.linspace(-30, 30, 121) * MRAD
+    width = edges[1] - edges[0]
+    counts = np.histogram2d(gx, gy, bins=(edges, edges))[0]
+    fine = ((edges[:-1] + edges[1:])[:, None] / 2 + ((np.arange(8) + 0.5) / 8 - 0.5) * width).ravel()
+    x, y = (mi.Float(g.ravel()) for g in np.meshgrid(fine, fine, indexing="ij"))
+    density = np.array(profile.density(x, y), dtype=np.float64).reshape(120, 8, 120, 8)
+    expected = COUNT * density.mean(axis=(1, 3)) * width**2
+    assert expected.sum() == pytest.approx(COUNT, rel=2e-3)
+    used = expected > 50
+    if kind != "gaussian":
+        used &= density.min(axis=(1, 3)) == density.max(axis=(1, 3))  # cells that no edge cuts
+    assert used.sum() >= 24
+    statistic = np.sum((counts - expected)[used] ** 2 / expected[used])
+    assert chi2.sf(statistic, used.sum()) > 1e-4
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "top_hat"])
+def test_elliptic_samples_have_the_moments_of_a_turned_ellipse(kind):
+    """Variances a^2 and b^2 along axes turned by 30 degrees (a quarter of them for an even disc); no sign is free."""
+    gx, gy = tangent_samples(PROFILES[kind]())
+    a2, b2 = (36.0, 2.25) if kind == "gaussian" else (9.0, 0.5625)
+    cos2, sin2, mixed = 0.75, 0.25, np.sqrt(3) / 4
+    expected = np.array([a2 * cos2 + b2 * sin2, a2 * sin2 + b2 * cos2, (a2 - b2) * mixed]) * MRAD**2
+    np.testing.assert_allclose([np.mean(gx**2), np.mean(gy**2), np.mean(gx * gy)], expected, rtol=0.01)
+    assert np.abs([gx.mean(), gy.mean()]).max() < 4 * 6 * MRAD / np.sqrt(COUNT)
+
+
+def test_elliptic_gaussian_falls_to_e_to_the_minus_half_at_its_half_angles():
+    beam = laser(divergence_mrad=12.0, divergence_across_mrad=3.0, ellipse_deg=30.0)
+    cos, sin = np.cos(TURN), np.sin(TURN)
+    gx, gy = mi.Float([0, 6e-3 * cos, -1.5e-3 * sin]), mi.Float([0, 6e-3 * sin, 1.5e-3 * cos])
+    density = np.array(beam.tangent_density(gx, gy))
+    assert density[0] == pytest.approx(1 / (2 * np.pi * 6e-3 * 1.5e-3), rel=1e-5)
+    np.testing.assert_allclose(density[1:] / density[0], np.exp(-0.5), rtol=1e-4)
+
+
+def test_image_cells_hold_their_shares():
+    """Row 0 is far (+gx) and column 0 at -gy: a flipped image would put the brightest cell, 12 of 25, elsewhere."""
+    gx, gy = tangent_samples(PROFILES["image"]())
+    far, left = 6 * MRAD - 4 * MRAD * np.arange(4), -8 * MRAD + 4 * MRAD * np.arange(5)
+    counts = np.histogram2d(-gx, gy, bins=(-far, left))[0]
+    expected = COUNT * IMAGE / IMAGE.sum()
+    assert counts.sum() == COUNT
+    assert not counts[IMAGE == 0].any()
+    lit = IMAGE > 0
+    assert chi2.sf(np.sum((counts - expected)[lit] ** 2 / expected[lit]), lit.sum() - 1) > 1e-4
+    density = np.array(ImageBeam(IMAGE, 16 * MRAD).density(mi.Float([-4e-3, 4e-3]), mi.Float([6e-3, 6e-3])))
+    np.testing.assert_allclose(density, [12 / 25 / 16e-6, 0], rtol=1e-6)
+
+
+def test_fine_image_of_a_gaussian_is_that_gaussian():
+    ticks = (np.arange(400) - 199.5) * 0.05  # mrad
+    far, left = np.meshgrid(-ticks, ticks, indexing="ij")
+    along, across = 0.8 * far + 0.6 * left, 0.8 * left - 0.6 * far
+    profile = ImageBeam(np.exp(-0.5 * (along**2 / 4 + across**2)), 20 * MRAD)
+    np.testing.assert_allclose(profile.spreads, [2 * MRAD, 1 * MRAD], rtol=1e-3)
+    assert np.degrees(profile.turn) % 180 == pytest.approx(np.degrees(np.arctan2(0.6, 0.8)), abs=0.01)
+    gx, gy = tangent_samples(profile)
+    np.testing.assert_allclose(
+        [np.var(gx), np.var(gy)], [(0.64 * 4 + 0.36) * 1e-6, (0.36 * 4 + 0.64) * 1e-6], rtol=0.01
+    )
+    (half, (rim,)), (_, (outer,)) = profile.outlines()
+    assert half == pytest.approx(np.exp(-0.5))
+    for line, scale in ((rim, 1), (outer, 2)):
+        a, b = 0.8 * line[:, 0] + 0.6 * line[:, 1], 0.8 * line[:, 1] - 0.6 * line[:, 0]
+        np.testing.assert_allclose(np.hypot(a / 2, b) / MRAD, scale, rtol=3e-3)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "image"])
+def test_rays_follow_the_intensity(kind, tmp_path):
+    """Over the sphere, at angles where the solid angle per tangent-plane area is not constant."""
+    if kind == "gaussian":
+        beam = laser(divergence_mrad=500.0, divergence_across_mrad=200.0, ellipse_deg=60.0)
+    else:
+        ticks = (np.arange(64) - 31.5) / 20
+        image = np.exp(-(ticks[:, None] ** 2) - 2 * (ticks - 0.4) ** 2)
+        beam = laser(beam_profile="image", profile_file=image_file(tmp_path, image), profile_mrad=900.0)
+
+    def sample(u):
+        return beam.sample_ray(0.0, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(u[0], u[1]))[0].d
+
+    def density(d):
+        return beam.intensity(d) / beam.energy
+
+    assert ChiSquareTest(
+        SphericalDomain(), sample, density, 2, sample_count=1_000_000, res=101, ires=16, seed=5
+    ).run()  # fmt: skip
+
+
+def test_spreads_are_those_of_the_narrow_and_the_wide_axis():
+    """Cells go by the narrow one, what covers the beam by the wide one."""
+    flat = laser(beam_profile="top_hat", divergence_mrad=2.0, divergence_across_mrad=12.0)
+    assert (flat.angular_spread, flat.widest_angular_spread) == (pytest.approx(0.5e-3), pytest.approx(3e-3))
+    assert laser().angular_spread == laser().widest_angular_spread == 5e-3
+    assert flat.divergence == pytest.approx(2e-3)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
+def test_files_of_all_kinds_hold_the_same_beam(suffix, tmp_path):
+    beam = laser(beam_profile="image", profile_file=image_file(tmp_path, suffix=suffix), profile_mrad=16.0)
+    gx, gy = (g.ravel() for g in np.meshgrid([4e-3, 0, -4e-3], [-6e-3, -2e-3, 2e-3, 6e-3], indexing="ij"))
+    density = np.array(beam.tangent_density(mi.Float(gx), mi.Float(gy)))
+    np.testing.assert_allclose(density * 16e-6, IMAGE.ravel() / 25, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", PROFILES)
+@pytest.mark.parametrize("view_mrad", [2.0, 60.0])
+def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
+    """Photons stand for the pulse's energy, wherever the samples are moved to; so do rays for Mitsuba."""
+    shape = {"divergence_mrad": 12.0, "divergence_across_mrad": 3.0, "ellipse_deg": 30.0}
+    if kind == "image":
+        shape = {"profile_file": image_file(tmp_path), "profile_mrad": 16.0}
+    beam = laser(beam_profile=kind, **shape)
+    receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": view_mrad}).receiver
+    sampler = BeamSampler(beam, receiver)
+    assert sampler.use_view == (view_mrad == 2.0)
+    index = dr.arange(mi.UInt32, COUNT)
+    direction, energy = sampler.sample(index, COUNT, pass_streams(1, 0, COUNT))
+    energy = np.array(energy, dtype=np.float64) * np.ones(COUNT)
+    assert np.isfinite(energy).all()
+    assert energy.sum() == pytest.approx(4.5e-3, rel=3e-3)
+    # And they stand for it where it is: the part beyond gx = 0 is the beam's own.
+    gx, gy, _ = beam.pose.tangent(direction)
+    far, left = tangent_samples(beam.profile)
+    for seen, own in ((np.array(gx) > 0, far > 0), (np.array(gy) > 1e-3, left > 1e-3)):
+        assert energy[seen].sum() / 4.5e-3 == pytest.approx(own.mean(), abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((3, 3)), "zeros only"),
+        (np.array([[1.0, -2.0]]), "holds -2 but no irradiance may be negative"),
+        (np.array([[1.0, np.nan]]), "must hold finite numbers"),
+        (np.ones((2, 2, 3)), r"has the shape \(2, 2, 3\)"),
+        (np.ones((1, 3000)), r"shape \(1, 3000\) must have two dimensions of 1 to 2048"),
+        (np.ones((0, 3)), r"has the shape \(0, 3\)"),
+        (np.array([["a", "b"]]), "must hold real numbers"),
+    ],
+)
+def test_images_that_are_no_beam_are_refused(image, message, tmp_path):
+    with pytest.raises(RuntimeError, match=message):
+        laser(beam_profile="image", profile_file=image_file(tmp_path, image), profile_mrad=16.0)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
+def test_damaged_files_are_told_in_one_sentence(suffix, tmp_path, capfd):
+    path = tmp_path / f"beam{suffix}"
+    image_file(tmp_path, np.random.default_rng(1).uniform(0, 10, (64, 64)), suffix)
+    half = path.stat().st_size // 2
+    for content in (b"", b"no image", path.read_bytes()[:half]):
+        path.write_bytes(content)
+        with pytest.raises(RuntimeError, match=rf"profile_file = '.*{suffix}' cannot be read: it is damaged"):
+            laser(beam_profile="image", profile_file=str(path), profile_mrad=16.0)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_colour_png_is_refused(tmp_path):
+    matplotlib.image.imsave(tmp_path / "beam.png", IMAGE)
+    with pytest.raises(
+        RuntimeError, match=r"has the shape \(3, 4, 4\): it must have rows and columns, and one \(grey\) channel"
+    ):
+        laser(beam_profile="image", profile_file=str(tmp_path / "beam.png"), profile_mrad=16.0)
