@@ -301,7 +301,7 @@ def _check_solids(system: LidarScene, probe: EchoProbe) -> None:
 
     Tell of a target that rises through the sea, or lies above it.
     """
-    bottom = max(system.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
+    bottom: Any = max(system.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
     highest = max((float(surface.bbox().max.z) for surface in system.surfaces), default=np.inf)
     for solid in system.solids:
         low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
