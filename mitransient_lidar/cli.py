@@ -7,13 +7,14 @@ stdout, everything else to stderr. Modules that take long to import are imported
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitransient_lidar import cli_studies
 from mitransient_lidar._version import __version__
 from mitransient_lidar.cli_support import (
+    draw,
     parameters,
     positive,
     reporting,
@@ -23,6 +24,9 @@ from mitransient_lidar.cli_support import (
     summarise,
 )
 from mitransient_lidar.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _INTERRUPTED = 130  # what shells report after Ctrl-C
 _DIFFERENT = 1
@@ -74,10 +78,10 @@ def render(
     passes: Annotated[int | None, typer.Option(help="Number of independent passes.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
     variant: Annotated[str | None, typer.Option(help="Mitsuba variant, e.g. llvm_ad_mono.")] = None,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the waveforms.")] = True,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms and pixels.")] = True,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the paths and errors.")] = False,
 ) -> None:
-    """Render SCENE to DIR/<scene>.exr, .nc and .png and print their paths."""
+    """Render SCENE to DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and print their paths."""
     with sentences():
         require(target_error is None or positive(target_error), "--target-error", target_error, "above 0")
         require(max_time is None or positive(max_time), "--max-time", max_time, "above 0")
@@ -88,10 +92,11 @@ def render(
         from mitransient_lidar.resources import scene_path
 
         name = scene_path(scene).stem
-        targets = [output / f"{name}{suffix}" for suffix in (".exr", ".nc", *([".png"] if plot else []))]
+        drawings = {output / f"{name}.png": "plot_waveforms", output / f"{name}_layout.png": "plot_layout"}
+        targets = [output / f"{name}.exr", output / f"{name}.nc", *(drawings if plot else ())]
         require_writable(output, targets)
 
-        from mitransient_lidar import rendering, results
+        from mitransient_lidar import rendering
 
         with reporting(quiet) as progress:
             dataset = rendering.render(
@@ -106,20 +111,31 @@ def render(
                 progress=progress,
             )
         output.mkdir(parents=True, exist_ok=True)
-        for target in targets:
-            if target.suffix == ".png":
-                from mitransient_lidar.plotting import plot_waveforms
-
-                plot_waveforms(dataset, target)
-            else:
-                results.save(dataset, target)
-        for target in targets:
+        written = [target for target in targets if _write(dataset, target, drawings.get(target))]
+        for target in written:
             typer.echo(target)
         if not quiet:
             summarise(dataset)
         if dataset.attrs.get("interrupted"):
             typer.echo(f"interrupted after {dataset.attrs.get('passes')} passes; what was rendered is kept.", err=True)
             raise typer.Exit(_INTERRUPTED)
+
+
+def _write(dataset: xr.Dataset, target: Path, drawing: str | None) -> bool:
+    """Write a result or a drawing of it; return False for pixels that do not look at the sea."""
+    from mitransient_lidar import results
+
+    if drawing is None:
+        results.save(dataset, target)
+        return True
+    try:
+        draw(dataset, target, drawing)
+    except UserError as error:
+        if drawing != "plot_layout":
+            raise
+        typer.echo(f"no drawing of the pixels: {error}", err=True)
+        return False
+    return True
 
 
 @app.command()

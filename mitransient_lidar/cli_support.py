@@ -156,6 +156,14 @@ def _describe(state: Any) -> str:
     return ", ".join(parts)
 
 
+def draw(dataset: xr.Dataset, path: Path, kind: str) -> None:
+    """Write one of the drawings of a result: ``plot_waveforms`` or ``plot_layout``."""
+    from mitransient_lidar import layout_plot, plotting
+
+    functions = {"plot_waveforms": plotting.plot_waveforms, "plot_layout": layout_plot.plot_layout}
+    functions[kind](dataset, path)
+
+
 def summarise(dataset: xr.Dataset) -> None:
     """Print passes, time, error and the peak power of each pixel on stderr."""
     from rich.table import Table

@@ -197,7 +197,12 @@ def test_ctrl_c_on_the_command_line_writes_the_files(tmp_path):
     command = [sys.executable, "-c", INTERRUPTED_COMMAND, "render", "table1", "--passes", "100000", "-o", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 130, done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["table1.exr", "table1.nc", "table1.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "table1.exr",
+        "table1.nc",
+        "table1.png",
+        "table1_layout.png",
+    ]
     attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
     assert (attributes["interrupted"], attributes["passes"]) == (1, 3)
 

@@ -49,6 +49,7 @@ def calls(monkeypatch):
             raise extra["error"]
         waveform = np.array([[1e-6, 3e-6, 2e-6], [1e-6, 5e-6, 2e-6]])
         attributes = {"scene": "fig09", "passes": 4, "elapsed_s": 1.5, "error_median": 0.0123, "error_p95": 0.04}
+        attributes |= {"altitude": 200.0, "off_nadir_deg": 20.0}
         return results.build(
             waveform,
             waveform,
@@ -84,12 +85,13 @@ def assert_sentence(result, *parts):
         assert part in result.stderr
 
 
-def test_render_writes_three_files_and_prints_their_paths(scene, calls, tmp_path):
+def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     out = tmp_path / "new" / "folder"
     result = run("render", scene, "-o", out, "-D", "wind_speed=3", "-D", "file=a=b", "--passes", 4, "--seed", 7)
     assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines() == [str(out / f"fig09.{suffix}") for suffix in ("exr", "nc", "png")]
-    assert sorted(path.name for path in out.iterdir()) == ["fig09.exr", "fig09.nc", "fig09.png"]
+    names = ["fig09.exr", "fig09.nc", "fig09.png", "fig09_layout.png"]
+    assert result.stdout.splitlines() == [str(out / name) for name in names]
+    assert sorted(path.name for path in out.iterdir()) == ["fig09.exr", "fig09.nc", "fig09.png", "fig09_layout.png"]
     assert results.open(out / "fig09.exr").attrs["passes"] == 4
     ((name, options),) = calls.seen
     assert name == "fig09"
@@ -122,7 +124,7 @@ def test_interrupted_render_is_kept(scene, calls, tmp_path):
     result = run("render", scene, "-o", tmp_path, "--quiet")
     assert result.exit_code == 130
     assert "interrupted after 4 passes" in result.stderr
-    assert len(result.stdout.splitlines()) == 3
+    assert len(result.stdout.splitlines()) == 4
     assert results.open(tmp_path / "fig09.nc").attrs["interrupted"] == 1
 
 
