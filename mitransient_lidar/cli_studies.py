@@ -10,19 +10,27 @@ import typer
 
 from mitransient_lidar.cli_support import (
     counting,
+    keep_drawing,
     numbers,
     parameters,
     place,
     positive,
+    prepare_drawing,
     require,
-    require_writable,
     sentences,
 )
 
+Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")]
+Define = Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
+Drawing = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")]
+MaybeDrawing = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc beside it.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")]
+
 
 def shots(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    scene: Scene,
+    define: Define = None,
     at: Annotated[
         list[str] | None, typer.Option("--at", metavar="X,Y", help="A place [m] instead of a search.")
     ] = None,
@@ -54,50 +62,37 @@ def shots(
 
 
 def survey(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    scene: Scene,
+    define: Define = None,
     count: Annotated[int, typer.Option(help="Number of shots.")] = 200,
     seed: Annotated[int, typer.Option(help="Seed of their places.")] = 1,
-    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")] = Path(
-        "survey.png"
-    ),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the paths and errors.")] = False,
+    output: Drawing = Path("survey.png"),
+    quiet: Quiet = False,
 ) -> None:
     """Render shots at random places of the sea and show how their echoes go with the slope they meet."""
     with sentences():
         require(2 <= count <= 100_000, "--count", count, "2 to 100000")
         require(seed >= 0, "--seed", seed, "0 or above")
         params = parameters(define or [])
-        targets = [output, output.with_suffix(".nc")]
-        require_writable(output.parent, targets)
+        prepare_drawing(output)
 
-        from mitransient_lidar import results
         from mitransient_lidar import survey as surveying
-        from mitransient_lidar.plotting import check_format
 
-        check_format(output)
         with counting(quiet, "shot") as progress:
             shots = surveying.survey(scene, params, count=count, seed=seed, progress=progress)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        correlations = surveying.plot_survey(shots, output)
-        with results.replacing(targets[1]) as temporary:
-            shots.to_netcdf(temporary, engine="h5netcdf")
-        for target in targets:
-            typer.echo(target)
+        correlations = keep_drawing(shots, output, surveying.plot_survey)
         for name, value in correlations.items():
             typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
 
 
 def spread(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
+    scene: Scene,
     depths: Annotated[str, typer.Option(metavar="D1,D2,...", help="Depths below the mean sea level [m].")],
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    define: Define = None,
     passes: Annotated[int, typer.Option(help="Number of independent passes.")] = 8,
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
-    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")] = Path(
-        "spread.png"
-    ),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the paths and errors.")] = False,
+    seed: Seed = 0,
+    output: Drawing = Path("spread.png"),
+    quiet: Quiet = False,
 ) -> None:
     """Show how far the laser's light has spread at depths, sideways and in time, and what share the receiver sees."""
     with sentences():
@@ -105,37 +100,27 @@ def spread(
         require(seed >= 0, "--seed", seed, "0 or above")
         params = parameters(define or [])
         wanted = numbers("--depths", depths)
-        targets = [output, output.with_suffix(".nc")]
-        require_writable(output.parent, targets)
+        prepare_drawing(output)
 
-        from mitransient_lidar import beam_spread, results
+        from mitransient_lidar import beam_spread
         from mitransient_lidar.beam_spread_plots import plot_beam_spread
-        from mitransient_lidar.plotting import check_format
 
-        check_format(output)
         with counting(quiet, "pass") as progress:
             found = beam_spread.beam_spread(scene, wanted, params, passes=passes, seed=seed, progress=progress)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        plot_beam_spread(found, output)
-        with results.replacing(targets[1]) as temporary:
-            found.to_netcdf(temporary, engine="h5netcdf")
-        for target in targets:
-            typer.echo(target)
+        keep_drawing(found, output, plot_beam_spread)
         if not quiet:
             for line in beam_spread.describe_spread(found):
                 typer.echo(line)
 
 
 def orders(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    scene: Scene,
+    define: Define = None,
     count: Annotated[int, typer.Option("--orders", help="Orders to tell apart.")] = 8,
     passes: Annotated[int, typer.Option(help="Number of passes.")] = 32,
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc beside it.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")] = False,
+    seed: Seed = 0,
+    output: MaybeDrawing = None,
+    quiet: Quiet = False,
 ) -> None:
     """Tell how often the received light was scattered, and how much of it turned more than once."""
     with sentences():
@@ -143,45 +128,33 @@ def orders(
         require(2 <= passes <= 100_000, "--passes", passes, "2 to 100000")
         require(seed >= 0, "--seed", seed, "0 or above")
         params = parameters(define or [])
-        targets = [output, output.with_suffix(".nc")] if output is not None else []
-        if output is not None:
-            from mitransient_lidar.plotting import check_format
+        prepare_drawing(output)
 
-            check_format(output)
-            require_writable(output.parent, targets)
-
-        from mitransient_lidar import results, scattering_orders
+        from mitransient_lidar import scattering_orders
 
         with counting(quiet, "pass") as progress:
             found = scattering_orders.scattering_orders(
                 scene, params, orders=count, passes=passes, seed=seed, progress=progress
             )
         if output is not None:
-            output.parent.mkdir(parents=True, exist_ok=True)
-            scattering_orders.plot_orders(found, output)
-            with results.replacing(targets[1]) as temporary:
-                found.to_netcdf(temporary, engine="h5netcdf")
-            for target in targets:
-                typer.echo(target)
+            keep_drawing(found, output, scattering_orders.plot_orders)
         typer.echo(f"{'order':<8}{'energy (J)':>12}{'share (%)':>12}{'several turns (%)':>20}")
         for name, energy, share, several in scattering_orders.shares(found):
             typer.echo(f"{name:<8}{energy:>12.4g}{100 * share:>12.3f}{100 * several:>20.3f}")
 
 
 def views(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    scene: Scene,
+    define: Define = None,
     fields: Annotated[
         str, typer.Option(metavar="F1,F2,...", help="Full angles of the fields of view in mrad.")
     ] = "2,5,10,20,50,100",
     from_depth: Annotated[float, typer.Option("--from", help="Depth in m from which the slope is measured.")] = 1.0,
     to_depth: Annotated[float, typer.Option("--to", help="Depth in m to which it is measured.")] = 5.0,
     passes: Annotated[int, typer.Option(help="Number of independent passes for each field.")] = 48,
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
-    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc lies beside it.")] = Path(
-        "views.png"
-    ),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")] = False,
+    seed: Seed = 0,
+    output: Drawing = Path("views.png"),
+    quiet: Quiet = False,
 ) -> None:
     """Show how the slope of the column signal goes with the field of view, between c and a."""
     with sentences():
@@ -189,38 +162,28 @@ def views(
         require(seed >= 0, "--seed", seed, "0 or above")
         params = parameters(define or [])
         wanted = numbers("--fields", fields)
-        targets = [output, output.with_suffix(".nc")]
-        require_writable(output.parent, targets)
+        prepare_drawing(output)
 
-        from mitransient_lidar import column_views, results
-        from mitransient_lidar.plotting import check_format
+        from mitransient_lidar import column_views
 
-        check_format(output)
         depths = {"from_depth": from_depth, "to_depth": to_depth}
         with counting(quiet, "pass") as progress:
             found = column_views.views(scene, wanted, params, **depths, passes=passes, seed=seed, progress=progress)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        column_views.plot_views(found, output)
-        with results.replacing(targets[1]) as temporary:
-            found.to_netcdf(temporary, engine="h5netcdf")
-        for target in targets:
-            typer.echo(target)
+        keep_drawing(found, output, column_views.plot_views)
         for line in column_views.describe_views(found):
             typer.echo(line)
 
 
 def target(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene or path of an XML file.")],
-    define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a scene parameter.")] = None,
+    scene: Scene,
+    define: Define = None,
     shape: Annotated[str, typer.Option("--id", help="The id of the shape that is the target.")] = "target",
     grid: Annotated[int, typer.Option(help="Places along each axis to move the target to, 1 to 15.")] = 1,
     reach: Annotated[float, typer.Option(help="How far the outermost places are from the middle [m].")] = 2.0,
     passes: Annotated[int, typer.Option(help="Number of passes of each render.")] = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file; a .nc beside it.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but results and errors.")] = False,
+    seed: Seed = 0,
+    output: MaybeDrawing = None,
+    quiet: Quiet = False,
 ) -> None:
     """Measure a target's own signal: with and without it on the same random numbers, by pixel and best combined."""
     with sentences():
@@ -229,14 +192,9 @@ def target(
         require(16 <= passes <= 100_000, "--passes", passes, "16 to 100000")
         require(seed >= 0, "--seed", seed, "0 or above")
         params = parameters(define or [])
-        targets = [output, output.with_suffix(".nc")] if output is not None else []
-        if output is not None:
-            from mitransient_lidar.plotting import check_format
+        prepare_drawing(output)
 
-            check_format(output)
-            require_writable(output.parent, targets)
-
-        from mitransient_lidar import results, target_plots, target_signal
+        from mitransient_lidar import target_plots, target_signal
 
         options: dict[str, Any] = {"target": shape, "passes": passes, "seed": seed}
         lines: list[str]
@@ -251,12 +209,7 @@ def target(
                 found = target_signal.target_signal(scene, params, progress=progress, **options)
             lines, draw = target_signal.describe_target(found), target_plots.plot_target
         if output is not None:
-            output.parent.mkdir(parents=True, exist_ok=True)
-            draw(found, output)
-            with results.replacing(targets[1]) as temporary:
-                found.to_netcdf(temporary, engine="h5netcdf")
-            for written in targets:
-                typer.echo(written)
+            keep_drawing(found, output, draw)
         for line in lines:
             typer.echo(line)
 

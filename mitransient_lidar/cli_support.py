@@ -156,6 +156,30 @@ def _describe(state: Any) -> str:
     return ", ".join(parts)
 
 
+def prepare_drawing(path: Path | None) -> None:
+    """Find out before long work whether a drawing, and the NetCDF file beside it, can be written."""
+    if path is None:
+        return
+    from mitransient_lidar.plotting import check_format
+
+    require_writable(path.parent, [path, path.with_suffix(".nc")])
+    check_format(path)
+
+
+def keep_drawing(dataset: xr.Dataset, path: Path, plot: Callable[[xr.Dataset, Path], Any]) -> Any:
+    """Write a drawing and its data beside it, print both paths, and return what the drawing tells."""
+    from mitransient_lidar import results
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    told = plot(dataset, path)
+    data = path.with_suffix(".nc")
+    with results.replacing(data) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf")
+    for written in (path, data):
+        typer.echo(written)
+    return told
+
+
 def draw(dataset: xr.Dataset, path: Path, kind: str) -> None:
     """Write one of the drawings of a result: ``plot_waveforms`` or ``plot_layout``."""
     from mitransient_lidar import layout_plot, plotting
