@@ -107,7 +107,8 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     # If the results agree, both have the errors that belong to their common mean.
     weight = np.where(counted, relative[0] + relative[1], np.nan)
     common = (relative[1] * values[0] + relative[0] * values[1]) / weight
-    parts = [part * common**2 for part in relative]
+    # At least what each has found itself: where one has missed rare paths the common mean is too small.
+    parts = [np.maximum(part * common**2, own) for part, own in zip(relative, variances, strict=True)]
     total = parts[0] + parts[1]
     freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
     z = _as_normal(difference / np.sqrt(total), freedom)
