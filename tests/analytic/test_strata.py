@@ -96,4 +96,4 @@ def test_index_changes_within_the_waves_are_refused(lidar_scene, passes):
 
 def test_layers_below_the_bottom_are_refused(lidar_scene, passes):
     with pytest.raises((RuntimeError, ValueError), match=r"tops = 9 m is a layer below the bottom: .* less than 8 m"):
-        passes(lidar_scene(water={"tops": "0, 9"}), 1)
+        passes(lidar_scene(water={"tops": "0, 9", "attenuation": "0.3, 0.4"}), 1)

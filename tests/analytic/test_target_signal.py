@@ -8,6 +8,7 @@ from mitransient_lidar.errors import UserError
 from mitransient_lidar.target_signal import describe_map, describe_target, target_map, target_signal
 
 NEAR = {"surface_extent": 200, "bin_count": 170}
+SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_target_shades_the_bottom_behind_it(published):
 
 
 def test_map_moves_the_target():
-    maps = target_map("fig13_2x2", NEAR, x=(0.0, 2.0), y=(-1.0, 1.0), passes=16)
+    maps = target_map("fig13_2x2", NEAR, x=(0.0, 2.0), y=(-1.0, 1.0), passes=16, integrator=SMALL)
     far = maps["echo"].sel(pixel=["red", "green"]).sum("pixel") / maps["combined_echo"].sel(combination="whole")
     # Farther away it is seen by the far pixels, and to one side by the pixels of that side.
     assert np.all(far.sel(target_x=2.0) > far.sel(target_x=0.0) + 0.2)
@@ -90,7 +91,7 @@ def test_table_tells_pixels_and_combinations(published):
 )
 def test_mistakes_are_told(scene, params, options, message):
     with pytest.raises(UserError, match=message):
-        target_signal(scene, {**NEAR, **params}, passes=16, **options)
+        target_signal(scene, {**NEAR, **params}, passes=16, integrator=SMALL, **options)
 
 
 def test_target_above_the_sea_is_refused(lidar_scene):

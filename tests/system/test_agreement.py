@@ -24,7 +24,7 @@ TURBID = {"fig15_1x1", "fig15_2x2", "thin_layer", "nepheloid_layer", "fresh_wate
 def test_integrators_agree_in_every_shipped_scene(name):
     bins = SHORT_BINS if name in ZOOMS.values() else BINS
     merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=16, seed=1)
-    count = 24 if name in TURBID else 8
+    count = 16 if name in TURBID else 8
     reference = mitransient_lidar.render(name, params=bins, integrator="lidar_volpath", passes=count, seed=2)
     outcome = comparison.compare(reference, merged)
     # At grazing incidence the reference knows few bins to 30 %: its connection takes the sea as level.
@@ -34,7 +34,7 @@ def test_integrators_agree_in_every_shipped_scene(name):
     assert 0.7 < outcome.rms < 1.1
     # Cells blur the first metre of water by 0.5 %, a fifth of which is in the whole.
     assert abs(outcome.energy_ratio - 1) < 0.002 + 4 * outcome.energy_ratio_stderr
-    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.01 if name in TURBID else 0.006)
+    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.012 if name in TURBID else 0.006)
 
 
 @pytest.mark.parametrize(("zoom", "whole"), ZOOMS.items())
