@@ -92,11 +92,11 @@ def plot_map(maps: xr.Dataset, path: str | os.PathLike[str]) -> None:
     gain = (
         maps["combined_detectability"].sel(combination="best") / maps["combined_detectability"].sel(combination="whole")
     ).transpose("target_x", "target_y")
-    figure = Figure(figsize=(2.6 * (len(names) + 1), 3.4), layout="constrained")
+    figure = Figure(figsize=(2.7 * (len(names) + 1), 3.0), layout="constrained")
     panels: list[tuple[str, Any, float, float]] = [
-        (f"{name}: share of the echo (%)", share.values[i], 0, 100) for i, name in enumerate(names)
+        (f"{name} (%)", share.values[i], 0, 100) for i, name in enumerate(names)
     ]
-    panels.append(("SNR of the best weights\nover that of the sum", gain.values, 1.0, float(np.nanmax(gain))))
+    panels.append(("SNR, best / sum", gain.values, 1.0, float(np.nanmax(gain))))
     steps = [np.diff(axis).mean() / 2 if len(axis) > 1 else 0.5 for axis in (y, x)]
     extent = (y[0] - steps[0], y[-1] + steps[0], x[0] - steps[1], x[-1] + steps[1])
     for ax, (title, values, low, high) in zip(figure.subplots(1, len(panels)), panels, strict=True):
@@ -110,6 +110,6 @@ def plot_map(maps: xr.Dataset, path: str | os.PathLike[str]) -> None:
         ax.set_xlabel("target_y (m)")
         ax.set_ylabel("target_x (m)")
         figure.colorbar(image, ax=ax, shrink=0.7)
-    figure.suptitle(f"{maps.attrs.get('scene', '')}")
+    figure.suptitle(f"{maps.attrs.get('scene', '')}: each pixel's share of the echo, by the target's place")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=160)
