@@ -138,9 +138,10 @@ def orders(
             )
         if output is not None:
             keep_drawing(found, output, scattering_orders.plot_orders)
-        typer.echo(f"{'order':<8}{'energy (J)':>12}{'share (%)':>12}{'several turns (%)':>20}")
-        for name, energy, share, several in scattering_orders.shares(found):
-            typer.echo(f"{name:<8}{energy:>12.4g}{100 * share:>12.3f}{100 * several:>20.3f}")
+        typer.echo(f"{'order':<8}{'energy (J)':>22}{'share (%)':>12}{'several turns (%)':>20}")
+        for name, energy, error, share, several in scattering_orders.shares(found):
+            known = f"{energy:.3e} +- {error:.0e}"
+            typer.echo(f"{name:<8}{known:>22}{100 * share:>12.3f}{100 * several:>20.3f}")
 
 
 def views(

@@ -53,7 +53,8 @@ def scattering_orders(
     xarray.Dataset
         ``impulse_response`` [J per bin] and ``waveform`` [W] with their standard errors, over ``pixel``, ``turns``
         (``one``, ``several``), ``order`` (the last stands for itself and all higher ones) and ``time`` [ns]. Summed
-        over ``turns`` and ``order`` they are what `rendering.render` estimates. After Ctrl-C it holds the passes done
+        over ``turns`` and ``order`` they are what `rendering.render` estimates. ``energy`` [J] of all pixels and times
+        and its standard error, over ``turns`` and ``order``. After Ctrl-C it holds the passes done
         so far, and the attribute ``interrupted`` is 1.
 
     Raises
@@ -74,7 +75,8 @@ def scattering_orders(
         system, _ = engine.prepare(loaded, sensor)
     film, pixels = system.film, system.receiver.pixels
     kernel = system.transmitter.pulse.kernel(film.bin_width_ns, system.receiver.optics.response_time_ns)
-    energy, power = PassStatistics(), PassStatistics()
+    shape = (pixels.count, len(_TURNS), orders + 1, film.bin_count)
+    energy, power, whole_record = PassStatistics(), PassStatistics(), PassStatistics()
     interrupted = False
     try:
         with InterruptAfterPass() as interruption:
@@ -83,6 +85,7 @@ def scattering_orders(
                     engine.render(loaded, sensor, seed=rendering.pass_seed(seed, number), develop=False)
                 histogram = film.energy()
                 energy.add(histogram)
+                whole_record.add(histogram.reshape(shape).sum(axis=(0, 3)))
                 power.add(waveform(histogram, film.bin_width_ns, kernel))
                 if progress is not None:
                     progress(number + 1, passes)
@@ -95,7 +98,6 @@ def scattering_orders(
     finally:
         engine.release()
         engine.sort_by_order(0)
-    shape = (pixels.count, len(_TURNS), orders + 1, film.bin_count)
     dims = ("pixel", "turns", "order", "time")
     time = film.time_start_ns + film.bin_width_ns * (np.arange(film.bin_count) + 0.5)
     data = {
@@ -103,6 +105,9 @@ def scattering_orders(
         "impulse_response_stderr": (dims, energy.stderr.reshape(shape), {"units": "J"}),
         "waveform": (dims, power.mean.reshape(shape), {"units": "W", "long_name": "received power"}),
         "waveform_stderr": (dims, power.stderr.reshape(shape), {"units": "W"}),
+        # Bins of a pass share paths: the errors of sums over them come from the passes, not from the bins' errors.
+        "energy": (dims[1:3], whole_record.mean, {"units": "J", "long_name": "received energy"}),
+        "energy_stderr": (dims[1:3], whole_record.stderr, {"units": "J"}),
     }
     coords = {
         "pixel": list(pixels.names),
@@ -122,8 +127,8 @@ def scattering_orders(
     return xr.Dataset(data, coords=coords, attrs=attributes)
 
 
-def shares(result: xr.Dataset) -> list[tuple[str, float, float, float]]:
-    """Return order, energy [J], share of the whole, and share of that order that came by several turns.
+def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
+    """Return order, energy and its standard error [J], share of the whole, and of that order by several turns.
 
     Parameters
     ----------
@@ -133,17 +138,19 @@ def shares(result: xr.Dataset) -> list[tuple[str, float, float, float]]:
     Returns
     -------
     list
-        One row an order and a last one for all; NaN where there is no light.
+        One row an order and a last one for all; NaN where there is no light. Errors of sums are taken as if those of
+        the parts were of one sign, the largest that they can be.
     """
-    energy = result["impulse_response"].sum(("pixel", "time")).values
+    energy, stderr = result["energy"].values, result["energy_stderr"].values
     total = energy.sum()
     last = int(result["order"][-1])
     names = [*(str(order) for order in range(last)), f">={last}", "all"]
     columns = np.column_stack([energy, energy.sum(axis=1)])
+    errors = np.append(stderr.sum(axis=0), stderr.sum())
     rows = []
-    for name, (one, several) in zip(names, columns.T, strict=True):
+    for name, (one, several), error in zip(names, columns.T, errors, strict=True):
         both = one + several
-        rows.append((name, float(both), _share(both, total), _share(several, both)))
+        rows.append((name, float(both), float(error), _share(both, total), _share(several, both)))
     return rows
 
 

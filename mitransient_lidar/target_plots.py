@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.plotting import check_format, colours, time_limits
+from mitransient_lidar.plotting import check_format, colours
 from mitransient_lidar.results import replacing
-
-#: Time before and after the gate that is drawn, in gates.
-_MARGIN = 3.0
 
 
 def plot_target(result: xr.Dataset, path: str | os.PathLike[str]) -> None:
@@ -55,8 +52,7 @@ def plot_target(result: xr.Dataset, path: str | os.PathLike[str]) -> None:
     lower.axhline(0, color="0.6", linewidth=0.8)
     lower.set_ylabel("the target's own (\u00b5W)")
     lower.set_xlabel("time since the pulse left the transmitter (ns)")
-    left, right = time_limits(result) if "window_start_ns" in result.attrs else (time[0], time[-1])
-    lower.set_xlim(left, right)
+    lower.set_xlim(time[0], time[-1])
     for ax in (upper, lower):
         ax.axvspan(start, end, color="0.93", zorder=0)
         ax.grid(True, color="0.9", linewidth=0.7)

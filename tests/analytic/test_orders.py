@@ -24,17 +24,15 @@ def test_integrators_agree_by_order_and_turns():
         scattering_orders("fig09_2x2", PARAMS, orders=6, passes=16, seed=seed, integrator=integrator)
         for seed, integrator in enumerate(["lidar_merging", "lidar_volpath"])
     ]
-    energy, variance = (
-        [function(result).sum(("pixel", "time")).values for result in results]
-        for function in (lambda r: r["impulse_response"], lambda r: r["impulse_response_stderr"] ** 2)
-    )
-    # Bins of one pass share paths: their errors add up at worst, in fact to twice what independent bins would give.
-    error = 2 * np.sqrt(variance[0] + variance[1])
-    known = error > 0
-    z = (energy[0] - energy[1])[known] / error[known]
-    assert np.all(np.abs(z) < 3), z
-    assert np.all(error[0, 1:6] < 0.05 * energy[0][0, 1:6])
-    several = shares(results[0])[-1][3]
+    energy, error = (np.array([result[name].values for result in results]) for name in ("energy", "energy_stderr"))
+    # Orders that one of them has met in a few passes only have no normal errors.
+    known = np.all(error < 0.2 * energy, axis=0)
+    assert known.sum() >= 12
+    z = (energy[0] - energy[1])[known] / np.hypot(*error)[known]
+    assert np.all(np.abs(z) < 4), z
+    # Merging's cells blur the first metre of water, half a per cent of which is in the whole: far below these errors.
+    assert np.all(error[:, 0, :5] < 0.03 * energy[:, 0, :5])
+    several = shares(results[0])[-1][4]
     assert 0.001 < several < 0.004
 
 

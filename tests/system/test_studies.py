@@ -19,7 +19,7 @@ def test_orders(tmp_path):
     assert done.exit_code == 0, done.stderr
     assert lines[:2] == [str(plot), str(plot.with_suffix(".nc"))]
     assert [line.split()[0] for line in lines[3:]] == ["0", "1", "2", ">=3", "all"]
-    assert sum(float(line.split()[2]) for line in lines[3:-1]) == pytest.approx(100, abs=0.01)
+    assert sum(float(line.split()[4]) for line in lines[3:-1]) == pytest.approx(100, abs=0.01)
     assert plot.stat().st_size > 20_000
     assert plot.with_suffix(".nc").is_file()
 
