@@ -6,15 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.stats import norm
+from significance import largest_z
 
 WAVY = {"spectrum": "elfouhaily", "slope_variance": "cox_munk"}
 ROUGH = {"slope_variance": "0.01836"}
-
-
-def sidak(count, false_alarm=1e-3):
-    """Return the |z| that the largest of `count` independent deviates exceeds with probability `false_alarm`."""
-    return norm.isf(0.5 * (1 - (1 - false_alarm) ** (1 / count)))
 
 
 def gates(energy, width):
@@ -23,7 +18,7 @@ def gates(energy, width):
     return total[:, : total.shape[1] // width * width].reshape(len(total), -1, width).sum(axis=-1)
 
 
-def compare(first, second, z_limit=None):
+def compare(first, second):
     """Assert that two sets of passes have one mean in every column where their difference is known to 10 %.
 
     Return these columns. A column that only one of the two has found counts, too, as long as that one knows it well.
@@ -32,7 +27,7 @@ def compare(first, second, z_limit=None):
     error = np.array([a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (first, second)])
     known = np.hypot(*error) < 0.1 * mean.max(axis=0)
     z = (mean[0] - mean[1])[known] / np.hypot(*error)[known]
-    assert np.all(np.abs(z) < (z_limit or sidak(known.sum()))), z
+    assert np.all(np.abs(z) < largest_z(min(len(first), len(second)), known.sum())), z
     return known
 
 
@@ -95,7 +90,7 @@ def test_connections_by_lobe_by_walk_and_combined_have_one_mean(lidar_scene, pas
     combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:7])
     for other, count in (("lobe", 48), ("walk", 96)):
         alone = with_total(connected(lidar_scene, passes, sea, count, connection=other)[:, 1:7])
-        assert compare(combined, alone, z_limit=4).sum() >= 5
+        assert compare(combined, alone).sum() >= 5
 
 
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
@@ -214,7 +209,7 @@ def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, p
     relative = np.hypot(*(b.std(ddof=1) / np.sqrt(32) / b.mean() for b in bottoms))
     assert relative < 5e-3
     # Rays of the beam within 5 mrad cross 0.1 % more or less water.
-    assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < 4 * relative + 1e-3
+    assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < largest_z(32) * relative + 1e-3
 
 
 def test_nothing_returns_more_than_was_sent(lidar_scene, passes):

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 from mitransient_lidar.optics.phase import henyey_greenstein
 from mitransient_lidar.optics.refraction import fresnel, refracted_path, solid_angle_per_area
@@ -122,7 +123,10 @@ def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, wa
     reference = references[:, 1:]
     error = np.hypot(*(a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (rendered, reference)))
     z = (rendered.mean(axis=0) - reference.mean(axis=0)) / error
-    assert np.all(np.abs(z) < 4), (z, rendered.mean(axis=0) / reference.mean(axis=0))
+    assert np.all(np.abs(z) < largest_z(min(count, len(reference)), z.size)), (
+        z,
+        rendered.mean(axis=0) / reference.mean(axis=0),
+    )
     relative = error / reference.mean(axis=0)
     assert np.median(relative) < 0.03, relative
     assert np.all(relative < 0.15), relative

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.scattering_orders import scattering_orders, shares
@@ -29,7 +30,7 @@ def test_integrators_agree_by_order_and_turns():
     known = np.all(error < 0.2 * energy, axis=0)
     assert known.sum() >= 12
     z = (energy[0] - energy[1])[known] / np.hypot(*error)[known]
-    assert np.all(np.abs(z) < 4), z
+    assert np.all(np.abs(z) < largest_z(16, z.size)), z
     # Merging's cells blur the first metre of water, half a per cent of which is in the whole: far below these errors.
     assert np.all(error[:, 0, :5] < 0.03 * energy[:, 0, :5])
     several = shares(results[0])[-1][4]

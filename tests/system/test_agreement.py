@@ -1,6 +1,7 @@
 """The fast integrator against the unbiased one, in every scene that ships."""
 
 import pytest
+from significance import FALSE_ALARM, largest_z
 
 import mitransient_lidar
 from mitransient_lidar import comparison, resources
@@ -30,10 +31,10 @@ def test_integrators_agree_in_every_shipped_scene(name):
     # At grazing incidence the reference knows few bins to 30 %: its connection takes the sea as level.
     grazing = name == "fig04_mast"
     assert outcome.bin_count >= (100 if grazing else 200) * merged.sizes["pixel"]
-    assert outcome.agrees, (outcome.largest, outcome.limit)
-    assert 0.7 < outcome.rms < 1.1
+    assert outcome.largest < comparison.sidak_limit(outcome.bin_count, FALSE_ALARM), (outcome.largest, outcome.limit)
+    assert 0.7 < outcome.rms < 1.2
     # Cells blur the first metre of water by 0.5 %, a fifth of which is in the whole.
-    assert abs(outcome.energy_ratio - 1) < 0.002 + 4 * outcome.energy_ratio_stderr
+    assert abs(outcome.energy_ratio - 1) < 0.002 + largest_z(64) * outcome.energy_ratio_stderr
     assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.012 if name in TURBID else 0.006)
 
 
