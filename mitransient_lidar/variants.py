@@ -32,11 +32,14 @@ _PLUGIN_MODULES = (
     "seabed",
     "retroreflector",
     "lidar_transmitter",
+    "sun",
+    "sky",
     "pixel_fov",
     "multipixel_receiver",
     "time_gated_film",
     "lidar_volpath",
     "lidar_merging",
+    "passive_volpath",  # derives from lidar_volpath
 )
 
 _registered_for: str | None = None

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.optics.checks import in_range, whole
-from mitransient_lidar.transport.connection import LaserDirection, SurfaceLobe, laser_through
+from mitransient_lidar.transport.connection import (
+    ConnectedPath,
+    SourceDirection,
+    SourceLobe,
+    SurfaceLobe,
+    Turn,
+    laser_through,
+    start_path,
+)
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.path import Path, advance, count_turns, optical_length
+from mitransient_lidar.transport.path import advance, count_turns, optical_length
 from mitransient_lidar.transport.phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.receiving import ViewSampler
 from mitransient_lidar.transport.sorting import MOST_ORDERS, receive
 from mitransient_lidar.transport.strata import ascend
 from mitransient_lidar.transport.streams import pass_streams
-from mitransient_lidar.transport.system import LidarScene
+from mitransient_lidar.transport.system import LidarScene, WaterScene
 from mitransient_lidar.transport.walk import scattering_event
 
 #: Asymmetry of the broad lobe towards the laser from which a share of the turns is drawn. Of asymmetries 0.7 to 0.95
@@ -28,39 +34,6 @@ TURN_ASYMMETRY = 0.87
 _STREAM = 3
 
 _CONNECTIONS = ("combined", "lobe", "walk")
-
-
-@dataclass
-class ConnectedPath(Path):
-    """A path whose vertices are connected to the laser.
-
-    Attributes
-    ----------
-    lobe_ratio
-        Density of the surface connection's proposal over that of the walk, for the direction of the next leg; 0 where
-        no connection was tried.
-    pristine
-        Whether the path has met no solid yet.
-    """
-
-    lobe_ratio: mi.Float
-    pristine: mi.Bool
-
-
-@dataclass
-class Turn:
-    """Directions that leave a vertex, as density and as value of phase function or BSDF.
-
-    Attributes
-    ----------
-    value
-        Phase function [1/sr], or BSDF times cosine.
-    pdf
-        Density with which the walk draws the direction [1/sr].
-    """
-
-    value: mi.Float
-    pdf: mi.Float
 
 
 class LidarVolpath(mi.CppADIntegrator):
@@ -108,12 +81,15 @@ class LidarVolpath(mi.CppADIntegrator):
     #: Name under which results record the integrator.
     plugin = "lidar_volpath"
 
+    #: Value of ``turn_share`` where none is given.
+    default_turn_share = 0.4
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.paths_per_pass = whole("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
         self.max_scatterings = whole("max_scatterings", props.get("max_scatterings", -1), -1, 2**30)
         self.roulette_threshold = in_range("roulette_threshold", props.get("roulette_threshold", 0.001), 0.0, 1.0)
-        self.turn_share = in_range("turn_share", props.get("turn_share", 0.4), 0.0, 0.99)
+        self.turn_share = in_range("turn_share", props.get("turn_share", self.default_turn_share), 0.0, 0.99)
         self.connection = props.get("connection", "combined")
         if self.connection not in _CONNECTIONS:
             raise ValueError(f"connection = {self.connection!r} must be one of {', '.join(_CONNECTIONS)}")
@@ -188,24 +164,22 @@ class LidarVolpath(mi.CppADIntegrator):
         """Trace `count` paths from the receiver and add what they find to the film."""
         rng = pass_streams(seed, _STREAM, count)
         start = view.sample(dr.arange(mi.UInt32, count), count, rng)
-        path = ConnectedPath(
-            point=opaque_point(system.receiver.pose.origin),
-            direction=start.direction,
-            in_water=mi.Bool(False),
-            length=mi.Float(0),
-            throughput=mi.Float(1),
-            scatterings=mi.UInt32(0),
-            turns=mi.UInt32(0),
-            stratum=mi.UInt32(0),
-            rays=mi.UInt32(0),
-            active=start.weight > 0,
-            lobe_ratio=mi.Float(0),
-            pristine=mi.Bool(True),
-        )
-        lobe = SurfaceLobe(system)
+        path = start_path(system.receiver.pose, start.direction, start.weight > 0)
+        self._trace(system, SurfaceLobe(system), path, rng, start.pixel, start.weight)
+
+    def _trace(
+        self,
+        system: WaterScene,
+        lobe: SourceLobe,
+        path: ConnectedPath,
+        rng: mi.PCG32,
+        pixel: mi.UInt32,
+        weight: mi.Float,
+    ) -> None:
+        """Follow paths to their ends; what they find counts for their pixels with their weights."""
 
         def body(path: ConnectedPath, rng: mi.PCG32) -> tuple[ConnectedPath, mi.PCG32]:
-            self._step(system, lobe, path, rng, start.pixel, start.weight)
+            self._step(system, lobe, path, rng, pixel, weight)
             return path, rng
 
         path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="lidar_volpath")
@@ -213,19 +187,21 @@ class LidarVolpath(mi.CppADIntegrator):
 
     def _step(
         self,
-        system: LidarScene,
-        lobe: SurfaceLobe,
+        system: WaterScene,
+        lobe: SourceLobe,
         path: ConnectedPath,
         rng: mi.PCG32,
         pixel: mi.UInt32,
         weight: mi.Float,
     ) -> None:
-        """Go to the next vertex, connect it to the laser, and choose the direction in which the path goes on."""
+        """Go to the next vertex, connect it to the source, and choose the direction in which the path goes on."""
         # Advance to whichever comes first, a scattering event or a surface.
         first = path.length == 0
         si = system.scene.ray_intersect(path.ray(), path.active)
         scattered, at_edge, distance, transmittance = self._fly(system, path, si, rng)
-        path.active &= scattered | at_edge | si.is_valid()
+        met_nothing = path.active & ~(scattered | at_edge | si.is_valid())
+        self._escape(path, met_nothing, pixel, weight)
+        path.active &= ~met_nothing
         in_leg = mi.Bool(path.in_water)
         free = scattered | at_edge
         advance(path, system, distance, dr.select(free, path.point + path.direction * distance, si.p))
@@ -248,11 +224,11 @@ class LidarVolpath(mi.CppADIntegrator):
         merged = self._merged(path, first, scattered, hit, submerged, at_sea)
 
         # Connect: from under water through the surface, from the surface and from solids in the air directly.
-        laser = lobe.towards_laser(path.point)
-        up, lobe_pdf = lobe.sample(laser, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        source = lobe.towards_source(path.point)
+        up, lobe_pdf = lobe.sample(source, mi.Point2f(rng.next_float32(), rng.next_float32()))
         up, lobe_pdf = lobe.below(up, lobe_pdf, path.stratum)
         tried = submerged & (lobe_pdf > 0) if self.connection != "walk" else mi.Bool(False)
-        turn = self._turn(laser, si, mei, phase, scattered, tried, up)
+        turn = self._turn(source, si, mei, phase, scattered, tried, up)
         ascent = ascend(system, dr.select(scattered, mi.Ray3f(path.point, up), si.spawn_ray(up)), path.stratum, tried)
         above = system.scene.ray_intersect(ascent.ray, tried)
         risen = tried & (ascent.factor > 0)
@@ -267,27 +243,64 @@ class LidarVolpath(mi.CppADIntegrator):
         factor = dr.select(met, connected, self._walk_weight(path, transmittance))
         crossing = dr.select(met, above, si)
         direct = hit & (at_sea | ~in_leg)
-        radiance, air_length = laser_through(system, crossing, met | direct)
+        radiance, air_length = self._light(system, source, crossing, met | direct)
         water_length = dr.select(met, ascent.optical_length + optical_length(system, above.t, True), 0)
         energy = dr.select(merged, 0, weight * path.throughput * factor * radiance)
-        # One ray along the path, one up to the surface, one to the laser.
+        # One ray along the path, one up to the surface, one to the source.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(tried, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
-        # On to the laser the path goes up: from a vertex where it came down it turns.
-        turns = path.turns + dr.select(path.downward > 0, mi.UInt32(1), 0)
-        length = path.length + water_length + air_length
-        receive(system, pixel, path.scatterings, turns, length, energy, radiance > 0)
+        self._receive(system, path, pixel, path.length + water_length + air_length, energy, radiance > 0)
+        self._connect_more(system, path, si, at_sea & ~in_leg, pixel, weight, rng)
         # The lobe's own density stands for the surface's in what is lost.
         lobe_share = weight * path.throughput * connected * lobe_pdf
-        self._account(system, laser, dr.select(lost, lobe_share, 0), ascent.ray(leg))
+        self._account(system, source, dr.select(lost, lobe_share, 0), ascent.ray(leg))
 
-        # Choose the next direction; beyond the film's end nothing can arrive any more.
-        self._turn_path(system, lobe, laser, path, si, mei, phase, scattered, submerged, at_sea, hit & ~at_sea, rng)
+        # Choose the next direction.
+        self._turn_path(system, lobe, source, path, si, mei, phase, scattered, submerged, at_sea, hit & ~at_sea, rng)
         if system.strata is not None and system.strata.count > 1:
             path.lobe_ratio = dr.select(at_edge, path.lobe_ratio / transmittance, path.lobe_ratio)
             system.strata.bend(path, at_edge & path.active, radiance=True)
-        path.active &= path.length + dr.norm(lobe.laser - path.point) < system.film.path_end
+        path.active &= self._is_useful(system, lobe, path)
         self._roulette(path, rng)
+
+    def _light(
+        self, system: LidarScene, source: SourceDirection, crossing: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Connect points in the air or on the surface to the source: radiance, and optical length of the way [m]."""
+        return laser_through(system, crossing, active)
+
+    def _receive(
+        self,
+        system: LidarScene,
+        path: ConnectedPath,
+        pixel: mi.UInt32,
+        length: mi.Float,
+        energy: mi.Float,
+        active: mi.Bool,
+    ) -> None:
+        """Record light that has come along a path of an optical length [m]."""
+        # On to the laser the path goes up: from a vertex where it came down it turns.
+        turns = path.turns + dr.select(path.downward > 0, mi.UInt32(1), 0)
+        receive(system, pixel, path.scatterings, turns, length, energy, active)
+
+    def _escape(self, path: ConnectedPath, active: mi.Bool, pixel: mi.UInt32, weight: mi.Float) -> None:
+        """Serve paths that meet nothing any more: no laser is there."""
+
+    def _connect_more(
+        self,
+        system: WaterScene,
+        path: ConnectedPath,
+        si: mi.SurfaceInteraction3f,
+        at_dry_sea: mi.Bool,
+        pixel: mi.UInt32,
+        weight: mi.Float,
+        rng: mi.PCG32,
+    ) -> None:
+        """Connect points on the sea's dry side to other sources: there are none."""
+
+    def _is_useful(self, system: LidarScene, lobe: SurfaceLobe, path: ConnectedPath) -> mi.Bool:
+        """Return which paths can still find light: beyond the film's end nothing can arrive any more."""
+        return path.length + dr.norm(lobe.laser - path.point) < system.film.path_end
 
     def _merged(
         self,
@@ -304,7 +317,7 @@ class LidarVolpath(mi.CppADIntegrator):
         return (first & hit) | (path.pristine & (submerged | (at_sea & (path.scatterings > 0))))
 
     def _fly(
-        self, system: LidarScene, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32
+        self, system: WaterScene, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32
     ) -> tuple[mi.Bool, mi.Bool, mi.Float, mi.Float]:
         """Return how far the path goes, and the transmittance of that leg to the next surface or edge.
 
@@ -326,7 +339,7 @@ class LidarVolpath(mi.CppADIntegrator):
 
     @staticmethod
     def _optical_depth(
-        system: LidarScene, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool
+        system: WaterScene, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool
     ) -> mi.Float:
         """Return the optical depth of a leg in water, 0 for inactive lanes."""
         if system.water is None:
@@ -335,7 +348,7 @@ class LidarVolpath(mi.CppADIntegrator):
 
     def _turn(
         self,
-        laser: LaserDirection,
+        source: SourceDirection,
         si: mi.SurfaceInteraction3f,
         mei: mi.MediumInteraction3f,
         phase: object,
@@ -348,12 +361,12 @@ class LidarVolpath(mi.CppADIntegrator):
         if phase is not None:
             at_event = scattered & active
             phase_value, phase_pdf = phase.eval_pdf(mi.PhaseFunctionContext(), mei, direction, at_event)
-            broad = henyey_greenstein(dr.dot(direction, laser.in_water), TURN_ASYMMETRY)
+            broad = henyey_greenstein(dr.dot(direction, source.in_water), TURN_ASYMMETRY)
             value = dr.select(at_event, phase_value[0], 0)
             pdf = dr.select(at_event, dr.lerp(phase_pdf, broad, self.turn_share), 0)
         at_solid = active & ~scattered
         solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), at_solid)
-        broad = henyey_greenstein(dr.dot(direction, laser.in_water), TURN_ASYMMETRY)
+        broad = henyey_greenstein(dr.dot(direction, source.in_water), TURN_ASYMMETRY)
         solid_pdf = dr.select(self._is_rough(si), dr.lerp(solid_pdf, broad, self.turn_share), solid_pdf)
         return Turn(dr.select(at_solid, solid_value[0], value), dr.select(at_solid, solid_pdf, pdf))
 
@@ -373,7 +386,7 @@ class LidarVolpath(mi.CppADIntegrator):
     def _account(
         self,
         system: LidarScene,
-        laser: LaserDirection,
+        source: SourceDirection,
         lobe_share: mi.Float,
         crossing: mi.Point3f,
     ) -> None:
@@ -384,15 +397,15 @@ class LidarVolpath(mi.CppADIntegrator):
         offset = opaque_point(system.transmitter.pose.origin) - crossing
         index = float(system.refractive_index)
         transmittance = 4 * index / (1 + index) ** 2
-        through = transmittance * laser.in_air.z / laser.in_water.z
+        through = transmittance * source.in_air.z / source.in_water.z
         missing = lobe_share * through * system.transmitter.intensity(-dr.normalize(offset)) / dr.squared_norm(offset)
         dr.scatter_add(self.lost, mi.Float64(missing), mi.UInt32(0), missing > 0)
 
     def _turn_path(
         self,
-        system: LidarScene,
-        lobe: SurfaceLobe,
-        laser: LaserDirection,
+        system: WaterScene,
+        lobe: SourceLobe,
+        source: SourceDirection,
         path: ConnectedPath,
         si: mi.SurfaceInteraction3f,
         mei: mi.MediumInteraction3f,
@@ -402,8 +415,11 @@ class LidarVolpath(mi.CppADIntegrator):
         at_sea: mi.Bool,
         solid: mi.Bool,
         rng: mi.PCG32,
-    ) -> None:
-        """Draw the direction in which the path goes on, and update throughput, medium and lobe ratio."""
+    ) -> mi.Bool:
+        """Draw the direction in which the path goes on, and update throughput, medium and lobe ratio.
+
+        Return where a surface has given it the one direction that a mirror or a smooth interface allows.
+        """
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at_surface = at_sea | solid
         # Scattering events and rough solids under water: a share of the directions is drawn towards the laser.
@@ -418,9 +434,9 @@ class LidarVolpath(mi.CppADIntegrator):
             natural, _, _ = phase.sample(mi.PhaseFunctionContext(), mei, rest, u, scattered)
             natural = dr.select(scattered, natural, direction)
             cosine = sample_henyey_greenstein(u.x, TURN_ASYMMETRY)
-            broad = deflect(mi.Frame3f(laser.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
+            broad = deflect(mi.Frame3f(source.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
             drawn = dr.select(broadly, broad, natural)
-            turn = self._turn(laser, si, mei, phase, scattered, mixed, drawn)
+            turn = self._turn(source, si, mei, phase, scattered, mixed, drawn)
             direction = dr.select(mixed, dr.normalize(drawn), direction)
             pdf = dr.select(mixed, turn.pdf, pdf)
             factor = dr.select(mixed, turn.value / turn.pdf, factor)
@@ -432,7 +448,7 @@ class LidarVolpath(mi.CppADIntegrator):
             if not system.has_unmerged_solids:
                 path.active &= ~(path.pristine & scattered)
         path.pristine &= ~met
-        ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf_below(laser, direction, path.stratum) / pdf, 0)
+        ratio = dr.select(submerged & ~delta & (pdf > 0), lobe.pdf_below(source, direction, path.stratum) / pdf, 0)
         path.lobe_ratio = dr.select(at_surface | scattered, ratio, path.lobe_ratio)
         path.in_water = dr.select(at_sea, bs.wo.z < 0, path.in_water)
         path.throughput *= dr.select(path.active, factor, 1)
@@ -441,6 +457,7 @@ class LidarVolpath(mi.CppADIntegrator):
         before = mi.Float(path.direction.z)
         path.direction = dr.select(path.active & (at_surface | scattered), direction, path.direction)
         count_turns(path, before)
+        return delta
 
     def _roulette(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths of little throughput at random, and give their share to the ones that go on."""

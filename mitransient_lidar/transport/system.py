@@ -18,100 +18,28 @@ _UNKNOWN_SLOPE_VARIANCE = 0.04
 
 
 @dataclass(frozen=True)
-class LidarScene:
-    """Transmitter, receiver, film, water and sea surface of a Mitsuba scene.
+class WaterScene:
+    """Receiver, water and sea surface of a Mitsuba scene, whatever lights it.
 
     Attributes
     ----------
     scene
         The Mitsuba scene.
-    transmitter
-        The ``lidar_transmitter``.
     receiver
         Pose, aperture and pixels of the sensor.
-    film
-        Its ``time_gated_film``.
     water
         The ``layered_water``, or None in a scene without any.
     surfaces
         Shapes that have the water as interior medium.
     slope_variance
         Total slope variance of the sea, which shapes the proposals of the surface connection.
-    sorting
-        Classes by which the received light is told apart, or None.
     """
 
     scene: mi.Scene
-    transmitter: mi.Emitter
     receiver: Receiver
-    film: mi.Film
     water: mi.Medium | None
     surfaces: list[mi.Shape]
     slope_variance: float
-    sorting: Sorting | None = None
-
-    @classmethod
-    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor, orders: int = 0) -> LidarScene:
-        """Find the parts in a loaded scene; `orders` of scattering are told apart, 0 for none.
-
-        Raises
-        ------
-        ValueError
-            When a part is missing, of a foreign kind, or there is more than one where one is allowed.
-        """
-        if not isinstance(getattr(sensor, "receiver", None), Receiver):
-            raise ValueError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
-        film = sensor.film()
-        if not hasattr(film, "add_transient"):
-            raise ValueError("film: the lidar integrators need a time_gated_film inside the sensor")
-        transmitters = [emitter for emitter in scene.emitters() if hasattr(emitter, "pulse_energy")]
-        if len(transmitters) != 1 or len(scene.emitters()) != 1:
-            raise ValueError(
-                f"emitters: the scene has {len(scene.emitters())} of which {len(transmitters)} are lidar_transmitter; "
-                "allowed is exactly one lidar_transmitter"
-            )
-        surfaces: list[mi.Shape] = []
-        waters: list[mi.Medium] = []
-        for shape in scene.shapes():
-            if not shape.is_medium_transition():
-                continue
-            if shape.exterior_medium() is not None:
-                raise ValueError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
-            water = shape.interior_medium()
-            if not hasattr(water, "flight"):
-                raise ValueError(f"shape {shape.id()!r}: its interior medium must be layered_water")
-            surfaces.append(shape)
-            if not any(water is other for other in waters):
-                waters.append(water)
-        for shape in scene.shapes():
-            if hasattr(shape, "ripple_variance") and shape not in surfaces:
-                raise ValueError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
-        if len(waters) > 1:
-            raise ValueError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
-        if sensor.receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
-            raise ValueError("altitude: transmitter and receiver must be above the mean sea level z = 0")
-        _check_cells(surfaces, transmitters[0])
-        if waters:
-            _check_layers(scene, surfaces, waters[0])
-        variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
-        return cls(
-            scene,
-            transmitters[0],
-            sensor.receiver,
-            film,
-            waters[0] if waters else None,
-            surfaces,
-            max(variances, default=_UNKNOWN_SLOPE_VARIANCE),
-            Sorting(orders) if orders > 0 else None,
-        )
-
-    def prepare_film(self) -> None:
-        """Clear the film and make room for the pixels, or for their classes."""
-        pixels, energy = self.receiver.pixels, self.transmitter.energy
-        if self.sorting is None:
-            self.film.prepare_pixels(pixels.count, energy, pixels.grid)
-        else:
-            self.film.prepare_pixels(pixels.count * self.sorting.classes, energy)
 
     @property
     def solids(self) -> list[mi.Shape]:
@@ -167,6 +95,108 @@ class LidarScene:
         return is_one_of(shape, self.surfaces)
 
 
+@dataclass(frozen=True)
+class LidarScene(WaterScene):
+    """A scene with a transmitter and a receiver that records when its light comes back.
+
+    Attributes
+    ----------
+    transmitter
+        The ``lidar_transmitter``.
+    film
+        The receiver's ``time_gated_film``.
+    sorting
+        Classes by which the received light is told apart, or None.
+    """
+
+    transmitter: mi.Emitter
+    film: mi.Film
+    sorting: Sorting | None = None
+
+    @classmethod
+    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor, orders: int = 0) -> LidarScene:
+        """Find the parts in a loaded scene; `orders` of scattering are told apart, 0 for none.
+
+        Sun and sky may be there, too: they do not pulse, and are left out.
+
+        Raises
+        ------
+        ValueError
+            When a part is missing, of a foreign kind, or there is more than one where one is allowed.
+        """
+        receiver = find_receiver(sensor)
+        film = sensor.film()
+        if not hasattr(film, "add_transient"):
+            raise ValueError("film: the lidar integrators need a time_gated_film inside the sensor")
+        emitters = [emitter for emitter in scene.emitters() if not hasattr(emitter, "daylight")]
+        transmitters = [emitter for emitter in emitters if hasattr(emitter, "pulse_energy")]
+        if len(transmitters) != 1 or len(emitters) != 1:
+            raise ValueError(
+                f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
+                "allowed is exactly one lidar_transmitter, beside sun and sky"
+            )
+        water, surfaces = find_water(scene)
+        if receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
+            raise ValueError("altitude: transmitter and receiver must be above the mean sea level z = 0")
+        _check_cells(surfaces, transmitters[0])
+        if water is not None:
+            check_layers(scene, surfaces, water)
+        variance = largest_slope_variance(surfaces)
+        sorting = Sorting(orders) if orders > 0 else None
+        return cls(scene, receiver, water, surfaces, variance, transmitters[0], film, sorting)
+
+    def prepare_film(self) -> None:
+        """Clear the film and make room for the pixels, or for their classes."""
+        pixels, energy = self.receiver.pixels, self.transmitter.energy
+        if self.sorting is None:
+            self.film.prepare_pixels(pixels.count, energy, pixels.grid)
+        else:
+            self.film.prepare_pixels(pixels.count * self.sorting.classes, energy)
+
+
+def find_receiver(sensor: mi.Sensor) -> Receiver:
+    """Return what the integrators need of a sensor; raise ValueError when it is of a foreign kind."""
+    receiver = getattr(sensor, "receiver", None)
+    if not isinstance(receiver, Receiver):
+        raise ValueError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
+    return receiver
+
+
+def find_water(scene: mi.Scene) -> tuple[mi.Medium | None, list[mi.Shape]]:
+    """Return the water of a scene, None without any, and the shapes that have it as interior medium.
+
+    Raises
+    ------
+    ValueError
+        When a medium is of a foreign kind or in the wrong place, or there is more than one.
+    """
+    surfaces: list[mi.Shape] = []
+    waters: list[mi.Medium] = []
+    for shape in scene.shapes():
+        if not shape.is_medium_transition():
+            continue
+        if shape.exterior_medium() is not None:
+            raise ValueError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
+        water = shape.interior_medium()
+        if not hasattr(water, "flight"):
+            raise ValueError(f"shape {shape.id()!r}: its interior medium must be layered_water")
+        surfaces.append(shape)
+        if not any(water is other for other in waters):
+            waters.append(water)
+    for shape in scene.shapes():
+        if hasattr(shape, "ripple_variance") and shape not in surfaces:
+            raise ValueError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
+    if len(waters) > 1:
+        raise ValueError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
+    return (waters[0] if waters else None), surfaces
+
+
+def largest_slope_variance(surfaces: list[mi.Shape]) -> float:
+    """Return the total slope variance of the roughest surface; a usual one where none tells its own."""
+    variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
+    return max(variances, default=_UNKNOWN_SLOPE_VARIANCE)
+
+
 def _check_cells(surfaces: list[mi.Shape], transmitter: mi.Emitter) -> None:
     """Refuse waves in cells longer than the beam is wide: a shot would see a single slope."""
     spot = transmitter.pose.ground_point()
@@ -180,7 +210,7 @@ def _check_cells(surfaces: list[mi.Shape], transmitter: mi.Emitter) -> None:
             )
 
 
-def _check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: mi.Medium) -> None:
+def check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: mi.Medium) -> None:
     """Refuse layers below all solids, and strata that begin within the waves."""
     solids = [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
     lowest = min((float(solid.bbox().min.z) for solid in solids), default=-np.inf)

@@ -14,7 +14,7 @@ from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path, advance, count_turns
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.strata import Strata
-from mitransient_lidar.transport.system import LidarScene
+from mitransient_lidar.transport.system import LidarScene, WaterScene
 from mitransient_lidar.transport.tracks import Tracks
 
 
@@ -73,7 +73,7 @@ Action = Callable[[WalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
 
 
 def scattering_event(
-    system: LidarScene, path: Path, flight: LayeredFlight | None, scattered: mi.Bool, rng: mi.PCG32
+    system: WaterScene, path: Path, flight: LayeredFlight | None, scattered: mi.Bool, rng: mi.PCG32
 ) -> tuple[mi.MediumInteraction3f, Any, mi.UInt32]:
     """Return the interaction, the phase function (None without water) and the scatterer that paths have met.
 

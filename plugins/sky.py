@@ -1,0 +1,110 @@
+"""Emitter plugin ``sky``: what the sky sends to the sea beside the sun."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.optics.checks import non_negative
+from mitransient_lidar.optics.daylight import clear_sky
+from mitransient_lidar.transport.daylight import SKIES, read_direction, shape_irradiance
+
+
+class Sky(mi.Emitter):
+    r"""Sky (``sky``).
+
+    =====================  ======  =====================================================================================
+    Parameter              Type    Meaning
+    =====================  ======  =====================================================================================
+    distribution           string  ``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon),
+                                   ``overcast`` (Moon and Spencer 1942: three times as bright at the zenith as at the
+                                   horizon), or ``uniform``. Default: ``clear``
+    irradiance             float   What it gives at the sea on a level plane [W m^-2 nm^-1], at least 0. Default for
+                                   ``clear``: that of a clear sky at 532 nm
+                                   (`mitransient_lidar.optics.daylight.clear_sky`); the others need it
+    sun_zenith_deg         float   ``clear``: angle of the sun from the vertical [deg], 0 to 89. Default: 40
+    sun_azimuth_deg        float   ``clear``: where it stands, from +x towards +y [deg]. Default: 0
+    =====================  ======  =====================================================================================
+
+    The upper half of an infinite sphere; the lower half is black. The radiance is a shape (after Harrison and Coombes
+    1988, doi:10.1016/0038-092X(88)90072-2, for ``clear``) scaled to the irradiance. The sun itself is the plugin
+    ``sun``; its angles and those of a clear sky must be the same. The lidar integrators leave the sky out.
+
+    .. code-block:: xml
+
+        <emitter type="sky">
+            <string name="distribution" value="clear"/>
+            <float name="sun_zenith_deg" value="40"/>
+        </emitter>
+
+    .. code-block:: python
+
+        {'type': 'sky', 'distribution': 'clear', 'sun_zenith_deg': 40.0}
+    """
+
+    #: What kind of daylight it is, by which integrators know it.
+    daylight = "sky"
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.distribution = props.get("distribution", "clear")
+        if self.distribution not in SKIES:
+            raise ValueError(f"distribution = {self.distribution!r} must be one of {', '.join(SKIES)}")
+        for name in ("sun_zenith_deg", "sun_azimuth_deg"):
+            if name in props and self.distribution != "clear":
+                raise ValueError(f"{name} = {props[name]:g} is for distribution = 'clear': leave it out")
+        zenith, self.sun = read_direction(props, "sun_")
+        if "irradiance" not in props and self.distribution != "clear":
+            raise ValueError(f"irradiance is missing: a sky of distribution = {self.distribution!r} needs it")
+        default = clear_sky(zenith).diffuse
+        self.irradiance = non_negative("irradiance", props.get("irradiance", default))
+        self._scale = self.irradiance / shape_irradiance(self.distribution, self.sun)
+        self.m_needs_sample_2 = True
+        self.m_flags = mi.EmitterFlags.Infinite.value
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Float:
+        """Return the radiance in a unit direction [W m^-2 sr^-1 nm^-1]; 0 below the horizon."""
+        shape = SKIES[self.distribution](direction, mi.Vector3f(self.sun.tolist()))
+        return dr.select(direction.z > 0, self._scale * shape, 0)
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Draw a direction in proportion to its cosine from the vertical; the weight is radiance over density."""
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = mi.warp.square_to_cosine_hemisphere(sample)
+        ds.pdf = mi.warp.square_to_cosine_hemisphere_pdf(ds.d)
+        ds.dist = dr.largest(mi.Float)
+        ds.p = it.p + ds.d * 1e6
+        ds.n = -ds.d
+        ds.time = it.time
+        ds.delta = False
+        ds.emitter = mi.EmitterPtr(self)
+        weight = dr.select(ds.pdf > 0, self.radiance(ds.d) / ds.pdf, 0)
+        return ds, mi.Spectrum(weight) & active
+
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Return the density [1/sr] with which a direction is drawn."""
+        return dr.select(ds.d.z > 0, mi.warp.square_to_cosine_hemisphere_pdf(ds.d), 0)
+
+    def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Return the radiance in a direction [W m^-2 sr^-1 nm^-1]."""
+        return mi.Spectrum(self.radiance(ds.d)) & active
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Return the radiance that a ray meets which leaves the scene [W m^-2 sr^-1 nm^-1]."""
+        return mi.Spectrum(self.radiance(-si.wi)) & active
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return an invalid box: the sky does not extend the scene."""
+        return mi.ScalarBoundingBox3f()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters: a changed sky is loaded anew."""
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"Sky[{self.distribution}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
+
+
+mi.register_emitter("sky", lambda props: Sky(props))

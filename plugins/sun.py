@@ -1,0 +1,111 @@
+"""Emitter plugin ``sun``: the sun's disc."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.optics.checks import in_range, non_negative
+from mitransient_lidar.optics.daylight import SUN_RADIUS_DEG, clear_sky
+from mitransient_lidar.transport.daylight import read_direction
+from mitransient_lidar.transport.phase import deflect, half_angle
+
+
+class Sun(mi.Emitter):
+    r"""Sun (``sun``).
+
+    =====================  ======  =====================================================================================
+    Parameter              Type    Meaning
+    =====================  ======  =====================================================================================
+    zenith_deg             float   Angle of the sun's middle from the vertical [deg], 0 to 89. Default: 40
+    azimuth_deg            float   Where it stands, from +x (the way the receiver looks) towards +y [deg]. Default: 0
+    irradiance             float   What it gives at the sea on a plane normal to its rays [W m^-2 nm^-1], at least 0.
+                                   Default: that of a clear sky at 532 nm
+                                   (`mitransient_lidar.optics.daylight.clear_sky`)
+    angular_radius_deg     float   Radius of its disc [deg], 0.001 to 5. Default: 0.2666
+    =====================  ======  =====================================================================================
+
+    The disc is even, at infinity, of the radiance :math:`E / (\pi \sin^2 r)`. ``passive_volpath`` draws one point of it
+    for each path; the lidar integrators leave it out. Mitsuba's own integrators sample its disc, and do not meet it by
+    chance.
+
+    .. code-block:: xml
+
+        <emitter type="sun">
+            <float name="zenith_deg" value="40"/>
+            <float name="azimuth_deg" value="120"/>
+        </emitter>
+
+    .. code-block:: python
+
+        {'type': 'sun', 'zenith_deg': 40.0, 'azimuth_deg': 120.0}
+    """
+
+    #: What kind of daylight it is, by which integrators know it.
+    daylight = "sun"
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.zenith_deg, self.direction = read_direction(props)
+        default = clear_sky(self.zenith_deg).direct_normal
+        self.irradiance = non_negative("irradiance", props.get("irradiance", default))
+        radius = in_range("angular_radius_deg", props.get("angular_radius_deg", SUN_RADIUS_DEG), 1e-3, 5.0)
+        # sin^2 of half the radius: cosines of so small angles are 1 to rounding.
+        self._edge = float(np.sin(0.5 * np.radians(radius)) ** 2)
+        self._radiance = self.irradiance / (np.pi * np.sin(np.radians(radius)) ** 2)
+        #: Irradiance that each direction of the disc stands for when all are drawn evenly [W m^-2 nm^-1].
+        self.sampled_irradiance = float(self._radiance * 4 * np.pi * self._edge)
+        self.m_needs_sample_2 = True
+        self.m_flags = mi.EmitterFlags.Infinite.value | mi.EmitterFlags.DeltaDirection.value
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Float:
+        """Return the radiance in a unit direction [W m^-2 sr^-1 nm^-1]: even within the disc, 0 outside."""
+        inside = half_angle(direction, mi.Vector3f(self.direction.tolist())) <= self._edge
+        return dr.select(inside, mi.Float(self._radiance), 0)
+
+    def sample(self, u: mi.Point2f) -> mi.Vector3f:
+        """Map uniform numbers to directions that are even in the disc's solid angle."""
+        frame = mi.Frame3f(mi.Vector3f(self.direction.tolist()))
+        return dr.normalize(deflect(frame, u.x * self._edge, dr.two_pi * u.y))
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Draw a direction of the disc; the weight is the irradiance normal to it [W m^-2 nm^-1]."""
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = self.sample(sample)
+        ds.dist = dr.largest(mi.Float)
+        ds.p = it.p + ds.d * 1e6
+        ds.n = -ds.d
+        ds.time = it.time
+        ds.delta = True
+        ds.pdf = 1.0
+        ds.emitter = mi.EmitterPtr(self)
+        return ds, mi.Spectrum(self.sampled_irradiance) & active
+
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Return 0: only its own samples find the disc."""
+        return mi.Float(0)
+
+    def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Return the irradiance that a direction of the disc stands for [W m^-2 nm^-1]."""
+        return mi.Spectrum(self.sampled_irradiance) & active
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Return 0: only its own samples find the disc."""
+        return mi.Spectrum(0)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return an invalid box: the sun does not extend the scene."""
+        return mi.ScalarBoundingBox3f()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters: a changed sun is loaded anew."""
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"Sun[zenith_deg={self.zenith_deg:g}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
+
+
+mi.register_emitter("sun", lambda props: Sun(props))

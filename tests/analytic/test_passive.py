@@ -1,0 +1,317 @@
+"""Radiance by daylight against closed forms and published values: plates, glints, mirrored sky, deep water, waves."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from significance import largest_z
+
+from mitransient_lidar import passive
+from mitransient_lidar.optics.phase import fournier_forand, fournier_forand_parameters
+from mitransient_lidar.optics.refraction import fresnel, snell
+from mitransient_lidar.transport.connection import start_path
+from mitransient_lidar.transport.streams import pass_streams
+
+N = 1.34
+SMOOTH = {"spectrum": "flat", "slope_variance": "2e-5"}
+CLEAR = {"attenuation": 1e-6, "scattering": 0.0, "backscattering": 0.0}
+
+
+def build(*, sun=None, sky=None, rx=None, sea=None, water=None, depth=None, rho=0.5, integrator=None, extra=None):
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "passive_volpath", "paths_per_pass": 2**14, **(integrator or {})},
+        "rx": {
+            "type": "multipixel_receiver",
+            "film": {"type": "time_gated_film"},
+            **{"field_of_view_mrad": 1.0, "off_nadir_deg": 0.0, **(rx or {})},
+            **({} if "pixel_map" in (rx or {}) else {"layout": "1x1"}),
+        },
+        "sea": {
+            "type": "ocean_surface",
+            "interior": {"type": "layered_water", "refractive_index": N, **(water or CLEAR)},
+            **(sea or SMOOTH),
+        },
+        **(extra or {}),
+    }
+    if sun is not None:
+        scene["sun"] = {"type": "sun", "irradiance": 1.0, **sun}
+    if sky is not None:
+        scene["sky"] = {"type": "sky", "distribution": "uniform", **sky}
+    if depth is not None:
+        scene["plate"] = plate(depth, rho, 500)
+    # Not optimised: that would make one shape of plates.
+    return mi.load_dict(scene, optimize=False)
+
+
+def plate(depth, rho, half, y=0.0):
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, y, -depth]).scale([500, half, 1]),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": rho}},
+    }
+
+
+def passes(scene, count):
+    """Return radiances of independent passes, shape (passes, pixels)."""
+    images = [np.array(scene.integrator().render(scene, seed=seed), dtype=np.float64) for seed in range(count)]
+    return np.array(images).reshape(count, -1)
+
+
+def agrees(samples, expected, comparisons=1, bias=0.0):
+    """Assert that the mean of the first pixel is as expected, or within a relative bias of it."""
+    error = samples[:, 0].std(ddof=1) / np.sqrt(len(samples))
+    difference = abs(samples[:, 0].mean() - expected)
+    assert difference < largest_z(len(samples), comparisons) * error + bias * expected, (difference, error, expected)
+    return error / expected
+
+
+# (a) a white plate just below the surface
+
+
+@pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (60.0, 0.0, 0.5), (40.0, 35.0, 0.9)])
+def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
+    """E cos(theta) T(theta) rho / pi, raised by what the sea's underside returns, times T(view) / n^2.
+
+    Without n^2 it would be 1.8 times as bright, without the returned light up to 1.7 times darker.
+    """
+    scene = build(sun={"zenith_deg": zenith, "azimuth_deg": 90.0}, rx={"off_nadir_deg": off_nadir}, depth=0.02, rho=rho)
+    returned = quad(lambda angle: fresnel(angle, 1 / N)[0] * np.sin(2 * angle), 0, np.pi / 2, points=[np.arcsin(1 / N)])
+    sun, view = np.radians(zenith), np.radians(off_nadir)
+    below = np.cos(sun) * fresnel(sun, N)[1] * rho / np.pi / (1 - rho * returned[0])
+    # Ripples of 2e-5 change Fresnel's factors by as much, at 60 degrees.
+    error = agrees(passes(scene, 12), below * fresnel(view, N)[1] / N**2, 3, bias=2e-4)
+    assert error < 3e-3
+
+
+@pytest.mark.parametrize(
+    ("sea", "layers", "lost"),
+    [
+        (SMOOTH, {}, 0.0),
+        (SMOOTH, {"tops": "0, 0.5", "attenuation": "0.3, 0.6", "refractive_index": "1.33, 1.37"}, 0.0),
+        ({"wind_speed": 6.0, "cell_size": 0.25}, {}, 0.025),
+    ],
+)
+def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, lost):
+    """A white bottom and water that only scatters: whatever light does, it has come from a sky of radiance 1.
+
+    Ripples lose a little at each crossing: light that one facet sends to another one is not followed.
+    """
+    water = {"attenuation": 0.3, "backscattering": 0.01, **layers}
+    scene = build(
+        sky={"irradiance": np.pi},
+        water={**water, "scattering": water["attenuation"]},
+        sea=sea,
+        rx={"off_nadir_deg": 20.0},
+        depth=2.0,
+        rho=1.0,
+        integrator={"turn_share": 0.02},
+    )
+    assert agrees(passes(scene, 12), 1 - lost / 2, 3, bias=lost / 2) < 3e-3
+
+
+# (c) sun glint
+
+
+@pytest.mark.parametrize(
+    ("zenith", "azimuth", "view", "wind", "wind_azimuth"),
+    [(30.0, 180.0, 20.0, 6.0, 0.0), (10.0, 60.0, 25.0, 10.0, 30.0), (35.0, 10.0, 30.0, 4.0, 90.0)],
+)
+def test_sun_glint_of_gaussian_slopes(zenith, azimuth, view, wind, wind_azimuth):
+    """Cox and Munk 1954, equation 9: L = E rho(omega) p(slope) / (4 cos(view) cos^4(tilt))."""
+    scene = build(
+        sun={"zenith_deg": zenith, "azimuth_deg": azimuth},
+        sea={"spectrum": "flat", "wind_speed": wind, "wind_direction_deg": wind_azimuth},
+        rx={"off_nadir_deg": view, "field_of_view_mrad": 0.1},
+        depth=0.5,
+        rho=0.0,
+    )
+    to_sun, to_receiver = direction(zenith, azimuth), direction(view, 180.0)
+    half = (to_sun + to_receiver) / np.linalg.norm(to_sun + to_receiver)
+    slope = -half[:2] / half[2]
+    along = np.array([np.cos(np.radians(wind_azimuth)), np.sin(np.radians(wind_azimuth))])
+    up, across = slope @ along, slope @ [-along[1], along[0]]
+    variance_up, variance_across = 3.16e-3 * wind, 0.003 + 1.92e-3 * wind
+    exponent = up**2 / variance_up + across**2 / variance_across
+    density = np.exp(-0.5 * exponent) / (2 * np.pi * np.sqrt(variance_up * variance_across))
+    reflectance = fresnel(np.arccos(half @ to_sun), N)[0]
+    expected = float(reflectance * density / (4 * to_receiver[2] * half[2] ** 4))
+    # Facets in the shadow of others, which the formula leaves out, and the sun's disc: below a thousandth here.
+    assert agrees(passes(scene, 4), expected, 3, bias=1.5e-3) < 1e-3
+
+
+def direction(zenith, azimuth):
+    zenith, azimuth = np.radians(zenith), np.radians(azimuth)
+    return np.array([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
+
+
+# (d) the sky's mirror image
+
+
+@pytest.mark.parametrize("view", [0.0, 40.0, 70.0])
+def test_a_level_sea_mirrors_the_sky(view):
+    """Fresnel's reflectance times the sky's radiance; 53 degrees is Brewster's angle, far below 4 times 2 %."""
+    scene = build(sky={"irradiance": np.pi}, rx={"off_nadir_deg": view, "field_of_view_mrad": 0.1}, depth=0.5, rho=0.0)
+    expected = float(fresnel(np.radians(view), N)[0])
+    assert agrees(passes(scene, 4), expected, 3, bias=1e-3) < 1e-3
+
+
+def test_a_level_sea_mirrors_the_sky_where_it_is_seen():
+    """The clear sky opposite to the view, near the sun's azimuth and away from it."""
+    sky = {"distribution": "clear", "irradiance": 1.0, "sun_zenith_deg": 50.0}
+    view = np.radians(40.0)
+    for azimuth in (0.0, 180.0):
+        scene = build(
+            sky={**sky, "sun_azimuth_deg": azimuth},
+            rx={"off_nadir_deg": 40.0, "field_of_view_mrad": 0.1},
+            depth=0.5,
+            rho=0.0,
+        )
+        mirrored = mi.Vector3f(float(np.sin(view)), 0, float(np.cos(view)))
+        radiance = float(next(e for e in scene.emitters() if hasattr(e, "sun")).radiance(mirrored)[0])
+        agrees(passes(scene, 4), float(fresnel(view, N)[0]) * radiance, 2, bias=2e-3)
+
+
+# (b) deep water
+
+WATER = {"attenuation": 1.0, "scattering": 0.9, "backscattering": 0.9 * 0.0183}
+
+
+@pytest.mark.parametrize(("zenith", "view"), [(30.0, 0.0), (50.0, 25.0)])
+def test_light_scattered_once(zenith, view):
+    """L = E T cos / mu_s b p / (c (1/mu_s + 1/mu_v) mu_v) T / n^2 of uniform water, with sines bent by n."""
+    scene = build(
+        sun={"zenith_deg": zenith, "azimuth_deg": 0.0},
+        rx={"off_nadir_deg": view},
+        water=WATER,
+        sea={"spectrum": "flat", "slope_variance": "2e-4"},
+        integrator={"max_scatterings": 1},
+    )
+    sun, seen = np.radians(zenith), np.radians(view)
+    mu_s, mu_v = np.cos(snell(sun, N)), np.cos(snell(seen, N))
+    # The light goes down away from the sun, which is ahead; what is seen goes up and back.
+    down = np.array([-np.sin(sun) / N, 0, -mu_s])
+    up = np.array([-np.sin(seen) / N, 0, mu_v])
+    phase = fournier_forand(np.arccos(down @ up), *fournier_forand_parameters(0.0183))
+    below = np.cos(sun) * fresnel(sun, N)[1] / mu_s * 0.9 * phase / (1 / mu_s + 1 / mu_v) / mu_v
+    # Reflected at the underside first, in a few thousandths, and the ripples.
+    assert agrees(passes(scene, 12), float(below * fresnel(seen, N)[1] / N**2), 2, bias=6e-3) < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("albedo", "hydrolight", "monte_carlo"), [(0.9, 8.1159e-3, 8.049e-3), (0.6, 1.1462e-3, 1.1533e-3)]
+)
+def test_deep_water_under_an_even_sky(albedo, hydrolight, monte_carlo):
+    """Remote-sensing reflectance [1/sr] of Fournier-Forand water, bb/b 0.0183, that HydroLight 4.2 gives for its polar
+    cap of 10 degrees, and a backward Monte Carlo that was validated with it (A. Castagna, owa_shading, version 1.6).
+    """
+    scene = build(
+        sky={"irradiance": 1.0},
+        water={"attenuation": 1.0, "scattering": albedo, "backscattering": 0.0183 * albedo},
+        integrator={"paths_per_pass": 2**15},
+    )
+    leaving = passes(scene, 12) - float(fresnel(0.0, N)[0]) / np.pi
+    # The two differ by a hundredth, and HydroLight's polar cap by another one.
+    agrees(leaving, 0.5 * (hydrolight + monte_carlo), 2, bias=0.015)
+
+
+@pytest.mark.parametrize(
+    ("albedo", "depth", "expected", "spread"), [(0.9, 1.0, 4.85e-2, 0.015), (0.2, 1.0, 1.72e-3, 0.044)]
+)
+def test_canonical_problem_1(albedo, depth, expected, spread):
+    """Mobley et al. 1993 (doi:10.1364/AO.32.007484), problem 1: upward radiance at the nadir.
+
+    Rayleigh's phase function, sun at 60 degrees, black sky; mean and relative spread of the models.
+    """
+    water = {"attenuation": 1.0, "scattering": albedo, "backscattering": albedo / 2, "phase": {"type": "rayleigh"}}
+    scene = build(sun={"zenith_deg": 60.0}, water=water, integrator={"turn_share": 0.05})
+    engine = scene.integrator()
+    system, _ = engine.prepare_view(scene, scene.sensors()[0])
+    count, found = 2**14, []
+    for seed in range(8):
+        path = start_path(system.receiver.pose, mi.Vector3f(0, 0, -1), dr.full(mi.Bool, True, count))
+        path.point, path.in_water = mi.Point3f(0, 0, -depth), mi.Bool(True)
+        weight = dr.full(mi.Float, 1 / count, count)
+        engine.follow(system, path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
+        found.append([float(engine.found[0])])
+    assert agrees(np.array(found), expected, 2, bias=spread) < 0.01
+
+
+# (e) waves focus the sun
+
+
+def test_a_sinusoidal_sea_focuses_the_sun(tmp_path):
+    """Light on plates at five depths, seen through still water, against rays traced here.
+
+    Waves of 1 m and 12 mm lie where the sun shines in, crests along its azimuth. Crests focus at
+    n cos(phi) / ((n cos(phi) - cos(theta)) a k^2), 4 m (Schenck 1957, doi:10.1364/JOSA.47.000653, with Coddington's
+    equation for the slant). With the spherical aberration of the wave the contrast is largest a quarter deeper.
+    """
+    k, focus, ripple = 2 * np.pi, 4.0, 1e-4
+    sun = np.radians(60.0)
+    bent = N * np.cos(snell(sun, N))
+    amplitude = float(bent / (bent - np.cos(sun)) / (k**2 * focus))
+    x = np.arange(-500, 501) * 0.04
+    taper = np.clip((x - 0.1) / 0.4, 0, 1)
+    heights = amplitude * np.cos(k * x)[:, None] * taper[None, :] * np.ones((len(x), 1))
+    np.save(tmp_path / "waves.npy", heights)
+    resolved = float(np.mean(np.diff(heights, axis=0) ** 2)) / 0.04**2
+    depths, places = np.array([2.0, 3.5, 5.0, 7.0, 10.0]), np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
+    # Columns of 1/24 m along y, of a band of half a metre along x.
+    columns, side = 480, 20.0
+    labels = np.zeros((columns, columns), dtype=np.uint16)
+    band = slice(columns // 2 - 6, columns // 2 + 6)
+    y = (np.arange(columns) + 0.5) / columns * side - side / 2
+    plate_of = np.argmin(np.abs(y[:, None] - places), axis=1)
+    inside = np.abs(y - places[plate_of]) < 1.0
+    labels[band, inside] = 1 + np.flatnonzero(inside)
+    np.save(tmp_path / "columns.npy", labels)
+    scene = build(
+        sun={"zenith_deg": 60.0},
+        sea={
+            "spectrum": "height_map",
+            "filename": str(tmp_path / "waves.npy"),
+            "map_size": 40.0,
+            "slope_variance": str(2 * (resolved + ripple)),
+            "extent": 200.0,
+        },
+        rx={
+            "pixel_map": str(tmp_path / "columns.npy"),
+            "altitude": 200.0,
+            "field_of_view_mrad": 1e3 * side / 200.0,
+            "shot_x": -0.5,
+        },
+        integrator={"paths_per_pass": 2**19, "max_scatterings": 0},
+        extra={f"plate{i}": plate(d, 0.05, 1.9, p) for i, (d, p) in enumerate(zip(depths, places, strict=True))},
+    )
+    picture = passive.render_passive(scene, passes=4)
+    radiance, error = picture["radiance"].values, picture["radiance_stderr"].values
+    contrast = []
+    for number in range(len(depths)):
+        chosen = plate_of[inside] == number
+        light, noise = radiance[chosen], error[chosen]
+        contrast.append(np.sqrt(light.var(ddof=1) - np.mean(noise**2)) / light.mean())
+    expected = [ray_contrast(depth, amplitude, k, sun, ripple, resolved) for depth in depths]
+    np.testing.assert_allclose(contrast, expected, rtol=0.12)
+    assert np.argmax(contrast) == 2
+    assert contrast[2] > 1.2 * max(contrast[1], contrast[3] / 1.05)
+
+
+def ray_contrast(depth, amplitude, k, sun, ripple, resolved):
+    """Return the contrast, over columns of 1/24 m, of sunlight on a level plate below a sinusoidal sea."""
+    rng = np.random.default_rng(3)
+    count = 10**6
+    y = rng.random(count) * 2 * np.pi / k
+    slope = -amplitude * k * np.sin(k * y) + rng.normal(0, np.sqrt(ripple), count)
+    normal = np.stack([rng.normal(0, np.sqrt(resolved + ripple), count), -slope, np.ones(count)])
+    lit = np.cos(sun) + normal[0] * np.sin(sun)
+    normal /= np.linalg.norm(normal, axis=0)
+    incoming = -np.array([np.sin(sun), 0, np.cos(sun)])[:, None]
+    cosine = -(incoming * normal).sum(axis=0)
+    inside = incoming / N + (cosine / N - np.sqrt(1 - (1 - cosine**2) / N**2)) * normal
+    landed = y - inside[1] / inside[2] * depth
+    # Where the receiver looks, ripples spread the columns.
+    landed += rng.normal(0, (1 - 1 / N) * np.sqrt(ripple) * depth, count)
+    light, _ = np.histogram(np.mod(landed, 2 * np.pi / k), 24, weights=lit)
+    return light.std() / light.mean()
