@@ -43,6 +43,52 @@ class PassStatistics:
             return np.full_like(self._squares, np.nan)
         return np.sqrt(self._squares / (self.count - 1) / self.count)
 
+    def stderr_of(self, part: slice) -> FloatArray:
+        """Return the standard error of the mean of part of the first axis."""
+        if self._squares is None or self.count < 2:
+            raise ValueError(f"passes = {self.count} must be at least 2 for a standard error")
+        return np.asarray(np.sqrt(self._squares[part] / (self.count - 1) / self.count))
+
+
+class ErrorGrowth:
+    """How errors of sums over neighbouring bins grow beyond those of independent bins.
+
+    Bins of one pass share paths, so that their errors go together. Sums over blocks of 2, 4, 8, ... bins are followed
+    from pass to pass.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: dict[int, PassStatistics] = {}
+
+    def add(self, values: FloatArray) -> None:
+        """Add the result of one pass, shape (pixels, time)."""
+        size, sums = 2, values
+        while sums.shape[1] >= 2:
+            sums = sums[:, : sums.shape[1] // 2 * 2].reshape(len(sums), -1, 2).sum(axis=2)
+            self._blocks.setdefault(size, PassStatistics()).add(sums)
+            size *= 2
+
+    def over(self, mean: FloatArray, stderr: FloatArray) -> tuple[list[int], list[float]]:
+        """Return numbers of bins and, for each, the median ratio of a sum's true error to that of independent bins.
+
+        Parameters
+        ----------
+        mean, stderr
+            Mean and standard error of the bins, shape (pixels, time). Blocks that hold less than a millionth of the
+            brightest one do not count.
+        """
+        bins, growth = [1], [1.0]
+        for size, block in self._blocks.items():
+            if block.count < 2:
+                continue
+            used = mean.shape[1] // size * size
+            quadrature = np.sqrt((stderr[:, :used] ** 2).reshape(len(stderr), -1, size).sum(axis=2))
+            counted = (quadrature > 0) & (block.mean > 1e-6 * np.nanmax(block.mean, initial=0.0))
+            if counted.any():
+                bins.append(size)
+                growth.append(float(np.median(block.stderr[counted] / quadrature[counted])))
+        return bins, growth
+
 
 @dataclass(frozen=True)
 class ErrorWindow:

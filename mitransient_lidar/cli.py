@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar import cli_studies
+from mitransient_lidar import cli_gates, cli_passive, cli_studies, cli_waveforms
 from mitransient_lidar._version import __version__
+from mitransient_lidar.cli_gates import GateFiles
 from mitransient_lidar.cli_support import (
     draw,
     parameters,
@@ -78,15 +79,25 @@ def render(
     passes: Annotated[int | None, typer.Option(help="Number of independent passes.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
     variant: Annotated[str | None, typer.Option(help="Mitsuba variant, e.g. llvm_ad_mono.")] = None,
-    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms and pixels.")] = True,
+    max_memory: Annotated[
+        float | None, typer.Option(help="Memory for histograms [GB]; by default 2. With less, gates alone are kept.")
+    ] = None,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
+    gif: Annotated[bool, typer.Option("--gif", help="Write an animation of the gates, too.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Write a movie of the gates, too; needs ffmpeg.")] = False,
+    html: Annotated[bool, typer.Option("--html", help="Write a page to look at the gates in a browser, too.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the paths and errors.")] = False,
 ) -> None:
-    """Render SCENE to DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and print their paths."""
+    """Render SCENE to DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and print their paths.
+
+    A scene with gates gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short.
+    """
     with sentences():
         require(target_error is None or positive(target_error), "--target-error", target_error, "above 0")
         require(max_time is None or positive(max_time), "--max-time", max_time, "above 0")
         require(passes is None or passes >= 2, "--passes", passes, "at least 2")
         require(seed >= 0, "--seed", seed, "0 or above")
+        require(max_memory is None or positive(max_memory), "--max-memory", max_memory, "above 0")
         params = parameters(define or [])
 
         from mitransient_lidar.resources import scene_path
@@ -94,9 +105,11 @@ def render(
         name = scene_path(scene).stem
         drawings = {output / f"{name}.png": "plot_waveforms", output / f"{name}_layout.png": "plot_layout"}
         targets = [output / f"{name}.exr", output / f"{name}.nc", *(drawings if plot else ())]
-        require_writable(output, targets)
+        wanted = {"drawings": plot, "gif": gif, "mp4": mp4, "html": html}
+        gates = GateFiles(output, name, frozenset(kind for kind, on in wanted.items() if on))
+        require_writable(output, [*targets, *gates.names()])
 
-        from mitransient_lidar import rendering
+        from mitransient_lidar import gate_files, rendering
 
         with reporting(quiet) as progress:
             dataset = rendering.render(
@@ -107,13 +120,22 @@ def render(
                 max_time=max_time,
                 passes=passes,
                 seed=seed,
+                max_memory=max_memory,
                 variant=variant,
                 progress=progress,
             )
         output.mkdir(parents=True, exist_ok=True)
-        written = [target for target in targets if _write(dataset, target, drawings.get(target))]
-        for target in written:
-            typer.echo(target)
+        if "waveform" in dataset:
+            for target in targets:
+                if _write(dataset, target, drawings.get(target)):
+                    typer.echo(target)
+        else:
+            gate_files.save_stack(dataset, output / f"{name}.nc")
+            typer.echo(output / f"{name}.nc")
+        if "gate_energy" in dataset:
+            gates.write(dataset, dataset, quiet)
+        elif wanted["gif"] or mp4 or html:
+            raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
         if not quiet:
             summarise(dataset)
         if dataset.attrs.get("interrupted"):
@@ -126,6 +148,8 @@ def _write(dataset: xr.Dataset, target: Path, drawing: str | None) -> bool:
     from mitransient_lidar import results
 
     if drawing is None:
+        if target.suffix == ".exr":
+            dataset = dataset.drop_dims("gate", errors="ignore")
         results.save(dataset, target)
         return True
     try:
@@ -168,7 +192,7 @@ def plot(
         typer.echo(target)
 
 
-for _study in cli_studies.COMMANDS:
+for _study in (*cli_studies.COMMANDS, *cli_gates.COMMANDS, cli_passive.passive, *cli_waveforms.COMMANDS):
     app.command()(_study)
 
 
@@ -252,9 +276,15 @@ def bench(
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     case: Annotated[str | None, typer.Option(help="Run this case only.")] = None,
     target_error: Annotated[float | None, typer.Option(help="Relative standard error to reach.")] = None,
+    images: Annotated[bool, typer.Option("--images", help="A gate of 4 to 65536 pixels to 10 % instead.")] = False,
 ) -> None:
     """Measure the time to a given accuracy."""
     with sentences():
+        if images:
+            from mitransient_lidar import bench_images
+
+            bench_images.run(json=json)
+            return
         require(target_error is None or positive(target_error), "--target-error", target_error, "above 0")
 
         from mitransient_lidar import bench as benchmark

@@ -203,6 +203,11 @@ def summarise(dataset: xr.Dataset) -> None:
     add("time (s)", "elapsed_s", ".2f")
     add("median error (%)", "error_median", ".3g", 100.0)
     add("95th percentile error (%)", "error_p95", ".3g", 100.0)
+    if "waveform" not in dataset:
+        table.add_row("gates", str(dataset.sizes["gate"]))
+        table.add_row("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}")
+        _console().print(table, markup=False)
+        return
     peaks = dataset["waveform"].max("time")
     if "pixel" in peaks.dims and peaks.size <= _LISTED_PIXELS:
         for name, peak in zip(peaks["pixel"].values, peaks.values, strict=True):

@@ -1,12 +1,12 @@
-"""Stacks of time bins in OpenEXR files.
+"""Images of 32-bit floating-point numbers in OpenEXR files, and stacks of time bins in one image.
 
-A file holds one part of 32-bit floating-point scan lines, compressed with ZIP. Every time bin is a layer: the stack
-``bin`` with the components ``Y`` and ``stderr`` becomes the channels ``bin0000.Y``, ``bin0000.stderr``, ``bin0001.Y``
-and so on, with four digits, or as many as the last bin needs.
+A file holds parts of scan lines, compressed with ZIP. A stack of time bins is one part whose layers are the bins: the
+stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels ``bin0000.Y``, ``bin0000.stderr``,
+``bin0001.Y`` and so on, with four digits, or as many as the last bin needs.
 
-The attributes of a stack are written twice. OpenEXR knows integers and floats of 32 bits only and no empty list, so
-one JSON string (header attribute ``mitransientLidar``) carries them exactly, and readable copies under their own names
-serve ``exrheader`` and other programs.
+The attributes are written twice. OpenEXR knows integers and floats of 32 bits only and no empty list, so one JSON
+string (header attribute ``mitransientLidar``) carries them exactly, and readable copies under their own names serve
+``exrheader`` and other programs.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,14 @@ _INT32 = np.iinfo(np.int32)
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 Stacks = dict[str, dict[str, npt.NDArray[np.float32]]]
+
+
+class Part(NamedTuple):
+    """One image of a file."""
+
+    name: str  #: Different for every part; empty where the file has one part.
+    attributes: dict[str, Any]  #: The header, for writing as `header` makes it.
+    channels: dict[str, npt.NDArray[np.float32]]  #: Channel name to values of shape (row, column).
 
 
 def write(
@@ -70,16 +78,7 @@ def write(
             for index, image in enumerate(images):
                 channels[f"{stack}{index:0{digits}d}.{component}"] = image
 
-    header = {name: _plain(value) for name, value in readable.items() if _is_storable(name, value)}
-    header[_EXACT] = json.dumps(exact)
-    header["compression"] = OpenEXR.ZIP_COMPRESSION
-    header["type"] = OpenEXR.scanlineimage
-    with silent_library():
-        try:
-            with OpenEXR.File(header, channels) as file:
-                file.write(os.fspath(path))
-        except RuntimeError as error:
-            raise OSError(str(error)) from error
+    write_parts(path, [Part("", header(readable, exact), channels)])
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
@@ -100,37 +99,118 @@ def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
     Raises
     ------
     UserError
-        If the file is damaged, truncated, or was not written by `write`.
+        If the file is damaged, truncated, holds no stack of time bins, or was not written by `write`.
     """
-    damaged = f"{path} is damaged or truncated: its OpenEXR data cannot be read."
-    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
-    with silent_library():
-        try:
-            with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
-                # Closing the file empties its dictionaries and frees the pixels.
-                header = dict(file.header())
-                images = {name: channel.pixels.copy() for name, channel in file.channels().items()}
-        except (RuntimeError, ValueError) as error:
-            raise UserError(damaged) from error
-    if _EXACT not in header:
-        raise UserError(foreign)
+    parts = read_parts(path)
+    exact = exact_metadata(path, parts[0].attributes)
+    if len(parts) > 1:
+        raise UserError(f"{path} holds {len(parts)} images and no time bins.")
 
     layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
-    for name, image in images.items():
+    for name, image in parts[0].channels.items():
         if match := _LAYER.fullmatch(name):
             layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
     stacks: Stacks = {}
     for (stack, component), by_bin in layers.items():
         if sorted(by_bin) != list(range(len(by_bin))):
-            raise UserError(damaged)
+            raise UserError(_damaged(path))
         stacks.setdefault(stack, {})[component] = np.stack([by_bin[index] for index in range(len(by_bin))], axis=-1)
+    if not stacks:
+        raise UserError(f"{path} holds no time bins.")
+    return stacks, exact
+
+
+def header(readable: Mapping[str, Any], exact: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the header attributes of a part.
+
+    Parameters
+    ----------
+    readable : mapping of str to int, float, str or a list of those
+        Attributes for readers of the header; those that OpenEXR cannot hold become text or are left out, as in `write`.
+    exact : mapping, optional
+        Metadata that must come back exactly through `exact_metadata`; anything that JSON holds.
+    """
+    attributes = {name: _plain(value) for name, value in readable.items() if _is_storable(name, value)}
+    if exact is not None:
+        attributes[_EXACT] = json.dumps(exact)
+    return attributes
+
+
+def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the exact metadata of a part that was read from a file.
+
+    Raises
+    ------
+    UserError
+        If the part has none, or they cannot be read.
+    """
+    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
+    if _EXACT not in attributes:
+        raise UserError(foreign)
     try:
-        exact = json.loads(header[_EXACT])
+        exact = json.loads(attributes[_EXACT])
     except ValueError as error:
-        raise UserError(damaged) from error
+        raise UserError(_damaged(path)) from error
     if not isinstance(exact, dict):
         raise UserError(foreign)
-    return stacks, exact
+    return exact
+
+
+def write_parts(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
+    """Write images into one file, in their order.
+
+    Parameters
+    ----------
+    path : path
+        File to write; an existing one is overwritten.
+    parts : sequence of Part
+        At least one.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with silent_library():
+        try:
+            with OpenEXR.File(
+                [OpenEXR.Part({**part.attributes, **kind}, part.channels, part.name) for part in parts]
+            ) as file:
+                file.write(os.fspath(path))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+
+def read_parts(path: str | os.PathLike[str]) -> list[Part]:
+    """Read all images of a file.
+
+    Raises
+    ------
+    UserError
+        If the file is damaged or truncated.
+    """
+    with silent_library():
+        try:
+            with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+                # Closing the file empties its dictionaries and frees the pixels.
+                parts = [
+                    Part(
+                        str(part.header.get("name", "")),
+                        dict(part.header),
+                        {name: channel.pixels.copy() for name, channel in part.channels.items()},
+                    )
+                    for part in file.parts
+                ]
+        except (RuntimeError, ValueError) as error:
+            raise UserError(_damaged(path)) from error
+    if not parts:
+        raise UserError(_damaged(path))
+    return parts
+
+
+def _damaged(path: str | os.PathLike[str]) -> str:
+    return f"{path} is damaged or truncated: its OpenEXR data cannot be read."
 
 
 def _is_storable(name: str, value: Any) -> bool:

@@ -245,13 +245,14 @@ def _draw_field(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatA
     from mitransient_lidar.plotting import number
 
     width, shape = number(attributes, "field_of_view_mrad"), attributes.get("field_of_view_shape")
-    if width is None or shape not in ("circle", "square"):
+    if width is None or shape not in ("circle", "square", "rectangle"):
         return np.zeros((0, 2))
     azimuth = np.linspace(0, 2 * np.pi, 181)
     angles = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-    if shape == "square":
+    if shape != "circle":
         angles /= np.abs(angles).max(axis=1, keepdims=True)
-    points = ground.project(ground.receiver, width / 2 * angles)
+    sides = np.array(attributes.get("field_of_view_sides_mrad") or [width, width])
+    points = ground.project(ground.receiver, sides / 2 * angles)
     ax.plot(*points.T, color="0.2", linewidth=1.2, label="field of view")
     return points
 

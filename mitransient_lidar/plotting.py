@@ -197,14 +197,15 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, names: Sequence[str], colours: S
             ax.scatter(gy, gx, c=list(colours), s=24)
             ax.set_aspect("equal", "datalim")
         return
+    sides = tuple(attributes.get("field_of_view_sides_mrad") or (width, width))
     outline: Patch
     if attributes.get("field_of_view_shape", "circle") == "circle":
         outline = Circle((0, 0), width / 2)
     else:
-        outline = Rectangle((-width / 2, -width / 2), width, width)
+        outline = Rectangle((-sides[1] / 2, -sides[0] / 2), sides[1], sides[0])
     outline.set(facecolor="none", edgecolor="0.25", linewidth=1.2)
     ax.add_patch(outline)
-    cells = _cells(str(attributes.get("layout", "")), gx, gy, width)
+    cells = _cells(str(attributes.get("layout", "")), gx, gy, sides)
     if cells is None:
         ax.scatter(gy, gx, c=list(colours), s=12)
     else:
@@ -218,7 +219,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, names: Sequence[str], colours: S
 
 
 def _cells(
-    layout: str, gx: npt.NDArray[np.float64], gy: npt.NDArray[np.float64], width: float
+    layout: str, gx: npt.NDArray[np.float64], gy: npt.NDArray[np.float64], sides: tuple[float, float]
 ) -> list[tuple[float, float, float, float]] | None:
     """Return each pixel's rectangle (left, bottom, width, height) in a layout of equal cells, None for other layouts.
 
@@ -228,13 +229,13 @@ def _cells(
     if not (separator and first.isdecimal() and second.isdecimal() and int(first) * int(second) == len(gx) > 0):
         return None
     for along, across in {(int(first), int(second)), (int(second), int(first))}:
-        height, breadth = width / along, width / across
-        rows = np.floor((width / 2 - gx) / height).astype(int)
-        columns = np.floor((gy + width / 2) / breadth).astype(int)
+        height, breadth = sides[0] / along, sides[1] / across
+        rows = np.floor((sides[0] / 2 - gx) / height).astype(int)
+        columns = np.floor((gy + sides[1] / 2) / breadth).astype(int)
         inside = ((rows >= 0) & (rows < along) & (columns >= 0) & (columns < across)).all()
         if inside and len(set(zip(rows.tolist(), columns.tolist(), strict=True))) == len(gx):
             return [
-                (column * breadth - width / 2, width / 2 - (row + 1) * height, breadth, height)
+                (column * breadth - sides[1] / 2, sides[0] / 2 - (row + 1) * height, breadth, height)
                 for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
             ]
     return None

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitransient_lidar import results, variants
-from mitransient_lidar.accuracy import ErrorWindow, PassStatistics
+from mitransient_lidar import variants
+from mitransient_lidar.accuracy import ErrorWindow
 from mitransient_lidar.errors import UserError
 from mitransient_lidar.interruption import InterruptAfterPass
 from mitransient_lidar.loading import load_scene, readable_errors
-from mitransient_lidar.optics.pulse import waveform
+from mitransient_lidar.recording import recording_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -30,6 +30,11 @@ logger = logging.getLogger(__name__)
 #: Accuracy and longest time when the caller asks for none.
 DEFAULT_TARGET_ERROR = 0.03
 DEFAULT_MAX_TIME = 300.0
+
+#: Accuracy of gates, for each pixel, and longest time when the caller asks for none; memory [GB].
+DEFAULT_GATE_ERROR = 0.1
+DEFAULT_GATE_TIME = 60.0
+DEFAULT_MAX_MEMORY = 2.0
 
 #: With fewer passes the standard error itself is too uncertain to stop by (8 passes: 27 %).
 SMALLEST_PASS_COUNT = 8
@@ -49,7 +54,8 @@ class Progress:
     elapsed_s, remaining_s
         Time since the start and estimate of the time left [s].
     error_median, error_p95
-        Median and 95th percentile of the relative standard error of the waveform's bins between surface and bottom.
+        Median and 95th percentile of the relative standard error of the waveform's bins between surface and bottom, or
+        of gates, each with the median over its lit pixels.
     target_error
         The error asked for.
     """
@@ -72,15 +78,25 @@ class Goal:
     passes: int | None
 
     @classmethod
-    def from_options(cls, target_error: float | None, max_time: float | None, passes: int | None) -> Goal:
-        """Check the options of `render`; without any, aim for 3 % within five minutes."""
+    def from_options(
+        cls,
+        target_error: float | None,
+        max_time: float | None,
+        passes: int | None,
+        gates: bool = False,
+    ) -> Goal:
+        """Check the options of `render`; without any, aim for 3 % within five minutes, or gates of 10 % in one."""
         for name, value in (("target_error", target_error), ("max_time", max_time)):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise UserError(f"{name} = {value} must be a number greater than 0")
         if passes is not None and passes < 2:
             raise UserError(f"passes = {passes} must be at least 2: their spread gives the standard error")
         if target_error is None and max_time is None and passes is None:
-            return cls(DEFAULT_TARGET_ERROR, DEFAULT_MAX_TIME, None)
+            return (
+                cls(DEFAULT_GATE_ERROR, DEFAULT_GATE_TIME, None)
+                if gates
+                else cls(DEFAULT_TARGET_ERROR, DEFAULT_MAX_TIME, None)
+            )
         return cls(target_error, max_time, passes)
 
     def reached(self, done: int, elapsed: float, error: float | None) -> bool:
@@ -115,6 +131,7 @@ def render(
     max_time: float | None = None,
     passes: int | None = None,
     seed: int = 0,
+    max_memory: float | None = None,
     variant: str | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> xarray.Dataset:
@@ -130,13 +147,18 @@ def render(
         Name or dict of an integrator plugin, or an integrator, instead of the scene's.
     target_error
         Relative standard error, greater than 0: passes end when 95 % of the waveform's bins, of every lit pixel from
-        the surface echo to the end of the bottom echo, have reached it (after at least 8 passes).
+        the surface echo to the end of the bottom echo, have reached it (after at least 8 passes). In a scene
+        with gates: when 95 % of the gates have, in the median over the pixels that are lit in them.
     max_time
         Longest time for the passes [s], greater than 0.
     passes
-        Number of passes, at least 2. Without any of the three the target is 0.03 within 300 s.
+        Number of passes, at least 2. Without any of the three the target is 0.03 within 300 s, or 0.1 within
+        60 s in a scene with gates.
     seed
         Any integer; the same seed gives the same result on the same machine.
+    max_memory
+        Memory for histograms, means and errors [GB], greater than 0; 2 by default. When those of a
+        scene with gates take more, gates alone are kept, which is told in a warning.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
@@ -147,6 +169,7 @@ def render(
     xarray.Dataset
         ``impulse_response`` [J per bin], ``waveform`` [W] (after the pulse and the receiver's response) and their
         standard errors, with dimensions (pixel, time) or (row, column, time); see :mod:`mitransient_lidar.results`.
+        With gates in the scene's film also, or instead, ``gate_energy`` [J]; see :mod:`mitransient_lidar.gating`.
         After Ctrl-C it holds the passes done so far, and the attribute ``interrupted`` is 1.
 
     Raises
@@ -154,7 +177,10 @@ def render(
     UserError
         When the scene, a parameter or an option is wrong; the message is one sentence.
     """
-    goal = Goal.from_options(target_error, max_time, passes)
+    Goal.from_options(target_error, max_time, passes)
+    max_memory = DEFAULT_MAX_MEMORY if max_memory is None else max_memory
+    if not (np.isfinite(max_memory) and max_memory > 0):
+        raise UserError(f"max_memory = {max_memory} must be a number greater than 0")
     variants.set_variant(variant)
     loaded, name, parameters = load_scene(scene, params)
     engine = choose_integrator(loaded, integrator)
@@ -167,39 +193,38 @@ def render(
     window = _error_window(system, probe)
     _check_record(system, probe)
     _check_solids(system, probe)
-    film, pulse = system.film, system.transmitter.pulse
-    kernel = pulse.kernel(film.bin_width_ns, system.receiver.optics.response_time_ns)
-    energy, power = PassStatistics(), PassStatistics()
+    seen = probe.surface_ns[:, 1]
+    surface_time = float(np.nanmean(seen)) if np.isfinite(seen).any() else None
+    recording = recording_of(system, window, surface_time, max_memory)
+    goal = Goal.from_options(target_error, max_time, passes, recording.train is not None)
     lost_energy = 0.0
     start = time.perf_counter()
     interrupted = False
     median = p95 = None
     try:
         with InterruptAfterPass() as interruption:
-            while not goal.reached(energy.count, time.perf_counter() - start, p95):
+            while not goal.reached(recording.count, time.perf_counter() - start, p95):
                 with readable_errors():
-                    engine.render(loaded, sensor, seed=pass_seed(seed, energy.count), develop=False)
-                histogram = film.energy().reshape(system.receiver.pixels.count, film.bin_count)
-                energy.add(histogram)
-                power.add(waveform(histogram, film.bin_width_ns, kernel))
+                    engine.render(loaded, sensor, seed=pass_seed(seed, recording.count), develop=False)
+                recording.add_pass()
                 lost_energy += float(np.array(engine.lost).item())
-                if energy.count > 1:
-                    errors = window.relative_errors(power.mean, power.stderr)
-                    median, p95 = _percentiles(errors)
+                if recording.count > 1:
+                    median, p95 = _percentiles(recording.errors())
                 if progress is not None:
                     elapsed = time.perf_counter() - start
-                    left = goal.remaining(energy.count, elapsed, p95)
-                    progress(Progress(energy.count, goal.passes, elapsed, median, p95, goal.target_error, left))
-                if energy.count > 1:
+                    left = goal.remaining(recording.count, elapsed, p95)
+                    progress(Progress(recording.count, goal.passes, elapsed, median, p95, goal.target_error, left))
+                if recording.count > 1:
                     interruption.check()
     except KeyboardInterrupt:
-        if energy.count < 2:
+        if recording.count < 2:
             raise
         interrupted = True
     finally:
         engine.release()
+        system.film.sum_bins()
     elapsed = time.perf_counter() - start
-    received = float(np.nansum(energy.mean)) * energy.count
+    received = recording.received
     lost = lost_energy / (lost_energy + received) if lost_energy > 0 else 0.0
     _warn_of_losses(system, probe, lost)
     attributes = {
@@ -207,7 +232,7 @@ def render(
         **variants.versions(),
         "integrator": engine.plugin,
         "seed": int(seed),
-        "passes": energy.count,
+        "passes": recording.count,
         "elapsed_s": elapsed,
         "interrupted": int(interrupted),
         "error_median": float("nan") if median is None else median,
@@ -217,19 +242,7 @@ def render(
         **_describe(system, probe, window),
         **{f"scene.{key}": value for key, value in parameters.items()},
     }
-    pixels = system.receiver.pixels
-    return results.build(
-        energy.mean,
-        energy.stderr,
-        power.mean,
-        power.stderr,
-        time_start_ns=film.time_start_ns,
-        bin_width_ns=film.bin_width_ns,
-        pixel_names=pixels.names,
-        pixel_centres_mrad=1e3 * pixels.centres(),
-        grid=pixels.grid,
-        attributes=attributes,
-    )
+    return recording.dataset(attributes)
 
 
 def choose_integrator(scene: mi.Scene, wanted: Any) -> Any:
@@ -348,6 +361,7 @@ def _describe(system: LidarScene, probe: EchoProbe, window: ErrorWindow) -> dict
     described = {
         "layout": receiver.pixels.layout,
         "field_of_view_mrad": 1e3 * receiver.pixels.field_of_view,
+        "field_of_view_sides_mrad": [1e3 * side for side in getattr(receiver.pixels, "sides", [])],
         "field_of_view_shape": receiver.pixels.field_of_view_shape,
         "aperture_area": receiver.optics.aperture_area,
         "obscuration": receiver.optics.obscuration,

@@ -11,7 +11,6 @@ EXR files keep the values in 32 bits and everything else exactly; NetCDF files k
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import math
 import os
@@ -25,8 +24,9 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar import exr
+from mitransient_lidar import dataset_files, exr
 from mitransient_lidar._version import __version__
+from mitransient_lidar.dataset_files import attribute, text
 from mitransient_lidar.errors import UserError
 
 _LOG = logging.getLogger(__name__)
@@ -47,8 +47,6 @@ _CHANNELS = {
     "waveform": ("wave", "Y"),
     "waveform_stderr": ("wave", "stderr"),
 }
-_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_LISTS = "mitransient_lidar_lists"  # NetCDF attribute that names the attributes to read back as lists
 _NAMED_PIXELS = 5  # pixels named one by one in a warning
 
 
@@ -118,19 +116,54 @@ def build(
     if not (math.isfinite(bin_width_ns) and bin_width_ns > 0):
         raise ValueError(f"bin_width_ns = {bin_width_ns} must be a finite number above 0.")
 
+    coords = pixel_coordinates(pixel_names, centres, grid)
+    dims = coords["gx"][0]
+    layout = coords["gx"][1].shape
+    time = time_start_ns + (np.arange(shape[1]) + 0.5) * bin_width_ns
+    time_name = "time at the centre of the bin since the pulse's peak left the transmitter"
+    coords["time"] = ("time", time, {"units": "ns", "long_name": time_name})
+
+    _warn_of_non_finite(
+        values,
+        coords["pixel"][1].tolist() if grid is None else [f"({i // grid[1]}, {i % grid[1]})" for i in range(shape[0])],
+    )
+    return xr.Dataset(
+        {name: ((*dims, "time"), values[name].reshape(*layout, -1), dict(_VARIABLES[name])) for name in _VARIABLES},
+        coords,
+        provenance({"time_start_ns": float(time_start_ns), "bin_width_ns": float(bin_width_ns), **attributes}),
+    )
+
+
+def pixel_coordinates(
+    pixel_names: Sequence[str], pixel_centres_mrad: npt.ArrayLike, grid: tuple[int, int] | None = None
+) -> dict[str, Any]:
+    """Return the coordinates of pixels: names, or row and column, and the centres gx and gy.
+
+    Parameters
+    ----------
+    pixel_names, pixel_centres_mrad, grid
+        As for `build`.
+
+    Raises
+    ------
+    ValueError
+        If names repeat, or their number or that of the grid's cells is not that of the centres.
+    """
+    centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
+    count = len(centres)
     dims: tuple[str, ...]
     layout: tuple[int, ...]
     coords: dict[str, Any]
     if grid is None:
-        names = [_text(name) for name in pixel_names]
-        if len(names) != shape[0] or len(set(names)) != len(names):
-            raise ValueError(f"pixel_names = {names} must be {shape[0]} different names, one a pixel.")
-        dims, layout = ("pixel",), (shape[0],)
+        names = [text(name) for name in pixel_names]
+        if len(names) != count or len(set(names)) != len(names):
+            raise ValueError(f"pixel_names = {names} must be {count} different names, one a pixel.")
+        dims, layout = ("pixel",), (count,)
         coords = {"pixel": ("pixel", np.array(names, dtype=str), {"long_name": "pixel name"})}
     else:
         rows, columns = grid
-        if rows < 1 or columns < 1 or rows * columns != shape[0]:
-            raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {shape[0]}.")
+        if rows < 1 or columns < 1 or rows * columns != count:
+            raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
         dims, layout = ("row", "column"), (rows, columns)
         coords = {
             "row": ("row", np.arange(rows), {"long_name": "row of the image, 0 farthest from nadir"}),
@@ -140,26 +173,24 @@ def build(
     for axis, (name, direction) in enumerate(where.items()):
         described = {"units": "mrad", "long_name": f"angle of the pixel's centre {direction}"}
         coords[name] = (dims, centres[:, axis].reshape(layout), described)
-    time = time_start_ns + (np.arange(shape[1]) + 0.5) * bin_width_ns
-    time_name = "time at the centre of the bin since the pulse's peak left the transmitter"
-    coords["time"] = ("time", time, {"units": "ns", "long_name": time_name})
+    return coords
 
-    _warn_of_non_finite(
-        values, names if grid is None else [f"({i // grid[1]}, {i % grid[1]})" for i in range(shape[0])]
-    )
-    return xr.Dataset(
-        {name: ((*dims, "time"), values[name].reshape(*layout, -1), dict(_VARIABLES[name])) for name in _VARIABLES},
-        coords,
-        {
-            "Conventions": "CF-1.11",
-            "title": f"Received lidar power, scene {attributes['scene']}" if "scene" in attributes else "Lidar power",
-            "source": f"mitransient-lidar {__version__}",
-            "history": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} rendered by mitransient-lidar {__version__}",
-            "time_start_ns": float(time_start_ns),
-            "bin_width_ns": float(bin_width_ns),
-            **{_text(name): _attribute(name, value) for name, value in attributes.items()},
-        },
-    )
+
+def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return attributes of a result: those given, checked, and what made it (``title``, ``source``, ``history``).
+
+    Raises
+    ------
+    ValueError
+        If an attribute is no int, float, str or list of one of those.
+    """
+    return {
+        "Conventions": "CF-1.11",
+        "title": f"Received lidar power, scene {attributes['scene']}" if "scene" in attributes else "Lidar power",
+        "source": f"mitransient-lidar {__version__}",
+        "history": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} rendered by mitransient-lidar {__version__}",
+        **{text(name): attribute(name, value) for name, value in attributes.items()},
+    }
 
 
 def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
@@ -187,7 +218,7 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         if suffix == ".exr":
             _write_exr(dataset, path, temporary)
         else:
-            _write_netcdf(dataset, temporary)
+            dataset_files.write_netcdf(dataset, temporary, _VARIABLES)
 
 
 def open(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -216,7 +247,7 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
         raise UserError(f"cannot read {path}: {error.strerror}.") from error
     if signature.startswith(exr.SIGNATURE):
         return _read_exr(path)
-    if signature == _HDF5_SIGNATURE:
+    if signature == dataset_files.HDF5_SIGNATURE:
         return _read_netcdf(path)
     raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file.")
 
@@ -258,15 +289,7 @@ def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
         "dims": list(dataset["impulse_response"].dims),
         "attributes": dataset.attrs,
         "variables": {name: dataset[name].attrs for name in _VARIABLES},
-        "coordinates": {
-            str(name): {
-                "dims": list(coordinate.dims),
-                "kind": "str" if coordinate.dtype.kind in "UO" else coordinate.dtype.name,
-                "values": coordinate.values.tolist(),
-                "attributes": coordinate.attrs,
-            }
-            for name, coordinate in dataset.coords.items()
-        },
+        "coordinates": dataset_files.describe_coordinates(dataset),
     }
     readable = {f"lidar.{name}": value for name, value in dataset.attrs.items()}
     readable |= {"timeStartNs": dataset.attrs["time_start_ns"], "binWidthNs": dataset.attrs["bin_width_ns"]}
@@ -285,73 +308,18 @@ def _read_exr(path: Path) -> xr.Dataset:
                 name: (dims, (image if len(dims) == 3 else image[0]).astype(np.float64), exact["variables"][name])
                 for name, image in images.items()
             },
-            {
-                name: (item["dims"], np.array(item["values"], dtype=item["kind"]), item["attributes"])
-                for name, item in exact["coordinates"].items()
-            },
+            dataset_files.coordinates(exact["coordinates"]),
             exact["attributes"],
         )
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is damaged: its metadata and its image do not belong together.") from error
 
 
-def _write_netcdf(dataset: xr.Dataset, temporary: Path) -> None:
-    dataset = dataset.drop_encoding()
-    # NetCDF cannot tell a list of one item from the item.
-    dataset.attrs[_LISTS] = json.dumps([name for name, value in dataset.attrs.items() if isinstance(value, list)])
-    # No fill value: CF forbids it for coordinates, and a NaN in the data means what it says.
-    encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in dataset.variables}
-    for name in _VARIABLES:
-        encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True}
-    dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
-
-
 def _read_netcdf(path: Path) -> xr.Dataset:
-    try:
-        dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path} is damaged or truncated: its NetCDF data cannot be read.") from error
+    dataset = dataset_files.read_netcdf(path)
     if any(name not in dataset for name in _VARIABLES):
         raise UserError(f"{path} is a NetCDF file, but not a result of mitransient-lidar.")
-    dataset = dataset.drop_encoding()
-    lists = json.loads(dataset.attrs.pop(_LISTS, "[]"))
-    dataset.attrs = {
-        str(name): np.atleast_1d(value).tolist() if name in lists else _attribute(str(name), value)
-        for name, value in dataset.attrs.items()
-    }
-    for name, coordinate in dataset.coords.items():
-        if coordinate.dtype.kind == "O":
-            dataset[name] = coordinate.astype(str)
     return dataset
-
-
-def _attribute(name: str, value: Any) -> int | float | str | list[int] | list[float] | list[str]:
-    """Turn an attribute into the Python kinds that both file formats return unchanged.
-
-    Raises
-    ------
-    ValueError
-        If it is no int, float, str or list of one of those.
-    """
-    if isinstance(value, (tuple, list, np.ndarray)):
-        items = [_attribute(name, item) for item in value]
-        if {type(item) for item in items} == {int, float}:
-            items = [float(item) for item in items]  # type: ignore[arg-type]
-        if len({type(item) for item in items}) <= 1 and not any(isinstance(item, list) for item in items):
-            return items  # type: ignore[return-value]
-    elif isinstance(value, (bool, int, np.bool_, np.integer)):
-        if -(2**63) <= int(value) < 2**63:
-            return int(value)
-    elif isinstance(value, (float, np.floating)):
-        return float(value)
-    elif isinstance(value, (str, Path)):
-        return _text(value)
-    raise ValueError(f"attribute {name} = {value!r} must be a 64-bit int, a float, a str or a list of one of those.")
-
-
-def _text(value: str | Path) -> str:
-    """Replace what UTF-8 or NetCDF cannot hold: bytes of undecodable file names, and NUL."""
-    return str(value).replace("\0", "\ufffd").encode("utf-8", "replace").decode("utf-8")
 
 
 def _warn_of_non_finite(values: Mapping[str, npt.NDArray[np.float64]], names: Sequence[str]) -> None:

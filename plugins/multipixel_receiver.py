@@ -8,7 +8,7 @@ from mitransient_lidar.optics.checks import in_range, positive
 from mitransient_lidar.transport.blur import Blur
 from mitransient_lidar.transport.hexagons import HexagonPixels
 from mitransient_lidar.transport.pixel_maps import MappedPixels
-from mitransient_lidar.transport.pixels import LayoutPixels, PixelArray, ShapedPixels
+from mitransient_lidar.transport.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.receiving import Receiver, ReceiverOptics
 
@@ -35,7 +35,12 @@ class MultipixelReceiver(mi.Sensor):
                                                    in the order of labels and named ``label1``, ...; 0 is no pixel
     field_of_view_mrad                  float      Full angle of the field of view [mrad], positive: diameter, side, or
                                                    diameter of the circle that just holds the hexagons. Default: 30
-    field_of_view_shape                 string     ``circle`` or ``square``, for ``RxC``. Default: ``circle``
+    field_of_view_shape                 string     ``circle`` or ``square``, for ``RxC``. Default: ``circle``, or
+                                                   ``square`` with a focal length
+    focal_length_mm, pixel_pitch_um     float      Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the
+                                                   lens and distance of square pixels on the detector, both positive.
+                                                   The field of view is then R by C times pitch over focal length, a
+                                                   rectangle (or, with ``circle`` and R = C, the circle within)
     (nested)                            sensor     ``pixel_fov`` sensors instead of layout and field of view
     blur_mrad                           float      Optical blur: standard deviation along each axis of a Gaussian
                                                    point-spread function [mrad], 0 (sharp) to 1000. Default: 0
@@ -115,7 +120,8 @@ class MultipixelReceiver(mi.Sensor):
 
 
 #: Parameters of pixels that are not nested.
-_OWN = ("layout", "pixel_map", "field_of_view_mrad", "field_of_view_shape", "fill_factor", "imager")
+_LENS = ("focal_length_mm", "pixel_pitch_um")
+_OWN = ("layout", "pixel_map", "field_of_view_mrad", "field_of_view_shape", "fill_factor", "imager", *_LENS)
 
 
 def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
@@ -139,15 +145,29 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
 
     field_of_view = 1e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
     if "pixel_map" in props:
-        only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager")
+        only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager", *_LENS)
         return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
     layout = str(props.get("layout", "2x2"))
     fill_factor = in_range("fill_factor", props.get("fill_factor", 1.0), 0.01, 1.0)
     if layout.startswith("hex"):
-        only_for("layouts of rows x columns", "field_of_view_shape", "imager")
+        only_for("layouts of rows x columns", "field_of_view_shape", "imager", *_LENS)
         return HexagonPixels(layout, field_of_view, fill_factor)
+    if any(name in props for name in _LENS):
+        only_for("receivers without a focal length", "field_of_view_mrad")
+        sides, shape = _sides_of_lens(props, layout), "square"
+        return LayoutPixels(layout, sides, props.get("field_of_view_shape", shape), props.get("imager"), fill_factor)
     shape = props.get("field_of_view_shape", "circle")
     return LayoutPixels(layout, field_of_view, shape, props.get("imager", None), fill_factor)
+
+
+def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:
+    """Return the sides (gx, gy) [rad] of the field of view of a detector behind a lens."""
+    for name in _LENS:
+        if name not in props:
+            raise ValueError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
+    focal_length, pitch = (positive(name, props[name]) for name in _LENS)
+    rows, columns = parse_layout(layout)
+    return 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns
 
 
 mi.register_sensor("multipixel_receiver", lambda props: MultipixelReceiver(props))

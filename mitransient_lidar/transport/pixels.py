@@ -50,7 +50,7 @@ class PixelArray(ABC):
     field_of_view
         Full angle that holds all pixels [rad]: diameter or side about the axis.
     field_of_view_shape
-        ``circle``, ``square`` or ``nested``.
+        ``circle``, ``square``, ``rectangle`` or ``nested``.
     """
 
     names: list[str]
@@ -82,7 +82,7 @@ class PixelArray(ABC):
 
 
 class LayoutPixels(PixelArray):
-    """A circular or square field of view cut into rows and columns.
+    """A circular, square or rectangular field of view cut into rows and columns.
 
     Points are drawn over the whole field of view and then given to the pixel that they fall into, so the number of
     pixels costs nothing and the pixels sum to the single pixel of the same field of view, path by path.
@@ -93,9 +93,9 @@ class LayoutPixels(PixelArray):
         ``RxC``: R rows along range, row 0 the far edge (+gx); C columns, column 0 the -gy edge. ``1x4`` is the
         published receiver of four strips across range, the same as ``4x1``.
     field_of_view
-        Diameter or side [rad], positive.
+        Diameter or side [rad], positive; of a rectangle (height along gx, width along gy).
     shape
-        ``circle`` or ``square``.
+        ``circle`` or ``square``; a pair of sides makes a rectangle of any.
     imager
         Whether rows and columns stay apart in the result; None decides by the number of pixels.
     fill_factor
@@ -104,19 +104,28 @@ class LayoutPixels(PixelArray):
     """
 
     def __init__(
-        self, layout: str, field_of_view: float, shape: str, imager: bool | None = None, fill_factor: float = 1.0
+        self,
+        layout: str,
+        field_of_view: float | tuple[float, float],
+        shape: str,
+        imager: bool | None = None,
+        fill_factor: float = 1.0,
     ) -> None:
         rows, columns = parse_layout(layout)
-        half = 0.5 * field_of_view
         if shape not in FIELD_SHAPES:
             raise ValueError(f"field_of_view_shape = {shape!r} must be one of {', '.join(FIELD_SHAPES)}")
-        self.field: Field = Sector(half) if shape == "circle" else Rectangle(-half, half, -half, half)
+        #: Sides along gx and gy [rad].
+        self.sides = field_of_view if isinstance(field_of_view, tuple) else (field_of_view, field_of_view)
+        height, width = (0.5 * side for side in self.sides)
+        if height != width:
+            shape = "rectangle"
+        self.field: Field = Sector(height) if shape == "circle" else Rectangle(-height, height, -width, width)
         self.layout = layout
-        self.field_of_view = field_of_view
+        self.field_of_view = max(self.sides)
         self.field_of_view_shape = shape
         # Of cells that leave gaps the whole ones are sampled, though the circle cuts some.
         self._shrink = math.sqrt(fill_factor)
-        self.area = fill_factor * field_of_view**2 if fill_factor < 1 else self.field.area
+        self.area = fill_factor * self.sides[0] * self.sides[1] if fill_factor < 1 else self.field.area
         self._rows, self._columns = rows, columns
         self.grid = (rows, columns) if (rows * columns > _LARGEST_LAYOUT if imager is None else imager) else None
         if (rows, columns) in ((2, 2), (4, 1)):
@@ -130,15 +139,15 @@ class LayoutPixels(PixelArray):
         """Map uniform numbers to uniform points of the field of view, or of its cells when they leave gaps."""
         if self._shrink == 1:
             return self.field.sample(u)
-        half, full = 0.5 * self.field_of_view, self.field_of_view
+        height, width = self.sides
         row, column = u.x * self._rows, u.y * self._columns
         row, column = (dr.lerp(dr.floor(g) + 0.5, g, self._shrink) for g in (row, column))
-        return half - row * (full / self._rows), column * (full / self._columns) - half
+        return 0.5 * height - row * (height / self._rows), column * (width / self._columns) - 0.5 * width
 
     def pixel_at(self, gx: mi.Float, gy: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether the field of view holds it (1 or 0)."""
-        half, full = 0.5 * self.field_of_view, self.field_of_view
-        down, across = (half - gx) * (self._rows / full), (gy + half) * (self._columns / full)
+        height, width = self.sides
+        down, across = (0.5 * height - gx) * (self._rows / height), (gy + 0.5 * width) * (self._columns / width)
         row = dr.clip(mi.Int32(dr.floor(down)), 0, self._rows - 1)
         column = dr.clip(mi.Int32(dr.floor(across)), 0, self._columns - 1)
         inside = self.field.contains(gx, gy)
@@ -149,13 +158,13 @@ class LayoutPixels(PixelArray):
 
     def centres(self) -> NDArray[np.float64]:
         """Return centres of gravity (gx, gy) [rad], shape (pixels, 2); of the uncut cells in imagers."""
-        half = 0.5 * self.field_of_view
-        far = half - (np.arange(self._rows) + 0.5) * self.field_of_view / self._rows
-        left = (np.arange(self._columns) + 0.5) * self.field_of_view / self._columns - half
+        height, width = self.sides
+        far = 0.5 * height - (np.arange(self._rows) + 0.5) * height / self._rows
+        left = (np.arange(self._columns) + 0.5) * width / self._columns - 0.5 * width
         centres = np.stack(np.meshgrid(far, left, indexing="ij"), axis=-1).reshape(-1, 2)
-        if self.count > _LARGEST_LAYOUT or self.field_of_view_shape == "square":
+        if self.count > _LARGEST_LAYOUT or self.field_of_view_shape != "circle":
             return centres
-        ticks = half * (2 * (np.arange(400) + 0.5) / 400 - 1)
+        ticks = 0.5 * height * (2 * (np.arange(400) + 0.5) / 400 - 1)
         gx, gy = (g.ravel() for g in np.meshgrid(ticks, ticks))
         pixel, count = (np.array(a) for a in self.pixel_at(mi.Float(gx), mi.Float(gy), mi.Float(0)))
         for index in range(self.count):

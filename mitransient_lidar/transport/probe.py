@@ -20,6 +20,9 @@ from mitransient_lidar.transport.system import LidarScene
 _RAYS = 2**16
 _TAIL = 0.05
 
+#: Receivers of more pixels are probed as a whole: a pixel would get too few rays.
+_MOST_PIXELS = 1024
+
 
 @dataclass(frozen=True)
 class EchoProbe:
@@ -64,13 +67,17 @@ def probe_echoes(system: LidarScene, view: ViewSampler) -> EchoProbe:
 
     pixel, weight = np.array(start.pixel), np.array(beam, dtype=np.float64)
     surface, bottom = np.array(at_sea), np.array(solid)
-    count = system.receiver.pixels.count
+    pixels = system.receiver.pixels.count
+    count = pixels if pixels <= _MOST_PIXELS else 1
+    pixel = pixel if count > 1 else np.zeros_like(pixel)
     per_ns = 1e9 / C0
     beside = ~surface if system.surfaces else np.zeros_like(surface)
     total = weight.sum()
     return EchoProbe(
-        _quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)),
-        _quantiles(np.array(air + water) * per_ns, weight * bottom, pixel, count, (None, 1 - _TAIL)),
+        np.broadcast_to(_quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)), (pixels, 2)),
+        np.broadcast_to(
+            _quantiles(np.array(air + water) * per_ns, weight * bottom, pixel, count, (None, 1 - _TAIL)), (pixels, 2)
+        ),
         float(weight[beside].sum() / total) if total > 0 else 1.0,
         _pierced(system, first, below, at_sea, solid),
     )

@@ -26,18 +26,22 @@ def small(scene="table1", **options):
 
 @pytest.mark.parametrize("name", resources.scene_names())
 def test_every_shipped_scene_renders_and_its_files_read_back(name, tmp_path):
-    shot = small(name, seed=5)
+    # Files of images in full are a matter of the gates' tests.
+    image = "x" in (layout := resources.scene_parameters(resources.scene_path(name))["layout"]) and len(layout) > 5
+    shot = small(name, seed=5, params={"layout": "8x8"} if image else {})
     assert shot.sizes["time"] == int(shot.attrs["scene.bin_count"])
     assert float(shot.impulse_response.sum()) > 0
     assert np.isfinite(shot.waveform).all()
     # EXR keeps 32 bits, NetCDF everything.
     for suffix, rtol in ((".exr", 6e-8), (".nc", 0)):
-        results.save(shot, tmp_path / f"shot{suffix}")
+        kept = shot.drop_dims("gate", errors="ignore") if suffix == ".exr" else shot
+        results.save(kept, tmp_path / f"shot{suffix}")
         again = mitransient_lidar.open(tmp_path / f"shot{suffix}")
-        for variable in shot.data_vars:
+        for variable in kept.data_vars:
             np.testing.assert_allclose(again[variable], shot[variable], rtol=rtol, atol=1e-38)
         assert again.attrs == shot.attrs
-        assert list(again.pixel.values) == list(shot.pixel.values)
+        for name in kept.coords:
+            assert again[name].values.tolist() == kept[name].values.tolist()
 
 
 def test_parameters_have_the_same_names_in_every_scene():
@@ -48,7 +52,9 @@ def test_parameters_have_the_same_names_in_every_scene():
         *("phase", "phase_g", "bottom_depth", "bottom_reflectivity", "time_start_ns", "bin_width_ns", "bin_count"),
     }
     for name in resources.scene_names():
-        assert wanted <= set(resources.scene_parameters(resources.scene_path(name)))
+        # Its bottom is a stair.
+        missing = {"bottom_depth", "bottom_reflectivity"} if name == "gated_waves" else set()
+        assert wanted - missing <= set(resources.scene_parameters(resources.scene_path(name)))
 
 
 @pytest.mark.parametrize("phase", ["fournier_forand", "petzold", "hg"])

@@ -1,0 +1,301 @@
+"""Files of gate stacks: images of the energy that a detector collects while a gate is open.
+
+A gate stack is an `xarray.Dataset` with the variables ``gate_energy`` and ``gate_energy_stderr`` [J] over the
+dimensions (row, column, gate), or (pixel, gate) for few pixels, and the coordinates ``gate`` (counted from 0),
+``gate_start`` [ns], ``gate_width`` [ns], ``gate_depth`` [m] and those of the pixels, as in `mitransient_lidar.results`.
+
+An EXR file holds one part a gate, named ``gate000``, ``gate001`` and so on (four digits from 1000 gates on), with the
+channels ``Y`` and ``Y.stderr``. Pixels that form no grid lie side by side in an image one row high. Every part has the
+header attributes ``gateStartNs``, ``gateWidthNs`` and, where it is known, ``gateDepthM``; the first part has all other
+labels of the stack as well. A sequence is a folder of files with one part each, numbered like the parts.
+
+EXR files keep the values in 32 bits and everything else exactly; NetCDF files keep everything exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar import dataset_files, exr
+from mitransient_lidar.errors import UserError
+from mitransient_lidar.results import replacing
+
+_LOG = logging.getLogger(__name__)
+
+_CHANNELS = {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}
+_HISTOGRAM = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")
+_HEADER = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
+_IDENTITY = "gateStackId"  # header attribute that is the same in all files of one sequence, and in no other
+_NUMBERED = re.compile(r"(.+)_gate(\d{3,})\.exr", re.IGNORECASE | re.DOTALL)
+
+
+def check_stack(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the gates of a dataset, which may hold a histogram beside them.
+
+    Returns
+    -------
+    xarray.Dataset
+        The dataset without its histogram, the gates in the last dimension.
+
+    Raises
+    ------
+    UserError
+        If it holds no gates, or they lie over other dimensions than (row, column, gate) or (pixel, gate).
+    """
+    if missing := [name for name in _CHANNELS if name not in dataset]:
+        raise UserError(f"the dataset is no gate stack: it has no variable {missing[0]}.")
+    energy = dataset["gate_energy"]
+    pixels = next((names for names in (("row", "column"), ("pixel",)) if {*names, "gate"} == set(energy.dims)), None)
+    if pixels is None or energy.size == 0 or set(dataset["gate_energy_stderr"].dims) != set(energy.dims):
+        raise UserError(
+            f"the dataset is no gate stack: gate_energy has the shape {dict(energy.sizes)}, but must have the "
+            "dimensions (row, column, gate) or (pixel, gate), like gate_energy_stderr, and be not empty."
+        )
+    needed = {"gate_start": {"gate"}, "gate_width": {"gate"}, "gx": {*pixels}, "gy": {*pixels}}
+    for name, dims in needed.items():
+        if name not in dataset.coords or set(dataset[name].dims) != dims:
+            raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
+    gates = dataset.drop_vars([name for name in _HISTOGRAM if name in dataset])
+    unused = [name for name in gates.coords if name == "time" or "time" in gates[name].dims]
+    return gates.drop_vars(unused).transpose(*pixels, "gate", ...)
+
+
+def save_stack(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a gate stack to an EXR file, one part a gate, or to a NetCDF file, whole or not at all.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A gate stack. A histogram that it holds as well is left out: `results.save` keeps that.
+    path : path
+        File name that ends in ``.exr`` or ``.nc``. An existing file is replaced.
+
+    Raises
+    ------
+    UserError
+        If the suffix is another one, the dataset is no gate stack, or the file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".exr", ".nc"):
+        raise UserError(f"cannot write {path}: the file name must end in .exr or .nc.")
+    stack = _writable(dataset, path, exr_file=suffix == ".exr")
+    with replacing(path) as temporary:
+        if suffix == ".exr":
+            exr.write_parts(temporary, _parts(stack, is_sequence=False))
+        else:
+            dataset_files.write_netcdf(stack, temporary, tuple(_CHANNELS))
+
+
+def save_sequence(dataset: xr.Dataset, folder: str | os.PathLike[str], stem: str) -> list[Path]:
+    """Write a gate stack as numbered EXR files, one a gate: ``<stem>_gate000.exr`` and so on.
+
+    The first file is written last, so that `open_stack` refuses what an interruption has left.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A gate stack. A histogram that it holds as well is left out.
+    folder : path
+        Where to write; made if there is none. Existing files of the same names are replaced.
+    stem : str
+        Start of the file names; no folders.
+
+    Returns
+    -------
+    list of Path
+        The files, in the order of the gates.
+
+    Raises
+    ------
+    UserError
+        If the dataset is no gate stack, `stem` is no file name, or a file cannot be written.
+    """
+    folder = Path(folder)
+    if not stem or Path(stem).name != stem:
+        raise UserError(f"stem = {stem!r} must be the start of a file name, without folders.")
+    stack = _writable(dataset, folder, exr_file=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}.") from error
+    parts = _parts(stack, is_sequence=True)
+    paths = [folder / f"{stem}_{part.name}.exr" for part in parts]
+    for path, part in reversed(list(zip(paths, parts, strict=True))):
+        with replacing(path) as temporary:
+            exr.write_parts(temporary, [part])
+    if stale := sorted({path for path in _numbered(folder) if _stem(path) == stem} - set(paths)):
+        _LOG.warning("%s is not of this sequence of %d gates, but has a name like them", stale[0], len(paths))
+    return paths
+
+
+def open_stack(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a gate stack.
+
+    Parameters
+    ----------
+    path : path
+        An EXR or NetCDF file of `save_stack`, the first file of a sequence, or a folder with one sequence.
+
+    Returns
+    -------
+    xarray.Dataset
+        The saved stack, in memory; the values of EXR files have been rounded to 32 bits.
+
+    Raises
+    ------
+    UserError
+        If a file is missing, damaged, truncated, or no gate stack of this package.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = _first_of_folder(path)
+    try:
+        with path.open("rb") as file:
+            signature = file.read(8)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    if signature.startswith(exr.SIGNATURE):
+        return _read_exr(path)
+    if signature == dataset_files.HDF5_SIGNATURE:
+        dataset = dataset_files.read_netcdf(path)
+        try:
+            return check_stack(dataset)
+        except UserError as error:
+            raise UserError(f"{path} is a NetCDF file, but holds no gate stack of mitransient-lidar.") from error
+    raise UserError(f"{path} is neither an EXR nor a NetCDF-4 file.")
+
+
+def _writable(dataset: xr.Dataset, path: Path, *, exr_file: bool) -> xr.Dataset:
+    try:
+        stack = check_stack(dataset)
+    except UserError as error:
+        raise UserError(f"cannot write {path}: {error}") from error
+    if exr_file and (extra := [str(name) for name in stack.data_vars if name not in _CHANNELS]):
+        raise UserError(f"cannot write {path}: an EXR file has no place for the variable {extra[0]}; use a .nc file.")
+    return stack.assign_attrs({name: dataset_files.attribute(name, value) for name, value in stack.attrs.items()})
+
+
+def _parts(stack: xr.Dataset, *, is_sequence: bool) -> list[exr.Part]:
+    """Return the images of a stack; the readable attributes are in the first one, of a sequence in all."""
+    images = {name: _images(stack[name].values) for name in _CHANNELS}
+    count = len(images["gate_energy"])
+    exact = {
+        "content": "gates",
+        "is_sequence": is_sequence,
+        "dims": list(stack["gate_energy"].dims),
+        "attributes": stack.attrs,
+        "variables": {name: stack[name].attrs for name in _CHANNELS},
+        "coordinates": dataset_files.describe_coordinates(stack),
+    }
+    identity = hashlib.sha256(json.dumps(exact).encode())
+    for values in images.values():
+        identity.update(values.tobytes())
+    readable: dict[str, Any] = {f"lidar.{name}": value for name, value in stack.attrs.items()}
+    if "pixel" in stack.coords:
+        readable["pixelNames"] = [str(name) for name in stack["pixel"].values]
+
+    parts = []
+    digits = 3 if count < 1000 else max(4, len(str(count - 1)))
+    for index in range(count):
+        header: dict[str, Any] = {
+            attribute: float(stack[name].values[index])
+            for name, attribute in _HEADER.items()
+            if name in stack.coords and np.isfinite(stack[name].values[index])
+        }
+        header[_IDENTITY] = identity.hexdigest()
+        parts.append(
+            exr.Part(
+                f"gate{index:0{digits}d}",
+                exr.header(readable | header if is_sequence or index == 0 else header, exact if index == 0 else None),
+                {channel: images[name][index] for name, channel in _CHANNELS.items()},
+            )
+        )
+    return parts
+
+
+def _images(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Return values over (row, column, gate) or (pixel, gate) as images (gate, row, column)."""
+    images = np.moveaxis(values.astype(np.float32), -1, 0)
+    return np.ascontiguousarray(images if images.ndim == 3 else images[:, np.newaxis])
+
+
+def _read_exr(path: Path) -> xr.Dataset:
+    parts = exr.read_parts(path)
+    number = _NUMBERED.fullmatch(path.name)
+    if number and int(number[2]) > 0 and len(parts) == 1 and _IDENTITY in parts[0].attributes:
+        first = f"{number[1]}_gate{0:0{len(number[2])}d}.exr"
+        raise UserError(f"{path} is gate {int(number[2])} of a sequence: open the folder or the first file, {first}.")
+    exact = exr.exact_metadata(path, parts[0].attributes)
+    if exact.get("content") != "gates":
+        raise UserError(f"{path} holds no gates, but a result with time bins: cut gates from it first.")
+    try:
+        dims, labels = tuple(exact["dims"]), dataset_files.coordinates(exact["coordinates"])
+        count = len(labels["gate_start"][1])
+        if exact["is_sequence"] and count > 1:
+            parts += _later_files(path, count)
+        if len(parts) != count:
+            raise UserError(f"{path} is damaged or truncated: {len(parts)} of its {count} gates can be read.")
+        if len({part.attributes[_IDENTITY] for part in parts}) != 1:
+            raise UserError(f"{path} is damaged: its {count} gates do not belong together.")
+        variables: dict[str, Any] = {}
+        for name, channel in _CHANNELS.items():
+            images = np.stack([part.channels[channel] for part in parts], axis=-1).astype(np.float64)
+            variables[name] = (dims, images if len(dims) == 3 else images[0], exact["variables"][name])
+        return xr.Dataset(variables, labels, exact["attributes"])
+    except UserError:
+        raise
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is damaged: its metadata and its images do not belong together.") from error
+
+
+def _later_files(first: Path, count: int) -> list[exr.Part]:
+    """Return the images of a sequence that follow the first file's.
+
+    Raises
+    ------
+    UserError
+        If the first file does not bear the number 0, or a later file is missing or damaged.
+    """
+    number = _NUMBERED.fullmatch(first.name)
+    if number is None or int(number[2]) != 0:
+        raise UserError(f"{first} is the first of {count} files of a sequence: its name must end in _gate000.exr.")
+    parts: list[exr.Part] = []
+    for index in range(1, count):
+        path = first.with_name(f"{number[1]}_gate{index:0{len(number[2])}d}{first.suffix}")
+        if not path.is_file():
+            raise UserError(f"cannot read {path}: gate {index} of the {count} gates of the sequence is missing.")
+        parts += exr.read_parts(path)
+    return parts
+
+
+def _numbered(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if _NUMBERED.fullmatch(path.name)]
+
+
+def _stem(path: Path) -> str:
+    number = _NUMBERED.fullmatch(path.name)
+    return number[1] if number else ""
+
+
+def _first_of_folder(folder: Path) -> Path:
+    try:
+        firsts = sorted(path for path in _numbered(folder) if re.search(r"_gate0+\.exr$", path.name, re.IGNORECASE))
+    except OSError as error:
+        raise UserError(f"cannot read {folder}: {error.strerror}.") from error
+    if len(firsts) == 1:
+        return firsts[0]
+    if firsts:
+        names = ", ".join(path.name for path in firsts[:3])
+        raise UserError(f"{folder} holds {len(firsts)} sequences of gates: open the first file of one ({names}).")
+    raise UserError(f"{folder} holds no sequence of gates: its first file would end in _gate000.exr.")

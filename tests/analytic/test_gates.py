@@ -1,0 +1,194 @@
+"""Gates in renders: against the waveform, against one another, and where geometry puts a target."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from significance import largest_z
+
+import mitransient_lidar
+from mitransient_lidar import gating
+from mitransient_lidar.errors import UserError
+from mitransient_lidar.optics.gates import GateTrain
+from mitransient_lidar.optics.water import C0
+
+#: Bytes of the histogram of four pixels and 300 bins, with its means and errors.
+HISTOGRAM = 4 * 300 * 116
+GATES = {"gate_start_ns": 1425.0, "gate_width_ns": 8.0, "gate_step_ns": 5.0, "gate_count": 20, "gate_rise_ns": 2.0}
+
+
+def gated(lidar_scene, integrator="lidar_merging", film=None, **more):
+    options = {"type": integrator, "paths_per_pass": 2**14}
+    return lidar_scene(
+        integrator=options, film={"bin_width_ns": 0.5, "bin_count": 300, **GATES, **(film or {})}, **more
+    )
+
+
+def render(scene, gigabytes=2.0, passes=4, **options):
+    return mitransient_lidar.render(scene, passes=passes, seed=3, max_memory=gigabytes, **options)
+
+
+def test_gates_are_the_waveform_behind_a_shutter(lidar_scene):
+    """The integral of power times transmission; a gate shifted by half a bin would differ by per cents at its edges."""
+    result = render(gated(lidar_scene))
+    time = result["time"].values
+    for gate, opens in enumerate(result["gate_start"].values):
+        train = GateTrain(opens, 8.0, 1.0, 1, rise_ns=2.0)
+        # Bins are short against pulse and edges: power is linear, and the shutter sampled, within each.
+        fine = np.linspace(time[0], time[-1], 20 * len(time))
+        power = np.array([np.interp(fine, time, pixel) for pixel in result["waveform"].values])
+        energy = np.trapezoid(power * train.transmission(fine, 0), 1e-9 * fine, axis=1)
+        np.testing.assert_allclose(result["gate_energy"].values[:, gate], energy, rtol=0.01)
+
+
+def test_recut_gates_are_those_of_the_render(lidar_scene):
+    result = render(gated(lidar_scene), passes=16)
+    options = {"start_ns": 1425.0, "width_ns": 8.0, "step_ns": 5.0, "count": 20, "rise_ns": 2.0}
+    cut = gating.cut_gates(result, gating.train_from_options(result.attrs, **options))
+    np.testing.assert_allclose(cut["gate_energy"], result["gate_energy"], rtol=0.01)
+    # The error is that of the passes to the growth of sums over bins, which is one for the whole record.
+    ratio = cut["gate_energy_stderr"] / result["gate_energy_stderr"]
+    assert 0.7 < float(ratio.median()) < 1.4
+
+
+@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
+    """The same paths: cut from each pass in 32 bits, or summed where they arrive, exact to the bin's width."""
+    pulses = {"pulses": 10}
+    whole = render(gated(lidar_scene, integrator, pulses))
+    assert not caplog.records
+    for share, rtol, words in ((0.5, 2e-6, "gates are kept, histograms are not"), (0.2, 0.02, "summed directly")):
+        result = render(gated(lidar_scene, integrator, pulses), gigabytes=1e-9 * share * HISTOGRAM)
+        assert words in caplog.text
+        assert "waveform" not in result
+        assert result.attrs["pulses"] == 10
+        bright = whole["gate_energy"] > 1e-3 * whole["gate_energy"].max()
+        np.testing.assert_allclose(
+            result["gate_energy"].values[bright], whole["gate_energy"].values[bright], rtol=rtol, err_msg=words
+        )
+    ten = gated(lidar_scene, integrator)
+    np.testing.assert_allclose(10 * render(ten)["gate_energy"], whole["gate_energy"], rtol=1e-6)
+
+
+def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene):
+    gates = {"gate_start_depth": 3.0, "gate_width_ns": 8.0, "gate_count": 6}
+    result = render(lidar_scene(film={"bin_width_ns": 0.5, "bin_count": 300, **gates}), passes=2)
+    cosine = np.cos(np.arcsin(np.sin(np.radians(20.0)) / 1.34))
+    expected = result.attrs["surface_time_ns"] + 2e9 * 1.34 * 3.0 / (C0 * cosine)
+    assert float(result["gate_start"][0]) == pytest.approx(expected, abs=1e-6)
+    # The middle of the gate is 4 ns later, and the next gate, by default, a width.
+    assert float(result["gate_depth"][0]) == pytest.approx(3.0 + 4.0 / 9.24576, abs=1e-4)
+    assert float(result["gate_start"][1]) == pytest.approx(expected + 8.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("film", "gigabytes", "words"),
+    [
+        ({"gate_start_ns": 1391.0, "gate_count": 2}, 2.0, "before the surface"),
+        ({"gate_start_ns": 1500.0, "gate_count": 20}, 2.0, "must lie within the record"),
+        ({}, 1e-9 * 4 * 84 * 0.5, "max_memory .* is less than one gate needs"),
+        ({}, 1e-9 * 4 * 84 * 3.5, "max_memory .* is room for 3 of them"),
+        ({"gate_count": 0}, 1e-9 * HISTOGRAM * 0.5, r"more than max_memory .* take fewer bins or pixels, or gates"),
+        ({}, 0.0, "max_memory = 0.0 must be a number greater than 0"),
+    ],
+)
+def test_gates_that_cannot_be(lidar_scene, film, gigabytes, words):
+    with pytest.raises(UserError, match=words):
+        render(gated(lidar_scene, film=film), gigabytes, passes=2)
+
+
+@pytest.mark.parametrize(
+    ("film", "words"),
+    [
+        ({"gate_width_ns": 0.0}, "gate_width_ns = 0"),
+        ({"gate_step_ns": -1.0}, "gate_step_ns = -1"),
+        ({"gate_count": -1}, "gate_count = -1"),
+        ({"gate_start_depth": 3.0}, "either gate_start_ns or gate_start_depth"),
+        ({"pulses": 0}, "pulses = 0"),
+        ({"gate_profile": "missing.txt"}, "gate_width_ns = 8 and gate_profile"),
+    ],
+)
+def test_parameters_of_gates_out_of_range(film, words):
+    with pytest.raises(Exception, match=words):
+        mi.load_dict({"type": "time_gated_film", **GATES, **film})
+
+
+def image(lidar_scene, layout, film=None, **integrator):
+    """Return an imager of a square field of view over a wavy sea, with eight gates from the surface to the bottom."""
+    gates = {"gate_start_ns": 1410.0, "gate_width_ns": 10.0, "gate_count": 8, "bin_width_ns": 8.0, "bin_count": 20}
+    return lidar_scene(
+        integrator={"type": "lidar_merging", "paths_per_pass": 2**16, **integrator},
+        film={**gates, **(film or {})},
+        rx={"layout": layout, "field_of_view_mrad": 20.0, "field_of_view_shape": "square"},
+        sea={"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk", "surface_seed": 4},
+    )
+
+
+def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
+    """256 x 256 pixels binned to 2 x 2, and all of them, against receivers of so many pixels with other seeds."""
+    sums = {}
+    for first_seed, (layout, count) in enumerate((("256x256", 8), ("2x2", 16), ("1x1", 16))):
+        scene = image(lidar_scene, layout)
+        energy = passes(scene, count, 1000 * first_seed)
+        if layout == "256x256":
+            energy = energy.reshape(count, 2, 128, 2, 128, -1).sum(axis=(2, 4)).reshape(count, 4, -1)
+        sums[layout] = energy[..., 2:17].reshape(*energy.shape[:2], 5, 3).sum(axis=-1)
+        scene.integrator().release()
+    pairs = [
+        (sums["256x256"], sums["2x2"]),
+        *((sums[name].sum(axis=1), sums["1x1"][:, 0]) for name in ("256x256", "2x2")),
+    ]
+    for first, second in pairs:
+        error = np.hypot(*(a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (first, second)))
+        z = (first.mean(axis=0) - second.mean(axis=0)) / error
+        assert np.all(np.abs(z) < largest_z(8, z.size)), z
+        assert np.all(error < 0.05 * second.mean(axis=0))
+
+
+def test_paths_go_with_the_pixels(lidar_scene):
+    """16 a pixel, and half the points: an image needs more paths, not better ones."""
+    for layout, paths, photons in (("2x2", 2**15, 2**15), ("128x128", 2**18, 2**16), ("512x512", 2**21, 2**16)):
+        scene = lidar_scene(integrator={"type": "lidar_merging"}, rx={"layout": layout})
+        engine = scene.integrator()
+        engine.prepare(scene, scene.sensors()[0])
+        assert engine.photons_per_pass == photons
+        engine.release()
+        # The builder asks for 2^16 paths itself.
+        assert engine.paths_per_pass == 2**16
+        free = mi.load_dict({"type": "lidar_merging"})
+        free.prepare(scene, scene.sensors()[0])
+        assert free.paths_per_pass == paths
+        free.release()
+
+
+def test_contrast_of_the_mine_is_greatest_where_geometry_says():
+    """The sphere's energy, and its Weber contrast against the water around it, by gate.
+
+    A Lambertian sphere that is lit and seen along the same ray returns its energy as the square of the cosine: from its
+    middle third, 41 degrees about the ray, from 0.887 of the radius before its centre. From the centre it would come
+    4 ns later.
+    """
+    params = {"layout": "64x64", "gate_start_depth": 4.6, "gate_step_ns": 1, "gate_count": 14, "spectrum": "flat"}
+    params |= {"surface_size": "auto", "surface_cell_size": "auto"}
+    quick = {"type": "lidar_merging", "paths_per_pass": 2**16}
+    stack = mitransient_lidar.render("gated_mine", params=params, passes=10, seed=2, integrator=quick)
+    cosine = np.array([np.cos(np.arcsin(0.33 / 0.5)), 1.0])
+    share = np.diff(cosine**4)[0] / 4 / (np.diff(cosine**3)[0] / 3)
+    slant = 6.0 / np.cos(np.arcsin(np.sin(np.radians(20.0)) / 1.34)) - 0.5 * share
+    expected = stack.attrs["surface_time_ns"] + 2e9 * 1.34 * slant / C0
+    # The sphere is seen on the axis, 0.5 m to the side at an apparent range of 212.8 m + 6.2 m / 1.34.
+    per_metre = 1e3 / 217.4
+    away = np.hypot(stack["gx"], stack["gy"] + 0.5 * per_metre)
+    energy = stack["gate_energy"]
+    target = energy.where(away < 0.33 * per_metre).mean(("row", "column")).values
+    around = energy.where((away > 7) & (away < 9)).mean(("row", "column")).values
+    middles = (stack["gate_start"] + 0.5 * stack["gate_width"]).values
+    assert abs(middles[np.argmax(target)] - expected) < 0.8
+    # Light of the sphere that the water scatters comes late to the pixels around it: contrast is greatest a bit early.
+    contrast = target / around - 1
+    assert -2.0 < middles[np.argmax(contrast)] - expected < 0.8
+    assert contrast.max() > 20
+    # Radiance falls as the cosine: brighter than half of its middle is 0.866 of the diameter.
+    image = energy.sum("gate").values
+    bright = image > 0.5 * image[(away < 0.15 * per_metre).values].mean()
+    width = np.sqrt(bright.sum() * (20.0 / 64) ** 2 * 4 / np.pi)
+    assert width == pytest.approx(np.sqrt(0.75) * per_metre, rel=0.1)

@@ -1,0 +1,400 @@
+"""The page for gate stacks, in a real browser: what it shows, and that it asks the network for nothing."""
+
+import re
+import shutil
+import time as clock
+
+import matplotlib
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitransient_lidar.gate_page import write_page
+
+METRES_PER_NS = 0.0299792458 * 5 / 1.364 * 0.967  # the depth axis at 20 degrees off nadir
+SURFACE_NS = 1420.0
+SIZE = 64  # rows and columns
+PLAIN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")  # of signs in labels
+PLATE, BALL, SAND = (40, 37), (23, 22), (50, 20)  # pixels on them
+
+
+def scene_of(size, gates=40, seed=3):
+    """Return (stack, render) of a sphere and a plate over rippled sand, lit by a Gaussian beam."""
+    rng = np.random.default_rng(seed)
+    time = 1411.0 + np.arange(120)
+    angles = (np.arange(size) + 0.5) / size * 30 - 15
+    gy, gx = np.meshgrid(angles, angles[::-1])
+    x, y = 0.21 * gx[..., np.newaxis], 0.21 * gy[..., np.newaxis]
+    depth = (time - SURFACE_NS) * METRES_PER_NS
+    ripples = np.sin(2 * np.pi * (0.8 * x + 0.25 * y) / 0.7)
+    floor, reflectance = 8 + 0.06 * ripples + 0.04 * x, 0.1 + 0.035 * ripples + 0.01 * np.sin(1.7 * x - 0.9 * y)
+    ball = 0.7**2 - (x - 0.9) ** 2 - (y + 1.1) ** 2
+    floor = np.where(ball > 0, 6.4 - np.sqrt(np.maximum(ball, 0)), floor)
+    reflectance = np.where(ball > 0, 0.36 * np.sqrt(np.maximum(ball, 0)), reflectance)
+    across, along = 0.94 * (x + 0.7) + 0.34 * (y - 1.2), -0.34 * (x + 0.7) + 0.94 * (y - 1.2)
+    plate = (abs(across) < 0.75) & (abs(along) < 0.75)
+    floor = np.where(plate, 5.5 + 0.2 * across, floor)
+    reflectance = np.where(plate, 0.2 + 0.1 * ((across > 0) ^ (along > 0)), reflectance)
+    waves = 0.15 * np.sin(1.1 * x + 0.6 * y) + 0.05 * np.sin(4.1 * x - 2.3 * y + 1)
+    water = 1 / (1 + np.exp((waves - depth) / 0.09)) / (1 + np.exp((depth - floor) / 0.09))
+    power = 0.006 * water * np.exp(-0.4 * np.maximum(depth, 0))
+    power += 0.3 * reflectance * np.exp(-0.4 * floor - 0.5 * ((depth - floor) / 0.22) ** 2)
+    power += 0.003 * np.exp(3 * np.sin(5 * x + 3 * np.cos(3 * y)) - 0.5 * ((depth - waves) / 0.22) ** 2)
+    power *= 1e-6 * np.exp(-(x**2 + y**2) / (2 * 1.4**2)) * (1 + 0.06 * rng.standard_normal(power.shape))
+    start = 1412.0 + 2.5 * np.arange(gates)
+    opened = np.clip(np.minimum(time[:, None] + 0.5, start + 5) - np.maximum(time[:, None] - 0.5, start), 0, 1)
+    energy = 1e-9 * power @ opened
+    centres = {"gx": (("row", "column"), gx, {"units": "mrad"}), "gy": (("row", "column"), gy, {"units": "mrad"})}
+    attributes = {
+        "scene": "sphere & <b>plate",
+        "note": "</script><script>document.title = 'broken'</script>",
+        "altitude": 200.0,
+        "off_nadir_deg": 20.0,
+        "pulses": 1,
+        "surface_time_ns": SURFACE_NS,
+        "seed": seed,
+    }
+    gate_coords = {
+        "gate": np.arange(gates),
+        "gate_start": ("gate", start),
+        "gate_width": ("gate", np.full(gates, 5.0)),
+        "gate_depth": ("gate", (start + 2.5 - SURFACE_NS) * METRES_PER_NS),
+    }
+    dims = ("row", "column", "gate")
+    stack = xr.Dataset(
+        {"gate_energy": (dims, energy), "gate_energy_stderr": (dims, 0.03 * energy)}, centres | gate_coords, attributes
+    )
+    dims = ("row", "column", "time")
+    result = xr.Dataset({"waveform": (dims, power), "waveform_stderr": (dims, 0.06 * power)}, centres | {"time": time})
+    return stack, result
+
+
+BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+needs_browser = pytest.mark.skipif(BROWSER is None or DRIVER is None, reason="chromium and chromedriver are needed")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scene_of(SIZE)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    # With the driver's path given, nothing is looked for or downloaded.
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def show(browser, tmp_path):
+    """Function that writes the page of a stack and opens it; in the end nothing must have gone wrong in the browser."""
+
+    def open_page(stack, result=None, **options):
+        write_page(stack, tmp_path / "page.html", result, **options)
+        browser.get(f"file://{tmp_path}/page.html")
+        page = Page(browser)
+        page.wait("return document.querySelectorAll('#curve-plot .line').length > 0")
+        return page
+
+    yield open_page
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
+
+
+class Page:
+    """What a person does with the page and sees of it."""
+
+    def __init__(self, browser):
+        self.browser = browser
+        self.run = browser.execute_script
+
+    def wait(self, script):
+        end = clock.monotonic() + 10
+        while not self.run(script):
+            assert clock.monotonic() < end, script
+            clock.sleep(0.02)
+
+    def settle(self):
+        """Wait until what has just changed is drawn: after a change of size that takes three frames."""
+        self.browser.execute_async_script(
+            "const wait = (more) => (more ? requestAnimationFrame(() => wait(more - 1)) : arguments[0]()); wait(3)"
+        )
+
+    def choose(self, **values):
+        for name, value in values.items():
+            self.run(
+                "const control = document.getElementById(arguments[0]);"
+                "if (control.type === 'checkbox') control.checked = arguments[1]; else control.value = arguments[1];"
+                "control.dispatchEvent(new Event('input')); control.dispatchEvent(new Event('change'))",
+                name.replace("_", "-"),
+                value,
+            )
+        self.settle()
+
+    def press(self, key):
+        from selenium.webdriver import ActionChains
+
+        ActionChains(self.browser, duration=0).send_keys(key).perform()
+        self.settle()
+
+    def point(self, name, across, along, click=True, key=None):
+        """Move the mouse to a place given as shares of an element's width and height, and click there."""
+        from selenium.webdriver import ActionChains
+
+        element = self.browser.find_element("id", name)
+        size = element.rect
+        actions = ActionChains(self.browser, duration=0)
+        if key:
+            actions.key_down(key)
+        actions.move_to_element_with_offset(
+            element, round((across - 0.5) * size["width"]), round((along - 0.5) * size["height"])
+        )
+        if click:
+            actions.click()
+        if key:
+            actions.key_up(key)
+        actions.perform()
+        self.settle()
+
+    def point_at(self, pixel, **how):
+        self.point("pixels", (pixel[1] + 0.5) / SIZE, (pixel[0] + 0.5) / SIZE, **how)
+
+    def text(self, name):
+        return self.browser.find_element("id", name).text
+
+    def colours(self, rows, columns):
+        """Return the image's colours, array of shape (row, column, 3), read from the middles of its pixels."""
+        colours = self.run(
+            "const [rows, columns] = arguments, canvas = document.getElementById('pixels'), found = [];"
+            # Chromium complains of a canvas that is read again and again, unless it is made for that.
+            "const copy = new OffscreenCanvas(canvas.width, canvas.height);"
+            "const context = copy.getContext('2d', { willReadFrequently: true }); context.drawImage(canvas, 0, 0);"
+            "const dots = context.getImageData(0, 0, canvas.width, canvas.height);"
+            "for (let r = 0; r < rows; r++) for (let c = 0; c < columns; c++) {"
+            "  const x = Math.floor((c + 0.5) * canvas.width / columns);"
+            "  const y = Math.floor((r + 0.5) * canvas.height / rows);"
+            "  found.push(...dots.data.subarray(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)); }"
+            "return found",
+            rows,
+            columns,
+        )
+        return np.array(colours).reshape(rows, columns, 3)
+
+    def peaks(self):
+        """Return the largest value of every line drawn, read from the value axis beside it."""
+        ticks = self.run(
+            "return [...document.querySelectorAll('#curve-plot .value-tick')]"
+            ".map((tick) => [Number(tick.getAttribute('y')) - 4, tick.textContent])"
+        )
+        ticks = [(y, float(re.sub("^10(?=[⁻⁰¹²³⁴⁵⁶⁷⁸⁹])", "1e", text).translate(PLAIN))) for y, text in ticks]
+        paths = self.run(
+            "return [...document.querySelectorAll('#curve-plot path.line:not(.bars)')]"
+            ".map((line) => line.getAttribute('d'))"
+        )
+        (first, low), (last, high) = ticks[0], ticks[-1]
+        tops = [min(float(y) for y in re.findall(r" ([-\d.]+)", path)) for path in paths]
+        shares = [(top - first) / (last - first) for top in tops]
+        if self.run("return document.getElementById('curve-log').checked"):
+            return [low * (high / low) ** share for share in shares]
+        return [low + (high - low) * share for share in shares]
+
+
+def expected_colours(values, low, high, name, log=False):
+    """Return the colours of values between the lowest and the highest of a map."""
+    values = values.astype(np.float32).astype(float)
+    share = np.log(values / low) / np.log(high / low) if log else (values - low) / (high - low)
+    index = np.clip(np.floor(256 * share), 0, 255).astype(int)
+    return matplotlib.colormaps[name](index, bytes=True)[..., :3]
+
+
+@needs_browser
+def test_gates(show, scene):
+    stack, result = scene
+    energy = stack["gate_energy"].values
+    page = show(stack, result)
+    # It opens at the brightest gate.
+    brightest = int(energy.sum((0, 1)).argmax())
+    assert page.text("number") == f"{brightest} / 39"
+    assert page.text("summary") == "64 × 64 pixels · 40 gates · 1 pulse · 200 m high · 20° off nadir"
+
+    # One range for all gates, from 0 to the largest value.
+    page.choose(slider=20, log=False)
+    assert page.text("caption") == f"Gate 20 · 1462.00 to 1467.00 ns · depth {44.5 * METRES_PER_NS:.2f} m"
+    assert (page.colours(SIZE, SIZE) == expected_colours(energy[..., 20], 0, energy.max(), "viridis")).all()
+    page.choose(slider=26, range="one", map="magma")
+    shown = energy[..., 26]
+    assert (page.colours(SIZE, SIZE) == expected_colours(shown, shown.min(), shown.max(), "magma")).all()
+    # A logarithmic range leaves out the lowest hundredth; a clipped one the brightest.
+    page.choose(log=True, clip="0.01")
+    low, high = np.sort(shown, axis=None)[[int(0.01 * shown.size), int(0.99 * shown.size)]]
+    same = page.colours(SIZE, SIZE) == expected_colours(shown, low, high, "magma", log=True)
+    assert same.all(-1).mean() > 0.999  # logarithms may differ in their last digit
+
+    # Arrow keys, and the ends.
+    page.choose(clip="0", map="gray")
+    page.press("\ue014")
+    assert page.text("number") == "27 / 39"
+    page.press("\ue011")
+    assert page.text("number") == "0 / 39"
+    page.press("\ue012")
+    assert page.text("number") == "0 / 39"
+    page.press("\ue010")
+    assert page.text("number") == "39 / 39"
+    page.browser.find_element("id", "play").click()
+    page.wait("return document.getElementById('number').textContent === '1 / 39'")
+    page.browser.find_element("id", "play").click()
+
+
+@needs_browser
+def test_records(show, scene):
+    stack, result = scene
+    power, energy = result["waveform"].values, stack["gate_energy"].values
+    page = show(stack, result)
+    page.choose(slider=22)
+    page.point_at(PLATE)
+    assert page.peaks() == pytest.approx([1e9 * power[PLATE].max()], rel=0.01)
+    value, error = energy[PLATE][22], stack["gate_energy_stderr"].values[PLATE][22]
+    assert page.text("reading").startswith("row 40, column 37 · gx −3.98, gy 2.58 mrad: ")
+    shown, shown_error = re.search(r"mrad: ([\d.]+) ± ([\d.]+) aJ", page.text("reading")).groups()
+    assert float(shown) == pytest.approx(1e18 * value, rel=0.01)
+    assert float(shown_error) == pytest.approx(1e18 * error, rel=0.06)
+    page.choose(curve_log=True)
+    assert page.peaks() == pytest.approx([1e9 * power[PLATE].max()], rel=0.02)
+
+    # A pinned one stays; what is pointed at is previewed.
+    page.press("p")
+    page.point_at(BALL, key="\ue008")
+    page.point_at((32, 32), click=False)
+    page.choose(curve_log=False)
+    assert page.peaks()[:2] == pytest.approx([1e9 * power[place].max() for place in (PLATE, BALL)], rel=0.01)
+    lines = page.text("list").splitlines()
+    assert [line for line in lines if line.startswith("row")] == [
+        f"row {row}, column {column} · gx {gx}, gy {gy} mrad"
+        for row, column, gx, gy in ((40, 37, "−3.98", "2.58"), (23, 22, "3.98", "−4.45"), (32, 32, "−0.23", "0.23"))
+    ]
+
+    # A click on the record goes to the gate of that time.
+    page.point("curve-plot", 0.5, 0.5)
+    time, gate = float(page.text("moment").split()[1]), int(page.text("number").split()[0])
+    assert abs(time - stack["gate_start"].values[gate] - 2.5) <= 1.26
+    at_time = 1e12 * power[PLATE][np.abs(result["time"].values - time).argmin()]
+    shown = next(line for line in page.text("list").splitlines() if "±" in line)
+    assert float(shown.split()[0]) * {"pW": 1, "nW": 1000}[shown.split()[-1]] == pytest.approx(at_time, rel=0.01)
+
+    page.choose(source="gates")
+    assert page.peaks()[:2] == pytest.approx([1e18 * energy[place].max() for place in (PLATE, BALL)], rel=0.01)
+    page.browser.find_element("css selector", "#list button").click()
+    page.settle()
+    assert page.peaks()[0] == pytest.approx(1e18 * energy[BALL].max(), rel=0.01)
+
+
+@needs_browser
+def test_depths(show, scene):
+    stack, result = scene
+    page = show(stack, result)
+    page.choose(view="echo", slider=10)
+    depth = stack["gate_depth"].values
+    for pixel, place in {PLATE: 5.4, BALL: 5.8, SAND: 7.9}.items():
+        page.point_at(pixel, click=False)
+        shown = float(page.text("reading").split(": ")[1].removesuffix(" m"))
+        assert shown == pytest.approx(place, abs=0.4)
+        assert np.abs(depth - shown).min() < 0.0051
+    page.choose(view="centroid")
+    page.point_at(SAND, click=False)
+    energy = stack["gate_energy"].values[SAND][10:]
+    assert float(page.text("reading").split(": ")[1].removesuffix(" m")) == pytest.approx(
+        (energy * depth[10:]).sum() / energy.sum(), abs=0.0051
+    )
+    page.choose(view="sum")
+    assert float(re.search(r": ([\d.]+) aJ", page.text("reading"))[1]) == pytest.approx(1e18 * energy.sum(), rel=0.01)
+
+
+@needs_browser
+def test_sizes_and_zoom(show, scene, browser):
+    page = show(*scene)
+    page.choose(slider=26, log=False)
+    before = page.colours(SIZE, SIZE)
+    try:
+        for width, height in ((1280, 800), (420, 900), (1900, 1000)):
+            browser.set_window_size(width, height)
+            page.settle()
+            inside = page.run("return [document.documentElement.scrollWidth <= innerWidth, innerWidth]")
+            assert inside[0], inside
+            box = page.run(
+                "const b = document.getElementById('pixels').getBoundingClientRect(); return [b.width, b.height]"
+            )
+            assert box[0] == pytest.approx(box[1], abs=1.01)
+            assert box[0] > 200
+            assert (page.colours(SIZE, SIZE) == before).all()
+    finally:
+        browser.set_window_size(1280, 800)
+    for _ in range(2):
+        browser.find_element("id", "zoom-in").click()
+    page.settle()
+    # Fourfold about the middle.
+    assert (page.colours(SIZE // 4, SIZE // 4) == before[24:40, 24:40]).all()
+    page.press("0")
+    assert (page.colours(SIZE, SIZE) == before).all()
+
+
+@needs_browser
+@pytest.mark.parametrize(("limit", "block", "waveform_block"), [(4.0, 1, 2), (1.0, 2, 4)])
+def test_blocks(show, scene, limit, block, waveform_block):
+    stack, result = scene
+    page = show(stack, result, limit_mb=limit)
+    notes = page.text("notes")
+    assert f"The waveforms are means over blocks of {waveform_block} by {waveform_block} pixels" in notes
+    assert (f"The images show means over blocks of {block} by {block} pixels" in notes) == (block > 1)
+    page.choose(slider=26, log=False)
+    count = SIZE // block
+    means = stack["gate_energy"].values.reshape(count, block, count, block, -1).mean((1, 3))
+    assert (page.colours(count, count) == expected_colours(means[..., 26], 0, means.max(), "viridis")).all()
+    page.point_at((24, 21))
+    rows, columns = (slice(start, start + waveform_block) for start in (24, 20))
+    power = result["waveform"].values[rows, columns].mean((0, 1))
+    assert page.peaks()[0] == pytest.approx(1e9 * power.max(), rel=0.01)
+    place = "row 24, column 21 · gx 3.52, gy −4.92" if block == 1 else "block (12, 10) · gx 3.28, gy −5.16"
+    assert page.text("reading").startswith(f"{place} mrad: ")
+
+
+@needs_browser
+def test_pixels_and_gaps(show, scene):
+    stack, result = (dataset.isel(row=slice(28, 32), column=32) for dataset in scene)
+    names = ["<i>red", "green", "blue", "black"]
+    stack, result = (
+        dataset.rename(row="pixel").assign_coords(pixel=names).drop_vars("gate_depth", errors="ignore")
+        for dataset in (stack, result)
+    )
+    stack["gate_energy"][2, 30] = np.nan
+    page = show(stack, result)
+    page.choose(slider=30, log=False)
+    colours = page.colours(1, 4)[0]
+    assert colours[2].tolist() == [0, 0, 0]  # of a transparent dot
+    top = float(stack["gate_energy"].max())
+    expected = expected_colours(np.nan_to_num(stack["gate_energy"].values[:, 30]), 0, top, "viridis")
+    assert (colours[[0, 1, 3]] == expected[[0, 1, 3]]).all()
+    assert page.text("reading") == "blue: no value"
+    assert page.text("caption") == "Gate 30 · 1487.00 to 1492.00 ns"
+    assert page.run("return document.querySelector('i') === null")
+    assert "<i>red" in page.run("return document.getElementById('image-axes').textContent")
+
+
+@needs_browser
+def test_text_is_only_text(show, scene):
+    page = show(scene[0])
+    assert page.browser.title == "sphere & <b>plate · gate stack"
+    assert page.browser.find_element("css selector", "h1").text == "sphere & <b>plate"
+    page.run("document.getElementById('provenance').open = true")
+    assert "note </script><script>document.title = 'broken'</script>" in page.text("attributes")
+    assert page.run("return document.querySelector('b') === null")
+    # Without a render the record is the gates.
+    assert not page.browser.find_element("id", "source").is_displayed()
+    assert page.peaks() == pytest.approx([1e18 * scene[0]["gate_energy"].values[SIZE // 2, SIZE // 2].max()], rel=0.01)
