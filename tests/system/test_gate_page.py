@@ -1,7 +1,7 @@
 """The page for gate stacks, in a real browser: what it shows, and that it asks the network for nothing."""
 
-import re
 import os
+import re
 import shutil
 import time as clock
 
