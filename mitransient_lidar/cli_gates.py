@@ -39,19 +39,27 @@ def gates(
     html: Annotated[bool, typer.Option("--html", help="Write a page to look at in a browser, too.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Cut gates from STACK: DIR/<stack>_gates.exr, _gates.png (all gates) and _depth.png; print their paths."""
+    """Cut gates from STACK: DIR/<stack>_gates.exr, _gates.png (all gates) and _depth.png; print their paths.
+
+    Without a start the gates that STACK already has are drawn and written as they are.
+    """
     with sentences():
         require(1 <= count <= 100_000, "--count", count, "1 to 100000")
         require(pulses >= 1, "--pulses", pulses, "1 or above")
         folder = output or stack.parent
         wanted = {"drawings": plot, "sequence": sequence, "gif": gif, "mp4": mp4, "html": html}
-        files = GateFiles(folder, stack.stem, frozenset(name for name, on in wanted.items() if on))
+        files = GateFiles(
+            folder, stack.stem.removesuffix("_gates"), frozenset(name for name, on in wanted.items() if on)
+        )
         require_writable(folder, files.names())
 
         from mitransient_lidar import gating
 
         with reporting(quiet):
             result = _open(stack)
+            if "gate_energy" in result and start_ns is None and start_depth is None:
+                files.write(result, result, quiet)
+                return
             train = gating.train_from_options(
                 result.attrs,
                 start_ns=start_ns,
@@ -99,7 +107,7 @@ class GateFiles:
             if path.suffix == ".exr":
                 gate_files.save_stack(stack, path)
             elif path.suffix == ".html":
-                gate_page.write_page(stack, path, result)
+                gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
             elif path.suffix != ".png":
                 gate_plots.animation(stack, path)
             elif path.name.endswith("_gates.png"):

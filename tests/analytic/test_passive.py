@@ -323,7 +323,7 @@ def test_a_wind_sea_focuses_the_sun_most_some_metres_down(tmp_path):
     """Contrast of light on plates below a sea at 5 m/s, lit through its waves and seen through still water.
 
     Hieronymi (2011, thesis, Kiel) computed the strongest fluctuations at 0.5 to 10 m, made by waves of 20 cm to 5 m.
-    Shallower the light has not met yet; deeper, the patterns of many waves lie over one another. Measured here in steps:
+    Shallower the light has not met yet; deeper, the patterns of many waves lie over one another. Measured here:
     0.10 at 0.25 m, 0.35 at 0.4, 0.75 at 0.8, 1.05 at 1.2, 0.92 at 2, 0.65 at 3, 0.50 at 5, 0.29 at 7 m.
     """
     cells, period, ripple = 1024, 20.48, 1e-4

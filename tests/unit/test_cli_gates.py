@@ -123,3 +123,15 @@ def test_missing_files(tmp_path):
     result = run(tmp_path / "none.nc", *TRAIN)
     assert result.exit_code == 2
     assert "cannot read" in result.stderr
+
+
+def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
+    path, _ = stored
+    assert run(path, *TRAIN, "--no-plot").exit_code == 0
+    cut = path.with_name("scene_gates.exr")
+    result = run(cut, "--html", "-o", tmp_path / "again", "--quiet")
+    assert result.exit_code == 0, result.output
+    names = ["scene_gates.exr", "scene_gates.png", "scene_depth.png", "scene_gates.html"]
+    assert result.stdout.split() == [str(tmp_path / "again" / name) for name in names]
+    again = gate_files.open_stack(tmp_path / "again" / "scene_gates.exr")
+    np.testing.assert_array_equal(again["gate_energy"], gate_files.open_stack(cut)["gate_energy"])
