@@ -84,6 +84,11 @@ class RatioStatistics:
         unknown = np.full_like(sampled, np.nan)
         return np.asarray(np.divide(np.sqrt(variance), sampled, out=unknown, where=sampled > 0))
 
+    @property
+    def invalid(self) -> int:
+        """Number of pixels that were sampled and whose mean is not finite."""
+        return int(np.count_nonzero((self._sums[1] > 0) & ~np.isfinite(self.ratio)))
+
     def relative_errors(self) -> FloatArray:
         """Return the relative standard errors of the pixels that are not dark."""
         ratio, stderr = self.ratio, self.stderr
@@ -186,6 +191,8 @@ def render_passive(
         if statistics.count < 2:
             break
         pictures.append((statistics.ratio, statistics.stderr))
+        if statistics.invalid:
+            logger.warning("%d of %d pixels hold no finite radiance", statistics.invalid, len(statistics.ratio))
         errors = statistics.relative_errors()
         done, lost = statistics.count, max(lost, lost_here)
         if interrupted:

@@ -97,6 +97,7 @@ class PassiveVolpath(lidar_volpath.LidarVolpath):
         self.found = mi.Float64(0)
         #: Solid angle of its samples for each pixel [sr].
         self.sampled = mi.Float64(0)
+        self._invalid = mi.Bool(False)
         self._view: tuple[mi.Scene, mi.Sensor, DaylightScene, FieldSampler] | None = None
         self._system: DaylightScene | None = None
 
@@ -180,13 +181,17 @@ class PassiveVolpath(lidar_volpath.LidarVolpath):
         self.connection = "walk" if system.sun is None else self._wanted_connection
         self.lost = dr.zeros(mi.Float64, 1)
         self.found = dr.zeros(mi.Float64, system.receiver.pixels.count)
+        self._invalid = dr.zeros(mi.Bool, system.receiver.pixels.count)
         self.sampled = dr.zeros(mi.Float64, system.receiver.pixels.count)
         dr.scatter_add(self.sampled, mi.Float64(weight), pixel, weight > 0)
         lobe = SunLobe(system, system.sun_directions(mi.Point2f(rng.next_float32(), rng.next_float32())))
         seen = DaylightPath(**vars(path), mirrored=mi.Bool(True), reflected=mi.Bool(False))
         self._trace(system, lobe, seen, rng, pixel, weight)
+        self.found = dr.select(self._invalid, dr.nan, self.found)
 
     def _add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
+        # Sums leave out what is not a number: it is marked apart, to be told of.
+        dr.scatter(self._invalid, mi.Bool(True), pixel, active & ~dr.isfinite(found))
         dr.scatter_add(self.found, mi.Float64(found), pixel, active & (found > 0))
 
     def _escape(self, path: DaylightPath, active: mi.Bool, pixel: mi.UInt32, weight: mi.Float) -> None:

@@ -1,5 +1,6 @@
 """Pictures by daylight as their user makes them: what is returned, files, frames, the command, and mistakes."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -76,6 +77,20 @@ def test_ratio_statistics():
         nothing.add(np.array([1.0, 0.0]), np.array([1.0, 0.0]))
     assert np.isnan(nothing.ratio[1])
     assert nothing.relative_errors() == pytest.approx([0.0])
+
+
+def test_what_is_no_number_is_told(monkeypatch, caplog):
+    """One pixel of sixteen gets a value that is none; it stays one and is counted."""
+    engine = mi.load_dict(PASSIVE)
+    spoil = type(engine)._add
+
+    def add(self, pixel, found, active):
+        spoil(self, pixel, dr.select(pixel == 5, dr.nan, found), active)
+
+    monkeypatch.setattr(type(engine), "_add", add)
+    picture = render()
+    assert np.flatnonzero(~np.isfinite(picture["radiance"].values)).tolist() == [5]
+    assert "1 of 16 pixels hold no finite radiance" in caplog.text
 
 
 def test_solid_angles():
