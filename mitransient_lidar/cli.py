@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar import cli_gates, cli_passive, cli_studies, cli_waveforms
+from mitransient_lidar import cli_estimates, cli_gates, cli_passive, cli_studies, cli_waveforms
 from mitransient_lidar._version import __version__
 from mitransient_lidar.cli_gates import GateFiles
 from mitransient_lidar.cli_support import (
@@ -192,7 +192,13 @@ def plot(
         typer.echo(target)
 
 
-for _study in (*cli_studies.COMMANDS, *cli_gates.COMMANDS, cli_passive.passive, *cli_waveforms.COMMANDS):
+for _study in (
+    *cli_studies.COMMANDS,
+    *cli_gates.COMMANDS,
+    cli_passive.passive,
+    *cli_waveforms.COMMANDS,
+    *cli_estimates.COMMANDS,
+):
     app.command()(_study)
 
 
