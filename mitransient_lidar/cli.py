@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar import cli_estimates, cli_gates, cli_passive, cli_studies, cli_waveforms
+from mitransient_lidar import cli_detect, cli_estimates, cli_gates, cli_passive, cli_studies, cli_waveforms
 from mitransient_lidar._version import __version__
 from mitransient_lidar.cli_gates import GateFiles
 from mitransient_lidar.cli_support import (
@@ -194,6 +194,7 @@ def plot(
 
 for _study in (
     *cli_studies.COMMANDS,
+    *cli_detect.COMMANDS,
     *cli_gates.COMMANDS,
     cli_passive.passive,
     *cli_waveforms.COMMANDS,
