@@ -64,20 +64,31 @@ def _lines(found: Any) -> list[str]:
         slope, error = value[f"slope_{name}"], value[f"slope_{name}_stderr"]
         text = "not told by these pixels" if np.isnan(slope) else f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
         lines.append(f"slope {name}: {text}")
-    lines.append(f"surface: {value['surface_height']:+.3f} m from the mean level")
-    depth, reflectivity = found["depth_m"].values, found["reflectivity"].values
-    if np.isnan(depth[0]):
-        return [*lines, "bottom: no echo"]
-    lines.append(f"bottom: {depth[1]:.3f} m deep, {depth[0]:.3f} m through a level sea")
-    text = ", ".join(f"{by} {rho:.4f}" for by, rho in zip(found["correction"].values, reflectivity, strict=True))
-    lines.append(f"bottom reflectivity: {text}")
-    shares = zip(found["bottom_class"].values, found["class_probability"].values, strict=True)
-    lines.append("bottom class: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares))
+    height = value["surface_height"]
+    lines.append("surface: no echo" if np.isnan(height) else f"surface: {height:+.3f} m from the mean level")
+    lines += _bottom_lines(found["depth_m"].values, found)
     if "kd" not in value:
         return [*lines, "water: the view is too narrow to tell"]
+    if np.isnan(value["kd"]):
+        return [*lines, "water: no column that can be fitted"]
     lines.append("water (1/m): " + ", ".join(f"{name} {value[key]:.4g}" for name, key in _WATER.items()))
     low, high = value["attenuation_low"], value["attenuation_high"]
     return [*lines, f"c is a guess: {low:.2g} to {high:.2g} 1/m, as bb/b goes from 0.044 to 0.01"]
+
+
+def _bottom_lines(depth: Any, found: Any) -> list[str]:
+    import numpy as np
+
+    if np.isnan(depth[0]):
+        return ["bottom: no echo"]
+    lines = [f"bottom: {depth[1]:.3f} m deep, {depth[0]:.3f} m through a level sea"]
+    reflectivity = found["reflectivity"].values
+    if np.isnan(reflectivity).all():
+        return [*lines, "bottom reflectivity: no column that can be fitted"]
+    text = ", ".join(f"{by} {rho:.4f}" for by, rho in zip(found["correction"].values, reflectivity, strict=True))
+    shares = zip(found["bottom_class"].values, found["class_probability"].values, strict=True)
+    classes = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares)
+    return [*lines, f"bottom reflectivity: {text}", f"bottom class: {classes}"]
 
 
 #: In the order in which the help lists them.

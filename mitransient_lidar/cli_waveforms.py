@@ -18,7 +18,9 @@ _LISTED_COLUMNS = 16  # waveforms whose layers are listed
 
 
 def waveforms(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, or NetCDF file of recorded shots.")
+    ],
     table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
     output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
     method: Annotated[
@@ -50,11 +52,11 @@ def waveforms(
         elif not table:
             raise UserError("--no-table leaves nothing to do: give --csv OUT, too.")
 
-        from mitransient_lidar import results, waveform_tables
+        from mitransient_lidar import waveform_source, waveform_tables
         from mitransient_lidar import waveforms as measuring
 
         found = measuring.extract(
-            results.open(file),
+            waveform_source.open_waveforms(file),
             method or ["gaussian"],
             threshold=threshold,
             contrast=contrast,

@@ -7,8 +7,8 @@ it returns keeps the dimension ``shot``. Receiver and transmitter must share the
 from __future__ import annotations
 
 import json
+import logging
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,49 +17,15 @@ import xarray as xr
 
 from mitransient_lidar import waveforms
 from mitransient_lidar.errors import UserError
+from mitransient_lidar.estimates_lidar import Lidar, number
 from mitransient_lidar.loading import readable_errors
 from mitransient_lidar.optics import slope_corrections, surface_slope, turbidity
 from mitransient_lidar.optics.checks import FloatArray, in_range, positive
-from mitransient_lidar.optics.lidar_equation import LidarSystem
-from mitransient_lidar.optics.refraction import snell, solid_angle_per_area, surface_time_ns
+from mitransient_lidar.optics.refraction import snell, solid_angle_per_area
 from mitransient_lidar.optics.water import C0
 
+_LOG = logging.getLogger(__name__)
 _SPOT_MARGIN = 1.75  # echo widths after the surface at which `waveforms` begins to fit the column
-
-
-@dataclass(frozen=True)
-class _Lidar:
-    """Numbers of a result that estimators need: [m], [rad], indices, and mean surface [ns]."""
-
-    height: float
-    off_nadir: float
-    index: float
-    group: float
-    surface_ns: float
-
-    @classmethod
-    def of(cls, dataset: xr.Dataset) -> _Lidar:
-        height, degrees = _number(dataset, "altitude"), _number(dataset, "off_nadir_deg")
-        surface = float(surface_time_ns(height, math.radians(degrees)))
-        return cls(
-            height,
-            math.radians(degrees),
-            _number(dataset, "refractive_index"),
-            _number(dataset, "group_index"),
-            float(dataset.attrs.get("surface_time_ns", surface)),
-        )
-
-    @property
-    def metres_per_ns(self) -> float:
-        """Way in the water per delay [m/ns]."""
-        return 1e-9 * C0 / (2 * self.group)
-
-    def system(self, dataset: xr.Dataset, efficiency: float | None) -> LidarSystem:
-        """Return the lidar equation's system, its energy being that which the receiver's field of view holds."""
-        energy = 1e-3 * _number(dataset, "pulse_energy_mj") * _efficiency(dataset, efficiency) * _in_view(dataset)
-        return LidarSystem(
-            self.height, self.off_nadir, energy, _number(dataset, "aperture_area"), self.index, self.group
-        )
 
 
 def surface_slopes(
@@ -96,7 +62,7 @@ def surface_slopes(
     Times are those of `waveforms.extract` with its Gaussians. Positions of the light in pixels are those of a Gaussian
     beam inside the outlines that a result keeps; without outlines, the pixels' centres, as if each were a point.
     """
-    lidar = _Lidar.of(dataset)
+    lidar = Lidar.of(dataset)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
         raise UserError("surface slopes need waveforms of at least 2 pixels over the dimension pixel")
     echoes = waveforms.extract(dataset).sel(echo="surface").transpose(..., "pixel")
@@ -136,7 +102,7 @@ def pixel_light(dataset: xr.Dataset) -> surface_slope.PixelLight:
         return surface_slope.PixelLight(gx, gy, np.zeros_like(gx))
     lines: list[list[npt.ArrayLike]] = [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in outlines]
     with readable_errors():
-        return surface_slope.PixelLight.of_outlines(lines, 0.5e-3 * _number(dataset, "divergence_mrad"))
+        return surface_slope.PixelLight.of_outlines(lines, 0.5e-3 * number(dataset, "divergence_mrad"))
 
 
 def bottom(
@@ -170,7 +136,8 @@ def bottom(
         level sea at its mean height, through the shot's own plane, and by the ratio of the echo to the column. Over
         ``correction`` (level, slope) alone, under ``depth_m``: depth below the mean sea level [m]. Also
         ``bottom_energy`` [J], ``reflectivity_stderr`` from noise, an upper bound, and over ``bottom_class``:
-        ``class_probability`` of the last reflectivity. NaN without a bottom echo.
+        ``class_probability`` of the last reflectivity. NaN without a bottom echo; without any
+        column that can be fitted, reflectivities are NaN, too, and a sentence says so in the log.
 
     Raises
     ------
@@ -182,7 +149,7 @@ def bottom(
     Reflectivities ``level`` and ``slope`` take one attenuation for all shots, the mean column's. The ratio needs the
     column of each shot, at least 8 bins long, but no slope to speak of, and takes the waves' focusing out as well.
     """
-    lidar = _Lidar.of(dataset)
+    lidar = Lidar.of(dataset)
     with readable_errors():
         share = in_range("relative_error", relative_error, 0, 1)
     echoes = waveforms.extract(_summed(dataset), depth_from="mean").isel(pixel=0)
@@ -206,6 +173,8 @@ def bottom(
         system = lidar.system(dataset, efficiency)
         power, attenuation = column["amplitude"].values, echoes["attenuation"].values
         mean_level, mean_attenuation = (_mean(values) for values in (power, attenuation))
+        if math.isnan(mean_attenuation):
+            _LOG.warning("no waveform has a column long enough to be fitted: the bottom's reflectivity is unknown")
         received = system.energy * system.aperture_area
         reflectivity = [
             np.pi
@@ -276,19 +245,20 @@ def water(
     UserError
         If the view is too narrow, the dataset lacks an attribute or a number is out of range.
     """
-    lidar = _Lidar.of(dataset)
+    lidar = Lidar.of(dataset)
     whole = _summed(dataset)
     with readable_errors():
         end = lidar.surface_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
     echoes = waveforms.extract(whole.isel(time=whole["time"].values < end)).isel(pixel=0)
     level = echoes["amplitude"].sel(echo="column").values
-    diameter = 1e-3 * _number(dataset, "field_of_view_mrad") * lidar.height / math.cos(lidar.off_nadir)
     start = _SPOT_MARGIN * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
     with readable_errors():
         gain = lidar.system(dataset, efficiency).water_gain(0.0, lidar.off_nadir)
         backscatter = turbidity.backscatter_of_level(level, gain, lidar.group)
         decay = echoes["attenuation"].values
-        found = turbidity.water_of_column(decay, backscatter, diameter, first_path=start, phase_factor=phase_factor)
+        found = turbidity.water_of_column(
+            decay, backscatter, lidar.spot(dataset), first_path=start, phase_factor=phase_factor
+        )
     table = {
         "column_attenuation": (decay, "1/m", "attenuation of the column's signal along the path"),
         "absorption": (found.absorption, "1/m", "absorption coefficient"),
@@ -304,7 +274,7 @@ def water(
 def estimate(
     dataset: xr.Dataset, *, slope_deviation: tuple[float, float] | None = None, efficiency: float | None = None
 ) -> xr.Dataset:
-    """Return what `surface_slopes`, `bottom` and, where the view is wide enough, `water` tell, in one dataset.
+    """Return what `surface_slopes`, `bottom` and, where the view is wide enough, `water` tell; NaN for the rest.
 
     Parameters
     ----------
@@ -316,15 +286,17 @@ def estimate(
     Raises
     ------
     UserError
-        As they do.
+        As they do, or when nothing can be told.
     """
     slopes = surface_slopes(dataset, slope_deviation=slope_deviation)
     parts = [slopes, bottom(dataset, slopes, efficiency=efficiency)]
-    lidar = _Lidar.of(dataset)
-    spot = 1e-3 * _number(dataset, "field_of_view_mrad") * lidar.height / math.cos(lidar.off_nadir)
-    if spot >= turbidity.SMALLEST_SPOT:
+    if Lidar.of(dataset).spot(dataset) >= turbidity.SMALLEST_SPOT:
         parts.append(water(dataset, efficiency=efficiency))
-    return xr.merge(parts, combine_attrs="override", join="exact", compat="override")
+    found = xr.merge(parts, combine_attrs="override", join="exact", compat="override")
+    measured = ("surface_range", "depth_m", "column_attenuation")
+    if not any(np.isfinite(found[name]).any() for name in measured if name in found):
+        raise UserError("nothing can be told: no waveform has a surface echo, a column or a bottom echo")
+    return found
 
 
 def _summed(dataset: xr.Dataset) -> xr.Dataset:
@@ -355,43 +327,11 @@ def _labelled(dataset: xr.Dataset, table: dict[str, tuple[FloatArray, str, str]]
 
 
 def _mean(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    if not known.size:
-        raise UserError("no waveform has a column long enough to be fitted between surface and bottom")
-    return float(known.mean())
+    return float(values[known].mean()) if (known := np.isfinite(values)).any() else math.nan
 
 
-def _spreading(lidar: _Lidar, path: FloatArray) -> FloatArray:
+def _spreading(lidar: Lidar, path: FloatArray) -> FloatArray:
     """Return what distance and refraction leave of a signal from a path in the water over that at the surface."""
     depth = np.maximum(path, 0) * math.cos(float(snell(lidar.off_nadir, lidar.index)))
     below, surface = (solid_angle_per_area(lidar.height, d, lidar.off_nadir, lidar.index) for d in (depth, 0.0))
     return np.asarray(below / surface)
-
-
-def _in_view(dataset: xr.Dataset) -> float:
-    """Return the part of a Gaussian beam inside the receiver's field of view."""
-    half = _number(dataset, "field_of_view_mrad") / _number(dataset, "divergence_mrad")
-    if dataset.attrs.get("field_of_view_shape", "circle") == "circle":
-        return 1 - math.exp(-0.5 * half**2)
-    return math.erf(half / math.sqrt(2)) ** 2
-
-
-def _efficiency(dataset: xr.Dataset, given: float | None) -> float:
-    if given is not None:
-        with readable_errors():
-            return in_range("efficiency", given, 0, 1)
-    try:
-        optics, air = (
-            float(dataset.attrs[f"scene.{name}"])
-            for name in ("optical_efficiency", "two_way_atmospheric_transmittance")
-        )
-    except (KeyError, ValueError):
-        raise UserError("efficiency must be given: the dataset does not tell those of the optics and the air") from None
-    return optics**2 * air
-
-
-def _number(dataset: xr.Dataset, name: str) -> float:
-    value = dataset.attrs.get(name)
-    if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
-        raise UserError(f"the attribute {name} = {value!r} of the dataset must be a number of at least 0")
-    return float(value)

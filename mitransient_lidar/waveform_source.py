@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar import dataset_files, results
 from mitransient_lidar.errors import UserError
 from mitransient_lidar.optics.checks import FloatArray, positive
 from mitransient_lidar.optics.echoes import Records, Template
@@ -20,6 +23,42 @@ from mitransient_lidar.optics.water import C0
 _DIMENSIONS = (("pixel", "time"), ("row", "column", "time"))
 _SHOTS, _FEWEST_SHOTS = 200, 20  # shots that tell how alike neighbouring samples are
 _LONGEST_ECHO = 4.0  # pulse widths: beyond, the footprint's spread is not used
+
+
+def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read waveforms: a result, or a NetCDF file of shots or of what a receiver recorded.
+
+    Parameters
+    ----------
+    path : path
+        What `results.save` wrote, or `xarray.Dataset.to_netcdf` in the format NetCDF-4.
+
+    Returns
+    -------
+    xarray.Dataset
+        With ``waveform`` or ``signal``, in memory.
+
+    Raises
+    ------
+    UserError
+        If the file is missing or damaged, or holds neither.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            signature = file.read(len(dataset_files.HDF5_SIGNATURE))
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    if signature != dataset_files.HDF5_SIGNATURE:
+        return results.open(path)
+    try:
+        dataset = dataset_files.read_netcdf(path)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(f"{path} is not of mitransient-lidar: {error}") from error
+    if not {"signal", "waveform"} & set(dataset):
+        raise UserError(f"{path} holds neither a signal nor a waveform over time.")
+    return dataset
 
 
 @dataclass(frozen=True)

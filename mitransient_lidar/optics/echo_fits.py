@@ -17,6 +17,9 @@ Model = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatAr
 
 _FWHM = float(np.sqrt(8 * np.log(2)))
 _ITERATIONS = 30
+_TOLD = 9.0  # fall of the squared residuals by which a height of the surface's own is told from the column's onset
+_PLAIN = 10.0  # standard errors of a height above which that is not asked
+_HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # of the peak, tried where the height is not told
 
 
 def gaussian_surface(
@@ -26,8 +29,11 @@ def gaussian_surface(
 
     The model is A exp(-u^2/(2 s^2)) plus a column C exp(-k u) from u = 0 on that has been blurred by the same Gaussian,
     where u is the time since the surface's: the two share their time and their width s. It is fitted from two echo
-    widths before the peak to two after it, and finds the surface where the peak itself is that of the column. Where A
-    is less than its standard error, A = 0 is fitted: its time and a height of its own cannot be told apart then.
+    widths before the peak to two after it, and finds the surface where the peak itself is that of the column.
+
+    A surface that is low beside its column is nearly as well fitted without A and one or two nanoseconds earlier. Where
+    A lowers the squared residuals by less than 9, the result is therefore the mean over fits with given A, 0 to 0.45 of
+    the peak, weighted with their likelihood and with even odds that A = 0; the errors hold how far these fits differ.
 
     Parameters
     ----------
@@ -68,12 +74,19 @@ def gaussian_surface(
         return height * gauss + level * onset, np.stack([by_time, by_s, gauss, onset], axis=1)
 
     exists = (flags & int(EchoFlag.NO_ECHO)) == 0
-    fit = _fit(model, start, u, power, noise, usable, rate[:, np.newaxis], width, exists)
-    # Without a height of its own the echo's time cannot be told from it: the column's onset alone is the surface.
-    clear = fit.good & (fit.values[:, 2] > np.sqrt(fit.covariance[:, 2, 2]))
-    if (weak := exists & ~clear).any():
-        bare = _fit(model, start, u, power, noise, usable, rate[:, np.newaxis], width, weak, weak)
-        fit = fit.or_where(weak, bare)
+    fit = _fit(model, start, u, power, noise, usable, rate[:, np.newaxis], width, peak, exists)
+    error = np.sqrt(fit.covariance[:, 2, 2])
+    weak = exists & ~(fit.good & (fit.values[:, 2] > _PLAIN * error))
+    some = fit.good & (fit.values[:, 2] > error)
+    tried: list[_Fit] = []
+    for share in _HEIGHTS:
+        if not weak.any():
+            return _echoes(records, bins, fit, flags)
+        held = np.where(weak, share * peak, np.nan)
+        tried.append(_fit(model, start, u, power, noise, usable, rate[:, np.newaxis], width, peak, weak, held))
+        start = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, start)
+        weak &= ~some | (tried[0].cost <= fit.cost + _TOLD)
+    fit = fit.or_where(weak, _mean(tried))
     return _echoes(records, bins, fit, flags)
 
 
@@ -130,16 +143,17 @@ def gaussian_echo(
         return height * gauss + column, jacobian
 
     exists = (flags & int(EchoFlag.NO_ECHO)) == 0
-    fit = _fit(model, start, u, power, noise, usable, rate[:, np.newaxis], width, exists)
+    fit = _fit(model, start, u, power, noise, usable, rate[:, np.newaxis], width, peak, exists)
     return _echoes(records, bins, fit, flags)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Parameters (n, p), their covariance (n, p, p), and whether the fit has converged (n,)."""
+    """Parameters (n, p), their covariance (n, p, p), squared residuals and whether the fit has converged (n,)."""
 
     values: FloatArray
     covariance: FloatArray
+    cost: FloatArray
     good: BoolArray
 
     def or_where(self, other: BoolArray, fit: _Fit) -> _Fit:
@@ -147,8 +161,29 @@ class _Fit:
         return _Fit(
             np.where(other[:, np.newaxis], fit.values, self.values),
             np.where(other[:, np.newaxis, np.newaxis], fit.covariance, self.covariance),
+            np.where(other, fit.cost, self.cost),
             np.where(other, fit.good, self.good),
         )
+
+
+def _mean(tried: list[_Fit]) -> _Fit:
+    """Return the mean of fits at the heights `_HEIGHTS`, each weighted with its likelihood."""
+    cost = np.stack([np.where(fit.good, fit.cost, np.inf) for fit in tried])
+    good = np.isfinite(cost).any(axis=0)
+    likelihood = np.exp(-0.5 * (cost - np.where(good, cost.min(axis=0), 0)))
+    # Even odds for no height at all, and as much shared by all heights alike.
+    share = np.gradient(_HEIGHTS)
+    share[[0, -1]] *= 0.5
+    share /= share.sum()
+    share[0] += 1
+    weight = share[:, np.newaxis] * likelihood
+    weight /= np.where(good, weight.sum(axis=0), 1.0)
+    values = np.stack([fit.values for fit in tried])
+    mean = np.einsum("jn,jnp->np", weight, values)
+    apart = values - mean
+    within = np.stack([np.where(fit.good[:, np.newaxis, np.newaxis], fit.covariance, 0) for fit in tried])
+    covariance = np.einsum("jn,jnpq->npq", weight, within + apart[..., :, np.newaxis] * apart[..., np.newaxis, :])
+    return _Fit(mean, covariance, cost.min(axis=0), good)
 
 
 def _samples(
@@ -172,35 +207,40 @@ def _fit(
     usable: BoolArray,
     rate: FloatArray,
     width: float,
+    scale: FloatArray,
     wanted: BoolArray,
-    bare: BoolArray | None = None,
+    held: FloatArray | None = None,
 ) -> _Fit:
-    """Fit a model to many windows at once by Levenberg and Marquardt's damped least squares; no height if `bare`."""
+    """Fit a model to many windows at once by Levenberg and Marquardt's damped least squares.
+
+    Heights that are not NaN in `held`, shape (n,), stay as they are there.
+    """
     count, size = start.shape
-    bare = np.zeros(count, dtype=bool) if bare is None else bare
-    wanted = wanted & (np.count_nonzero(usable, axis=1) > size + 1) & (start[:, 2] > 0)
-    scale = np.where(start[:, 2] > 0, start[:, 2], 1.0)
+    held = np.full(count, np.nan) if held is None else held
+    fixed = np.isfinite(held)
+    wanted = wanted & (np.count_nonzero(usable, axis=1) > size + 1) & (scale > 0)
+    scale = np.where(scale > 0, scale, 1.0)
     values = start.copy()
-    values[bare, 2] = 0
+    values[fixed, 2] = held[fixed]
     covariance = np.full((count, size, size), np.nan)
     good = np.zeros(count, dtype=bool)
     damping = np.full(count, 1e-3)
+    # Fits with given heights are only compared: nothing in them is as flat as time against height.
+    enough = np.where(fixed, 1e-3, 1e-9)
     weights = np.where(usable, 1 / noise, 0.0)
     unit = np.ones((count, size))
     unit[:, :2] = width
     unit[:, 2:] = scale[:, np.newaxis]
     active = np.flatnonzero(wanted)
     cost = np.full(count, np.inf)
-    if active.size:
-        first, _ = model(values[active], u, rate[active])
-        cost[active] = np.sum((weights[active] * (power[active] - first)) ** 2, axis=1)
+    found, jacobian = model(values[active], u, rate[active])
+    cost[active] = np.sum((weights[active] * (power[active] - found)) ** 2, axis=1)
     for _ in range(_ITERATIONS):
         if not active.size:
             break
         w, x, y, k = weights[active], values[active], power[active], rate[active]
-        found, jacobian = model(x, u, k)
         weighted = jacobian * (w[:, np.newaxis, :] * unit[active][..., np.newaxis])
-        weighted[bare[active], 2] = 0
+        weighted[fixed[active], 2] = 0
         normal = weighted @ weighted.transpose(0, 2, 1)
         right = (weighted @ (w * (y - found))[..., np.newaxis])[..., 0]
         diagonal = np.einsum("nii->ni", normal)
@@ -211,30 +251,32 @@ def _fit(
         trial = x + np.clip(step, -1, 1) * unit[active]
         trial[:, 0] = np.clip(trial[:, 0], -1.2 * width, 1.2 * width)
         trial[:, 1] = np.clip(trial[:, 1], 0.1 * width / _FWHM, 3 * width / _FWHM)
-        trial[:, 2] = np.where(bare[active], 0, np.maximum(trial[:, 2], 0))
-        tried, _ = model(trial, u, k)
+        trial[:, 2] = np.where(fixed[active], held[active], np.maximum(trial[:, 2], 0))
+        tried, changed = model(trial, u, k)
         new = np.sum((w * (y - tried)) ** 2, axis=1)
         better = new <= cost[active]
-        settled = better & (cost[active] - new <= 1e-7 * new + 1e-9)
+        settled = better & (cost[active] - new <= 1e-7 * new + enough[active])
         small = np.max(np.abs(trial - x) / unit[active], axis=1) < 1e-7
         values[active] = np.where(better[:, np.newaxis], trial, x)
         cost[active] = np.where(better, new, cost[active])
         damping[active] = np.clip(np.where(better, 0.1, 8.0) * damping[active], 1e-12, 1e6)
         good[active] = settled | small
-        active = active[~(settled | small)]
+        found[better], jacobian[better] = tried[better], changed[better]
+        if (done := settled | small).any():
+            active, found, jacobian = (of_each[~done] for of_each in (active, found, jacobian))
     if good.any():
         _, jacobian = model(values[good], u, rate[good])
         weighted = jacobian * (weights[good][:, np.newaxis, :] * unit[good][..., np.newaxis])
         normal = weighted @ weighted.transpose(0, 2, 1)
-        # A height that is fixed is not correlated with anything; its error is that of a fit of the height alone.
-        fixed = bare[good]
-        normal[fixed, 2, :2] = normal[fixed, :2, 2] = 0
-        normal[fixed, 2, 3:] = normal[fixed, 3:, 2] = 0
+        # A height that is held is not correlated with anything; its error is that of a fit of the height alone.
+        still = fixed[good]
+        normal[still, 2, :2] = normal[still, :2, 2] = 0
+        normal[still, 2, 3:] = normal[still, 3:, 2] = 0
         trace = np.einsum("nii->n", normal)[:, np.newaxis, np.newaxis]
         inverse = np.linalg.inv(normal + 1e-13 * trace * np.eye(size))
         covariance[good] = inverse * unit[good][:, :, np.newaxis] * unit[good][:, np.newaxis, :]
-    good &= bare | (values[:, 2] > 0)
-    return _Fit(values, covariance, good)
+    good &= fixed | (values[:, 2] > 0)
+    return _Fit(values, covariance, cost, good)
 
 
 def _echoes(records: Records, bins: IntArray, fit: _Fit, flags: IntArray) -> Echoes:

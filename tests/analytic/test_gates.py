@@ -126,12 +126,12 @@ def image(lidar_scene, layout, film=None, **integrator):
 def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
     """256 x 256 pixels binned to 2 x 2, and all of them, against receivers of so many pixels with other seeds."""
     sums = {}
-    for first_seed, (layout, count) in enumerate((("256x256", 8), ("2x2", 16), ("1x1", 16))):
+    for first_seed, (layout, count) in enumerate((("256x256", 6), ("2x2", 12), ("1x1", 12))):
         scene = image(lidar_scene, layout)
         energy = passes(scene, count, 1000 * first_seed)
         if layout == "256x256":
             energy = energy.reshape(count, 2, 128, 2, 128, -1).sum(axis=(2, 4)).reshape(count, 4, -1)
-        sums[layout] = energy[..., 2:17].reshape(*energy.shape[:2], 5, 3).sum(axis=-1)
+        sums[layout] = energy[..., 2:14].reshape(*energy.shape[:2], 4, 3).sum(axis=-1)
         scene.integrator().release()
     pairs = [
         (sums["256x256"], sums["2x2"]),
@@ -140,8 +140,8 @@ def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
     for first, second in pairs:
         error = np.hypot(*(a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (first, second)))
         z = (first.mean(axis=0) - second.mean(axis=0)) / error
-        assert np.all(np.abs(z) < largest_z(8, z.size)), z
-        assert np.all(error < 0.05 * second.mean(axis=0))
+        assert np.all(np.abs(z) < largest_z(6, z.size)), z
+        assert np.all(error < 0.02 * second.mean(axis=0))
 
 
 def test_paths_go_with_the_pixels(lidar_scene):

@@ -38,9 +38,7 @@ def surface_echoes(wind, angle, cell):
     return np.array(energies), surface.resolved_variance, surface.ripple_variance
 
 
-@pytest.mark.parametrize(
-    ("wind", "angle"), [(3.0, 0.0), (3.0, 10.0), (3.0, 20.0), (6.0, 0.0), (6.0, 20.0), (10.0, 0.0), (10.0, 20.0)]
-)
+@pytest.mark.parametrize(("wind", "angle"), [(3.0, 0.0), (3.0, 20.0), (6.0, 20.0), (10.0, 0.0), (10.0, 20.0)])
 def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle):
     """Within 5 % of Gaussian slopes but in the tail at light wind, where ripples on facets are 20 % brighter.
 

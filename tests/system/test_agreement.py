@@ -33,8 +33,8 @@ def test_integrators_agree_in_every_shipped_scene(name):
     bins = dict(SHORT_BINS if name in ZOOMS.values() else BINS)
     if name in IMAGES:
         bins["layout"] = "2x2"
-    merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=16, seed=1)
-    count = 16 if name in TURBID else 8
+    merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=12, seed=1)
+    count = 12 if name in TURBID else 6
     reference = mitransient_lidar.render(name, params=bins, integrator="lidar_volpath", passes=count, seed=2)
     outcome = comparison.compare(reference, merged)
     # At grazing incidence the reference knows few bins to 30 %: its connection takes the sea as level.

@@ -137,9 +137,12 @@ def test_prior_weighs_slopes():
     # Squares of 6 mrad in a beam of 5 mrad: Gaussians cut at 0 and 6.
     light = truncnorm(0, 1.2, scale=5e-3)
     assert estimates.pixel_light(shot).gx == pytest.approx(np.sign(GX) * light.mean(), rel=1e-3)
-    # Far and near pair with two facets each; the time tells tan(theta - tilt).
-    tilt = math.atan(float(raw["slope_along"]))
-    expected = light.std() * math.tan(THETA) / (2 * light.mean()) * (math.cos(THETA - tilt) / math.cos(tilt)) ** 2
+    # Far and near pair with two facets each, alike by 0.4; the time tells tan(theta - tilt).
+    slope = float(raw["slope_along"])
+    tilt = math.atan(slope)
+    lever = light.std() * math.sqrt(1.4) / (2 * light.mean()) * (math.cos(THETA - tilt) / math.cos(tilt)) ** 2
+    level = lever * math.tan(THETA)
+    expected = lever * math.hypot(math.tan(THETA - math.atan(0.5 * slope)), level / math.sqrt(2))
     assert float(raw["slope_along_stderr"]) == pytest.approx(expected, rel=0.01)
     weighed = estimates.surface_slopes(shot, slope_deviation=(0.05, 0.04))
     error = float(raw["slope_along_stderr"])
@@ -195,6 +198,40 @@ def test_estimate_holds_all_that_can_be_told():
     assert "kd" not in narrow
     dark = result(np.stack([waveform(delay, depth=30.0) for delay in plane_delays(0, 0)]))
     assert np.isnan(estimates.estimate(dark)["depth_m"]).all()
+
+
+def short(bins=0, depth=DEPTH):
+    """Four pixels whose record ends before the bottom, or whose column is too short to be fitted."""
+    shot = result(np.stack([waveform(delay, depth=depth) for delay in plane_delays(0.1, 0.0)]))
+    return shot.isel(time=slice(0, bins or None))
+
+
+def test_without_a_column_the_rest_is_told(tmp_path, caplog):
+    """A record that ends 15 ns behind the surface, and a bottom 1.6 m deep, whose echo leaves no column free."""
+    app = typer.Typer()
+    app.command()(cli_estimates.estimate)
+    for shot, depth in ((short(bins=100), math.nan), (short(depth=1.6), 1.6)):
+        caplog.clear()
+        found = estimates.estimate(shot)
+        assert float(found["slope_along"]) == pytest.approx(0.1, abs=0.02)
+        assert float(found["depth_m"].sel(correction="slope")) == pytest.approx(depth, abs=0.1, nan_ok=True)
+        assert np.isnan(found["reflectivity"]).all()
+        assert np.isnan(found["class_probability"]).all()
+        assert np.isnan(found["kd"])
+        assert caplog.messages == [
+            "no waveform has a column long enough to be fitted: the bottom's reflectivity is unknown"
+        ]
+        results.save(shot, tmp_path / "short.nc")
+        run = CliRunner().invoke(app, [str(tmp_path / "short.nc")])
+        assert run.exit_code == 0, run.output
+        for text in ("slope along: +0.1", "bottom: ", "water: no column that can be fitted"):
+            assert text in run.output
+        assert "nan" not in run.output
+
+
+def test_nothing_can_be_told():
+    with pytest.raises(UserError, match="nothing can be told: no waveform has a surface echo"):
+        estimates.estimate(result(np.full((4, BINS), 1e-12)))
 
 
 def test_command(tmp_path):

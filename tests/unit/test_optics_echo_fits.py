@@ -57,15 +57,32 @@ def test_surface_is_told_from_the_column_behind_it():
     assert_true(found.energy, found.energy_stderr, 0.4 * np.sqrt(2 * np.pi) * SIGMA * 1e-9, bias=2e-11)
 
 
-def test_surface_without_an_echo_of_its_own_is_the_onset_of_the_column():
+@pytest.mark.parametrize(("height", "noise"), [(0.0, 0.03), (0.1, 0.03), (0.2, 0.03), (0.0, 0.01), (0.2, 0.01)])
+def test_a_surface_low_beside_its_column_has_one_time_with_a_true_error(height, noise):
+    """Without a height the surface is 1 to 2 ns earlier and fits alike: choosing gave two groups with 5 to 60 errors.
+
+    The height is the same in all records and unknown to each, so that errors are true over heights, not in each: the
+    root mean square of error over stated error was 0.8 to 2.2.
+    """
+    signal = onset(SURFACE) + gauss(SURFACE, height)
+    bins, flags = np.full(300, int(np.argmax(signal))), np.zeros(300, int)
+    found = gaussian_surface(noisy(signal, noise, 300), bins, WIDTH, DECAY, flags)
+    error = found.time_ns - SURFACE
+    assert 0.5 < np.sqrt(np.mean((error / found.time_stderr) ** 2)) < 2.7
+    assert np.median(found.time_stderr) < 1.0
+    if height == 0:
+        # Those that took noise for a height were a second group, 1.6 ns late.
+        assert np.mean(error > 1.4) < 0.04
+        assert np.mean(found.amplitude / found.amplitude_stderr > 3) < 0.02
+
+
+def test_the_onset_of_a_column_without_noise_is_the_surface():
     signal = onset(SURFACE)
-    bins, flags = np.full(COUNT, int(np.argmax(signal))), np.zeros(COUNT, int)
-    found = gaussian_surface(noisy(signal, 0.005), bins, WIDTH, DECAY, flags)
-    assert np.mean(found.amplitude == 0) > 0.5
-    # A height can only be taken for an echo where the noise makes one: those times are late, by little on average.
-    assert np.median(found.time_ns) == pytest.approx(SURFACE, abs=0.05)
-    clean = gaussian_surface(Records.of(signal[np.newaxis], TIME), bins[:1], WIDTH, DECAY, flags[:1])
+    clean = gaussian_surface(
+        Records.of(signal[np.newaxis], TIME), np.array([np.argmax(signal)]), WIDTH, DECAY, np.zeros(1, int)
+    )
     assert clean.time_ns[0] == pytest.approx(SURFACE, abs=0.02)
+    assert clean.amplitude[0] == pytest.approx(0, abs=0.005)
 
 
 def test_bottom_on_the_column_that_it_ends():

@@ -270,6 +270,30 @@ def test_command_refuses(tmp_path, options, sentence):
     assert sentence in run.output
 
 
+def test_command_reads_what_a_receiver_recorded(tmp_path):
+    """Shots hold a signal and no result's variables; a file of anything else is refused in one sentence."""
+    shots = recorded(np.stack([waveform()]), 3, 0.01)
+    shots.to_netcdf(tmp_path / "shots.nc", engine="h5netcdf")
+    app = typer.Typer()
+    app.command()(cli_waveforms.waveforms)
+    run = CliRunner().invoke(app, [str(tmp_path / "shots.nc"), "--no-table", "--csv", str(tmp_path / "echoes.csv")])
+    assert run.exit_code == 0, run.output
+    with (tmp_path / "echoes.csv").open() as file:
+        found = [float(line["depth_m"]) for line in csv.DictReader(file) if line["echo"] == "bottom"]
+    assert found == pytest.approx([70 * PER_NS] * 3, abs=0.05)
+    shots.rename(signal="sound").to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    (tmp_path / "short.nc").write_bytes((tmp_path / "other.nc").read_bytes()[:100])
+    for name, sentence in (
+        ("other.nc", "holds neither a signal nor a waveform over time."),
+        ("short.nc", "is damaged or truncated"),
+        ("missing.nc", "No such file or directory"),
+    ):
+        run = CliRunner().invoke(app, [str(tmp_path / name)])
+        assert run.exit_code == 2
+        assert sentence in run.output.replace("\n", " ")
+        assert "Traceback" not in run.output
+
+
 def test_flag_names():
     assert waveform_tables.flag_names(0) == ""
     assert waveform_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
