@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .checks import FloatArray, finite_array, non_negative, positive
+from .columns import read_two_columns
 
 #: Length of a whole raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
@@ -136,14 +137,7 @@ class GateShape:
         ValueError
             If the file does not hold two columns of numbers, or as for `sampled`.
         """
-        with open(path, encoding="utf-8") as file:
-            try:
-                rows = [row for line in file if (row := line.split("#")[0].replace(",", " ").split())]
-                table = np.array(rows, dtype=np.float64).reshape(len(rows), 2)
-            except ValueError:
-                raise ValueError(
-                    f"gate profile {path} must hold two columns of numbers: time in ns and transmission"
-                ) from None
+        table = read_two_columns(path, "gate profile", "time in ns and transmission")
         return cls.sampled(table[:, 0], table[:, 1])
 
     @property

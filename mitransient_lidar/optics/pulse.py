@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .checks import FloatArray, finite_array, non_negative, positive
+from .columns import read_two_columns
 
 FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 _TAIL = 1e-10  # energy left out at each end of a kernel
@@ -96,13 +97,7 @@ class Pulse:
         ValueError
             If the file does not hold two columns of numbers, or as for `sampled`.
         """
-        with open(path, encoding="utf-8") as file:
-            rows = [line.split("#")[0].replace(",", " ").split() for line in file]
-        rows = [row for row in rows if row]
-        try:
-            table = np.array(rows, dtype=np.float64).reshape(len(rows), 2)
-        except ValueError:
-            raise ValueError(f"pulse file {path} must hold two columns of numbers: time in ns and power") from None
+        table = read_two_columns(path, "pulse file", "time in ns and power")
         return cls.sampled(table[:, 0], table[:, 1])
 
     def cumulative(self, t_ns: npt.ArrayLike) -> FloatArray:
