@@ -29,6 +29,37 @@ def clean_drjit():
         dr.set_flag(flag, value)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def prepared(variant):
+    """Integrators that have prepared a scene since the list was last emptied."""
+    engines = []
+    for kind, method in (
+        ("lidar_volpath", "prepare"),
+        ("lidar_merging", "prepare"),
+        ("passive_volpath", "prepare_view"),
+    ):
+        plugin = type(mi.load_dict({"type": kind}))
+        original = getattr(plugin, method)
+
+        def prepare(self, *arguments, original=original):
+            engines.append(self)
+            return original(self, *arguments)
+
+        setattr(plugin, method, prepare)
+    return engines
+
+
+@pytest.fixture(autouse=True)
+def free_scenes(prepared):
+    """Let go of the scenes of a test: each left alive would be part of every later kernel, and slow it down.
+
+    A scene holds its integrator, and that holds the scene until it is released.
+    """
+    yield
+    while prepared:
+        prepared.pop().release()
+
+
 def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None, bottom=8.0, rho=0.1, extra=None):
     """Return a loaded scene: the table system over a flat, almost smooth sea, with changes by group."""
     scene = {
