@@ -39,12 +39,12 @@ def test_integrators_agree_in_every_shipped_scene(name):
     outcome = comparison.compare(reference, merged)
     # At grazing incidence the reference knows few bins to 30 %: its connection takes the sea as level.
     grazing = name == "fig04_mast"
-    assert outcome.bin_count >= (100 if grazing or name in IMAGES else 200) * merged.sizes["pixel"]
+    assert outcome.bin_count >= (100 if grazing or name in IMAGES else 180) * merged.sizes["pixel"]
     assert outcome.largest < comparison.sidak_limit(outcome.bin_count, FALSE_ALARM), (outcome.largest, outcome.limit)
     assert 0.7 < outcome.rms < 1.2
     # Cells blur the first metre of water by 0.5 %, a fifth of which is in the whole.
     assert abs(outcome.energy_ratio - 1) < 0.002 + largest_z(64) * outcome.energy_ratio_stderr
-    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.012 if name in TURBID | IMAGES else 0.006)
+    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.015 if name in TURBID | IMAGES else 0.007)
 
 
 @pytest.mark.parametrize(("zoom", "whole"), ZOOMS.items())
