@@ -103,6 +103,9 @@ def render(
         from mitransient_lidar.resources import scene_path
 
         name = scene_path(scene).stem
+        # Before a long render: a scene whose film has gates names their number.
+        if (gif or mp4 or html) and "gate_count" not in scene_path(scene).read_text(encoding="utf-8"):
+            raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
         drawings = {output / f"{name}.png": "plot_waveforms", output / f"{name}_layout.png": "plot_layout"}
         targets = [output / f"{name}.exr", output / f"{name}.nc", *(drawings if plot else ())]
         wanted = {"drawings": plot, "gif": gif, "mp4": mp4, "html": html}
@@ -134,8 +137,6 @@ def render(
             typer.echo(output / f"{name}.nc")
         if "gate_energy" in dataset:
             gates.write(dataset, dataset, quiet)
-        elif wanted["gif"] or mp4 or html:
-            raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
         if not quiet:
             summarise(dataset)
         if dataset.attrs.get("interrupted"):

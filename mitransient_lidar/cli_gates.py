@@ -102,6 +102,10 @@ class GateFiles:
         """Write the files and print their paths; `result` has the waveforms for the page, if there are any."""
         from mitransient_lidar import gate_files, gate_page, gate_plots
 
+        for path in self.names():
+            if path.suffix in (".gif", ".mp4"):
+                # Before anything is written.
+                gate_plots.check_movie(stack, path)
         self.folder.mkdir(parents=True, exist_ok=True)
         for path in self.names():
             if path.suffix == ".exr":

@@ -82,6 +82,19 @@ def contact_sheet(dataset: xr.Dataset, path: str | os.PathLike[str], log: bool =
     gate_drawing.save(figure, path)
 
 
+def check_movie(stack: xr.Dataset, path: Path) -> None:
+    """Raise a UserError where a movie of a gate stack cannot be made: of single pixels, or .mp4 without ffmpeg."""
+    from matplotlib.animation import FFMpegWriter
+
+    if "pixel" in stack.dims:
+        raise UserError(
+            f"cannot write {path}: a movie needs images, but this stack has {stack.sizes['pixel']} single pixels; "
+            "draw its contact sheet."
+        )
+    if path.suffix.lower() == ".mp4" and not FFMpegWriter.isAvailable():
+        raise UserError(f"cannot write {path}: .mp4 needs the program ffmpeg, which is not installed; choose .gif.")
+
+
 def animation(dataset: xr.Dataset, path: str | os.PathLike[str], log: bool = False) -> None:
     """Make a movie of the gates: one frame each, beside the mean energy against depth.
 
@@ -111,13 +124,7 @@ def animation(dataset: xr.Dataset, path: str | os.PathLike[str], log: bool = Fal
     if suffix not in (".gif", ".mp4"):
         raise UserError(f"cannot write {path}: the file name of a movie must end in .gif or .mp4.")
     stack = check_stack(dataset)
-    if "pixel" in stack.dims:
-        raise UserError(
-            f"cannot write {path}: a movie needs images, but this stack has {stack.sizes['pixel']} single pixels; "
-            "draw its contact sheet."
-        )
-    if suffix == ".mp4" and not FFMpegWriter.isAvailable():
-        raise UserError(f"cannot write {path}: .mp4 needs the program ffmpeg, which is not installed; choose .gif.")
+    check_movie(stack, path)
     figure, show = _movie_figure(stack, log=log)
     # The layout is settled once: frames must not shift against each other.
     figure.draw_without_rendering()

@@ -32,7 +32,8 @@ def test_wheel_holds_every_module_plugin_scene_and_data_file(wheel):
     expected = set()
     for folder, package in (("mitransient_lidar", ""), ("plugins", "plugins/"), ("scenes", "scenes/")):
         for path in (ROOT / folder).rglob("*"):
-            if path.suffix in (".py", ".xml", ".ply", ".csv", ".typed") and "__pycache__" not in path.parts:
+            kinds = (".py", ".xml", ".ply", ".csv", ".typed", ".html", ".css", ".js")
+            if path.suffix in kinds and "__pycache__" not in path.parts:
                 expected.add(f"mitransient_lidar/{package}{path.relative_to(ROOT / folder).as_posix()}")
     assert expected <= wheel
     assert any(name.endswith("licenses/LICENSE") for name in wheel)

@@ -85,6 +85,13 @@ def assert_sentence(result, *parts):
         assert part in result.stderr
 
 
+@pytest.mark.parametrize("kind", ["--gif", "--mp4", "--html"])
+def test_a_scene_without_gates_has_none_to_show(scene, calls, tmp_path, kind):
+    assert_sentence(run("render", scene, "-o", tmp_path / "out", kind), "fig09 has no gates to show", "gate_count")
+    assert calls.seen == []
+    assert not (tmp_path / "out").exists()
+
+
 def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     out = tmp_path / "new" / "folder"
     result = run("render", scene, "-o", out, "-D", "wind_speed=3", "-D", "file=a=b", "--passes", 4, "--seed", 7)

@@ -135,3 +135,13 @@ def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
     assert result.stdout.split() == [str(tmp_path / "again" / name) for name in names]
     again = gate_files.open_stack(tmp_path / "again" / "scene_gates.exr")
     np.testing.assert_array_equal(again["gate_energy"], gate_files.open_stack(cut)["gate_energy"])
+
+
+def test_a_movie_that_cannot_be_leaves_no_files(stored, tmp_path, monkeypatch):
+    path, _ = stored
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = run(path, *TRAIN, "-o", tmp_path / "out", "--mp4")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert ".mp4 needs the program ffmpeg" in result.stderr
+    assert not (tmp_path / "out").exists()
