@@ -166,7 +166,6 @@ class GateRecording(Recording):
 
     def __init__(self, system: LidarScene, window: ErrorWindow, train: GateTrain, direct: bool) -> None:
         super().__init__(system, window, train)
-        self._received = 0.0
         if direct:
             optics = system.receiver.optics
             system.film.sum_gates(train, train.response_weights(system.transmitter.pulse, optics.response_time_ns))
