@@ -98,6 +98,8 @@ class Recording(ABC):
         """Return the gates, labelled."""
         shape = (*(self.system.receiver.pixels.grid or (self.system.receiver.pixels.count,)), self._train.count)
         mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.stderr))
+        if invalid := np.count_nonzero(~np.isfinite(mean).all(axis=-1)):
+            logger.warning("gates of %d of %d pixels hold values that are not finite", invalid, mean[..., 0].size)
         return build_gates(mean, stderr, self._train, coords=coords, attributes=attributes)
 
 

@@ -1,5 +1,6 @@
 """Gates in renders: against the waveform, against one another, and where geometry puts a target."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -67,6 +68,23 @@ def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
         )
     ten = gated(lidar_scene, integrator)
     np.testing.assert_allclose(10 * render(ten)["gate_energy"], whole["gate_energy"], rtol=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.2])
+def test_what_is_no_number_is_told(lidar_scene, monkeypatch, caplog, share):
+    """Green's light is no number; the other pixels keep theirs, in both ways of keeping gates alone."""
+    scene = gated(lidar_scene)
+    film = type(scene.sensors()[0].film())
+    add = film._add
+
+    def spoil(self, pixel, number, energy, active):
+        add(self, pixel, number, dr.select(pixel == 1, dr.nan, energy), active)
+
+    monkeypatch.setattr(film, "_add", spoil)
+    result = render(scene, gigabytes=1e-9 * share * HISTOGRAM, passes=2)
+    finite = np.isfinite(result["gate_energy"]).any("gate").values
+    assert finite.tolist() == [True, False, True, True]
+    assert "gates of 1 of 4 pixels hold values that are not finite" in caplog.text
 
 
 def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene):
