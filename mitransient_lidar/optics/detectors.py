@@ -20,10 +20,10 @@ import numpy as np
 
 from . import dead_time
 from .checks import FloatArray, finite_array, in_range, non_negative, positive, whole
+from .daylight import PLANCK
 from .water import C0
 
 ELEMENTARY_CHARGE = 1.602176634e-19  # C, exact (SI, 2019)
-PLANCK = 6.62607015e-34  # J s, exact (SI, 2019)
 
 Moments = tuple[FloatArray, list[FloatArray]]
 """Mean, shape (..., time), and covariances of the bins k and k + l at index l, shape (..., time - l)."""

@@ -87,8 +87,8 @@ def connected(lidar_scene, passes, sea, count, **integrator):
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_connections_by_lobe_by_walk_and_combined_have_one_mean(lidar_scene, passes, sea):
     """Each alone is complete; weights that do not sum to one would lose or double what both can find."""
-    combined = with_total(connected(lidar_scene, passes, sea, 16)[:, 1:7])
-    for other, count in (("lobe", 32), ("walk", 64)):
+    combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:7])
+    for other, count in (("lobe", 48), ("walk", 96)):
         alone = with_total(connected(lidar_scene, passes, sea, count, connection=other)[:, 1:7])
         assert compare(combined, alone).sum() >= 5
 
@@ -96,8 +96,8 @@ def test_connections_by_lobe_by_walk_and_combined_have_one_mean(lidar_scene, pas
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
     """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
-    combined = connected(lidar_scene, passes, sea, 32)
-    walk = connected(lidar_scene, passes, sea, 64, connection="walk", turn_share=0.0)
+    combined = connected(lidar_scene, passes, sea, 48)
+    walk = connected(lidar_scene, passes, sea, 96, connection="walk", turn_share=0.0)
     assert walk.sum(axis=1).var(ddof=1) > 50 * combined.sum(axis=1).var(ddof=1)
     # The gate of the bottom echo, where every walk has turned.
     assert walk[:, 5].var(ddof=1) > 50 * combined[:, 5].var(ddof=1)
@@ -117,7 +117,7 @@ def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
             sea=sea,
             film={"bin_width_ns": 4.0, "bin_count": 32},
         )
-        signals.append(with_total(passes(scene, 24)[:, 0] / view**2))
+        signals.append(with_total(passes(scene, 32)[:, 0] / view**2))
     known = compare(*signals)
     assert known[-1]
     assert known.sum() >= 15

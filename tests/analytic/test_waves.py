@@ -3,7 +3,6 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from significance import largest_z
 
 from mitransient_lidar.optics.beam_average import echo_energies
 from mitransient_lidar.optics.lidar_equation import LidarSystem
@@ -38,7 +37,9 @@ def surface_echoes(wind, angle, cell):
     return np.array(energies), surface.resolved_variance, surface.ripple_variance
 
 
-@pytest.mark.parametrize(("wind", "angle"), [(3.0, 0.0), (3.0, 20.0), (6.0, 20.0), (10.0, 0.0), (10.0, 20.0)])
+@pytest.mark.parametrize(
+    ("wind", "angle"), [(3.0, 0.0), (3.0, 10.0), (3.0, 20.0), (6.0, 0.0), (6.0, 20.0), (10.0, 0.0), (10.0, 20.0)]
+)
 def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle):
     """Within 5 % of Gaussian slopes but in the tail at light wind, where ripples on facets are 20 % brighter.
 
@@ -55,7 +56,7 @@ def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle
         ratio, error = energy.mean() / gaussian, energy.std(ddof=1) / np.sqrt(SEAS) / gaussian
         expected = two_scale_ratio(facets, ripples, np.radians(angle))
         # Averaging the ratio over the beam of 5 mrad and masking are worth a percent.
-        assert abs(ratio - expected) < largest_z(SEAS) * error + 0.015, (ratio, expected, error)
+        assert abs(ratio - expected) < 4 * error + 0.015, (ratio, expected, error)
         if not (wind == 3.0 and angle == 20.0):
             assert abs(ratio - 1) < 0.05 + 4 * error
         means.append(energy)

@@ -33,18 +33,18 @@ def test_integrators_agree_in_every_shipped_scene(name):
     bins = dict(SHORT_BINS if name in ZOOMS.values() else BINS)
     if name in IMAGES:
         bins["layout"] = "2x2"
-    merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=12, seed=1)
-    count = 12 if name in TURBID else 6
+    merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=16, seed=1)
+    count = 16 if name in TURBID else 8
     reference = mitransient_lidar.render(name, params=bins, integrator="lidar_volpath", passes=count, seed=2)
     outcome = comparison.compare(reference, merged)
     # At grazing incidence the reference knows few bins to 30 %: its connection takes the sea as level.
     grazing = name == "fig04_mast"
-    assert outcome.bin_count >= (100 if grazing or name in IMAGES else 180) * merged.sizes["pixel"]
+    assert outcome.bin_count >= (100 if grazing or name in IMAGES else 200) * merged.sizes["pixel"]
     assert outcome.largest < comparison.sidak_limit(outcome.bin_count, FALSE_ALARM), (outcome.largest, outcome.limit)
-    assert 0.7 < outcome.rms < 1.2
+    assert 0.7 < outcome.rms < 1.1
     # Cells blur the first metre of water by 0.5 %, a fifth of which is in the whole.
     assert abs(outcome.energy_ratio - 1) < 0.002 + largest_z(64) * outcome.energy_ratio_stderr
-    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.015 if name in TURBID | IMAGES else 0.007)
+    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.012 if name in TURBID | IMAGES else 0.006)
 
 
 @pytest.mark.parametrize(("zoom", "whole"), ZOOMS.items())

@@ -242,14 +242,14 @@ def test_twice_the_paths_half_the_variance(integrator):
         scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
         film = scene.sensors()[0].film()
         total = []
-        for seed in range(40):
+        for seed in range(64):
             engine.render(scene, 0, seed=seed, develop=False)
             # Late light only: surface echo and early column are stratified and fall faster.
             total.append(film.energy()[:, 60:].sum())
         totals.append(np.var(total, ddof=1))
     from scipy.stats import f
 
-    low, high = f.interval(0.9999, 39, 39)
+    low, high = f.interval(0.9999, 63, 63)
     assert 8 * low < totals[0] / totals[1] < 8 * high * 2
 
 
