@@ -298,7 +298,7 @@ RECEIVERS = MappingProxyType(
             SiliconPhotomultiplier(0.33, 3600, 50.0, 0.087, 5.07e5, 1.7e6, 0.05),
             Amplifier(50.0, noise_pa_per_rthz=20.0, load_ohm=50.0, bandwidth_mhz=50.0),
             digitiser=Digitiser(12, 4.0, -0.2),
-            source="Hamamatsu S13360-3050CS: cells of the maker; crosstalk, dark counts of Li and Smoot (2019), arXiv:1908.10547",
+            source="Hamamatsu S13360-3050CS: cells; crosstalk, dark counts of Li and Smoot (2019), arXiv:1908.10547",
         ),
         "spad": ReceiverChain(
             SinglePhotonDetector(0.5, 30.0, 100.0),
