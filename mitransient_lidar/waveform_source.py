@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from mitransient_lidar import dataset_files, results
 from mitransient_lidar.errors import UserError
 from mitransient_lidar.optics.checks import FloatArray, positive
 from mitransient_lidar.optics.echoes import Records, Template
+from mitransient_lidar.optics.electronics import LogAmplifier
 from mitransient_lidar.optics.pulse import Pulse
 from mitransient_lidar.optics.refraction import snell, solid_angle_per_area, surface_time_ns
 from mitransient_lidar.optics.water import C0
@@ -70,7 +71,8 @@ class Source:
     dims, shape, unit
         Dimensions, their sizes and the unit of the variable.
     samples
-        Its values, shape (count, time); the pixels repeat from shot to shot.
+        Its values, shape (count, time); the pixels repeat from shot to shot. Of a signal behind a logarithm, the
+        voltages before it.
     time_ns
         Centres of the bins [ns], shape (time,).
     baseline
@@ -135,6 +137,10 @@ class Source:
             If another argument is out of range.
         """
         name, dims = _variable(dataset)
+        logarithm = _logarithm(dataset) if name == "signal" else None
+        if logarithm is not None:
+            dataset = _expanded(dataset, logarithm)
+            saturation_level = None if saturation_level is None else float(logarithm.expand(saturation_level))
         time = np.asarray(dataset["time"].values, dtype=np.float64)
         values = dataset[name].values
         samples = values.reshape(-1, time.size)
@@ -211,6 +217,25 @@ def _attribute(dataset: xr.Dataset, name: str) -> float:
     if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
         raise UserError(f"the attribute {name} = {value!r} of the dataset must be a number of at least 0")
     return float(value)
+
+
+def _logarithm(dataset: xr.Dataset) -> LogAmplifier | None:
+    """Return the logarithm behind which a signal was recorded."""
+    names = [f"receiver.logarithm.{field.name}" for field in fields(LogAmplifier)]
+    if not set(names) & set(dataset.attrs):
+        return None
+    return LogAmplifier(*(_attribute(dataset, name) for name in names))
+
+
+def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
+    """Return a dataset with the signal before the logarithm, and its standard deviation to first order."""
+    signal = dataset["signal"]
+    replaced = {"signal": signal.copy(data=logarithm.expand(signal.values))}
+    if "signal_deviation" in dataset:
+        deviation = dataset["signal_deviation"]
+        mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean("shot")
+        replaced["signal_deviation"] = deviation * logarithm.expansion(mean.transpose(*deviation.dims).values)
+    return dataset.assign(replaced)
 
 
 def _width(dataset: xr.Dataset, template: Template, ns_per_mrad: float) -> float:

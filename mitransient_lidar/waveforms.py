@@ -65,7 +65,9 @@ def extract(
     ----------
     dataset : xarray.Dataset
         A result with ``waveform`` [W], or what a receiver recorded, ``signal``, which is then used; over (pixel, time)
-        or (row, column, time), also with ``shot`` before these.
+        or (row, column, time), also with ``shot`` before these. A signal behind a logarithm (the attributes
+        ``receiver.logarithm.volts_per_decade`` and ``.knee_v`` of `receiver_chain.detect_waveforms`) is first expanded
+        to the voltage before it, of which all numbers are.
     methods : str or sequence of str
         How times are read: ``threshold`` (where the leading edge passes `threshold` standard deviations of the noise,
         or a fiftieth of the echo if that is more), ``leading_edge`` (where it passes half the amplitude), ``peak``
@@ -83,7 +85,7 @@ def extract(
     echo_fwhm_ns : float, optional
         Expected full width of an echo [ns]. Without it, that of pulse, response and the beam's spread over the surface.
     saturation_level : float, optional
-        Samples from here on are saturated, like those of the variable ``saturated``.
+        Samples, as recorded, from here on are saturated, like those of the variable ``saturated``.
     layers : int
         Number of changes in the column to test for, 0 to 8; see `optics.column_fits.change_points`.
     depth_from : {'echo', 'mean'}

@@ -139,6 +139,11 @@ class LogAmplifier:
                 2 * self.knee_v * np.sinh(np.asarray(volts, dtype=np.float64) * np.log(10) / self.volts_per_decade)
             )
 
+    def expansion(self, volts: npt.ArrayLike) -> FloatArray:
+        """Return the rise of the input per volt of output, at an output [V]."""
+        rate = np.log(10) / self.volts_per_decade
+        return np.asarray(2 * self.knee_v * rate * np.cosh(np.asarray(volts, dtype=np.float64) * rate))
+
 
 @dataclass(frozen=True)
 class Digitiser:

@@ -56,6 +56,9 @@ def test_logarithm():
     assert stage.compress(np.array(1e-6)) == pytest.approx(0.3e-6 / (2e-3 * np.log(10)), rel=1e-6)
     volts = np.array([-0.5, -1e-4, 0, 2e-3, 3.0])
     np.testing.assert_allclose(stage.expand(stage.compress(volts)), volts, rtol=1e-12)
+    out, step = stage.compress(volts), 1e-6
+    rise = (stage.expand(out + step) - stage.expand(out - step)) / (2 * step)
+    np.testing.assert_allclose(stage.expansion(out), rise, rtol=1e-6)
 
 
 def test_digitiser_rounds_and_saturates():

@@ -15,6 +15,7 @@ from mitransient_lidar import cli_waveforms, results, waveform_tables, waveforms
 from mitransient_lidar.errors import UserError
 from mitransient_lidar.optics.echoes import EchoFlag
 from mitransient_lidar.optics.pulse import FWHM_PER_SIGMA, Pulse
+from mitransient_lidar.receiver_chain import detect_waveforms
 
 DT = 0.5
 BINS = 320
@@ -163,6 +164,40 @@ def test_shots_of_a_receiver_have_true_errors():
         assert np.abs(time_ns.mean("shot") - SURFACE - truth).max() < 0.03
     energy = table["energy"].sel(echo="bottom")
     assert float(energy.mean()) == pytest.approx(6e-13 * 1e5, rel=0.01)
+
+
+def test_a_logarithm_is_undone_before_anything_is_measured():
+    """Echoes of a tenth of the light have a tenth of the energy, as behind the same photomultiplier without logarithm.
+
+    Ten times the light would saturate the linear one. Behind the logarithm it is 0.25 V more, of 0.84 V.
+    """
+    clean = np.maximum(np.stack([waveform(), waveform(bottom=75.3)]), 0)
+    tables = {
+        (name, scale): waveforms.extract(detect_waveforms(result(scale * clean), name, 400, 3), saturation_level=level)
+        for name, scale, level in (("pmt_log", 0.03, 0.9), ("pmt_log", 0.003, 0.9), ("pmt", 0.003, None))
+    }
+    strong, weak, linear = (table.sel(echo="bottom") for table in tables.values())
+    for one, other, ratio in ((strong, weak, 10), (weak, linear, 1)):
+        difference = one["energy"].mean("shot") - ratio * other["energy"].mean("shot")
+        error = np.hypot(one["energy"].std("shot"), ratio * other["energy"].std("shot")) / np.sqrt(400)
+        # Rounding of what is barely above the noise.
+        assert (abs(difference) < 4.5 * error + 2e-3 * one["energy"].mean("shot")).all()
+    for table in (strong, weak):
+        for name in ("energy", "time_ns"):
+            ratio = table[name].std("shot") / table[f"{name}_stderr"].mean("shot")
+            assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * 400) + 0.05
+        assert (table["flags"] & EchoFlag.SATURATED == 0).all()
+    # 0.835 V is the strong record's highest sample.
+    low = waveforms.extract(detect_waveforms(result(0.03 * clean), "pmt_log", 20, 3), saturation_level=0.8)
+    assert (low["flags"].sel(echo="bottom") & EchoFlag.SATURATED).all()
+    assert (low["flags"].sel(echo="surface") & EchoFlag.SATURATED == 0).all()
+
+
+def test_a_logarithm_needs_both_its_numbers():
+    shots = recorded(np.stack([waveform()]), 2, 0.01)
+    shots.attrs["receiver.logarithm.knee_v"] = 1e-3
+    with pytest.raises(UserError, match=r"receiver.logarithm.volts_per_decade = None"):
+        waveforms.extract(shots)
 
 
 def test_noise_that_a_filter_has_made_alike_counts_for_more():
