@@ -219,25 +219,85 @@ def test_deep_water_under_an_even_sky(albedo, hydrolight, monte_carlo):
 
 
 @pytest.mark.parametrize(
-    ("albedo", "depth", "expected", "spread"), [(0.9, 1.0, 4.85e-2, 0.015), (0.2, 1.0, 1.72e-3, 0.044)]
+    ("zenith", "azimuth", "view", "coefficients", "spread"),
+    [
+        (30.0, 0.0, 0.0, (0.03997, 0.13989, 0.058815, 0.050627), 0.025),
+        (60.0, 0.0, 0.0, (0.041763, 0.141928, 0.054032, 0.06433), 0.025),
+        (30.0, 90.0, 40.0, (0.04324, 0.152211, 0.057261, 0.065745), 0.06),
+        (60.0, 180.0, 40.0, (0.046406, 0.130495, 0.064989, 0.04711), 0.06),
+    ],
 )
-def test_canonical_problem_1(albedo, depth, expected, spread):
-    """Mobley et al. 1993 (doi:10.1364/AO.32.007484), problem 1: upward radiance at the nadir.
+@pytest.mark.parametrize(
+    ("absorption", "particles", "molecules"),
+    [(0.016, 0.08, 0.0048), (0.06, 0.33, 0.003), (0.15, 0.8, 0.002)],
+    ids=["blue_ocean", "chlorophyll_1_mg", "green_coast"],
+)
+def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, view, coefficients, spread):
+    """Remote-sensing reflectance by Lee et al. (2011, doi:10.1364/AO.50.003155), which they fitted to HydroLight's of
+    natural waters below winds of 5 m/s and a clear sky:
 
-    Rayleigh's phase function, sun at 60 degrees, black sky; mean and relative spread of the models.
+    R = (Gw0 + Gw1 bbw/(a + bb)) bbw/(a + bb) + (Gp0 + Gp1 bbp/(a + bb)) bbp/(a + bb).
+
+    Here the sun is alone; part of the light from the sky takes a few per cent off what depends on directions, the more
+    so beside the nadir. The shape of the particles' phase function, theirs a mean of measured ones, changes it by 4 to
+    7 % (Freda and Piskozub 2012, Oceanologia 54, 29). Measured: 0.98 to 1.01 at the nadir, 0.95 to 1.05 beside it.
     """
-    water = {"attenuation": 1.0, "scattering": albedo, "backscattering": albedo / 2, "phase": {"type": "rayleigh"}}
-    scene = build(sun={"zenith_deg": 60.0}, water=water, integrator={"turn_share": 0.05})
+    molecular, particulate = 0.5 * molecules, 0.01826 * particles
+    water = {
+        "attenuation": absorption + particles + molecules,
+        "scattering": particles + molecules,
+        "water_scattering": molecules,
+        "backscattering": molecular + particulate,
+        "phase": {"type": "petzold"},
+    }
+    kappa = absorption + molecular + particulate
+    u, v = molecular / kappa, particulate / kappa
+    gp0, gp1, gw0, gw1 = coefficients
+    expected = ((gw0 + gw1 * u) * u + (gp0 + gp1 * v) * v) * np.cos(np.radians(zenith))
+    seen = [
+        build(
+            sun={"zenith_deg": zenith, "azimuth_deg": azimuth},
+            sea={"spectrum": "flat", "wind_speed": 5.0},
+            rx={"off_nadir_deg": view},
+            water=water,
+            integrator={"paths_per_pass": 2**15, **limit},
+        )
+        for limit in ({}, {"max_scatterings": 0})
+    ]
+    # Without the glint.
+    leaving = passes(seen[0], 12) - passes(seen[1], 4).mean()
+    assert agrees(leaving, float(expected), 12, bias=spread) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("phase", "albedo", "expected", "spread"),
+    [
+        ("rayleigh", 0.9, 4.85e-2, 0.015),
+        ("rayleigh", 0.2, 1.72e-3, 0.044),
+        ("petzold", 0.9, 6.99e-3, 0.063),
+        ("petzold", 0.2, 5.47e-5, 0.060),
+    ],
+)
+def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
+    """Mobley et al. 1993 (doi:10.1364/AO.32.007484), problems 1 and 2: upward radiance at the nadir, one attenuation
+    length down.
+
+    Rayleigh's and Petzold's phase functions, sun at 60 degrees, black sky; mean and relative spread of the models.
+    """
+    depth = 1.0
+    ratio = {"rayleigh": 0.5, "petzold": 0.01826}[phase]
+    water = {"attenuation": 1.0, "scattering": albedo, "backscattering": ratio * albedo, "phase": {"type": phase}}
+    scene = build(sun={"zenith_deg": 60.0}, water=water, integrator={"turn_share": 0.05 if ratio > 0.1 else 0.3})
     engine = scene.integrator()
     system, _ = engine.prepare_view(scene, scene.sensors()[0])
-    count, found = 2**14, []
+    count, found = 2**14 if ratio > 0.1 else 2**17, []
     for seed in range(8):
         path = start_path(system.receiver.pose, mi.Vector3f(0, 0, -1), dr.full(mi.Bool, True, count))
         path.point, path.in_water = mi.Point3f(0, 0, -depth), mi.Bool(True)
         weight = dr.full(mi.Float, 1 / count, count)
         engine.follow(system, path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
         found.append([float(engine.found[0])])
-    assert agrees(np.array(found), expected, 2, bias=spread) < 0.01
+    assert agrees(np.array(found), expected, 4, bias=spread) < 0.03
 
 
 # (e) waves focus the sun
