@@ -16,12 +16,16 @@ _SMALLEST_EXPONENT = 1e-3
 #: s = sin^2(theta/2) of 2e-7 rad, below which float32 directions are the same.
 _SMALLEST_S = 1e-14
 
+#: Spacing of the nodes in ln s, change of ln p from node to node, and first node, up to which a series takes the place
+#: of logarithm and exponential and the cap below the first node (2 microradian) is even: both are exact to float32.
+_SHORT_STEP, _SMALL_CHANGE, _SMALL_CAP = 0.02, 0.2, 1.1e-12
+
 
 class TabulatedPhase:
     """Evaluates and samples phase functions given as power laws in s = sin^2(theta/2).
 
     A segment is picked by Walker's alias method (two look-ups, whatever the size of the table), and s within it by the
-    closed-form inverse of its power law, so that samples keep their accuracy in the forward peak.
+    inverse of its power law, so that samples keep their accuracy in the forward peak.
 
     Parameters
     ----------
@@ -37,7 +41,8 @@ class TabulatedPhase:
         self._log_s0 = float(self.table.log_s0)
         self._step = float(self.table.step)
         self._nodes = self.table.count
-        records = [_records(table) for table in tables]
+        self._short = all(_is_short(table) for table in tables)
+        records = [_records(table, self._short) for table in tables]
         # Of each cell: threshold and alias, the power law as sampled, and as evaluated. Packets are read at once.
         self._choice, self._law, self._value = (
             mi.Float(np.concatenate([record[i] for record in records]).ravel()) for i in range(3)
@@ -61,7 +66,10 @@ class TabulatedPhase:
         fraction = scaled - mi.Float(cell) + v * (self._nodes * 2**-24)
         accept, alias = dr.gather(mi.Vector2f, self._choice, cell + number * self._nodes)
         cell = dr.select(fraction < accept, cell, mi.UInt32(alias))
-        start, value, growth, inverse_k = dr.gather(mi.Vector4f, self._law, cell + number * self._nodes)
+        law = dr.gather(mi.Vector4f, self._law, cell + number * self._nodes)
+        if self._short:
+            return _within_short_segment(law, v, self._step)
+        start, value, growth, inverse_k = law
         # From the start of the cell s grows by `part` to the power of 1/k = 1/(1-m), and so p = s^-m by part/s.
         part = dr.maximum(dr.fma(v, growth, 1), 1e-30)
         beyond = dr.exp(dr.log(part) * inverse_k)
@@ -96,17 +104,46 @@ class NumberedPhase:
         return wo, mi.Spectrum(1), value
 
 
-def _records(table: PowerLawTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (threshold, alias), (s, p, growth, 1/k) and (exponent, ln p) of each segment and, last, of the cap."""
+def _is_short(table: PowerLawTable) -> bool:
+    """Return whether s and p change so little over each segment that a series serves for its power law."""
+    change = float(np.abs(table.exponent[:-1]).max()) * table.step
+    return table.step <= _SHORT_STEP and change <= _SMALL_CHANGE and np.exp(table.log_s0) <= _SMALL_CAP
+
+
+def _within_short_segment(law: mi.Vector4f, v: mi.Float, step: float) -> tuple[mi.Float, mi.Float]:
+    """Map a uniform number to s and p of a cell, given its start, its p there, k = 1 - m and whether it is the cap.
+
+    ln s grows by y = ln(1 + v (e^x - 1)) / k with x = k step, here to the third power of x in units of the step.
+    """
+    start, value, k, cap = law
+    x = k * step
+    y = step * v * dr.fma(0.5 * x * (1 - v), dr.fma(x, (1 - 2 * v) * (1 / 3), 1), 1)
+    z = (k - 1) * y
+    beyond = dr.fma(y, dr.fma(y, dr.fma(y, 1 / 6, 1 / 2), 1), 1)
+    fall = dr.fma(z, dr.fma(z, dr.fma(z, dr.fma(z, dr.fma(z, 1 / 120, 1 / 24), 1 / 6), 1 / 2), 1), 1)
+    even = cap > 0
+    return dr.minimum(start * dr.select(even, v, beyond), 1), value * dr.select(even, 1, fall)
+
+
+def _records(table: PowerLawTable, short: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (threshold, alias), the law as sampled, and (exponent, ln p) of each segment and, last, of the cap.
+
+    The law is (s, p, k, whether it is the cap) of short segments, and (s, p, growth, 1/k) otherwise.
+    """
     segments = table.count - 1
+    start = np.exp(table.log_s0 + table.step * np.append(np.arange(segments), 0))
+    choice = np.column_stack(_alias_table(np.append(np.diff(table.cdf), table.cdf[0])))
+    if short:
+        exponent = np.append(table.exponent[:segments], 0.0)
+        value = np.append(table.value[:segments], table.cdf[0] / (4 * np.pi * start[0]))
+        law = np.column_stack([start, value, 1 - exponent, np.arange(table.count) == segments])
+        return choice, law, np.column_stack([exponent, np.log(value)])
     exponent = np.append(table.exponent[:segments], table.cap_exponent)
     k = 1 - exponent
     k = np.where(np.abs(k) < _SMALLEST_EXPONENT, _SMALLEST_EXPONENT, k)
     # Growth of s^k over a segment; the cap goes from s_0 down to 0, with growth -1.
     growth = np.append(np.expm1(k[:segments] * table.step), -1.0)
-    start = np.exp(table.log_s0 + table.step * np.append(np.arange(segments), 0))
     value = np.append(table.value[:segments], table.value[0])
-    choice = np.column_stack(_alias_table(np.append(np.diff(table.cdf), table.cdf[0])))
     return choice, np.column_stack([start, value, growth, 1 / k]), np.column_stack([exponent, np.log(value)])
 
 

@@ -6,6 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.transport import phase
+
 FRAME_WI = np.array([0.48, -0.6, 0.64])
 
 #: Fournier-Forand family by bb/b: mean cosine, p(90 degrees) and p(180 degrees) of the closed form. The mean cosine is
@@ -110,3 +112,35 @@ def test_weight_outside_the_forward_lobe_is_the_backward_one():
     forward, backward = value(plugin, np.array([0.0, np.pi]))
     assert backward == pytest.approx(1.7 / (4 * np.pi * 0.3**2), rel=1e-3)
     assert forward == pytest.approx(0.3 / (4 * np.pi * 1.7**2), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        {"type": "fournier_forand", "backscatter_ratio": 0.005},
+        {"type": "fournier_forand", "backscatter_ratio": 0.0183},
+        {"type": "petzold", "water": "clear"},
+        {"type": "sea_water"},
+    ],
+)
+def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monkeypatch):
+    """The series against logarithm and exponential, whose own rounding grows where an exponent is close to 1."""
+    series = mi.load_dict(description).tabulated
+    assert series._short
+    monkeypatch.setattr(phase, "_is_short", lambda table: False)
+    law = phase.TabulatedPhase(series.table)
+    count = 2**20
+    rng = mi.PCG32(count, initstate=3)
+    u, v = rng.next_float32(), rng.next_float32()
+    s, value = (np.array(x, dtype=np.float64) for x in series.sample(u, v))
+    s_law, value_law = (np.array(x, dtype=np.float64) for x in law.sample(u, v))
+    inside = s_law > 1.01e-12
+    np.testing.assert_allclose(s[inside], s_law[inside], rtol=1e-4)
+    np.testing.assert_allclose(value[inside], value_law[inside], rtol=2e-4)
+    assert np.median(np.abs(s[inside] / s_law[inside] - 1)) < 5e-7
+    # What is drawn has the density that is asked for, in the cap, too: but for the rounding of ln s.
+    found = np.array(series.eval(mi.Float(s)), dtype=np.float64)
+    within = np.abs(np.log(np.maximum(s, 1e-300) / 1e-12)) > 1e-5
+    np.testing.assert_allclose(found[within], value[within], rtol=3e-5)
+    below = np.mean(s < 1e-12)
+    assert abs(below - series.table.cdf[0]) < 4.5 * np.sqrt(series.table.cdf[0] / count) + 1e-9
