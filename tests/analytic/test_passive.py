@@ -266,7 +266,7 @@ def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, v
     ]
     # Without the glint.
     leaving = passes(seen[0], 12) - passes(seen[1], 4).mean()
-    assert agrees(leaving, float(expected), 12, bias=spread) < 0.01
+    assert agrees(leaving, float(expected), 12, bias=spread) < 0.02
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
         weight = dr.full(mi.Float, 1 / count, count)
         engine.follow(system, path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
         found.append([float(engine.found[0])])
-    assert agrees(np.array(found), expected, 4, bias=spread) < 0.03
+    assert agrees(np.array(found), expected, 4, bias=spread) < 0.05
 
 
 # (e) waves focus the sun
