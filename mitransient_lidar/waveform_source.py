@@ -233,7 +233,7 @@ def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
     replaced = {"signal": signal.copy(data=logarithm.expand(signal.values))}
     if "signal_deviation" in dataset:
         deviation = dataset["signal_deviation"]
-        mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean("shot")
+        mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean({"shot"} & set(signal.dims))
         replaced["signal_deviation"] = deviation * logarithm.expansion(mean.transpose(*deviation.dims).values)
     return dataset.assign(replaced)
 

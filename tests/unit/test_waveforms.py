@@ -193,6 +193,15 @@ def test_a_logarithm_is_undone_before_anything_is_measured():
     assert (low["flags"].sel(echo="surface") & EchoFlag.SATURATED == 0).all()
 
 
+def test_a_logarithm_is_undone_for_a_single_record():
+    """A record without the dimension shot, and without the mean that its deviation belongs to."""
+    clean = np.maximum(np.stack([waveform()]), 0)
+    shots = detect_waveforms(result(0.03 * clean), "pmt_log", 2, 3)
+    both = waveforms.extract(shots)
+    one = waveforms.extract(shots.isel(shot=0, drop=True).drop_vars("signal_mean"))
+    np.testing.assert_allclose(one["energy"], both["energy"].isel(shot=0), rtol=0.02)
+
+
 def test_a_logarithm_needs_both_its_numbers():
     shots = recorded(np.stack([waveform()]), 2, 0.01)
     shots.attrs["receiver.logarithm.knee_v"] = 1e-3
