@@ -20,7 +20,7 @@ from mitransient_lidar.optics.checks import in_range, non_negative, whole
 from mitransient_lidar.optics.detectors import LinearDetector
 from mitransient_lidar.optics.receivers import RECEIVERS, ReceiverChain
 from mitransient_lidar.optics.water import C0
-from mitransient_lidar.target_signal import target_signal
+from mitransient_lidar.target_signal import find_target, target_signal
 
 _LOG = logging.getLogger(__name__)
 
@@ -122,6 +122,9 @@ def detect(
     if clutter and known.get("spectrum") == "flat":
         raise UserError("clutter needs waves: spectrum = flat makes every sea the same")
     system = _System.of(loaded, integrator, chain)
+    for depth in depths:
+        # Before anything is rendered.
+        find_target(load_scene(scene, {**(params or {}), "target_depth": depth})[0], target)
     places: list[float | None] = [None, *depths]
     experiments: list[Experiment] = []
     first: list[xr.Dataset] = []

@@ -184,16 +184,28 @@ def target_map(
     return maps.assign_coords(target_x=places[0], target_y=places[1])
 
 
-def _without(scene: mi.Scene, target: str) -> mi.Scene:
-    """Return a scene without one of its shapes; all else is shared."""
+def find_target(scene: mi.Scene, target: str) -> mi.Shape:
+    """Return the shape of a scene that is its target.
+
+    Raises
+    ------
+    UserError
+        When there is no such shape, or it is the sea, or wholly above the sea or below the bottom.
+    """
     shapes = list(scene.shapes())
     names = [shape.id() for shape in shapes]
     if target not in names:
         raise UserError(f"target = {target!r} must be the id of a shape of the scene: {', '.join(names)}")
-    gone = shapes[names.index(target)]
-    if gone.is_medium_transition():
+    found = shapes[names.index(target)]
+    if found.is_medium_transition():
         raise UserError(f"target = {target!r} must not be the sea surface")
-    _check_place(gone, [shape for shape in shapes if shape is not gone])
+    _check_place(found, [shape for shape in shapes if shape is not found])
+    return found
+
+
+def _without(scene: mi.Scene, target: str) -> mi.Scene:
+    """Return a scene without one of its shapes; all else is shared."""
+    shapes, gone = list(scene.shapes()), find_target(scene, target)
     parts: dict[str, Any] = {"type": "scene", "integrator": scene.integrator()}
     parts |= {f"sensor_{i}": sensor for i, sensor in enumerate(scene.sensors())}
     parts |= {f"emitter_{i}": emitter for i, emitter in enumerate(scene.emitters())}

@@ -273,6 +273,7 @@ def test_mistakes_end_with_one_sentence(arguments, message):
 @pytest.mark.parametrize(
     ("scene", "params", "options", "message"),
     [
+        ("fig13_2x2", {}, {"depths": (8, 14), "progress": pytest.fail}, r"below the bottom, up to z = -14 m"),
         ("fig13_2x2", {}, {"depths": (8, 4)}, r"depths = \[8, 4\] must be above 0 m and increase"),
         ("fig09_2x2", {}, {"depths": (4, 8)}, "scene fig09_2x2 has no parameter target_depth, which depths needs"),
         ("fig13_2x2", {"spectrum": "flat"}, {"clutter": 4}, "clutter needs waves"),
