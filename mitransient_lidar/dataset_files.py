@@ -18,6 +18,21 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"  #: The first eight bytes of every NetCDF-
 _LISTS = "mitransient_lidar_lists"  # NetCDF attribute that names the attributes to read back as lists
 
 
+def read_signature(path: str | os.PathLike[str]) -> bytes:
+    """Return the first eight bytes of a file, which tell its kind.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(len(HDF5_SIGNATURE))
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+
+
 def describe_coordinates(dataset: xr.Dataset) -> dict[str, Any]:
     """Return the coordinates of a dataset in the kinds that JSON holds, for `coordinates`."""
     return {

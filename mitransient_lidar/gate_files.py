@@ -160,11 +160,7 @@ def open_stack(path: str | os.PathLike[str]) -> xr.Dataset:
     path = Path(path)
     if path.is_dir():
         path = _first_of_folder(path)
-    try:
-        with path.open("rb") as file:
-            signature = file.read(8)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    signature = dataset_files.read_signature(path)
     if signature.startswith(exr.SIGNATURE):
         return _read_exr(path)
     if signature == dataset_files.HDF5_SIGNATURE:

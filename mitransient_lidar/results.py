@@ -240,11 +240,7 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
         If the file is missing, damaged, truncated, or not a result of this package.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            signature = file.read(8)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    signature = dataset_files.read_signature(path)
     if signature.startswith(exr.SIGNATURE):
         return _read_exr(path)
     if signature == dataset_files.HDF5_SIGNATURE:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,12 +43,7 @@ def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
     UserError
         If the file is missing or damaged, or holds neither.
     """
-    try:
-        with Path(path).open("rb") as file:
-            signature = file.read(len(dataset_files.HDF5_SIGNATURE))
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
-    if signature != dataset_files.HDF5_SIGNATURE:
+    if dataset_files.read_signature(path) != dataset_files.HDF5_SIGNATURE:
         return results.open(path)
     try:
         dataset = dataset_files.read_netcdf(path)

@@ -61,3 +61,13 @@ def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
         bad = array[~np.isfinite(array)][0]
         raise ValueError(f"{name} holds {bad} but every value must be finite")
     return array
+
+
+def samples(times_ns: npt.ArrayLike, name: str, values: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return strictly increasing times and as many values at them, two or more."""
+    t, v = finite_array("times_ns", times_ns), finite_array(name, values)
+    if t.ndim != 1 or t.size < 2 or t.shape != v.shape:
+        raise ValueError(f"times_ns of shape {t.shape} and {name} of shape {v.shape} must be equal lists of 2 or more")
+    if np.any(np.diff(t) <= 0):
+        raise ValueError("times_ns must increase strictly")
+    return t, v

@@ -8,7 +8,7 @@ from os import PathLike
 import numpy as np
 import numpy.typing as npt
 
-from .checks import FloatArray, finite_array, non_negative, positive
+from .checks import FloatArray, non_negative, positive, samples
 from .columns import read_two_columns
 
 #: Length of a whole raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
@@ -99,13 +99,7 @@ class GateShape:
         ValueError
             If the samples do not have this form.
         """
-        t, g = finite_array("times_ns", times_ns), finite_array("transmission", transmission)
-        if t.ndim != 1 or t.size < 2 or t.shape != g.shape:
-            raise ValueError(
-                f"times_ns of shape {t.shape} and transmission of shape {g.shape} must be equal lists of 2 or more"
-            )
-        if np.any(np.diff(t) <= 0):
-            raise ValueError("times_ns must increase strictly")
+        t, g = samples(times_ns, "transmission", transmission)
         if g.min() < 0 or g.max() > 1:
             bad = g.min() if g.min() < 0 else g.max()
             raise ValueError(f"transmission = {bad:g} must lie between 0 and 1")

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from .checks import FloatArray, finite_array, non_negative, positive
+from .checks import FloatArray, non_negative, positive, samples
 from .columns import read_two_columns
 
 FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
@@ -64,13 +64,7 @@ class Pulse:
         ValueError
             If the samples do not have this form.
         """
-        t, p = finite_array("times_ns", times_ns), finite_array("power", power)
-        if t.ndim != 1 or t.size < 2 or t.shape != p.shape:
-            raise ValueError(
-                f"times_ns of shape {t.shape} and power of shape {p.shape} must be equal lists of 2 or more"
-            )
-        if np.any(np.diff(t) <= 0):
-            raise ValueError("times_ns must increase strictly")
+        t, p = samples(times_ns, "power", power)
         if np.any(p < 0):
             raise ValueError(f"power = {p.min():g} must not be negative")
         area = np.sum(np.diff(t) * (p[1:] + p[:-1]) / 2)
