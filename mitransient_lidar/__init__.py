@@ -25,8 +25,8 @@ if importlib.util.find_spec("mitransient_lidar.plugins") is None:
     # Run from the repository root, this folder shadows the installed package; plugins/ and scenes/ lie beside it.
     __path__.append(str(Path(__file__).resolve().parent.parent))
 
-from mitransient_lidar import variants as _variants
-from mitransient_lidar.errors import UserError as _UserError
+from mitransient_lidar.core.errors import UserError as _UserError
+from mitransient_lidar.loading import variants as _variants
 
 _variants.prepare_llvm()
 
@@ -50,14 +50,14 @@ __all__ = ["__version__", "open", "render"]
 
 
 def render(scene: Any, **options: Any) -> xarray.Dataset:
-    """Render a lidar scene to an accuracy; see :func:`mitransient_lidar.rendering.render`."""
-    from mitransient_lidar.rendering import render as render_scene
+    """Render a lidar scene to an accuracy; see :func:`mitransient_lidar.rendering.render.render`."""
+    from mitransient_lidar.rendering.render import render as render_scene
 
     return render_scene(scene, **options)
 
 
 def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect
-    """Read a result from an EXR stack or a NetCDF file; see :func:`mitransient_lidar.results.open`."""
-    from mitransient_lidar.results import open as open_result
+    """Read a result from an EXR stack or a NetCDF file; see :func:`mitransient_lidar.results.dataset.open`."""
+    from mitransient_lidar.results.dataset import open as open_result
 
     return open_result(path)

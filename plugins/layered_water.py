@@ -8,14 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import finite_array, in_range
-from mitransient_lidar.optics.water import WaterColumn
-from mitransient_lidar.profiles import read_profile
-from mitransient_lidar.transport.flight import LayeredFlight
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite_array, in_range
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.profiles import read_profile
+from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
+from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.free_flight import LayeredFlight
+from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.medium.water_phases import KINDS, ScattererPhases, phases_of_layers
 from mitransient_lidar.transport.path import Path
-from mitransient_lidar.transport.plume import BubblePlume
-from mitransient_lidar.transport.strata import Strata
-from mitransient_lidar.transport.water_phases import KINDS, ScattererPhases, phases_of_layers
 
 #: Upper edges [m], attenuation, scattering and backscattering [1/m] unless they are given.
 _DEFAULTS = ("0", 0.3, 0.15, 0.006)
@@ -27,16 +29,16 @@ class LayeredWater(mi.Medium):
     =======================  ======  ===================================================================================
     Parameter                Type    Meaning
     =======================  ======  ===================================================================================
-    tops                     string  Depth of each layer's upper edge [m], first 0, increasing: ``0, 3``. Default: ``0``
+    layer_tops               string  Depth of each layer's upper edge [m], first 0, increasing: ``0, 3``. Default: ``0``
     attenuation              string  Beam attenuation c of each layer [1/m], or one value for all. Default: 0.3
     scattering               string  Scattering b [1/m], at most c. Default: 0.15
     backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
     profile                  string  A file instead of the four above: .csv or .nc with ``depth`` [m], two of ``a``,
-                                     ``b``, ``c``, ``omega``, and ``bb`` or ``bb_ratio`` (`mitransient_lidar.profiles`)
+                                     ``b``, ``c``, ``omega``, and ``bb`` or ``bb_ratio`` (`physics.water.profiles`)
     profile_tolerance        float   How far the layers that stand for the profile may be from it, relative, 1e-5 to
                                      0.5. Default: 0.01
-    phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``.
-                                     Default: ``fournier_forand``
+    phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``. Default:
+                                     ``fournier_forand``
     phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
     water_scattering         string  What the water itself scatters, part of b [1/m], each layer or all; mixed with the
                                      particles. 0.0022 is sea water at 532 nm. Default: 0, in the phase function already
@@ -69,7 +71,7 @@ class LayeredWater(mi.Medium):
     .. code-block:: xml
 
         <medium type="layered_water" name="interior">
-            <string name="tops" value="0, 3"/>
+            <string name="layer_tops" value="0, 3"/>
             <string name="attenuation" value="0.9, 0.5"/>
             <string name="scattering" value="0.7, 0.35"/>
             <string name="backscattering" value="0.014, 0.007"/>
@@ -95,7 +97,7 @@ class LayeredWater(mi.Medium):
         kind = props.get("phase_function", "fournier_forand")
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
         if kind not in KINDS:
-            raise ValueError(f"phase_function = {kind!r} must be one of {', '.join(KINDS)}")
+            raise UserError(f"phase_function = {kind!r} must be one of {', '.join(KINDS)}")
         #: Bubbles, if there are any, and their phase function.
         self.plume = BubblePlume.from_properties(props)
         ratio = in_range("plume_backscatter_ratio", props.get("plume_backscatter_ratio", 0.02), 1e-4, 0.4)
@@ -106,11 +108,18 @@ class LayeredWater(mi.Medium):
         for name in list(phases)[1:]:
             del props[name]
         water_scattering = _water_scattering(props.get("water_scattering", 0.0), self.column)
-        of_layers = phases_of_layers(self.column, phases, kind, phase_g, water_scattering)
+        of_layers = phases_of_layers(
+            self.column,
+            phases,
+            kind,
+            phase_g,
+            water_scattering,
+            lambda table: TabulatedPhaseFunction(mi.Properties(), table),
+        )
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
         #: Runs of layers of one refractive and one group index.
-        self.strata = Strata(self.column.tops, *(values[kept] for values in indices))
+        self.index_layers = IndexLayers(self.column.layer_tops, *(values[kept] for values in indices))
         #: Indices of the uppermost layer, where the sea surface is.
         self.refractive_index, self.group_index = (float(values[0]) for values in indices)
         if self.plume is not None:
@@ -125,7 +134,7 @@ class LayeredWater(mi.Medium):
         self.flight = LayeredFlight(self.column)
         self.scattering_flight = LayeredFlight(replace(self.column, attenuation=self.column.scattering))
         none = np.zeros(self.column.count)
-        self.absorption_flight = LayeredFlight(WaterColumn(self.column.tops, self.column.absorption, none, none))
+        self.absorption_flight = LayeredFlight(WaterColumn(self.column.layer_tops, self.column.absorption, none, none))
         self._majorant = float(np.max(self.column.attenuation)) + (self.plume.scattering if self.plume else 0)
         self.m_is_homogeneous = self.column.count == 1 and self.plume is None
         self.m_has_spectral_extinction = False
@@ -203,12 +212,12 @@ def _column(props: mi.Properties) -> WaterColumn:
     """Return the layers that the parameters describe, or those of a profile."""
     path = props.get("profile", "")
     tolerance = props.get("profile_tolerance", 0.01)
-    names = ("tops", "attenuation", "scattering", "backscattering")
+    names = ("layer_tops", "attenuation", "scattering", "backscattering")
     if not path:
         return WaterColumn.from_text(*(props.get(name, value) for name, value in zip(names, _DEFAULTS, strict=True)))
     given = [name for name in names if name in props]
     if given:
-        raise ValueError(f"profile = {path!r} says {', '.join(given)}, too: give either")
+        raise UserError(f"profile = {path!r} says {', '.join(given)}, too: give either")
     return read_profile(path).layers(tolerance)
 
 
@@ -220,14 +229,14 @@ def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn,
     rows = np.array([column.attenuation, column.scattering, column.backscattering, *others])
     kept = np.append(0, 1 + np.flatnonzero(np.any(np.diff(rows, axis=1) != 0, axis=0)))
     coefficients = (column.attenuation, column.scattering, column.backscattering)
-    return WaterColumn(column.tops[kept], *(values[kept] for values in coefficients)), kept
+    return WaterColumn(column.layer_tops[kept], *(values[kept] for values in coefficients)), kept
 
 
 def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
     """Return one value a layer of what is given for all or for each."""
     values = np.atleast_1d(finite_array(name, given.replace(",", " ").split() if isinstance(given, str) else given))
     if values.size not in (1, count):
-        raise ValueError(f"{name} has {values.size} values but must have 1 or {count}, one a layer")
+        raise UserError(f"{name} has {values.size} values but must have 1 or {count}, one a layer")
     return np.broadcast_to(values, count)
 
 
@@ -235,7 +244,7 @@ def _water_scattering(given: float | str, column: WaterColumn) -> np.ndarray:
     """Return what the water itself scatters [1/m], one value a layer."""
     water = _per_layer("water_scattering", given, column.count)
     for layer in np.flatnonzero((water < 0) | (water > column.scattering))[:1]:
-        raise ValueError(
+        raise UserError(
             f"water_scattering = {water[layer]:g} must be at least 0 and at most scattering = "
             f"{column.scattering[layer]:g}, in layer {layer}"
         )

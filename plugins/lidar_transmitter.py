@@ -6,11 +6,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import finite, in_range, positive
-from mitransient_lidar.optics.pulse import Pulse
-from mitransient_lidar.transport.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
-from mitransient_lidar.transport.images import read_image
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.sensor.image_sampling import read_image
 
 #: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian.
 _WIDTHS = {
@@ -25,12 +26,12 @@ _PROFILES = ("gaussian", "top_hat", "image")
 class LidarTransmitter(mi.Emitter):
     r"""Pulsed laser transmitter (``lidar_transmitter``).
 
-    ======================  =========  ==============================================================================
+    ======================  =========  =================================================================================
     Parameter               Type       Meaning
-    ======================  =========  ==============================================================================
+    ======================  =========  =================================================================================
     altitude                float      Height above the mean sea level [m], positive. Default: 200
     off_nadir_deg           float      Angle of the axis from the vertical, towards +x [deg], 0 to 89.9. Default: 20
-    shot_x, shot_y          float      Where the axis meets the mean sea level [m]. Default: 0
+    aim_x, aim_y            float      Where the axis meets the mean sea level [m]. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], positive. Default: 5
     optical_efficiency      float      Share of that energy which leaves the optics, above 0 to 1. Default: 0.9
@@ -38,29 +39,30 @@ class LidarTransmitter(mi.Emitter):
     divergence_mrad         float      Full angle [mrad] between the points where the irradiance of a Gaussian beam has
                                        fallen to e^-1/2 of its peak (its sigma is half of it); the full angle of a
                                        top-hat beam. Positive. Default: 10
-    divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak
-    divergence_1e2_mrad                (Gaussian only); give one of the three
-    divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along gx,
-                                       this the one along gy. Positive. Default: ``divergence_mrad``
-    ellipse_deg             float      Turns the ellipse: azimuth of the axis of ``divergence_mrad``, from +gx (far)
-                                       towards +gy [deg]. Default: 0
+    divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak (Gaussian
+    divergence_1e2_mrad                only); give one of the three
+    divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along
+                                       angle_x, this the one along angle_y. Positive. Default: ``divergence_mrad``
+    ellipse_deg             float      Turns the ellipse: azimuth of the axis of ``divergence_mrad``, from +angle_x
+                                       (far) towards +angle_y [deg]. Default: 0
     profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
-                                       image. Row 0 is the far edge (+gx), column 0 the -gy edge, the middle the axis
+                                       image. Row 0 is the far edge (+angle_x), column 0 the -angle_y edge, the middle
+                                       the axis
     profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
                                        positive; its cells are squares
     wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; kept with the result. Default: 532
     pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], positive. Default: 5
     pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit)
-    ======================  =========  ==============================================================================
+    ======================  =========  =================================================================================
 
     The beam leaves one point. Its energy per tangent-plane area is a Gaussian
 
     .. math:: g(g_x, g_y) = \exp(-(g_x^2 + g_y^2) / 2\sigma^2) / (2 \pi \sigma^2)
 
-    (+gx is away from nadir, +gy along +y), with a sigma for each axis when it is elliptic; that of an image is even
-    within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\, dg_y`,
-    so that the beam's energy is exactly the pulse's. The pulse's shape enters when waveforms are formed, not in the
-    transport.
+    (+angle_x is away from nadir, +angle_y along +y), with a sigma for each axis when it is elliptic; that of an image
+    is even within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\,
+    dg_y`, so that the beam's energy is exactly the pulse's. The pulse's shape enters when waveforms are formed, not in
+    the transport.
 
     .. code-block:: xml
 
@@ -84,10 +86,7 @@ class LidarTransmitter(mi.Emitter):
         self.beam_profile = props.get("beam_profile", "gaussian")
         self.profile = _profile(props, self.beam_profile)
         if "pulse_file" in props:
-            try:
-                self.pulse = Pulse.from_file(props["pulse_file"])
-            except OSError as error:
-                raise ValueError(f"pulse_file = {props['pulse_file']!r} cannot be read: {error.strerror}") from error
+            self.pulse = Pulse.from_file(props["pulse_file"])
         else:
             self.pulse = Pulse.gaussian(positive("pulse_fwhm_ns", props.get("pulse_fwhm_ns", 5.0)))
         self.m_needs_sample_2 = False
@@ -118,14 +117,14 @@ class LidarTransmitter(mi.Emitter):
 
     def intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Return the radiant intensity [J/sr] in a unit direction of the world."""
-        gx, gy, cos_axis = self.pose.tangent(direction)
+        angle_x, angle_y, cos_axis = self.pose.tangent(direction)
         # d(omega) = cos^3 dg: the tangent-plane density is divided by that.
-        density = self.tangent_density(gx, gy) / (cos_axis * cos_axis * cos_axis)
+        density = self.tangent_density(angle_x, angle_y) / (cos_axis * cos_axis * cos_axis)
         return dr.select(cos_axis > 0, self.energy * density, 0)
 
-    def tangent_density(self, gx: mi.Float, gy: mi.Float) -> mi.Float:
+    def tangent_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
-        return self.profile.density(gx, gy)
+        return self.profile.density(angle_x, angle_y)
 
     def sample_tangent(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers in the unit square to tangent-plane points distributed as the beam's energy."""
@@ -185,24 +184,24 @@ class LidarTransmitter(mi.Emitter):
 def _profile(props: mi.Properties, kind: str) -> BeamProfile:
     """Build the beam's shape from the plugin's parameters."""
     if kind not in _PROFILES:
-        raise ValueError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
+        raise UserError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
     ellipse = [*_WIDTHS, "divergence_across_mrad", "ellipse_deg"]
     for name in ellipse if kind == "image" else ("profile_file", "profile_mrad"):
         if name in props:
-            raise ValueError(f"{name} does not go with beam_profile = {kind!r}")
+            raise UserError(f"{name} does not go with beam_profile = {kind!r}")
     if kind == "image":
         for name in ("profile_file", "profile_mrad"):
             if name not in props:
-                raise ValueError(f"{name} is missing: beam_profile = 'image' needs it")
+                raise UserError(f"{name} is missing: beam_profile = 'image' needs it")
         image = read_image("profile_file", props["profile_file"])
         return ImageBeam(image, 1e-3 * _angle("profile_mrad", props["profile_mrad"]))
     along = across = 0.5 * _divergence(props, kind)
     if "divergence_across_mrad" in props:
         if any(name in props for name in _WIDTHS if name != "divergence_mrad"):
-            raise ValueError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
+            raise UserError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
         across = 0.5e-3 * _angle("divergence_across_mrad", props["divergence_across_mrad"])
     elif "ellipse_deg" in props:
-        raise ValueError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
+        raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
     turn = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
     return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, turn)
 
@@ -211,10 +210,10 @@ def _divergence(props: mi.Properties, profile: str) -> float:
     """Return the beam's divergence [rad] as the project defines it, from whichever definition was given."""
     given = [name for name in _WIDTHS if name in props]
     if len(given) > 1:
-        raise ValueError(f"lidar_transmitter: give one of {' and '.join(given)}, not both")
+        raise UserError(f"lidar_transmitter: give one of {' and '.join(given)}, not both")
     name = given[0] if given else "divergence_mrad"
     if profile == "top_hat" and name != "divergence_mrad":
-        raise ValueError(f"{name} describes a Gaussian beam; a top-hat beam takes divergence_mrad, its full angle")
+        raise UserError(f"{name} describes a Gaussian beam; a top-hat beam takes divergence_mrad, its full angle")
     return 1e-3 * _angle(name, props.get(name, 10.0)) / _WIDTHS[name]
 
 

@@ -4,64 +4,65 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitransient_lidar.optics.checks import in_range, positive
-from mitransient_lidar.transport.blur import Blur
-from mitransient_lidar.transport.hexagons import HexagonPixels
-from mitransient_lidar.transport.pixel_maps import MappedPixels
-from mitransient_lidar.transport.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import in_range, positive
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.receiving import Receiver, ReceiverOptics
+from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
+from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
+from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
+from mitransient_lidar.transport.sensor.point_spread import PointSpread
+from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
 
 class MultipixelReceiver(mi.Sensor):
     r"""Receiver with one, four or a hundred thousand pixels (``multipixel_receiver``).
 
-    ==================================  =========  ==================================================================
-    Parameter                           Type       Meaning
-    ==================================  =========  ==================================================================
-    layout                              string     ``1x1``, ``2x2``, ``1x4`` or ``RxC``: the field of view cut into
-                                                   R rows along range (row 0 is the far edge) and C columns (column 0
-                                                   is the -gy edge). ``1x4`` is the published receiver of four strips
-                                                   across range, the same as ``4x1``. ``hexN``, with N = 1, 7, 19,
-                                                   37, ... up to 2^20: a hexagon and whole rings of hexagons around it,
-                                                   in rows along gy. Default: ``2x2``
-    fill_factor                         float      Share of each cell or hexagon of a layout that receives light, 0.01
-                                                   to 1; the gaps receive none. Default: 1
-    imager                              boolean    Keep rows and columns apart in the result, (row, column, time)
-                                                   instead of (pixel, time). Default: true above 16 pixels of ``RxC``
-    pixel_map                           string     Instead of layout: image file (.png, .npy or .exr, one channel) of
-                                                   labels over a square field of view, whole numbers from 0 to 2^24.
-                                                   Row 0 is the far edge, column 0 the -gy edge. Each label is a pixel,
-                                                   in the order of labels and named ``label1``, ...; 0 is no pixel
-    field_of_view_mrad                  float      Full angle of the field of view [mrad], positive: diameter, side, or
-                                                   diameter of the circle that just holds the hexagons. Default: 30
-    field_of_view_shape                 string     ``circle`` or ``square``, for ``RxC``. Default: ``circle``, or
-                                                   ``square`` with a focal length
-    focal_length_mm, pixel_pitch_um     float      Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the
-                                                   lens and distance of square pixels on the detector, both positive.
-                                                   The field of view is then R by C times pitch over focal length, a
-                                                   rectangle (or, with ``circle`` and R = C, the circle within)
-    (nested)                            sensor     ``pixel_fov`` sensors instead of layout and field of view
-    blur_mrad                           float      Optical blur: standard deviation along each axis of a Gaussian
-                                                   point-spread function [mrad], 0 (sharp) to 1000. Default: 0
-    blur_file                           string     Instead: image file (as for ``pixel_map``) of a measured point-spread
-                                                   function in any unit, not negative; its middle is where sharp optics
-                                                   focus. Values are constant in each cell, and normalised
-    blur_file_mrad                      float      Angle over which that image reaches along its columns (gy) [mrad],
-                                                   above 0 to 1000; its cells are squares
-    aperture_area                       float      Area of the aperture [m^2], positive. Default: 0.025
-    obscuration                         float      Share of that area which is blocked, as by a secondary mirror, 0 to
-                                                   0.999. Default: 0
-    optical_efficiency                  float      Share of light that the optics pass, above 0 to 1. Default: 0.9
-    two_way_atmospheric_transmittance   float      Share of light that survives the air, both ways. Default: 0.9
-    response_time_ns                    float      Time constant of the exponential response [ns]. Default: 0
-    altitude, off_nadir_deg, shot_x,               Pose, as for ``lidar_transmitter``
-    shot_y, to_world
-    (nested)                            film       ``time_gated_film``
-    ==================================  =========  ==================================================================
+    =================================  =======  ========================================================================
+    Parameter                          Type     Meaning
+    =================================  =======  ========================================================================
+    layout                             string   ``1x1``, ``2x2``, ``1x4`` or ``RxC``: the field of view cut into R rows
+                                                along range (row 0 is the far edge) and C columns (column 0 is the
+                                                -angle_y edge). ``1x4`` is the published receiver of four strips across
+                                                range, the same as ``4x1``. ``hexN``, with N = 1, 7, 19, 37, ... up to
+                                                2^20: a hexagon and whole rings of hexagons around it, in rows along
+                                                angle_y. Default: ``2x2``
+    fill_factor                        float    Share of each cell or hexagon of a layout that receives light, 0.01 to
+                                                1; the gaps receive none. Default: 1
+    imager                             boolean  Keep rows and columns apart in the result, (row, column, time) instead
+                                                of (pixel, time). Default: true above 16 pixels of ``RxC``
+    pixel_map                          string   Instead of layout: image file (.png, .npy or .exr, one channel) of
+                                                labels over a square field of view, whole numbers from 0 to 2^24. Row 0
+                                                is the far edge, column 0 the -angle_y edge. Each label is a pixel, in
+                                                the order of labels and named ``label1``, ...; 0 is no pixel
+    field_of_view_mrad                 float    Full angle of the field of view [mrad], positive: diameter, side, or
+                                                diameter of the circle that just holds the hexagons. Default: 30
+    field_of_view_shape                string   ``circle`` or ``square``, for ``RxC``. Default: ``circle``, or
+                                                ``square`` with a focal length
+    focal_length_mm, pixel_pitch_um    float    Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the lens
+                                                and distance of square pixels on the detector, both positive. The field
+                                                of view is then R by C times pitch over focal length, a rectangle (or,
+                                                with ``circle`` and R = C, the circle within)
+    (nested)                           sensor   ``pixel_fov`` sensors instead of layout and field of view
+    blur_mrad                          float    Optical blur: standard deviation along each axis of a Gaussian
+                                                point-spread function [mrad], 0 (sharp) to 1000. Default: 0
+    blur_file                          string   Instead: image file (as for ``pixel_map``) of a measured point-spread
+                                                function in any unit, not negative; its middle is where sharp optics
+                                                focus. Values are constant in each cell, and normalised
+    blur_file_mrad                     float    Angle over which that image reaches along its columns (angle_y) [mrad],
+                                                above 0 to 1000; its cells are squares
+    aperture_area                      float    Area of the aperture [m^2], positive. Default: 0.025
+    obscuration                        float    Share of that area which is blocked, as by a secondary mirror, 0 to
+                                                0.999. Default: 0
+    optical_efficiency                 float    Share of light that the optics pass, above 0 to 1. Default: 0.9
+    two_way_atmospheric_transmittance  float    Share of light that survives the air, both ways. Default: 0.9
+    response_time_ns                   float    Time constant of the exponential response [ns]. Default: 0
+    altitude, off_nadir_deg, aim_x,             Pose, as for ``lidar_transmitter``
+    aim_y, to_world
+    (nested)                           film     ``time_gated_film``
+    =================================  =======  ========================================================================
 
-    Angles are tangent-plane coordinates about the optical axis: +gx is away from nadir ("far"), +gy is +y. Pixels
-    of a circular field of view that lie outside the circle exist and stay dark.
+    Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is +y.
+    Pixels of a circular field of view that lie outside the circle exist and stay dark.
 
     Paths are drawn over the whole field of view and then given to the pixel that they fall into, so more pixels cost
     nothing and the pixels of a layout sum to the single pixel of the same field of view path by path. So do those of a
@@ -71,8 +72,8 @@ class MultipixelReceiver(mi.Sensor):
     With a fill factor each cell of ``RxC`` shrinks about its centre, sides by the square root of the factor, and a
     circular field of view cuts the shrunk cells as a field stop does.
 
-    Blur moves light on the detector: what comes from the direction (gx, gy) is spread around that place by the
-    point-spread function, the same one all over the field of view, and what leaves the pixels is lost.
+    Blur moves light on the detector: what comes from the direction (angle_x, angle_y) is spread around that
+    place by the point-spread function, the same one all over the field of view, and what leaves the pixels is lost.
 
     .. code-block:: xml
 
@@ -93,7 +94,10 @@ class MultipixelReceiver(mi.Sensor):
         super().__init__(props)
         pixels = _nested_pixels(props, nested) if nested else _own_pixels(props)
         self.receiver = Receiver(
-            Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels, Blur.from_properties(props)
+            Pose.from_properties(props),
+            ReceiverOptics.from_properties(props),
+            pixels,
+            PointSpread.from_properties(props),
         )
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None
@@ -128,9 +132,9 @@ def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
     """Build the pixels from nested sensors."""
     for name in _OWN:
         if name in props:
-            raise ValueError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
+            raise UserError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
     if not all(hasattr(pixel, "field") for pixel in nested):
-        raise ValueError("multipixel_receiver: nested sensors must be pixel_fov")
+        raise UserError("multipixel_receiver: nested sensors must be pixel_fov")
     names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
     return ShapedPixels([pixel.field for pixel in nested], names)
 
@@ -141,7 +145,7 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
     def only_for(kind: str, *names: str) -> None:
         for name in names:
             if name in props:
-                raise ValueError(f"{name} = {props[name]!r} is for {kind}: leave it out")
+                raise UserError(f"{name} = {props[name]!r} is for {kind}: leave it out")
 
     field_of_view = 1e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
     if "pixel_map" in props:
@@ -151,7 +155,7 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
     fill_factor = in_range("fill_factor", props.get("fill_factor", 1.0), 0.01, 1.0)
     if layout.startswith("hex"):
         only_for("layouts of rows x columns", "field_of_view_shape", "imager", *_LENS)
-        return HexagonPixels(layout, field_of_view, fill_factor)
+        return HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
         only_for("receivers without a focal length", "field_of_view_mrad")
         sides, shape = _sides_of_lens(props, layout), "square"
@@ -161,10 +165,10 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
 
 
 def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:
-    """Return the sides (gx, gy) [rad] of the field of view of a detector behind a lens."""
+    """Return the sides (angle_x, angle_y) [rad] of the field of view of a detector behind a lens."""
     for name in _LENS:
         if name not in props:
-            raise ValueError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
+            raise UserError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
     focal_length, pitch = (positive(name, props[name]) for name in _LENS)
     rows, columns = parse_layout(layout)
     return 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns

@@ -5,39 +5,41 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import finite, finite_array, in_range, positive
-from mitransient_lidar.transport.blur import Blur
-from mitransient_lidar.transport.fields import Field, Polygon, Rectangle, Sector, Strip
-from mitransient_lidar.transport.pixels import ShapedPixels
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite, finite_array, in_range, positive
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.receiving import Receiver, ReceiverOptics
+from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
+from mitransient_lidar.transport.sensor.pixels import ShapedPixels
+from mitransient_lidar.transport.sensor.point_spread import PointSpread
+from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
 
 class PixelFov(mi.Sensor):
     r"""Field of view of one pixel (``pixel_fov``).
 
-    ====================  ========  ==================================================================================
-    Parameter             Type      Meaning (angles are full angles or positions in the tangent plane about the axis)
-    ====================  ========  ==================================================================================
-    shape                 string    ``circle``, ``ring``, ``sector``, ``rectangle``, ``strip`` or ``polygon``.
-                                    Default: ``circle``
-    field_of_view_mrad    float     Full angle of the circle, ring, sector, or of the circle that a strip is cut from
-                                    [mrad], positive. Default: 30
-    inner_mrad            float     ring, sector: full angle of the hole [mrad]. Default: 0
-    start_deg,            float     sector: first azimuth, from +gx (far) towards +gy [deg], and size [deg], up to 360.
-    extent_deg                      Defaults: 0, 360
-    width_mrad,           float     rectangle: full angle along gy and along gx [mrad], positive. Defaults: 15, 15
-    height_mrad
-    gx_min_mrad,          float     strip: the part of the circle between these gx [mrad]
-    gx_max_mrad
-    gx_mrad, gy_mrad      float     circle, ring, sector, rectangle: centre [mrad]. Default: 0
-    vertices_mrad         string    polygon: corners ``gx gy, gx gy, ...`` [mrad], at least three; its edges must not
-                                    cross, touch or overlap
-    pixel_name            string    Name in the result. Default: ``pixel`` (numbered by ``multipixel_receiver``)
-    altitude, off_nadir_deg, ...    As for ``lidar_transmitter``, when used alone
-    aperture_area, obscuration,     As for ``multipixel_receiver``, when used alone
+    ============================  ======  ==============================================================================
+    Parameter                     Type    Meaning (angles are full angles or positions in the tangent plane about the
+    ============================  ======  ==============================================================================
+                                          axis)
+    shape                         string  ``circle``, ``ring``, ``sector``, ``rectangle``, ``strip`` or ``polygon``.
+                                          Default: ``circle``
+    field_of_view_mrad            float   Full angle of the circle, ring, sector, or of the circle that a strip is cut
+                                          from [mrad], positive. Default: 30
+    inner_mrad                    float   ring, sector: full angle of the hole [mrad]. Default: 0
+    start_deg,                    float   sector: first azimuth, from +angle_x (far) towards +angle_y [deg], and size
+    extent_deg                            [deg], up to 360. Defaults: 0, 360
+    width_mrad,                   float   rectangle: full angle along angle_y and along angle_x [mrad], positive.
+    height_mrad                           Defaults: 15, 15
+    angle_x_min_mrad,             float   strip: the part of the circle between these angle_x [mrad]
+    angle_x_max_mrad
+    angle_x_mrad, angle_y_mrad    float   circle, ring, sector, rectangle: centre [mrad]. Default: 0
+    vertices_mrad                 string  polygon: corners ``angle_x angle_y, angle_x angle_y, ...`` [mrad], at least
+                                          three; its edges must not cross, touch or overlap
+    pixel_name                    string  Name in the result. Default: ``pixel`` (numbered by ``multipixel_receiver``)
+    altitude, off_nadir_deg, ...          As for ``lidar_transmitter``, when used alone
+    aperture_area, obscuration,           As for ``multipixel_receiver``, when used alone
     blur_mrad, ...
-    ====================  ========  ==================================================================================
+    ============================  ======  ==============================================================================
 
     Nested in ``multipixel_receiver`` only the shape and the name are used: pose, aperture, losses and blur are the
     receiver's. As the only sensor of a scene it is a receiver with one pixel.
@@ -63,7 +65,10 @@ class PixelFov(mi.Sensor):
         self.pixel_name = str(props.get("pixel_name", ""))
         pixels = ShapedPixels([self.field], [self.pixel_name or "pixel"])
         self.receiver = Receiver(
-            Pose.from_properties(props), ReceiverOptics.from_properties(props), pixels, Blur.from_properties(props)
+            Pose.from_properties(props),
+            ReceiverOptics.from_properties(props),
+            pixels,
+            PointSpread.from_properties(props),
         )
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None
@@ -86,14 +91,14 @@ class PixelFov(mi.Sensor):
         return f"PixelFov[{self.field}]"
 
 
-def _field(props: mi.Properties) -> Field:
+def _field(props: mi.Properties) -> FovShape:
     """Build the shape from the plugin's parameters."""
 
     def mrad(name: str, default: float) -> float:
         return 1e-3 * finite(name, props.get(name, default))
 
     shape = props.get("shape", "circle")
-    centre = (mrad("gx_mrad", 0.0), mrad("gy_mrad", 0.0))
+    centre = (mrad("angle_x_mrad", 0.0), mrad("angle_y_mrad", 0.0))
     if shape in ("circle", "ring", "sector"):
         outer = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
         if shape == "circle":
@@ -110,20 +115,25 @@ def _field(props: mi.Properties) -> Field:
         return Rectangle(centre[0] - height, centre[0] + height, centre[1] - width, centre[1] + width)
     if shape == "strip":
         radius = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
-        low = in_range("gx_min_mrad", props.get("gx_min_mrad", -1e3 * radius), -1e6, 1e3 * radius * (1 - 1e-6))
+        low = in_range(
+            "angle_x_min_mrad", props.get("angle_x_min_mrad", -1e3 * radius), -1e6, 1e3 * radius * (1 - 1e-6)
+        )
         high = max(low, -1e3 * radius) * (1 + 1e-6) + 1e-9
         return Strip(
-            radius, 1e-3 * low, 1e-3 * in_range("gx_max_mrad", props.get("gx_max_mrad", 1e3 * radius), high, 1e6)
+            radius,
+            1e-3 * low,
+            1e-3 * in_range("angle_x_max_mrad", props.get("angle_x_max_mrad", 1e3 * radius), high, 1e6),
         )
     if shape == "polygon":
         words = str(props.get("vertices_mrad", "")).replace(",", " ").split()
         numbers = finite_array("vertices_mrad", words)
         if numbers.size % 2 or numbers.size < 6:
-            raise ValueError(
-                f"vertices_mrad = {props.get('vertices_mrad', '')!r} must hold pairs 'gx gy' of at least three corners"
+            raise UserError(
+                f"vertices_mrad = {props.get('vertices_mrad', '')!r} must hold pairs 'angle_x angle_y' of at least "
+                "three corners"
             )
         return Polygon(1e-3 * numbers.reshape(-1, 2))
-    raise ValueError(f"shape = {shape!r} must be one of circle, ring, sector, rectangle, strip, polygon")
+    raise UserError(f"shape = {shape!r} must be one of circle, ring, sector, rectangle, strip, polygon")
 
 
 mi.register_sensor("pixel_fov", lambda props: PixelFov(props))

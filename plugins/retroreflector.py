@@ -7,8 +7,8 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.optics.checks import in_range
-from mitransient_lidar.transport.phase import deflect
+from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.transport.medium.tabulated_phase import deflect
 
 #: Narrowest lobe [deg]: directions in 32-bit numbers are good to a thousandth of it.
 _NARROWEST = 0.01
@@ -17,14 +17,14 @@ _NARROWEST = 0.01
 class Retroreflector(mi.BSDF):
     r"""Retro-reflecting surface (``retroreflector``).
 
-    ===================  =====  ========================================================================================
-    Parameter            Type   Meaning
-    ===================  =====  ========================================================================================
-    reflectance          float  Share of the light that comes back, 0 to 1. Default: 0.5
-    width_deg            float  Full angle between the directions where the lobe has fallen to e^-1/2 of its peak [deg],
-                                0.01 to 180. Default: 2
-    diffuse_share        float  Lambertian share of what comes back, 0 to 1. Default: 0
-    ===================  =====  ========================================================================================
+    =============  =====  ==============================================================================================
+    Parameter      Type   Meaning
+    =============  =====  ==============================================================================================
+    reflectance    float  Share of the light that comes back, 0 to 1. Default: 0.5
+    width_deg      float  Full angle between the directions where the lobe has fallen to e^-1/2 of its peak [deg], 0.01
+                          to 180. Default: 2
+    diffuse_share  float  Lambertian share of what comes back, 0 to 1. Default: 0
+    =============  =====  ==============================================================================================
 
     For reflective sheeting, beads and prisms on a target. Light that arrives from the direction :math:`\omega_i` leaves
     about the same direction,

@@ -5,26 +5,27 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.optics.checks import non_negative
-from mitransient_lidar.optics.daylight import clear_sky
-from mitransient_lidar.transport.daylight import SKIES, read_direction, shape_irradiance
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import non_negative
+from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
+from mitransient_lidar.transport.daylight.sky import SKIES, read_direction, relative_irradiance
 
 
 class Sky(mi.Emitter):
     r"""Sky (``sky``).
 
-    =====================  ======  =====================================================================================
-    Parameter              Type    Meaning
-    =====================  ======  =====================================================================================
-    distribution           string  ``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon),
-                                   ``overcast`` (Moon and Spencer 1942: three times as bright at the zenith as at the
-                                   horizon), or ``uniform``. Default: ``clear``
-    irradiance             float   What it gives at the sea on a level plane [W m^-2 nm^-1], at least 0. Default for
-                                   ``clear``: that of a clear sky at 532 nm
-                                   (`mitransient_lidar.optics.daylight.clear_sky`); the others need it
-    sun_zenith_deg         float   ``clear``: angle of the sun from the vertical [deg], 0 to 89. Default: 40
-    sun_azimuth_deg        float   ``clear``: where it stands, from +x towards +y [deg]. Default: 0
-    =====================  ======  =====================================================================================
+    ===============  ======  ===========================================================================================
+    Parameter        Type    Meaning
+    ===============  ======  ===========================================================================================
+    distribution     string  ``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon),
+                             ``overcast`` (Moon and Spencer 1942: three times as bright at the zenith as at the
+                             horizon), or ``uniform``. Default: ``clear``
+    irradiance       float   What it gives at the sea on a level plane [W m^-2 nm^-1], at least 0. Default for
+                             ``clear``: that of a clear sky at 532 nm
+                             (`mitransient_lidar.physics.lidar.clear_sky.clear_sky_irradiance`); the others need it
+    sun_zenith_deg   float   ``clear``: angle of the sun from the vertical [deg], 0 to 89. Default: 40
+    sun_azimuth_deg  float   ``clear``: where it stands, from +x towards +y [deg]. Default: 0
+    ===============  ======  ===========================================================================================
 
     The upper half of an infinite sphere; the lower half is black. The radiance is a shape (after Harrison and Coombes
     1988, doi:10.1016/0038-092X(88)90072-2, for ``clear``) scaled to the irradiance. The sun itself is the plugin
@@ -49,16 +50,16 @@ class Sky(mi.Emitter):
         super().__init__(props)
         self.distribution = props.get("distribution", "clear")
         if self.distribution not in SKIES:
-            raise ValueError(f"distribution = {self.distribution!r} must be one of {', '.join(SKIES)}")
+            raise UserError(f"distribution = {self.distribution!r} must be one of {', '.join(SKIES)}")
         for name in ("sun_zenith_deg", "sun_azimuth_deg"):
             if name in props and self.distribution != "clear":
-                raise ValueError(f"{name} = {props[name]:g} is for distribution = 'clear': leave it out")
+                raise UserError(f"{name} = {props[name]:g} is for distribution = 'clear': leave it out")
         zenith, self.sun = read_direction(props, "sun_")
         if "irradiance" not in props and self.distribution != "clear":
-            raise ValueError(f"irradiance is missing: a sky of distribution = {self.distribution!r} needs it")
-        default = clear_sky(zenith).diffuse
+            raise UserError(f"irradiance is missing: a sky of distribution = {self.distribution!r} needs it")
+        default = clear_sky_irradiance(zenith).diffuse
         self.irradiance = non_negative("irradiance", props.get("irradiance", default))
-        self._scale = self.irradiance / shape_irradiance(self.distribution, self.sun)
+        self._scale = self.irradiance / relative_irradiance(self.distribution, self.sun)
         self.m_needs_sample_2 = True
         self.m_flags = mi.EmitterFlags.Infinite.value
 

@@ -6,25 +6,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.optics.checks import in_range, non_negative
-from mitransient_lidar.optics.daylight import SUN_RADIUS_DEG, clear_sky
-from mitransient_lidar.transport.daylight import read_direction
-from mitransient_lidar.transport.phase import deflect, half_angle
+from mitransient_lidar.core.validation import in_range, non_negative
+from mitransient_lidar.physics.lidar.clear_sky import SUN_RADIUS_DEG, clear_sky_irradiance
+from mitransient_lidar.transport.daylight.sky import read_direction
+from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
 
 class Sun(mi.Emitter):
     r"""Sun (``sun``).
 
-    =====================  ======  =====================================================================================
-    Parameter              Type    Meaning
-    =====================  ======  =====================================================================================
-    zenith_deg             float   Angle of the sun's middle from the vertical [deg], 0 to 89. Default: 40
-    azimuth_deg            float   Where it stands, from +x (the way the receiver looks) towards +y [deg]. Default: 0
-    irradiance             float   What it gives at the sea on a plane normal to its rays [W m^-2 nm^-1], at least 0.
-                                   Default: that of a clear sky at 532 nm
-                                   (`mitransient_lidar.optics.daylight.clear_sky`)
-    angular_radius_deg     float   Radius of its disc [deg], 0.001 to 5. Default: 0.2666
-    =====================  ======  =====================================================================================
+    ==================  =====  =========================================================================================
+    Parameter           Type   Meaning
+    ==================  =====  =========================================================================================
+    zenith_deg          float  Angle of the sun's middle from the vertical [deg], 0 to 89. Default: 40
+    azimuth_deg         float  Where it stands, from +x (the way the receiver looks) towards +y [deg]. Default: 0
+    irradiance          float  What it gives at the sea on a plane normal to its rays [W m^-2 nm^-1], at least 0.
+                               Default: that of a clear sky at 532 nm
+                               (`mitransient_lidar.physics.lidar.clear_sky.clear_sky_irradiance`)
+    angular_radius_deg  float  Radius of its disc [deg], 0.001 to 5. Default: 0.2666
+    ==================  =====  =========================================================================================
 
     The disc is even, at infinity, of the radiance :math:`E / (\pi \sin^2 r)`. ``passive_volpath`` draws one point of it
     for each path; the lidar integrators leave it out. Mitsuba's own integrators sample its disc, and do not meet it by
@@ -48,7 +48,7 @@ class Sun(mi.Emitter):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.zenith_deg, self.direction = read_direction(props)
-        default = clear_sky(self.zenith_deg).direct_normal
+        default = clear_sky_irradiance(self.zenith_deg).direct_normal
         self.irradiance = non_negative("irradiance", props.get("irradiance", default))
         radius = in_range("angular_radius_deg", props.get("angular_radius_deg", SUN_RADIUS_DEG), 1e-3, 5.0)
         # sin^2 of half the radius: cosines of so small angles are 1 to rounding.

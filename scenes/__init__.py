@@ -1,1 +1,1 @@
-"""Shipped scenes: Mitsuba XML files, made to be read, copied and edited."""
+"""Shipped scenes, and the shared parts that they include, as Mitsuba XML files."""

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.variants import SUPPORTED_VARIANTS
+from mitransient_lidar.loading.variants import SUPPORTED_VARIANTS
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -27,37 +27,6 @@ def clean_drjit():
     yield
     for flag, value in flags.items():
         dr.set_flag(flag, value)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def prepared(variant):
-    """Integrators that have prepared a scene since the list was last emptied."""
-    engines = []
-    for kind, method in (
-        ("lidar_volpath", "prepare"),
-        ("lidar_merging", "prepare"),
-        ("passive_volpath", "prepare_view"),
-    ):
-        plugin = type(mi.load_dict({"type": kind}))
-        original = getattr(plugin, method)
-
-        def prepare(self, *arguments, original=original):
-            engines.append(self)
-            return original(self, *arguments)
-
-        setattr(plugin, method, prepare)
-    return engines
-
-
-@pytest.fixture(autouse=True)
-def free_scenes(prepared):
-    """Let go of the scenes of a test: each left alive would be part of every later kernel, and slow it down.
-
-    A scene holds its integrator, and that holds the scene until it is released.
-    """
-    yield
-    while prepared:
-        prepared.pop().release()
 
 
 def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None, bottom=8.0, rho=0.1, extra=None):
@@ -101,12 +70,9 @@ def passes():
     """Function that renders independent passes: energies [J], shape (passes, pixels, bins)."""
 
     def run(scene, count, first_seed=0):
-        film = scene.sensors()[0].film()
-        result = []
-        for seed in range(first_seed, first_seed + count):
-            scene.integrator().render(scene, 0, seed=seed, develop=False)
-            result.append(film.energy())
-        return np.array(result)
+        renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+        seeds = range(first_seed, first_seed + count)
+        return np.array([renderer.render_pass(seed).histogram.energy() for seed in seeds])
 
     return run
 

@@ -1,39 +1,42 @@
-"""State of a path and the one function that advances it."""
+"""State of a path, and the only function that advances it in distance and time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.system import LidarScene
+from mitransient_lidar.transport.medium.index_layers import IndexLayers
 
 
 @dataclass
 class Path:
-    """Where a path has got to.
+    """A path from the receiver or from the laser, up to its last vertex.
 
     Attributes
     ----------
     point, direction
-        Last vertex [m] (offset from surfaces against self-intersection) and unit direction of the next leg.
+        Last vertex [m] (offset from surfaces against self-intersection) and unit direction of the next segment.
     in_water
-        Whether the next leg runs in water.
+        Whether the next segment lies in water.
     length
-        Optical length so far [m]: distance times group index, summed over the legs.
+        Optical length so far [m]: distance times group index, summed over the segments.
     throughput
-        Product of the path's factors since the receiver.
+        Product of the path's factors so far.
     scatterings
         Number of scattering events in the water so far.
-    turns
-        How often the path has changed between going down and going up.
-    stratum
-        Stratum of the water in which the next leg runs, if it runs in water.
+    reversals
+        Number of changes between going down and going up so far.
+    index_layer
+        Index layer of the next segment, if it lies in water.
+    before_first_solid
+        Whether the path has met no solid (bottom or target) yet.
     rays
-        Number of rays traced so far, for the bench.
+        Number of rays traced so far, for the benchmark.
     active
-        Whether the path goes on.
+        Whether the path continues.
     """
 
     point: mi.Point3f
@@ -42,8 +45,9 @@ class Path:
     length: mi.Float
     throughput: mi.Float
     scatterings: mi.UInt32
-    turns: mi.UInt32
-    stratum: mi.UInt32
+    reversals: mi.UInt32
+    index_layer: mi.UInt32
+    before_first_solid: mi.Bool
     rays: mi.UInt32
     active: mi.Bool
 
@@ -58,40 +62,42 @@ class Path:
         return -self.direction.z
 
     def ray(self) -> mi.Ray3f:
-        """Return the next leg as a ray."""
+        """Return the next segment as a ray."""
         return mi.Ray3f(self.point, self.direction)
 
+    @staticmethod
+    def initial(origin: mi.Point3f, direction: mi.Vector3f, throughput: mi.Float, active: mi.Bool) -> dict[str, Any]:
+        """Return the fields of paths that start in the air."""
+        return {
+            "point": origin,
+            "direction": direction,
+            "in_water": mi.Bool(False),
+            "length": mi.Float(0),
+            "throughput": throughput,
+            "scatterings": mi.UInt32(0),
+            "reversals": mi.UInt32(0),
+            "index_layer": mi.UInt32(0),
+            "before_first_solid": mi.Bool(True),
+            "rays": mi.UInt32(0),
+            "active": active,
+        }
 
-def optical_length(
-    system: LidarScene, distance: mi.Float, in_water: mi.Bool | bool, stratum: mi.UInt32 | None = None
-) -> mi.Float:
-    """Return the optical length [m] of a leg: its distance times the group index of the medium that it crosses.
 
-    In water that is the index of a stratum, by default of the first.
-    """
-    group = system.group_index if stratum is None or system.strata is None else system.strata.group(stratum)
-    return distance * dr.select(mi.Bool(in_water), mi.Float(group), 1)
-
-
-def count_turns(path: Path, before: mi.Float) -> None:
-    """Count a turn where the vertical component of the direction, `before` the last vertex, has changed its sign."""
-    path.turns += dr.select(path.active & (before * path.direction.z < 0), mi.UInt32(1), 0)
-
-
-def advance(path: Path, system: LidarScene, distance: mi.Float, point: mi.Point3f) -> None:
-    """Move a path along its direction to its next vertex.
+def advance(path: Path, index_layers: IndexLayers | None, distance: mi.Float, point: mi.Point3f) -> None:
+    """Move a path along its direction to its next vertex; its point and its optical length change.
 
     Parameters
     ----------
     path
-        The path; its vertex and its optical length change.
-    system
-        The lidar scene, whose water times the leg.
+        The path.
+    index_layers
+        Index layers of the water, or None in a scene without water.
     distance
-        Length of the leg [m].
+        Length of the segment [m].
     point
         The vertex at its end [m]. On surfaces the intersection is more accurate than distance times direction.
     """
-    leg = optical_length(system, distance, path.in_water, path.stratum)
-    path.length = dr.select(path.active, path.length + leg, path.length)
+    group = mi.Float(1) if index_layers is None else index_layers.group(path.index_layer)
+    length = distance * dr.select(path.in_water, group, 1)
+    path.length = dr.select(path.active, path.length + length, path.length)
     path.point = dr.select(path.active, point, path.point)

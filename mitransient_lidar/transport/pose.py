@@ -9,22 +9,24 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitransient_lidar.optics.checks import finite, in_range, positive
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite, in_range, positive
 
 
 @dataclass(frozen=True)
 class Pose:
     """Where a transmitter or receiver is and where it looks.
 
-    A point of the tangent plane about the axis is (gx, gy), in radians: its direction is the unit vector along
-    ``axis + gx * far + gy * left``. +gx points away from nadir, and +gy along +y for the default pose.
+    A point of the tangent plane about the axis is (angle_x, angle_y), in radians: its direction is the unit vector
+    along ``axis + angle_x * far + angle_y * left``. +angle_x points away from nadir, and +angle_y along +y for the
+    default pose.
 
     Parameters
     ----------
     origin
         Position [m], shape (3,).
     axis, far, left
-        Orthonormal directions: the optical axis, the direction of +gx and the direction of +gy.
+        Orthonormal directions: the optical axis, the direction of +angle_x and the direction of +angle_y.
     """
 
     origin: NDArray[np.float64]
@@ -33,7 +35,7 @@ class Pose:
     left: NDArray[np.float64]
 
     @classmethod
-    def from_angles(cls, altitude: float, off_nadir_deg: float, shot_x: float = 0.0, shot_y: float = 0.0) -> Pose:
+    def from_angles(cls, altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0) -> Pose:
         """Return the pose whose axis lies in the x-z plane, points to +x and down, and meets z = 0 at the shot.
 
         Parameters
@@ -42,49 +44,49 @@ class Pose:
             Height above the mean sea level [m], positive.
         off_nadir_deg
             Angle of the axis from the vertical [deg], 0 to below 90.
-        shot_x, shot_y
+        aim_x, aim_y
             Where the axis meets the mean sea level [m].
 
         Raises
         ------
-        ValueError
+        UserError
             When a value is out of range.
         """
         altitude = positive("altitude", altitude)
         angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9))
         sin, cos = np.sin(angle), np.cos(angle)
-        origin = np.array([finite("shot_x", shot_x) - altitude * sin / cos, finite("shot_y", shot_y), altitude])
+        origin = np.array([finite("aim_x", aim_x) - altitude * sin / cos, finite("aim_y", aim_y), altitude])
         return cls(origin, np.array([sin, 0.0, -cos]), np.array([cos, 0.0, sin]), np.array([0.0, 1.0, 0.0]))
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> Pose:
-        """Read ``to_world``, or ``altitude``, ``off_nadir_deg``, ``shot_x`` and ``shot_y``, from plugin parameters.
+        """Read ``to_world``, or ``altitude``, ``off_nadir_deg``, ``aim_x`` and ``aim_y``, from plugin parameters.
 
         ``to_world`` maps the local axes as Mitsuba's ``look_at`` with ``up = (0, 0, 1)`` does: z is the optical
-        axis, y is +gx (away from nadir) and x is +gy.
+        axis, y is +angle_x (away from nadir) and x is +angle_y.
         """
         if "to_world" in props:
             if "altitude" in props or "off_nadir_deg" in props:
-                raise ValueError(f"{props.plugin_name()}: give either to_world or altitude and off_nadir_deg, not both")
+                raise UserError(f"{props.plugin_name()}: give either to_world or altitude and off_nadir_deg, not both")
             matrix = np.array(props["to_world"].matrix, dtype=np.float64)
             frame = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
             if not np.allclose(frame.T @ frame, np.eye(3), atol=1e-4):
-                raise ValueError(f"{props.plugin_name()}: to_world must be a rotation and a translation, without shear")
+                raise UserError(f"{props.plugin_name()}: to_world must be a rotation and a translation, without shear")
             return cls(matrix[:3, 3], frame[:, 2], frame[:, 1], frame[:, 0])
         return cls.from_angles(
             props.get("altitude", 200.0),
             props.get("off_nadir_deg", 20.0),
-            props.get("shot_x", 0.0),
-            props.get("shot_y", 0.0),
+            props.get("aim_x", 0.0),
+            props.get("aim_y", 0.0),
         )
 
-    def direction(self, gx: mi.Float, gy: mi.Float) -> mi.Vector3f:
-        """Return the unit direction of the tangent-plane point (gx, gy)."""
+    def direction(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Vector3f:
+        """Return the unit direction of the tangent-plane point (angle_x, angle_y)."""
         far, left, axis = (mi.Vector3f(v.tolist()) for v in (self.far, self.left, self.axis))
-        return dr.normalize(dr.fma(far, gx, dr.fma(left, gy, axis)))
+        return dr.normalize(dr.fma(far, angle_x, dr.fma(left, angle_y, axis)))
 
     def tangent(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Return (gx, gy) of a direction and its cosine with the axis, which is negative behind the tangent plane."""
+        """Return (angle_x, angle_y) of a direction and its cosine with the axis, negative behind the tangent plane."""
         cos_axis = dr.dot(direction, mi.Vector3f(self.axis.tolist()))
         scale = dr.rcp(cos_axis)
         return (
@@ -93,13 +95,18 @@ class Pose:
             cos_axis,
         )
 
+    @property
+    def off_nadir_deg(self) -> float:
+        """Angle of the axis from the vertical [deg]."""
+        return float(np.degrees(np.arccos(np.clip(-self.axis[2], -1, 1))))
+
     def ground_point(self) -> NDArray[np.float64]:
         """Return where the axis meets the mean sea level z = 0 [m]; far ahead when it does not look down."""
         slope = min(float(self.axis[2]), -1e-6)
         return self.origin + self.axis * (-float(self.origin[2]) / slope)
 
     def tangent_of_point(self, point: NDArray[np.float64]) -> tuple[float, float]:
-        """Return (gx, gy) in radians of a point [m], shape (3,)."""
+        """Return (angle_x, angle_y) in radians of a point [m], shape (3,)."""
         offset = point - self.origin
         along = float(offset @ self.axis)
         return float(offset @ self.far) / along, float(offset @ self.left) / along

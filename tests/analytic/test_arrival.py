@@ -7,10 +7,11 @@ index where the group index belongs is 1.8 % of the time in the water, 1.3 ns at
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.echo_times import bottom_time_ns
 from significance import largest_z
 
-from mitransient_lidar.optics.refraction import bottom_time_ns, surface_time_ns
-from mitransient_lidar.optics.water import C0
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 
 BIN_NS = 0.25
 #: A pencil beam from 200 m: across 0.1 mrad the arrival at 20 degrees changes by 0.05 ns, evenly about the mean.
@@ -69,7 +70,7 @@ def test_surface_arrives_when_geometry_says(lidar_scene, passes, altitude, angle
 def test_bottom_under_layers_arrives_at_the_same_time(lidar_scene, passes):
     """Layers of one index differ in attenuation, not in time."""
     expected = float(bottom_time_ns(200.0, 8.0, np.radians(20.0), 1.34, 1.364))
-    water = {"tops": "0, 1.5, 4", "attenuation": "0.5, 0.05, 0.3", "scattering": "0", "backscattering": "0"}
+    water = {"layer_tops": "0, 1.5, 4", "attenuation": "0.5, 0.05, 0.3", "scattering": "0", "backscattering": "0"}
     start = BIN_NS * round((expected - 8) / BIN_NS)
     water["group_index"] = 1.364
     mean, error = shoot(lidar_scene, passes, start, altitude=200.0, angle=20.0, water=water, bottom=8.0)
@@ -86,7 +87,7 @@ def test_layer_seen_by_its_scattering_begins_at_its_slanted_depth(lidar_scene, p
         tx=PENCIL,
         rx={"field_of_view_mrad": 2.0, "layout": "1x1"},
         film={"time_start_ns": start, "bin_width_ns": BIN_NS, "bin_count": 64},
-        water={"tops": "0, 3", "attenuation": "0.1, 0.5", "scattering": "0, 0.4", "backscattering": "0, 0.016"},
+        water={"layer_tops": "0, 3", "attenuation": "0.1, 0.5", "scattering": "0, 0.4", "backscattering": "0, 0.016"},
         bottom=None,
     )
     energy = passes(scene, 8).sum(axis=(0, 1))

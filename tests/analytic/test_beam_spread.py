@@ -7,26 +7,29 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.beam_spread import radius_rms
+from oracles.echo_times import layered_time_ns
 from scipy.integrate import quad, trapezoid
 from scipy.special import j1
 from significance import largest_z
 
-from mitransient_lidar.beam_spread import beam_spread
-from mitransient_lidar.optics.beam_spread import BeamSpread
-from mitransient_lidar.optics.refraction import fresnel, layered_time_ns, snell
-from mitransient_lidar.optics.water import C0
-from mitransient_lidar.transport.beam import BeamSampler
-from mitransient_lidar.transport.crossings import CrossingTracer
-from mitransient_lidar.transport.streams import pass_streams
-from mitransient_lidar.transport.system import LidarScene
-from mitransient_lidar.transport.tracks import Tracks
-from mitransient_lidar.transport.walk import Walk, start_walk
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.lidar.small_angle import BeamSpread
+from mitransient_lidar.studies.beam_spread import beam_spread
+from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.transport.merging.segments import SegmentBuffer
+from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.plane_crossings import CrossingTracer
+from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.scene import LidarScene
 
 #: A pencil that goes straight down into water without refraction.
 MATCHED = {"refractive_index": 1.0001, "group_index": 1.0}
 PENCIL = {"off_nadir_deg": 0.0, "divergence_mrad": 0.01}
 VIEW = {"off_nadir_deg": 0.0, "field_of_view_mrad": 200.0, "layout": "1x1"}
-LARGE_SEA = {"extent": 4000.0, "slope_variance": "2e-5"}
+LARGE_SEA = {"size": 4000.0, "slope_variance": "2e-5"}
 
 
 @pytest.fixture
@@ -56,7 +59,13 @@ def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
     # Van de Hulst (1980): Henyey-Greenstein g = 0.75, albedo 0.9, optical thickness 2, matched index, normal incidence.
     # Below the slab is clear water and a black bottom. Here the thickness is 20 m, and reflected light crosses a plane
     # at a ten-thousandth of a mean free path.
-    water = {"tops": "0, 20", "attenuation": "0.1, 0", "scattering": "0.09, 0", "phase_function": "hg", "phase_g": 0.75}
+    water = {
+        "layer_tops": "0, 20",
+        "attenuation": "0.1, 0",
+        "scattering": "0.09, 0",
+        "phase_function": "hg",
+        "phase_g": 0.75,
+    }
     down, up = fluxes(system({**MATCHED, **water}, bottom=21.0, rho=0.0), [1e-3, 20.0], 2**18, 10)
     for share, expected in ((down[:, 1], 0.66096), (up[:, 0], 0.09739)):
         z, error = z_score(share, expected)
@@ -66,7 +75,7 @@ def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
 
 def test_light_that_leaves_for_ever_is_counted(system):
     # No bottom: the last leg of nearly all light, through the clear water below, has no end.
-    water = {"tops": "0, 1", "attenuation": "0.2, 0", "scattering": "0, 0"}
+    water = {"layer_tops": "0, 1", "attenuation": "0.2, 0", "scattering": "0, 0"}
     down, up = fluxes(system({**MATCHED, **water}, bottom=None), [0.5, 2.0, 30.0], 4096, 2)
     np.testing.assert_allclose(down, np.tile(np.exp([-0.1, -0.2, -0.2]), (2, 1)), rtol=1e-4)
     assert np.all(up == 0)
@@ -77,21 +86,20 @@ def test_moments_of_an_infinite_medium(system, z_score):
     b, g, start, step = 1.0, 0.924, 150.0, 10.0
     water = {**MATCHED, "attenuation": b, "scattering": b, "phase_function": "hg", "phase_g": g}
     parts = system(water, bottom=None)
-    parts = replace(parts, film=SimpleNamespace(path_end=500.0))
     count, passes = 2**15, 8
     samples = np.zeros((passes, 3, 3))
     for number in range(passes):
         rng = pass_streams(3, number, count)
         down = mi.Vector3f(dr.zeros(mi.Float, count), 0, -1)
-        path = start_walk(parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(step))
+        path = RandomWalkPath.start(parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(step))
         path.point, path.in_water, path.length = mi.Point3f(0, 0, -start), mi.Bool(True), mi.Float(1)
-        tracks = Tracks(parts, step, 150 * count)
-        Walk(parts, mi.TransportMode.Importance, parts.receiver.pose).run(
-            path, rng, mi.UInt32(0), tracks, at_solid=lambda *_: None, past_solids=False
+        segments = SegmentBuffer(parts.water, PathClasses(), step, 150 * count)
+        RandomWalk(parts, mi.TransportMode.Importance, parts.receiver.pose, 500.0).run(
+            path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False
         )
-        points, legs = tracks.close()
-        assert legs <= tracks.capacity
-        found = tracks.points(dr.arange(mi.UInt32, points))
+        points, wanted = segments.finalize()
+        assert wanted <= segments.capacity
+        found = segments.points(dr.arange(mi.UInt32, points))
         x, y, z = np.array(found.point, dtype=np.float64)
         depth = -z - start
         stop = np.rint((np.array(found.length) - 1) / step).astype(int)
@@ -168,10 +176,10 @@ def test_many_weak_scatterings(lidar_scene, narrow, absorption, scattering):
         tolerance = 0.01 + thinned
         assert abs(row["transmitted"] / total - 1) < 5e-4
         assert abs(row["unscattered"] - theory.unscattered) < largest_z(8) * row["unscattered_stderr"] + 1e-6
-        assert abs(row["shift_rms"] / theory.radius_rms - 1) < tolerance
+        assert abs(row["shift_rms"] / radius_rms(theory) - 1) < tolerance
         assert abs(1e-9 * row["delay_mean"] / theory.mean_delay - 1) < tolerance
         assert abs(1e-9 * row["delay_std"] / np.sqrt(theory.delay_variance) - 1) < tolerance + 0.02
-        for rank in np.searchsorted(spread["radius"], theory.radius_rms * np.array([0.5, 1.0, 2.0])):
+        for rank in np.searchsorted(spread["radius"], radius_rms(theory) * np.array([0.5, 1.0, 2.0])):
             radius, share = float(spread["radius"][rank]), float(row["within_shift"][rank])
             assert abs(share - within_small_angle(radius, depth, scattering)) < 0.012
             assert abs(share - (drawn.unscattered + drawn.encircled(radius)) / total) < 0.11
@@ -188,7 +196,7 @@ def test_realistic_water_where_the_closed_form_holds(lidar_scene, name):
     """Rationale: the closed form is drawn beside the result of every uniform water.
 
     Expectation: its transmittance and the energy within half the depth of the axis hold while b z (1 - g) < 0.25. Its
-    moments and its core do not: few scatterings by large angles make them, see `optics.beam_spread.BeamSpread`.
+    moments and its core do not: few scatterings by large angles make them, see `physics.lidar.small_angle.BeamSpread`.
     Tolerance: 1 to 6 % for the transmittance, which is too high, 10 % for the energy, as a plain walk found.
     """
     water = {"backscattering": 0.0, **WATERS[name]}
@@ -214,17 +222,16 @@ def test_white_bottom_returns_all_light(system):
     # Water that does not absorb: what leaves upwards and what the surface reflects at once is what was sent.
     water = {"attenuation": 0.3, "scattering": 0.3, "phase_function": "hg", "phase_g": 0.9}
     parts = system({**water, "refractive_index": 1.34, "group_index": 1.34}, bottom=8.0, rho=1.0)
-    parts = replace(parts, film=SimpleNamespace(path_end=6000.0))
     count, passes = 2**15, 4
     returned, first = np.zeros((2, passes))
     for number in range(passes):
         rng = pass_streams(5, number, count)
         beam = BeamSampler(parts.transmitter, parts.receiver)
         direction, energy = beam.sample(dr.arange(mi.UInt32, count), count, rng)
-        start = start_walk(parts.transmitter.pose, direction, energy, mi.Float(0))
+        start = RandomWalkPath.start(parts.transmitter.pose, direction, energy, mi.Float(0))
         nothing = SimpleNamespace(add=lambda path, *_: path.offset)
-        end = Walk(parts, mi.TransportMode.Importance, parts.receiver.pose).run(
-            start, rng, mi.UInt32(0), nothing, at_solid=lambda *_: None, past_solids=True
+        end = RandomWalk(parts, mi.TransportMode.Importance, parts.receiver.pose, 6000.0).run(
+            start, rng, mi.UInt32(0), nothing, on_solid=lambda *_: None, past_solids=True
         )
         left = ~np.array(end.in_water) & (np.array(end.direction.z) > 0)
         share = np.array(end.throughput, dtype=np.float64) * left / parts.transmitter.energy
@@ -239,7 +246,7 @@ def test_white_bottom_returns_all_light(system):
 def test_no_crossing_is_lost_or_counted_twice(system):
     # Without absorption each path crosses every plane once more downwards than upwards if it ends on the black bottom,
     # and as often if it leaves through the surface: net fluxes agree pass by pass.
-    water = {"tops": "0, 3", "attenuation": "1, 2", "scattering": "1, 2", "phase_function": "hg", "phase_g": 0.7}
+    water = {"layer_tops": "0, 3", "attenuation": "1, 2", "scattering": "1, 2", "phase_function": "hg", "phase_g": 0.7}
     indices = {"refractive_index": "1.3, 1.4", "group_index": "1.3, 1.4"}
     down, up = fluxes(system({**water, **indices}, bottom=5.0, rho=0.0), [0.5, 2.9, 3.0, 3.1, 4.999], 2**14, 2)
     assert np.all(up[:, :-1] > 0.1)
@@ -249,7 +256,7 @@ def test_no_crossing_is_lost_or_counted_twice(system):
 def test_ways_through_strata(system):
     """Unscattered light arrives where and when Snell's law says, and hardly scattered light is hardly late."""
     oblique = {**PENCIL, "off_nadir_deg": 30.0}
-    water = {"tops": "0, 3", "attenuation": 0.2, "scattering": 0.2, "phase_function": "hg", "phase_g": 0.999}
+    water = {"layer_tops": "0, 3", "attenuation": 0.2, "scattering": 0.2, "phase_function": "hg", "phase_g": 0.999}
     indices = {"refractive_index": "1.3, 1.5", "group_index": "1.35, 1.6"}
     parts = system({**water, **indices}, tx=oblique, bottom=8.0, rho=0.0)
     light, _ = CrossingTracer(parts, np.array([2.0, 3.0, 7.0]), 2**13).trace(0, 0)

@@ -2,18 +2,19 @@
 
 import numpy as np
 import pytest
+from oracles.lidar_equation import bottom_energy
 from significance import FALSE_ALARM, largest_z
 
 import mitransient_lidar
-from mitransient_lidar import comparison
-from mitransient_lidar.optics.lidar_equation import LidarSystem, bottom_energy
-from mitransient_lidar.optics.water import WaterColumn
+from mitransient_lidar.analysis import comparison
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.water.layers import WaterColumn
 
 ENERGY = 5e-3 * 0.81 * 0.9
 DEPTH = 1.0
 CLEAR = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0}
 
-#: Row 0 is far, column 0 at -gy: no symmetry hides a flip.
+#: Row 0 is far, column 0 at -angle_y: no symmetry hides a flip.
 IMAGE = np.array([[1.0, 0.0, 2.0, 5.0], [0.0, 4.0, 8.0, 1.0], [3.0, 1.0, 0.0, 0.0]])
 
 
@@ -28,27 +29,27 @@ def expected_bottom(density, field):
     Parameters
     ----------
     density
-        Share of the energy per tangent-plane area, a function of (gx, gy) [rad].
+        Share of the energy per tangent-plane area, a function of (angle_x, angle_y) [rad].
     field
-        Predicate on (gx, gy): what a pixel sees.
+        Predicate on (angle_x, angle_y): what a pixel sees.
     """
     line = (np.arange(1000) - 499.5) * 5e-5
-    gx, gy = np.meshgrid(line, line, indexing="ij")
-    seen = field(gx, gy)
-    gx, gy = gx[seen], gy[seen]
+    angle_x, angle_y = np.meshgrid(line, line, indexing="ij")
+    seen = field(angle_x, angle_y)
+    angle_x, angle_y = angle_x[seen], angle_y[seen]
     sin, cos = np.sin(np.radians(20)), np.cos(np.radians(20))
-    theta = np.arctan2(np.hypot(sin + gx * cos, gy), cos - gx * sin)
+    theta = np.arctan2(np.hypot(sin + angle_x * cos, angle_y), cos - angle_x * sin)
     system = LidarSystem(200.0, np.radians(20), ENERGY, 0.025, 1.34, 1.34)
     echo = bottom_energy(system, WaterColumn.from_text(0, 0.1, 0, 0), DEPTH, 0.1, theta)
-    return float(np.sum(density(gx, gy) * echo) * 5e-5**2)
+    return float(np.sum(density(angle_x, angle_y) * echo) * 5e-5**2)
 
 
 def ellipse(along, across, turn, top_hat):
     """Return the density of a Gaussian or even ellipse of half angles [rad] whose first axis is turned."""
 
-    def density(gx, gy):
-        a = (gx * np.cos(turn) + gy * np.sin(turn)) / along
-        b = (gy * np.cos(turn) - gx * np.sin(turn)) / across
+    def density(angle_x, angle_y):
+        a = (angle_x * np.cos(turn) + angle_y * np.sin(turn)) / along
+        b = (angle_y * np.cos(turn) - angle_x * np.sin(turn)) / across
         if top_hat:
             return (a**2 + b**2 < 1) / (np.pi * along * across)
         return np.exp(-0.5 * (a**2 + b**2)) / (2 * np.pi * along * across)
@@ -56,8 +57,8 @@ def ellipse(along, across, turn, top_hat):
     return density
 
 
-def cells(gx, gy):
-    row, column = np.floor((3e-3 - gx) / 2e-3).astype(int), np.floor((gy + 4e-3) / 2e-3).astype(int)
+def cells(angle_x, angle_y):
+    row, column = np.floor((3e-3 - angle_x) / 2e-3).astype(int), np.floor((angle_y + 4e-3) / 2e-3).astype(int)
     inside = (row >= 0) & (row < 3) & (column >= 0) & (column < 4)
     return np.where(inside, IMAGE[row.clip(0, 2), column.clip(0, 3)], 0) / IMAGE.sum() / 4e-6
 
@@ -87,7 +88,9 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
     )
     energy = passes(scene, 16).sum(axis=-1)
     quadrants = [
-        lambda gx, gy, far=far, left=left: (gx**2 + gy**2 < half**2) & ((gx > 0) == far) & ((gy > 0) == left)
+        lambda angle_x, angle_y, far=far, left=left: (
+            (angle_x**2 + angle_y**2 < half**2) & ((angle_x > 0) == far) & ((angle_y > 0) == left)
+        )
         for far in (True, False)
         for left in (False, True)
     ]

@@ -10,8 +10,8 @@ import pytest
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.column_slope import effective_attenuation
-from mitransient_lidar.column_views import views
+from mitransient_lidar.analysis.retrieval.column_slope import effective_attenuation
+from mitransient_lidar.studies.fov_sweep import fov_sweep
 
 #: A vertical lidar 200 m above a level sea. Its ripples, the smoothest there are, spread light by millimetres.
 VERTICAL = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 2e-5, "bottom_depth": 30}
@@ -34,7 +34,7 @@ def test_single_scattering_falls_with_c(field_of_view):
 def test_narrow_view_of_a_narrow_beam_falls_with_c():
     """Where little of the scattering is forward, a spot of 0.2 m keeps next to nothing of what has been scattered."""
     water = {"attenuation": 0.3, "scattering": 0.03, "backscattering": 0.003, "phase": "hg", "phase_g": 0.5}
-    found = views("table1", [2], {**VERTICAL, **water, "divergence_mrad": 1}, passes=24, seed=2)
+    found = fov_sweep("table1", [2], {**VERTICAL, **water, "divergence_mrad": 1}, passes=24, seed=2)
     k, error = (float(found[name][0]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
     assert error < 0.001
     assert abs(k - 0.3) < 3 * error
@@ -44,7 +44,7 @@ def test_narrow_view_of_a_narrow_beam_falls_with_c():
 @pytest.fixture(scope="module")
 def ocean():
     """The default water, whose forward peak holds most of the scattering, seen by a narrow beam."""
-    return views("table1", [1, 5, 20, 60, 150], {**VERTICAL, "divergence_mrad": 1}, passes=12, seed=3)
+    return fov_sweep("table1", [1, 5, 20, 60, 150], {**VERTICAL, "divergence_mrad": 1}, passes=12, seed=3)
 
 
 def test_slope_falls_from_c_to_absorption(ocean):
@@ -86,7 +86,7 @@ def test_beam_and_view_may_be_exchanged(lidar_scene):
             sea={"slope_variance": "2e-5"},
             bottom=None,
         )
-        result = views(scene, [narrow, view] if view > narrow else [view], passes=24, seed=seed)
+        result = fov_sweep(scene, [narrow, view] if view > narrow else [view], passes=24, seed=seed)
         return (float(result[name][-1]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
 
     (first, first_error), (second, second_error) = slope(wide, narrow, 5), slope(narrow, wide, 6)

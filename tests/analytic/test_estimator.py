@@ -60,7 +60,8 @@ def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
     }
     nested_scene = lidar_scene(rx=nested, sea=ROUGH)
     names = nested_scene.sensors()[0].receiver.pixels.names
-    # +gx is far, +gy left: red is far and -gy, the azimuths 270 to 360 degrees; blue near and -gy, 180 to 270.
+    # +angle_x is far, +angle_y left: red is far and -angle_y, the azimuths 270 to 360 degrees; blue near and -angle_y,
+    # 180 to 270.
     order = [names.index(name) for name in ("red", "green", "blue", "black")]
     first = passes(nested_scene, 32)[:, order]
     second = passes(lidar_scene(sea=ROUGH), 32, 1000)
@@ -97,7 +98,7 @@ def test_connections_by_lobe_by_walk_and_combined_have_one_mean(lidar_scene, pas
 def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
     """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
     combined = connected(lidar_scene, passes, sea, 48)
-    walk = connected(lidar_scene, passes, sea, 96, connection="walk", turn_share=0.0)
+    walk = connected(lidar_scene, passes, sea, 96, connection="walk", guiding_probability=0.0)
     assert walk.sum(axis=1).var(ddof=1) > 50 * combined.sum(axis=1).var(ddof=1)
     # The gate of the bottom echo, where every walk has turned.
     assert walk[:, 5].var(ddof=1) > 50 * combined[:, 5].var(ddof=1)
@@ -188,7 +189,10 @@ def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
 def test_identical_layers_are_homogeneous_water(lidar_scene, passes):
     energies = [
         passes(lidar_scene(sea=ROUGH, water=water, integrator={"paths_per_pass": 2**15}), 4)
-        for water in ({}, {"tops": "0, 2, 5", "attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006"})
+        for water in (
+            {},
+            {"layer_tops": "0, 2, 5", "attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006"},
+        )
     ]
     # The same random numbers; layers add rounding, which moves a few paths across a bin's edge.
     assert energies[0].sum() == pytest.approx(energies[1].sum(), rel=1e-4)

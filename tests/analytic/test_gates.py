@@ -7,10 +7,11 @@ import pytest
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar import gating
-from mitransient_lidar.errors import UserError
-from mitransient_lidar.optics.gates import GateTrain
-from mitransient_lidar.optics.water import C0
+from mitransient_lidar.analysis.gates import cut as gating
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.results import gate_stack
 
 #: Bytes of the histogram of four pixels and 300 bins, with its means and errors.
 HISTOGRAM = 4 * 300 * 116
@@ -37,16 +38,16 @@ def test_gates_are_the_waveform_behind_a_shutter(lidar_scene):
         # Bins are short against pulse and edges: power is linear, and the shutter sampled, within each.
         fine = np.linspace(time[0], time[-1], 20 * len(time))
         power = np.array([np.interp(fine, time, pixel) for pixel in result["waveform"].values])
-        energy = np.trapezoid(power * train.transmission(fine, 0), 1e-9 * fine, axis=1)
+        energy = np.trapezoid(power * train.shape.transmission(fine - train.start_ns), 1e-9 * fine, axis=1)
         np.testing.assert_allclose(result["gate_energy"].values[:, gate], energy, rtol=0.01)
 
 
 def test_recut_gates_are_those_of_the_render(lidar_scene):
     result = render(gated(lidar_scene), passes=16)
     options = {"start_ns": 1425.0, "width_ns": 8.0, "step_ns": 5.0, "count": 20, "rise_ns": 2.0}
-    cut = gating.cut_gates(result, gating.train_from_options(result.attrs, **options))
+    cut = gating.cut_gates(result, gate_stack.train_from_options(result.attrs, **options))
     np.testing.assert_allclose(cut["gate_energy"], result["gate_energy"], rtol=0.01)
-    # The error is that of the passes to the growth of sums over bins, which is one for the whole record.
+    # The error is that of the passes within the inflation of sums over bins, which is one for the whole record.
     ratio = cut["gate_energy_stderr"] / result["gate_energy_stderr"]
     assert 0.7 < float(ratio.median()) < 1.4
 
@@ -150,7 +151,6 @@ def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
         if layout == "256x256":
             energy = energy.reshape(count, 2, 128, 2, 128, -1).sum(axis=(2, 4)).reshape(count, 4, -1)
         sums[layout] = energy[..., 2:14].reshape(*energy.shape[:2], 4, 3).sum(axis=-1)
-        scene.integrator().release()
     pairs = [
         (sums["256x256"], sums["2x2"]),
         *((sums[name].sum(axis=1), sums["1x1"][:, 0]) for name in ("256x256", "2x2")),
@@ -166,16 +166,11 @@ def test_paths_go_with_the_pixels(lidar_scene):
     """16 a pixel, and half the points: an image needs more paths, not better ones."""
     for layout, paths, photons in (("2x2", 2**15, 2**15), ("128x128", 2**18, 2**16), ("512x512", 2**21, 2**16)):
         scene = lidar_scene(integrator={"type": "lidar_merging"}, rx={"layout": layout})
-        engine = scene.integrator()
-        engine.prepare(scene, scene.sensors()[0])
-        assert engine.photons_per_pass == photons
-        engine.release()
+        sensor = scene.sensors()[0]
         # The builder asks for 2^16 paths itself.
-        assert engine.paths_per_pass == 2**16
-        free = mi.load_dict({"type": "lidar_merging"})
-        free.prepare(scene, scene.sensors()[0])
-        assert free.paths_per_pass == paths
-        free.release()
+        assert scene.integrator().prepare(scene, sensor).paths == 2**16
+        default = mi.load_dict({"type": "lidar_merging"}).prepare(scene, sensor)
+        assert (default.paths, default.photons) == (paths, photons)
 
 
 def test_contrast_of_the_mine_is_greatest_where_geometry_says():
@@ -186,7 +181,7 @@ def test_contrast_of_the_mine_is_greatest_where_geometry_says():
     4 ns later.
     """
     params = {"layout": "64x64", "gate_start_depth": 4.6, "gate_step_ns": 1, "gate_count": 14, "spectrum": "flat"}
-    params |= {"surface_size": "auto", "surface_cell_size": "auto"}
+    params |= {"surface_refined_size": "auto", "surface_cell_size": "auto"}
     quick = {"type": "lidar_merging", "paths_per_pass": 2**16}
     stack = mitransient_lidar.render("gated_mine", params=params, passes=10, seed=2, integrator=quick)
     cosine = np.array([np.cos(np.arcsin(0.33 / 0.5)), 1.0])
@@ -195,7 +190,7 @@ def test_contrast_of_the_mine_is_greatest_where_geometry_says():
     expected = stack.attrs["surface_time_ns"] + 2e9 * 1.34 * slant / C0
     # The sphere is seen on the axis, 0.5 m to the side at an apparent range of 212.8 m + 6.2 m / 1.34.
     per_metre = 1e3 / 217.4
-    away = np.hypot(stack["gx"], stack["gy"] + 0.5 * per_metre)
+    away = np.hypot(stack["angle_x"], stack["angle_y"] + 0.5 * per_metre)
     energy = stack["gate_energy"]
     target = energy.where(away < 0.33 * per_metre).mean(("row", "column")).values
     around = energy.where((away > 7) & (away < 9)).mean(("row", "column")).values

@@ -8,10 +8,10 @@ a wide view, which are their exchange (reciprocity is tested on its own): no lig
 
 import numpy as np
 import pytest
+from oracles.half_space import chandrasekhar_h
 from significance import largest_z
 
-from mitransient_lidar.optics.half_space import chandrasekhar_h
-from mitransient_lidar.optics.water import C0
+from mitransient_lidar.core.constants import C0
 
 HEIGHT = 2e4
 ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # J m^2
@@ -71,7 +71,7 @@ def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator
 def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
     """Light of up to hundreds of scatterings; at albedo 0.99 it is 3 to 6 times the single scattering."""
     # No direction is drawn towards the laser: each such draw costs variance, and here are hundreds.
-    walk = {"paths_per_pass": 2**15, "turn_share": 0.0, "roulette_threshold": 0.5}
+    walk = {"paths_per_pass": 2**15, "guiding_probability": 0.0, "roulette_threshold": 0.5}
     beam = {0.5: 20.0, 0.9: 40.0, 0.99: 100.0}[albedo]
     energy = returned(lidar_scene, passes, 24, degrees, albedo, 0.1, beam, walk)
     expected = single_scattering(degrees, albedo) * chandrasekhar_h(np.cos(np.radians(degrees)), albedo) ** 2

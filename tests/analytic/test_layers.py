@@ -7,19 +7,21 @@ cells of merging are then the same, and so are the paths until they reach the st
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.beam_average import column_energy_per_bin
+from oracles.echo_times import bottom_time_ns
 from scipy.optimize import curve_fit
 from scipy.special import ndtr
 
 import mitransient_lidar
-from mitransient_lidar import resources
-from mitransient_lidar.loading import load_scene
-from mitransient_lidar.optics.beam_average import column_energy_per_bin
-from mitransient_lidar.optics.lidar_equation import LidarSystem
-from mitransient_lidar.optics.phase import fournier_forand, fournier_forand_parameters
-from mitransient_lidar.optics.pulse import Pulse, waveform
-from mitransient_lidar.optics.refraction import bottom_time_ns, snell, surface_time_ns
-from mitransient_lidar.optics.water import C0, WaterColumn
-from mitransient_lidar.survey import highest_points
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
+from mitransient_lidar.physics.lidar.refraction import snell, surface_time_ns
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
+from mitransient_lidar.studies.shot_statistics import highest_points
 
 ANGLE, INDEX = np.radians(20.0), 1.34
 BIN_NS = 0.5
@@ -37,11 +39,8 @@ def shoot(name, params, count, start_ns, bins, cell_size=0.0):
     record = {"time_start_ns": start_ns, "bin_width_ns": BIN_NS, "bin_count": bins}
     scene, _, _ = load_scene(name, {**params, **record, "bottom_depth": 40})
     engine = mi.load_dict({"type": "lidar_merging", "cell_size": cell_size})
-    found = []
-    for seed in range(count):
-        engine.render(scene, 0, seed=seed, develop=False)
-        found.append(scene.sensors()[0].film().energy())
-    return np.array(found)
+    renderer = engine.prepare(scene, scene.sensors()[0])
+    return np.array([renderer.render_pass(seed).histogram.energy() for seed in range(count)])
 
 
 def jackknife(read_off, reference, stepped):
@@ -80,7 +79,7 @@ def closed_form_ns(side):
         bins = start + BIN_NS * np.arange(81)
         return column_energy_per_bin(
             *(bins, lidar, 5e-3, column, backward, 29.0),
-            lambda gx, gy: (gx**2 + gy**2 <= 17.5e-3**2) & (side * gx >= 0),
+            lambda angle_x, angle_y: (angle_x**2 + angle_y**2 <= 17.5e-3**2) & (side * angle_x >= 0),
             "a+bb",
         )
 
@@ -94,8 +93,13 @@ def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     Where they differ by 1e-7 flights through the edges are rounded, which moves one contribution in 1e5.
     """
 
-    def record(tops, attenuation="0.9", scattering=0.7):
-        water = {"tops": tops, "attenuation": attenuation, "scattering": scattering, "backscattering": 0.014}
+    def record(layer_tops, attenuation="0.9", scattering=0.7):
+        water = {
+            "layer_tops": layer_tops,
+            "attenuation": attenuation,
+            "scattering": scattering,
+            "backscattering": 0.014,
+        }
         engine = {"type": integrator, "paths_per_pass": 2**14}
         return passes(lidar_scene(integrator=engine, water=water, sea={"spectrum": "elfouhaily"}), 2)
 
@@ -106,15 +110,15 @@ def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
         return np.mean(np.isclose(whole, other, rtol=1e-5, atol=0)[lit])
 
     np.testing.assert_array_equal(record("0, 1.1, 2.3, 5.7"), whole)
-    for tops, attenuation in (("0, 3", "0.9, 0.9000001"), ("0, 1.1, 2.3, 5.7", "0.9, 0.9000001, 0.9, 0.9000001")):
-        divided = record(tops, attenuation)
+    for layer_tops, attenuation in (("0, 3", "0.9, 0.9000001"), ("0, 1.1, 2.3, 5.7", "0.9, 0.9000001, 0.9, 0.9000001")):
+        divided = record(layer_tops, attenuation)
         assert share_of_equal_bins(divided) > 0.9
         np.testing.assert_allclose(divided.sum(axis=(0, 2)), whole.sum(axis=(0, 2)), rtol=1e-4)
     assert share_of_equal_bins(record("0", scattering=0.701)) < 0.05
 
 
 def test_scenes_of_figure_15_differ_in_layout_only():
-    first, second = (resources.scene_parameters(resources.scene_path(f"fig15_{kind}")) for kind in ("2x2", "1x1"))
+    first, second = (catalogue.scene_parameters(catalogue.scene_path(f"fig15_{kind}")) for kind in ("2x2", "1x1"))
     assert {name for name in first if first[name] != second[name]} == {"layout"}
     assert first.keys() == second.keys()
 
@@ -139,7 +143,7 @@ def test_step_is_seen_at_its_slanted_depth(name, depth, group_index, sea):
 @pytest.fixture(scope="module")
 def fig15():
     """Passes of figure 15's scene without and with the step in reach, from 1415 to 1490 ns."""
-    return tuple(shoot("fig15_2x2", {"layer_tops": tops}, 24, 1415.0, 150) for tops in ("0, 30", "0, 3"))
+    return tuple(shoot("fig15_2x2", {"layer_tops": layer_tops}, 24, 1415.0, 150) for layer_tops in ("0, 30", "0, 3"))
 
 
 def of_pixels(energy, pixels):
@@ -208,7 +212,7 @@ def absorbing(upper, lower):
     b = np.array([0.045, 0.025])
     a = np.array([upper, lower])
     texts = (", ".join(f"{value:.6f}" for value in values) for values in (a + b, b, 0.04 * b))
-    return {"tops": "0, 3", **dict(zip(("attenuation", "scattering", "backscattering"), texts, strict=True))}
+    return {"layer_tops": "0, 3", **dict(zip(("attenuation", "scattering", "backscattering"), texts, strict=True))}
 
 
 def test_absorption_changes_the_bins_behind_it_and_no_others(lidar_scene, passes):

@@ -5,17 +5,19 @@ A wrong n^2 is a factor of 1.8, a wrong pi 3.1, a forgotten cosine 6 % at 20 deg
 
 import numpy as np
 import pytest
+from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
+from oracles.lidar_equation import surface_energy
 from significance import largest_z
 
-from mitransient_lidar.optics.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
-from mitransient_lidar.optics.lidar_equation import LidarSystem, surface_energy
-from mitransient_lidar.optics.phase import (
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase import (
     fournier_forand,
     fournier_forand_parameters,
     henyey_greenstein,
     petzold_average_particle,
 )
-from mitransient_lidar.optics.water import C0, WaterColumn
 
 ENERGY = 5e-3 * 0.81 * 0.9
 DARK = {"attenuation": 50.0, "scattering": 0.0, "backscattering": 0.0}
@@ -25,14 +27,20 @@ HALF = 15e-3
 def quadrant(row, column):
     """Return the predicate of one pixel of the 2x2 receiver with a circular field of view."""
 
-    def sees(gx, gy):
-        far, left = gx > 0, gy > 0
-        return (gx**2 + gy**2 <= HALF**2) & (far == (row == 0)) & (left == (column == 1))
+    def sees(angle_x, angle_y):
+        far, left = angle_x > 0, angle_y > 0
+        return (angle_x**2 + angle_y**2 <= HALF**2) & (far == (row == 0)) & (left == (column == 1))
 
     return sees
 
 
-FIELDS = [quadrant(0, 0), quadrant(0, 1), quadrant(1, 0), quadrant(1, 1), lambda gx, gy: gx**2 + gy**2 <= HALF**2]
+FIELDS = [
+    quadrant(0, 0),
+    quadrant(0, 1),
+    quadrant(1, 0),
+    quadrant(1, 1),
+    lambda angle_x, angle_y: angle_x**2 + angle_y**2 <= HALF**2,
+]
 
 
 def pixels_and_sum(energy):
@@ -164,7 +172,12 @@ def test_single_scattering_column(lidar_scene, passes, phase):
 
 def test_single_scattering_column_in_layers(lidar_scene, passes):
     """The step at the edge is the ratio of b p(180 deg); below it the upper layer's attenuation still counts."""
-    layers = {"tops": "0, 3", "attenuation": "0.5, 0.3", "scattering": "0.2, 0.2", "backscattering": "0.004, 0.008"}
+    layers = {
+        "layer_tops": "0, 3",
+        "attenuation": "0.5, 0.3",
+        "scattering": "0.2, 0.2",
+        "backscattering": "0.004, 0.008",
+    }
     backward = [float(fournier_forand(np.pi, *fournier_forand_parameters(ratio))) for ratio in (0.02, 0.04)]
     check_column(lidar_scene, passes, layers, backward, WaterColumn.from_text(*layers.values()))
 

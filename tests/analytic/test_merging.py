@@ -4,26 +4,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
 from scipy.stats import norm, t
 from significance import FALSE_ALARM, largest_z
 
-from mitransient_lidar.comparison import pooled_relative_variance
-from mitransient_lidar.loading import load_scene
-from mitransient_lidar.optics.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
-from mitransient_lidar.optics.lidar_equation import LidarSystem
-from mitransient_lidar.optics.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
-from mitransient_lidar.optics.water import WaterColumn
-from mitransient_lidar.transport.cells import (
+from mitransient_lidar.analysis.comparison import pooled_relative_variance
+from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
+from mitransient_lidar.transport.merging.cells import (
     Region,
-    SolidPatches,
     SurfaceHeights,
     WaterCells,
     WaterGrid,
-    solids_of_several_levels,
 )
-from mitransient_lidar.transport.receiving import ViewSampler
-from mitransient_lidar.transport.streams import pass_streams
-from mitransient_lidar.transport.system import LidarScene
+from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MERGING = {"type": "lidar_merging"}
 SIGMA = 5e-3
@@ -35,7 +34,9 @@ WAVES = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_mun
 
 def quadrant(row, column, half=15e-3):
     """Return the predicate of one pixel of the 2x2 receiver with a circular field of view."""
-    return lambda gx, gy: (gx**2 + gy**2 <= half**2) & ((gx > 0) == (row == 0)) & ((gy > 0) == (column == 1))
+    return lambda angle_x, angle_y: (
+        (angle_x**2 + angle_y**2 <= half**2) & ((angle_x > 0) == (row == 0)) & ((angle_y > 0) == (column == 1))
+    )
 
 
 FIELDS = [quadrant(0, 0), quadrant(0, 1), quadrant(1, 0), quadrant(1, 1)]
@@ -73,11 +74,11 @@ def assert_same(first, second, *, floor=0.0, largest=0.1):
 
 @pytest.mark.parametrize(
     ("sea", "water"),
-    [({}, CLEAR), ({}, {"tops": "0, 2", "attenuation": "0.3, 0.05", "scattering": "0", "backscattering": "0"})],
+    [({}, CLEAR), ({}, {"layer_tops": "0, 2", "attenuation": "0.3, 0.05", "scattering": "0", "backscattering": "0"})],
 )
 def test_bottom_level(lidar_scene, passes, z_score, sea, water):
     energy = passes(lidar_scene(integrator=MERGING, sea=sea, water=water, film={"time_start_ns": 1450.0}), 24).sum(-1)
-    column = WaterColumn.from_text(water.get("tops", 0), water["attenuation"], 0, 0)
+    column = WaterColumn.from_text(water.get("layer_tops", 0), water["attenuation"], 0, 0)
     expected = np.array([echo_energies(LIDAR, SIGMA, column, 0.0, 8.0, 0.1, (1e-4, 1e-4), f).bottom for f in FIELDS])
     z, relative = z_score(np.column_stack([energy, energy.sum(1)]), np.append(expected, expected.sum()))
     assert np.all(relative < 0.01)
@@ -109,7 +110,7 @@ def test_single_scattering_column(lidar_scene, passes, phase):
 def test_single_scattering_column_in_layers(lidar_scene, passes):
     backward = [float(fournier_forand(np.pi, *fournier_forand_parameters(ratio))) for ratio in (0.02, 0.04)]
     values = "0.5, 0.3", "2e-5, 2e-5", "4e-7, 8e-7"
-    check_column(lidar_scene, passes, {"tops": "0, 3"}, *values, backward)
+    check_column(lidar_scene, passes, {"layer_tops": "0, 3"}, *values, backward)
 
 
 def check_column(lidar_scene, passes, water, attenuation, scattering, backscattering, backward):
@@ -120,7 +121,7 @@ def check_column(lidar_scene, passes, water, attenuation, scattering, backscatte
     energy = passes(scene, 24)
     energy = np.concatenate([energy, energy.sum(axis=2, keepdims=True)], axis=2)
     mean, error = mean_and_error(energy)
-    column = WaterColumn.from_text(water.get("tops", 0), attenuation, scattering, backscattering)
+    column = WaterColumn.from_text(water.get("layer_tops", 0), attenuation, scattering, backscattering)
     expected = np.array([column_energy_per_bin(edges, LIDAR, SIGMA, column, backward, 30.0, f) for f in FIELDS])
     expected = np.concatenate([expected, expected.sum(axis=1, keepdims=True)], axis=1)
     assert np.all(error < 0.02 * mean)
@@ -157,7 +158,7 @@ def plate(x, y, z, half, tilt=0.0, **bsdf):
 
 
 SPHERE = {"type": "sphere", "center": [0.3, 0.2, -5.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
-LAYERS = {"tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35", "backscattering": "0.014, 0.007"}
+LAYERS = {"layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35", "backscattering": "0.014, 0.007"}
 BUBBLES = {"plume_scattering": 1.5, "plume_width": 3.0, "plume_depth": 2.0, "plume_bearing_deg": 60.0, "plume_x": 1.0}
 CASES = {
     "waves": {"sea": WAVES},
@@ -216,9 +217,9 @@ def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
 
 def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
     """Over a level sea without mirrors nothing is left; a mirror under water leaves what it shows."""
-    unmerged = {"unmerged": True, "paths_per_pass": 2**16}
-    assert passes(lidar_scene(integrator=unmerged), 2).sum() == 0
-    mirror = lidar_scene(integrator=unmerged, extra=CASES["mirror"]["extra"])
+    complement_only = {"complement_only": True, "paths_per_pass": 2**16}
+    assert passes(lidar_scene(integrator=complement_only), 2).sum() == 0
+    mirror = lidar_scene(integrator=complement_only, extra=CASES["mirror"]["extra"])
     assert passes(mirror, 2).sum() > 0
 
 
@@ -239,11 +240,8 @@ def test_standard_errors_are_honest():
     """Over 100 seeds, 95 % intervals of four passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
     scene, _, _ = load_scene("fig09_2x2", {"attenuation": "1.0", "scattering": "0.8", "backscattering": "0.016"})
     engine = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 2**12, "photons_per_pass": 2**12})
-    film = scene.sensors()[0].film()
-    energy = []
-    for seed in range(400):
-        engine.render(scene, 0, seed=seed, develop=False)
-        energy.append(film.energy()[:, 40:110])
+    renderer = engine.prepare(scene, scene.sensors()[0])
+    energy = [renderer.render_pass(seed).histogram.energy()[:, 40:110] for seed in range(400)]
     energy = np.array(energy).reshape(100, 4, 4, 14, 5).sum(axis=-1)
     mean, error = energy.mean(axis=1), energy.std(axis=1, ddof=1) / np.sqrt(4)
     # The long-run mean holds the run itself: its own error is a tenth of a run's.
@@ -258,7 +256,7 @@ def test_standard_errors_are_honest():
 def wavy_system(lidar_scene):
     scene = lidar_scene(integrator=MERGING, sea=WAVES)
     system = LidarScene.from_scene(scene, scene.sensors()[0])
-    region = Region.of_system(system, ViewSampler(system.receiver, system.transmitter))
+    region = Region.of_scene(system, SensorSampler(system.receiver, system.transmitter))
     return system, region
 
 
@@ -321,7 +319,7 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     half = 0.31
     scene = lidar_scene(integrator=MERGING, extra={"target": plate(0.1, 0.05, -4.0, half)})
     system = LidarScene.from_scene(scene, scene.sensors()[0])
-    region = Region.of_system(system, ViewSampler(system.receiver, system.transmitter))
+    region = Region.of_scene(system, SensorSampler(system.receiver, system.transmitter))
     width, count = 0.1, 2**18
     patches = SolidPatches(system, region, width, mi.Point2f(0.37, 0.61))
     rng = pass_streams(3, 0, count)
@@ -347,11 +345,13 @@ def test_narrow_view_in_a_wide_beam_draws_light_where_it_looks(lidar_scene, pass
     scene = lidar_scene(
         integrator={**MERGING, "cell_size": 0.02}, tx={"divergence_mrad": 40.0}, rx={"field_of_view_mrad": 6.0}
     )
-    energy = passes(scene, 16).sum(axis=(1, 2))
-    engine = scene.integrator()
-    assert engine._beam.use_view
-    engine._beam.use_view = False
-    plain = passes(scene, 16).sum(axis=(1, 2))
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    energies = []
+    for use_view in (True, False):
+        assert renderer._beam.use_view
+        renderer._beam.use_view = use_view
+        energies.append(np.array([renderer.render_pass(seed).histogram.energy().sum() for seed in range(16)]))
+    energy, plain = energies
     assert_same(energy[:, None], plain[:, None])
     assert energy.std() < 0.7 * plain.std()
 
@@ -360,10 +360,11 @@ def test_crowded_passes_make_room_and_lose_nothing(lidar_scene, passes):
     """Room for a tenth of what is needed: the pass is repeated with more, and gives the same bits."""
     scene = lidar_scene(integrator={**MERGING, "paths_per_pass": 2**14, "photons_per_pass": 2**14})
     whole = passes(scene, 1, 3)
-    engine = scene.integrator()
-    engine._room.light_legs = engine._room.view_legs = engine._room.hits = 0.1
-    np.testing.assert_array_equal(passes(scene, 1, 3), whole)
-    assert engine._room.light_legs > 1
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    layout = renderer.layout
+    layout.light_segments = layout.sensor_segments = layout.hits = 0.1
+    np.testing.assert_array_equal(renderer.render_pass(3).histogram.energy(), whole[0])
+    assert layout.light_segments > 1
     dr.sync_thread()
 
 
@@ -382,7 +383,7 @@ def test_levels_of_one_mesh_are_told_apart(lidar_scene, two_levels):
     flat = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(500)}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"levels": two_levels, "flat": flat})
     system = LidarScene.from_scene(scene, scene.sensors()[0])
-    region = Region.of_system(system, ViewSampler(system.receiver, system.transmitter))
+    region = Region.of_scene(system, SensorSampler(system.receiver, system.transmitter))
     assert [shape.id() for shape in solids_of_several_levels(system, region)] == ["levels"]
 
 

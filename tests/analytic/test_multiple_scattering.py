@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from significance import largest_z
 
-from mitransient_lidar.optics.phase import henyey_greenstein
-from mitransient_lidar.optics.refraction import fresnel, refracted_path, solid_angle_per_area
-from mitransient_lidar.optics.water import C0
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
+from mitransient_lidar.physics.water.phase import henyey_greenstein
 
 HEIGHT, G = 200.0, 0.9
 HALF_VIEW = 0.05  # tangent of the field of view's half angle: 10 m on the surface

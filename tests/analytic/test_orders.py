@@ -5,9 +5,10 @@ import pytest
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.scattering_orders import scattering_orders, shares
+from mitransient_lidar.studies.scattering_orders import scattering_orders, shares
+from mitransient_lidar.transport.path_classes import PathClasses
 
-PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_extent": 200}
+PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_size": 200}
 
 
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
@@ -15,7 +16,7 @@ def test_parts_sum_to_the_whole(integrator):
     """The classes split the same paths: same seed, same energy in every bin but for rounding of the sums."""
     parts = scattering_orders("fig09_2x2", PARAMS, orders=3, passes=2, seed=4, integrator=integrator)
     whole = mitransient_lidar.render("fig09_2x2", params=PARAMS, passes=2, seed=4, integrator=integrator)
-    total = parts["impulse_response"].sum(("turns", "order")).values
+    total = parts["impulse_response"].sum(("reversals", "order")).values
     np.testing.assert_allclose(total, whole["impulse_response"].values, rtol=1e-6, atol=1e-6 * total.max())
 
 
@@ -37,19 +38,18 @@ def test_integrators_agree_by_order_and_turns():
     assert 0.001 < several < 0.004
 
 
-def test_unscattered_light_turns_once():
+def test_unscattered_light_is_reversed_once():
     parts = scattering_orders("fig09_2x2", PARAMS, orders=2, passes=2)
     direct = parts["impulse_response"].sel(order=0).sum(("pixel", "time"))
-    assert direct.sel(turns="several") < 1e-3 * direct.sel(turns="one")
+    assert direct.sel(reversals="several") < 1e-3 * direct.sel(reversals="one")
 
 
 def test_single_scattering_is_that_of_paths_with_one_event(lidar_scene, passes):
     """`lidar_volpath` with max_scatterings stops the paths instead of sorting them."""
     one = {"layout": "1x1"}
     scene = lidar_scene(integrator={"type": "lidar_volpath"}, rx=one)
-    engine = scene.integrator()
-    engine.sort_by_order(3)
-    sorted_energy = passes(scene, 2).reshape(2, 2, 4, -1)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0], classes=PathClasses(3))
+    sorted_energy = np.array([renderer.render_pass(seed).histogram.energy() for seed in range(2)]).reshape(2, 2, 4, -1)
     for most in (0, 1, 2):
         limited = passes(lidar_scene(integrator={"type": "lidar_volpath", "max_scatterings": most}, rx=one), 2)[:, 0]
         kept = sorted_energy[:, :, : most + 1].sum(axis=(1, 2))

@@ -7,13 +7,13 @@ import pytest
 from scipy.integrate import quad
 from significance import largest_z
 
-from mitransient_lidar import passive
-from mitransient_lidar.optics.phase import fournier_forand, fournier_forand_parameters
-from mitransient_lidar.optics.refraction import fresnel, snell
-from mitransient_lidar.optics.waves import realise
-from mitransient_lidar.optics.wind_seas import ElfouhailySpectrum
-from mitransient_lidar.transport.connection import start_path
-from mitransient_lidar.transport.streams import pass_streams
+from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.sea.realization import realise
+from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
+from mitransient_lidar.rendering import passive
+from mitransient_lidar.transport.refracted_connection import ConnectedPath
+from mitransient_lidar.transport.rng import pass_streams
 
 N = 1.34
 SMOOTH = {"spectrum": "flat", "slope_variance": "2e-5"}
@@ -91,7 +91,7 @@ def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
     ("sea", "layers", "lost"),
     [
         (SMOOTH, {}, 0.0),
-        (SMOOTH, {"tops": "0, 0.5", "attenuation": "0.3, 0.6", "refractive_index": "1.33, 1.37"}, 0.0),
+        (SMOOTH, {"layer_tops": "0, 0.5", "attenuation": "0.3, 0.6", "refractive_index": "1.33, 1.37"}, 0.0),
         ({"wind_speed": 6.0, "cell_size": 0.25}, {}, 0.025),
     ],
 )
@@ -108,7 +108,7 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, l
         rx={"off_nadir_deg": 20.0},
         depth=2.0,
         rho=1.0,
-        integrator={"turn_share": 0.02},
+        integrator={"guiding_probability": 0.02},
     )
     assert agrees(passes(scene, 12), 1 - lost / 2, 3, bias=lost / 2) < 3e-3
 
@@ -287,16 +287,18 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
     depth = 1.0
     ratio = {"rayleigh": 0.5, "petzold": 0.01826}[phase]
     water = {"attenuation": 1.0, "scattering": albedo, "backscattering": ratio * albedo, "phase": {"type": phase}}
-    scene = build(sun={"zenith_deg": 60.0}, water=water, integrator={"turn_share": 0.05 if ratio > 0.1 else 0.3})
-    engine = scene.integrator()
-    system, _ = engine.prepare_view(scene, scene.sensors()[0])
+    scene = build(
+        sun={"zenith_deg": 60.0}, water=water, integrator={"guiding_probability": 0.05 if ratio > 0.1 else 0.3}
+    )
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     count, found = 2**14 if ratio > 0.1 else 2**17, []
     for seed in range(8):
-        path = start_path(system.receiver.pose, mi.Vector3f(0, 0, -1), dr.full(mi.Bool, True, count))
+        pose = renderer.scene.receiver.pose
+        path = ConnectedPath.start(pose, mi.Vector3f(0, 0, -1), dr.full(mi.Bool, True, count))
         path.point, path.in_water = mi.Point3f(0, 0, -depth), mi.Bool(True)
         weight = dr.full(mi.Float, 1 / count, count)
-        engine.follow(system, path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
-        found.append([float(engine.found[0])])
+        record = renderer.follow(path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
+        found.append([float(record.found[0])])
     assert agrees(np.array(found), expected, 4, bias=spread) < (0.01 if ratio > 0.1 else 0.05)
 
 
@@ -336,13 +338,13 @@ def test_a_sinusoidal_sea_focuses_the_sun(tmp_path):
             "filename": str(tmp_path / "waves.npy"),
             "map_size": 40.0,
             "slope_variance": str(2 * (resolved + ripple)),
-            "extent": 200.0,
+            "size": 200.0,
         },
         rx={
             "pixel_map": str(tmp_path / "columns.npy"),
             "altitude": 200.0,
             "field_of_view_mrad": 1e3 * side / 200.0,
-            "shot_x": -0.5,
+            "aim_x": -0.5,
         },
         integrator={"paths_per_pass": 2**19, "max_scatterings": 0},
         extra={f"plate{i}": plate(d, 0.05, 1.9, p) for i, (d, p) in enumerate(zip(depths, places, strict=True))},
@@ -411,13 +413,13 @@ def test_a_wind_sea_focuses_the_sun_most_some_metres_down(tmp_path):
                 "filename": str(tmp_path / "sea.npy"),
                 "map_size": period,
                 "slope_variance": str(2 * (resolved + ripple)),
-                "extent": 200.0,
+                "size": 200.0,
             },
             rx={
                 "pixel_map": str(tmp_path / "columns.npy"),
                 "altitude": 200.0,
                 "field_of_view_mrad": 1e3 * side / 200.0,
-                "shot_x": -0.1,
+                "aim_x": -0.1,
             },
             integrator={"paths_per_pass": 2**18, "max_scatterings": 0},
             extra={f"plate{i}": plate(d, 0.05, 1.9, p) for i, (d, p) in enumerate(zip(depths, places, strict=True))},

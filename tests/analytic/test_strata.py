@@ -4,26 +4,26 @@ import numpy as np
 import pytest
 from significance import largest_z
 
-from mitransient_lidar.optics.refraction import fresnel
-from mitransient_lidar.optics.water import C0
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.refraction import fresnel
 
 HEIGHT, THETA, AREA = 200.0, np.radians(20.0), 0.025
 INDEX, GROUP, THICKNESS = np.array([1.34, 1.6, 1.2]), np.array([1.36, 1.25, 1.2]), np.array([2.0, 3.0, 3.0])
 WATER = {
-    "tops": "0, 2, 5",
+    "layer_tops": "0, 2, 5",
     "refractive_index": "1.34, 1.6, 1.2",
     "group_index": "1.36, 1.25, 1.2",
 }
 
 
 def across(theta):
-    """Return how far a ray gets sideways from the receiver to the bottom [m], and its angles in the strata."""
+    """Return how far a ray gets sideways from the receiver to the bottom [m], and its angles in the index_layers."""
     phi = np.arcsin(np.sin(theta) / INDEX)
     return HEIGHT * np.tan(theta) + np.sum(THICKNESS * np.tan(phi)), phi
 
 
-def bottom_echo(attenuation, reflectivity):
-    """Return arrival [ns] and energy [J] of a narrow beam's echo from the bottom below three strata.
+def bottom_echo(attenuation, reflectance):
+    """Return arrival [ns] and energy [J] of a narrow beam's echo from the bottom below three index_layers.
 
     The solid angle of the aperture from the bottom is that of the bundle of rays: sideways its width grows by
     offset / sin(phi), in the plane of incidence by cos(theta) d(offset)/d(phi), with phi at the bottom.
@@ -36,13 +36,13 @@ def bottom_echo(attenuation, reflectivity):
     slant = THICKNESS / np.cos(phi)
     sent = 5e-3 * 0.81 * 0.9 * fresnel(THETA, INDEX[0])[1] ** 2 * np.exp(-2 * attenuation * slant.sum())
     arrival = 2e9 / C0 * (HEIGHT / np.cos(THETA) + np.sum(GROUP * slant))
-    return arrival, sent * reflectivity / np.pi * np.cos(phi[-1]) * solid_angle
+    return arrival, sent * reflectance / np.pi * np.cos(phi[-1]) * solid_angle
 
 
 @pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
 def test_bottom_echo_comes_in_time_and_strength_of_the_bent_path(lidar_scene, passes, z_score, integrator):
     """With one group index for all the echo would come 5 ns late; without bending it would have a fifth less energy."""
-    arrival, expected = bottom_echo(attenuation=0.1, reflectivity=0.1)
+    arrival, expected = bottom_echo(attenuation=0.1, reflectance=0.1)
     narrow = {"divergence_mrad": 0.2}
     scene = lidar_scene(
         integrator={"type": integrator, "paths_per_pass": 2**14},
@@ -57,7 +57,7 @@ def test_bottom_echo_comes_in_time_and_strength_of_the_bent_path(lidar_scene, pa
     time = 1390 + 0.25 * (np.arange(200, 640) + 0.5)
     assert abs(np.average(time, weights=late.mean(axis=0)) - arrival) < 0.1
     z, relative = z_score(late.sum(axis=1), expected)
-    # The partial reflections between the strata, 1 % a crossing here, are left out by both.
+    # The partial reflections between the index_layers, 1 % a crossing here, are left out by both.
     assert abs(z) < largest_z(24), (z, late.sum(axis=1).mean() / expected)
     assert relative < 0.005
 
@@ -65,10 +65,10 @@ def test_bottom_echo_comes_in_time_and_strength_of_the_bent_path(lidar_scene, pa
 def test_light_beyond_the_critical_angle_is_reflected(lidar_scene, passes, z_score):
     """Below 1.2 there is 1.0001: light steeper than 56 degrees from the vertical passes, both ways.
 
-    Both integrators bend, but only `lidar_volpath` connects through the strata: they would differ where one forgets the
-    square of the index or the density of a bent direction.
+    Both integrators bend, but only `lidar_volpath` connects through the index_layers: they would differ where one
+    forgets the square of the index or the density of a bent direction.
     """
-    water = {"tops": "0, 1", "refractive_index": "1.2, 1.0001", "attenuation": 0.6, "scattering": 0.55}
+    water = {"layer_tops": "0, 1", "refractive_index": "1.2, 1.0001", "attenuation": 0.6, "scattering": 0.55}
     water |= {"phase_function": "hg", "phase_g": 0.3}
     film = {"bin_width_ns": 4.0, "bin_count": 40}
     gates = {}
@@ -83,18 +83,20 @@ def test_light_beyond_the_critical_angle_is_reflected(lidar_scene, passes, z_sco
 
 
 def test_strata_of_one_index_are_one(lidar_scene, passes):
-    layered = {"tops": "0, 2, 5", "refractive_index": "1.34, 1.34, 1.34"}
-    energies = [passes(lidar_scene(water=water), 2) for water in (layered, {"tops": "0, 2, 5"})]
+    layered = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.34, 1.34"}
+    energies = [passes(lidar_scene(water=water), 2) for water in (layered, {"layer_tops": "0, 2, 5"})]
     np.testing.assert_array_equal(*energies)
 
 
 def test_index_changes_within_the_waves_are_refused(lidar_scene, passes):
-    water = {"tops": "0, 0.01", "refractive_index": "1.335, 1.34"}
-    scene = lidar_scene(sea={"spectrum": "elfouhaily", "wind_speed": 6.0, "extent": 60.0}, water=water)
+    water = {"layer_tops": "0, 0.01", "refractive_index": "1.335, 1.34"}
+    scene = lidar_scene(sea={"spectrum": "elfouhaily", "wind_speed": 6.0, "size": 60.0}, water=water)
     with pytest.raises((RuntimeError, ValueError), match=r"refractive_index changes at 0.01 m, within the waves"):
         passes(scene, 1)
 
 
 def test_layers_below_the_bottom_are_refused(lidar_scene, passes):
-    with pytest.raises((RuntimeError, ValueError), match=r"tops = 9 m is a layer below the bottom: .* less than 8 m"):
-        passes(lidar_scene(water={"tops": "0, 9", "attenuation": "0.3, 0.4"}), 1)
+    with pytest.raises(
+        (RuntimeError, ValueError), match=r"layer_tops = 9 m is a layer below the bottom: .* less than 8 m"
+    ):
+        passes(lidar_scene(water={"layer_tops": "0, 9", "attenuation": "0.3, 0.4"}), 1)

@@ -4,10 +4,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.errors import UserError
-from mitransient_lidar.target_signal import describe_map, describe_target, target_map, target_signal
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.studies.target_signal import describe_map, describe_target, target_map, target_signal
 
-NEAR = {"surface_extent": 200, "bin_count": 170}
+NEAR = {"surface_size": 200, "bin_count": 170}
 SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 
 
@@ -82,10 +82,10 @@ def test_table_tells_pixels_and_combinations(published):
 @pytest.mark.parametrize(
     ("scene", "params", "options", "message"),
     [
-        ("fig13_2x2", {}, {"target": "mine"}, "target = 'mine' must be the id of a shape of the scene: .*bottom"),
-        ("fig13_2x2", {}, {"target": "surface"}, "target = 'surface' must not be the sea surface"),
+        ("fig13_2x2", {}, {"target_id": "mine"}, "target_id = 'mine' must be the id of a shape of the scene: .*bottom"),
+        ("fig13_2x2", {}, {"target_id": "surface"}, "target_id = 'surface' must not be the sea surface"),
         ("fig13_2x2", {"target_depth": 13}, {}, "target 'target' lies below the bottom, up to z = -13 m"),
-        ("fig13_2x2", {"target_reflectivity": 0}, {}, "it returns no light"),
+        ("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light"),
         ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
     ],
 )

@@ -3,14 +3,15 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.beam_average import echo_energies
 from scipy.stats import t
 from significance import FALSE_ALARM, largest_z
 
-from mitransient_lidar.loading import load_scene
-from mitransient_lidar.optics.beam_average import echo_energies
-from mitransient_lidar.optics.lidar_equation import LidarSystem
-from mitransient_lidar.optics.refraction import fresnel, refracted_path, solid_angle_per_area
-from mitransient_lidar.optics.water import C0, WaterColumn
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
+from mitransient_lidar.physics.water.layers import WaterColumn
 
 SIGMA = 5e-3
 HEIGHT, OFF_NADIR, INDEX = 200.0, np.radians(20.0), 1.34
@@ -65,8 +66,8 @@ def gain(x, y, z):
     ray = np.stack([np.sin(theta) * east / rho, np.sin(theta) * north / rho, -np.cos(theta)], axis=-1)
     axis = np.array([np.sin(OFF_NADIR), 0.0, -np.cos(OFF_NADIR)])
     along = ray @ axis
-    gx, gy = ray @ np.array([np.cos(OFF_NADIR), 0.0, np.sin(OFF_NADIR)]) / along, ray[..., 1] / along
-    per_steradian = np.exp(-0.5 * (gx**2 + gy**2) / SIGMA**2) / (2 * np.pi * SIGMA**2) / along**3
+    angle_x, angle_y = ray @ np.array([np.cos(OFF_NADIR), 0.0, np.sin(OFF_NADIR)]) / along, ray[..., 1] / along
+    per_steradian = np.exp(-0.5 * (angle_x**2 + angle_y**2) / SIGMA**2) / (2 * np.pi * SIGMA**2) / along**3
     _, transmittance = fresnel(theta, INDEX)
     path = -z / np.cos(phi)
     one_way = transmittance * np.exp(-ABSORPTION * path) * solid_angle_per_area(HEIGHT, -z, theta, INDEX)
@@ -100,8 +101,8 @@ def test_quadrature_agrees_with_the_closed_form_of_the_bottom():
 def test_plate_that_fills_the_beam_is_a_bottom(lidar_scene, passes, integrator):
     column = WaterColumn.from_text(0, ABSORPTION, 0, 0)
 
-    def seen(gx, gy):
-        return gx**2 + gy**2 <= 15e-3**2
+    def seen(angle_x, angle_y):
+        return angle_x**2 + angle_y**2 <= 15e-3**2
 
     expected = echo_energies(LIDAR, SIGMA, column, 0.0, 6.0, 0.3, (1e-5, 1e-5), seen).bottom
     energy = render_one(lidar_scene, passes, integrator, plate(1.6, 0, -6.0, 7.0, diffuse(0.3))).sum(axis=1)
@@ -151,8 +152,8 @@ def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
 
 # The integrators agree, shadows and edges included.
 
-SAND = {"type": "seabed", "ripple_height": 0.06, "ripple_length": 0.4, "slope_x_deg": 8.0, "extent": 100.0}
-PATCHES = {"type": "seabed", "slope_x_deg": 6.0, "slope_y_deg": -3.0, "extent": 100.0, "patches": "2 0 1 0.4; 3 1 1 0"}
+SAND = {"type": "seabed", "ripple_height": 0.06, "ripple_length": 0.4, "slope_x_deg": 8.0, "size": 100.0}
+PATCHES = {"type": "seabed", "slope_x_deg": 6.0, "slope_y_deg": -3.0, "size": 100.0, "patches": "2 0 1 0.4; 3 1 1 0"}
 CASES = {
     "cube": {"target": {"type": "cube", "bsdf": diffuse(0.4)}},
     "cylinder": {

@@ -3,11 +3,11 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.beam_average import echo_energies
+from oracles.two_scale import two_scale_ratio
 
-from mitransient_lidar.optics.beam_average import echo_energies
-from mitransient_lidar.optics.lidar_equation import LidarSystem
-from mitransient_lidar.optics.two_scale import two_scale_ratio
-from mitransient_lidar.optics.water import WaterColumn
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.water.layers import WaterColumn
 
 #: So high that one shot takes in a patch of 40 m: the mean over seas needs fewer of them.
 HEIGHT = 2000.0
@@ -20,19 +20,23 @@ def surface_echoes(wind, angle, cell):
     film = {"type": "time_gated_film", "time_start_ns": 12000.0, "bin_width_ns": 6000.0, "bin_count": 1}
     energies = []
     for seed in range(SEAS):
-        sea = {"type": "ocean_surface", "wind_speed": wind, "cell_size": cell, "size": 96.0, "surface_seed": seed}
+        sea = {
+            "type": "ocean_surface",
+            "wind_speed": wind,
+            "cell_size": cell,
+            "refined_size": 96.0,
+            "surface_seed": seed,
+        }
         scene = mi.load_dict(
             {
                 "type": "scene",
                 "integrator": {"type": "lidar_volpath", "max_scatterings": 0, "paths_per_pass": 2**16},
                 "tx": {"type": "lidar_transmitter", **lidar},
                 "rx": {"type": "multipixel_receiver", **lidar, "field_of_view_mrad": 80.0, "layout": "1x1", "f": film},
-                "sea": {**sea, "extent": 400.0, "interior": {"type": "layered_water"}},
+                "sea": {**sea, "size": 400.0, "interior": {"type": "layered_water"}},
             }
         )
-        scene.integrator().render(scene, 0, seed=seed, develop=False)
-        energies.append(scene.sensors()[0].film().energy().sum())
-        scene.integrator().release()
+        energies.append(float(np.sum(mi.render(scene, seed=seed))))
     (surface,) = (shape.sea for shape in scene.shapes() if hasattr(shape, "sea"))
     return np.array(energies), surface.resolved_variance, surface.ripple_variance
 

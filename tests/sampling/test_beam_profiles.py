@@ -9,15 +9,15 @@ import pytest
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import chi2
 
-from mitransient_lidar.transport.beam import BeamSampler
-from mitransient_lidar.transport.beam_profiles import GaussianBeam, ImageBeam, TopHatBeam
-from mitransient_lidar.transport.streams import pass_streams
+from mitransient_lidar.transport.laser.beam_profiles import GaussianBeam, ImageBeam, TopHatBeam
+from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.transport.rng import pass_streams
 
 MRAD = 1e-3
 COUNT = 2**20
 IMAGE = np.array([[0, 7, 1, 0], [0, 0, 0, 0], [2, 3, 0, 12]], dtype=float)
 
-#: Half angles of 6 and 1.5 mrad, the long axis 30 degrees from +gx towards +gy.
+#: Half angles of 6 and 1.5 mrad, the long axis 30 degrees from +angle_x towards +angle_y.
 TURN = np.radians(30)
 PROFILES = {
     "gaussian": lambda: GaussianBeam(6 * MRAD, 1.5 * MRAD, TURN),
@@ -28,8 +28,8 @@ PROFILES = {
 
 def tangent_samples(profile, count=COUNT):
     rng = mi.PCG32(count, initstate=3)
-    gx, gy = profile.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    return np.array(gx, dtype=np.float64), np.array(gy, dtype=np.float64)
+    angle_x, angle_y = profile.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    return np.array(angle_x, dtype=np.float64), np.array(angle_y, dtype=np.float64)
 
 
 def laser(**parameters):
@@ -53,10 +53,10 @@ def image_file(folder, image=IMAGE, suffix=".npy"):
 @pytest.mark.parametrize("kind", PROFILES)
 def test_samples_follow_the_density(kind):
     profile = PROFILES[kind]()
-    gx, gy = tangent_samples(profile)
+    angle_x, angle_y = tangent_samples(profile)
     edges = np.linspace(-30, 30, 121) * MRAD
     width = edges[1] - edges[0]
-    counts = np.histogram2d(gx, gy, bins=(edges, edges))[0]
+    counts = np.histogram2d(angle_x, angle_y, bins=(edges, edges))[0]
     fine = ((edges[:-1] + edges[1:])[:, None] / 2 + ((np.arange(8) + 0.5) / 8 - 0.5) * width).ravel()
     x, y = (mi.Float(g.ravel()) for g in np.meshgrid(fine, fine, indexing="ij"))
     density = np.array(profile.density(x, y), dtype=np.float64).reshape(120, 8, 120, 8)
@@ -73,28 +73,30 @@ def test_samples_follow_the_density(kind):
 @pytest.mark.parametrize("kind", ["gaussian", "top_hat"])
 def test_elliptic_samples_have_the_moments_of_a_turned_ellipse(kind):
     """Variances a^2 and b^2 along axes turned by 30 degrees (a quarter of them for an even disc); no sign is free."""
-    gx, gy = tangent_samples(PROFILES[kind]())
+    angle_x, angle_y = tangent_samples(PROFILES[kind]())
     a2, b2 = (36.0, 2.25) if kind == "gaussian" else (9.0, 0.5625)
     cos2, sin2, mixed = 0.75, 0.25, np.sqrt(3) / 4
     expected = np.array([a2 * cos2 + b2 * sin2, a2 * sin2 + b2 * cos2, (a2 - b2) * mixed]) * MRAD**2
-    np.testing.assert_allclose([np.mean(gx**2), np.mean(gy**2), np.mean(gx * gy)], expected, rtol=0.01)
-    assert np.abs([gx.mean(), gy.mean()]).max() < 4 * 6 * MRAD / np.sqrt(COUNT)
+    np.testing.assert_allclose(
+        [np.mean(angle_x**2), np.mean(angle_y**2), np.mean(angle_x * angle_y)], expected, rtol=0.01
+    )
+    assert np.abs([angle_x.mean(), angle_y.mean()]).max() < 4 * 6 * MRAD / np.sqrt(COUNT)
 
 
 def test_elliptic_gaussian_falls_to_e_to_the_minus_half_at_its_half_angles():
     beam = laser(divergence_mrad=12.0, divergence_across_mrad=3.0, ellipse_deg=30.0)
     cos, sin = np.cos(TURN), np.sin(TURN)
-    gx, gy = mi.Float([0, 6e-3 * cos, -1.5e-3 * sin]), mi.Float([0, 6e-3 * sin, 1.5e-3 * cos])
-    density = np.array(beam.tangent_density(gx, gy))
+    angle_x, angle_y = mi.Float([0, 6e-3 * cos, -1.5e-3 * sin]), mi.Float([0, 6e-3 * sin, 1.5e-3 * cos])
+    density = np.array(beam.tangent_density(angle_x, angle_y))
     assert density[0] == pytest.approx(1 / (2 * np.pi * 6e-3 * 1.5e-3), rel=1e-5)
     np.testing.assert_allclose(density[1:] / density[0], np.exp(-0.5), rtol=1e-4)
 
 
 def test_image_cells_hold_their_shares():
-    """Row 0 is far (+gx) and column 0 at -gy: a flipped image would put the brightest cell, 12 of 25, elsewhere."""
-    gx, gy = tangent_samples(PROFILES["image"]())
+    """Row 0 is far (+angle_x) and column 0 at -angle_y: a flipped image would move the brightest cell, 12 of 25."""
+    angle_x, angle_y = tangent_samples(PROFILES["image"]())
     far, left = 6 * MRAD - 4 * MRAD * np.arange(4), -8 * MRAD + 4 * MRAD * np.arange(5)
-    counts = np.histogram2d(-gx, gy, bins=(-far, left))[0]
+    counts = np.histogram2d(-angle_x, angle_y, bins=(-far, left))[0]
     expected = COUNT * IMAGE / IMAGE.sum()
     assert counts.sum() == COUNT
     assert not counts[IMAGE == 0].any()
@@ -110,10 +112,10 @@ def test_fine_image_of_a_gaussian_is_that_gaussian():
     along, across = 0.8 * far + 0.6 * left, 0.8 * left - 0.6 * far
     profile = ImageBeam(np.exp(-0.5 * (along**2 / 4 + across**2)), 20 * MRAD)
     np.testing.assert_allclose(profile.spreads, [2 * MRAD, 1 * MRAD], rtol=1e-3)
-    assert np.degrees(profile.turn) % 180 == pytest.approx(np.degrees(np.arctan2(0.6, 0.8)), abs=0.01)
-    gx, gy = tangent_samples(profile)
+    assert np.degrees(profile.rotation) % 180 == pytest.approx(np.degrees(np.arctan2(0.6, 0.8)), abs=0.01)
+    angle_x, angle_y = tangent_samples(profile)
     np.testing.assert_allclose(
-        [np.var(gx), np.var(gy)], [(0.64 * 4 + 0.36) * 1e-6, (0.36 * 4 + 0.64) * 1e-6], rtol=0.01
+        [np.var(angle_x), np.var(angle_y)], [(0.64 * 4 + 0.36) * 1e-6, (0.36 * 4 + 0.64) * 1e-6], rtol=0.01
     )
     (half, (rim,)), (_, (outer,)) = profile.outlines()
     assert half == pytest.approx(np.exp(-0.5))
@@ -154,8 +156,8 @@ def test_spreads_are_those_of_the_narrow_and_the_wide_axis():
 @pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
 def test_files_of_all_kinds_hold_the_same_beam(suffix, tmp_path):
     beam = laser(beam_profile="image", profile_file=image_file(tmp_path, suffix=suffix), profile_mrad=16.0)
-    gx, gy = (g.ravel() for g in np.meshgrid([4e-3, 0, -4e-3], [-6e-3, -2e-3, 2e-3, 6e-3], indexing="ij"))
-    density = np.array(beam.tangent_density(mi.Float(gx), mi.Float(gy)))
+    angle_x, angle_y = (g.ravel() for g in np.meshgrid([4e-3, 0, -4e-3], [-6e-3, -2e-3, 2e-3, 6e-3], indexing="ij"))
+    density = np.array(beam.tangent_density(mi.Float(angle_x), mi.Float(angle_y)))
     np.testing.assert_allclose(density * 16e-6, IMAGE.ravel() / 25, rtol=1e-5)
 
 
@@ -175,10 +177,10 @@ def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
     energy = np.array(energy, dtype=np.float64) * np.ones(COUNT)
     assert np.isfinite(energy).all()
     assert energy.sum() == pytest.approx(4.5e-3, rel=3e-3)
-    # And they stand for it where it is: the part beyond gx = 0 is the beam's own.
-    gx, gy, _ = beam.pose.tangent(direction)
+    # And they stand for it where it is: the part beyond angle_x = 0 is the beam's own.
+    angle_x, angle_y, _ = beam.pose.tangent(direction)
     far, left = tangent_samples(beam.profile)
-    for seen, own in ((np.array(gx) > 0, far > 0), (np.array(gy) > 1e-3, left > 1e-3)):
+    for seen, own in ((np.array(angle_x) > 0, far > 0), (np.array(angle_y) > 1e-3, left > 1e-3)):
         assert energy[seen].sum() / 4.5e-3 == pytest.approx(own.mean(), abs=5e-3)
 
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.special import erf
 from scipy.stats import chi2
 
-from mitransient_lidar.transport.blur import GaussianBlur, MeasuredBlur
-from mitransient_lidar.transport.receiving import ViewSampler
-from mitransient_lidar.transport.streams import pass_streams
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MRAD = 1e-3
 COUNT = 2**20
@@ -20,13 +20,13 @@ SQUARE = {"layout": "4x4", "field_of_view_mrad": 16.0, "field_of_view_shape": "s
 def energies(receiver, transmitter):
     """Return each pixel's share of a Gaussian spot in the laser's place, its standard error, and the sampler."""
     plugin = mi.load_dict({"type": "multipixel_receiver", **receiver})
-    view = ViewSampler(plugin.receiver, mi.load_dict({"type": "lidar_transmitter", **transmitter}))
+    view = SensorSampler(plugin.receiver, mi.load_dict({"type": "lidar_transmitter", **transmitter}))
     start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(11, 0, COUNT))
-    gx, gy, _ = plugin.receiver.pose.tangent(start.direction)
-    x, y = (gx - view.centre[0]) / view.sigma, (gy - view.centre[1]) / view.sigma
+    angle_x, angle_y, _ = plugin.receiver.pose.tangent(start.direction)
+    x, y = (angle_x - view.centre[0]) / view.sigma, (angle_y - view.centre[1]) / view.sigma
     spot = dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * view.sigma**2)
     # Divided by the solid angle per area of the tangent plane, so that the spot sums to 1.
-    per_area = (1 + gx * gx + gy * gy) ** 1.5
+    per_area = (1 + angle_x * angle_x + angle_y * angle_y) ** 1.5
     sample = np.array(start.weight * spot * per_area, dtype=np.float64) * COUNT / COLLECTION
     pixel = np.array(start.pixel)
     count = plugin.receiver.pixels.count
@@ -51,7 +51,7 @@ def gaussian_shares(centre, sigma, edges):
     ],
 )
 def test_gaussian_blur_spreads_a_beam_as_its_integral_over_pixels(divergence, shift, blur, footprint):
-    mean, error, view = energies({**SQUARE, "blur_mrad": blur}, {"divergence_mrad": divergence, "shot_y": shift})
+    mean, error, view = energies({**SQUARE, "blur_mrad": blur}, {"divergence_mrad": divergence, "aim_y": shift})
     assert view.use_footprint == footprint
     centre = [1e3 * float(g[0]) for g in view.centre]
     expected = gaussian_shares(centre, np.hypot(0.5 * divergence, blur), np.linspace(-8, 8, 5)).ravel()
@@ -66,7 +66,9 @@ def test_what_leaves_the_field_of_view_is_lost_and_no_more():
     wide, _, _ = energies({"layout": "2x2", "field_of_view_mrad": 16.0, "blur_mrad": 1.0}, narrow)
     assert wide.sum() == pytest.approx(1, rel=2e-3)
     np.testing.assert_allclose(wide, 0.25, rtol=5e-3)
-    edge = {"a": {"type": "pixel_fov", "shape": "rectangle", "width_mrad": 40.0, "height_mrad": 20.0, "gx_mrad": 10.0}}
+    edge = {
+        "a": {"type": "pixel_fov", "shape": "rectangle", "width_mrad": 40.0, "height_mrad": 20.0, "angle_x_mrad": 10.0}
+    }
     half, _, _ = energies({**edge, "blur_mrad": 1.0}, narrow)
     assert half.sum() == pytest.approx(0.5, rel=5e-3)
 
@@ -74,8 +76,8 @@ def test_what_leaves_the_field_of_view_is_lost_and_no_more():
 def test_blur_serves_every_kind_of_pixels(tmp_path):
     """A narrow beam in a label, in overlapping circles (both 1 - exp(-r^2 / 2 sigma^2)) and in hexagons."""
     ticks = np.linspace(-10, 10, 400, endpoint=False) + 0.025
-    gx, gy = np.meshgrid(ticks[::-1], ticks, indexing="ij")
-    np.save(tmp_path / "disc.npy", np.where(np.hypot(gx, gy) < 4, 3, 0))
+    angle_x, angle_y = np.meshgrid(ticks[::-1], ticks, indexing="ij")
+    np.save(tmp_path / "disc.npy", np.where(np.hypot(angle_x, angle_y) < 4, 3, 0))
     circle = {"type": "pixel_fov", "field_of_view_mrad": 8.0}
     narrow = {"divergence_mrad": 0.04}
     within = 1 - np.exp(-(4.0**2) / (2 * 2.0**2))
@@ -86,8 +88,8 @@ def test_blur_serves_every_kind_of_pixels(tmp_path):
     share, error, _ = energies({"a": circle, "b": {**circle, "field_of_view_mrad": 4.0}, "blur_mrad": 2.0}, narrow)
     assert np.all(np.abs(share - [within, 1 - np.exp(-0.5)]) < 4 * error)
     # A hexagon with side s = 4 mrad, by numbers on a fine raster.
-    x, y = np.abs(gx), np.abs(gy)
-    density = np.exp(-(gx**2 + gy**2) / 8) / (8 * np.pi) * 0.05**2
+    x, y = np.abs(angle_x), np.abs(angle_y)
+    density = np.exp(-(angle_x**2 + angle_y**2) / 8) / (8 * np.pi) * 0.05**2
     within = density[np.maximum(y, np.sqrt(0.75) * x + 0.5 * y) < np.sqrt(0.75) * 4].sum()
     share, error, _ = energies({"layout": "hex7", "field_of_view_mrad": 8 * np.sqrt(7), "blur_mrad": 2.0}, narrow)
     assert share[3] == pytest.approx(within, rel=5e-3)
@@ -95,7 +97,7 @@ def test_blur_serves_every_kind_of_pixels(tmp_path):
 
 
 def test_measured_blur_puts_light_where_the_image_does(tmp_path):
-    """Three of four parts on the far, -gy side and one in the middle: row 0 is +gx, column 0 is -gy."""
+    """Three of four parts on the far, -angle_y side and one in the middle: row 0 is +angle_x, column 0 is -angle_y."""
     image = np.zeros((5, 5))
     image[0, 0], image[2, 2] = 3.0, 1.0
     np.save(tmp_path / "psf.npy", image)
@@ -111,14 +113,14 @@ def test_a_pixel_looks_where_its_light_comes_from(tmp_path):
     image[4, 2] = 1.0
     np.save(tmp_path / "psf.npy", image)
     blur = {"blur_file": str(tmp_path / "psf.npy"), "blur_file_mrad": 15.0}
-    for shot_y in (0.0, 30.0):
+    for aim_y in (0.0, 30.0):
         receiver = mi.load_dict({"type": "pixel_fov", "field_of_view_mrad": 0.2, **blur}).receiver
-        view = ViewSampler(receiver, mi.load_dict({"type": "lidar_transmitter", "shot_y": shot_y}))
+        view = SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter", "aim_y": aim_y}))
         start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(2, 0, COUNT))
         seen = np.array(start.weight) > 0
-        gx, gy, _ = (np.array(g, dtype=np.float64)[seen] for g in receiver.pose.tangent(start.direction))
-        np.testing.assert_allclose([gx.mean(), gy.mean()], [-3e-3, 5e-3], atol=2e-5)
-        assert max(np.ptp(gx), np.ptp(gy)) < 1.3e-3
+        angle_x, angle_y, _ = (np.array(g, dtype=np.float64)[seen] for g in receiver.pose.tangent(start.direction))
+        np.testing.assert_allclose([angle_x.mean(), angle_y.mean()], [-3e-3, 5e-3], atol=2e-5)
+        assert max(np.ptp(angle_x), np.ptp(angle_y)) < 1.3e-3
 
 
 def test_displacements_follow_the_measured_image():
@@ -126,8 +128,10 @@ def test_displacements_follow_the_measured_image():
     values = np.random.default_rng(4).uniform(0, 1, (12, 7)) * (np.arange(7) % 3 != 1)
     values[0] = values[-1] = 0
     rng = mi.PCG32(COUNT, initstate=6)
-    gx, gy = MeasuredBlur(values, 7 * MRAD).sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    fine = np.histogram2d(-np.array(gx), np.array(gy), bins=(24, 14), range=((-6e-3, 6e-3), (-3.5e-3, 3.5e-3)))[0]
+    angle_x, angle_y = MeasuredPointSpread(values, 7 * MRAD).sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    fine = np.histogram2d(
+        -np.array(angle_x), np.array(angle_y), bins=(24, 14), range=((-6e-3, 6e-3), (-3.5e-3, 3.5e-3))
+    )[0]
     expected = COUNT * np.repeat(np.repeat(values / values.sum() / 4, 2, axis=0), 2, axis=1)
     lit = expected > 20
     assert fine[expected == 0].sum() <= 1e-4 * COUNT  # edges to rounding
@@ -137,7 +141,7 @@ def test_displacements_follow_the_measured_image():
 def test_a_measured_gaussian_blurs_as_the_formula_does(tmp_path):
     ticks = np.linspace(-6, 6, 121)
     np.save(tmp_path / "psf.npy", 7e3 * np.exp(-(ticks[:, None] ** 2 + ticks**2) / 2 / 1.2**2))
-    beam = {"divergence_mrad": 2.0, "shot_y": 0.4}
+    beam = {"divergence_mrad": 2.0, "aim_y": 0.4}
     blur = {"blur_file": str(tmp_path / "psf.npy"), "blur_file_mrad": 12.1}
     measured, error, _ = energies({**SQUARE, **blur}, beam)
     formula, other, _ = energies({**SQUARE, "blur_mrad": 1.2}, beam)
@@ -148,7 +152,7 @@ def test_a_measured_gaussian_blurs_as_the_formula_does(tmp_path):
 
 def test_gaussian_displacements_have_the_given_width_along_each_axis():
     rng = mi.PCG32(COUNT, initstate=2)
-    for g in GaussianBlur(2 * MRAD).sample(mi.Point2f(rng.next_float32(), rng.next_float32())):
+    for g in GaussianPointSpread(2 * MRAD).sample(mi.Point2f(rng.next_float32(), rng.next_float32())):
         values = np.array(g, dtype=np.float64)
         assert values.std() == pytest.approx(2e-3, rel=4 / np.sqrt(2 * COUNT))
         assert abs(values.mean()) < 4 * 2e-3 / np.sqrt(COUNT)
@@ -158,7 +162,7 @@ def test_sharp_optics_are_blur_0_to_the_bit():
     views = []
     for blur in ({}, {"blur_mrad": 0.0}):
         receiver = mi.load_dict({"type": "multipixel_receiver", **blur}).receiver
-        view = ViewSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
+        view = SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
         start = view.sample(dr.arange(mi.UInt32, 4096), 4096, pass_streams(3, 0, 4096))
         views.append([np.array(values) for values in (start.direction, start.pixel, start.weight)])
     for sharp, zero in zip(*views, strict=True):
@@ -172,8 +176,8 @@ def test_rays_for_mitsubas_integrators_are_blurred():
     rng = mi.PCG32(COUNT, initstate=1)
     u, v = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
     ray, weight = plugin.sample_ray(0.0, mi.Float(0.5), u, v)
-    gx, gy, _ = (np.array(g, dtype=np.float64) for g in plugin.receiver.pose.tangent(ray.d))
-    for g in (gx, gy):
+    angle_x, angle_y, _ = (np.array(g, dtype=np.float64) for g in plugin.receiver.pose.tangent(ray.d))
+    for g in (angle_x, angle_y):
         assert g.std() == pytest.approx(3e-3, rel=5e-3)
     assert np.array(weight).mean() == pytest.approx(COLLECTION * np.pi * 0.05e-3**2, rel=1e-3)
 

@@ -10,13 +10,13 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from mitransient_lidar.transport.fields import Polygon, Rectangle, Sector, Strip
-from mitransient_lidar.transport.hexagons import HexagonPixels
-from mitransient_lidar.transport.pixel_lookup import FieldLookup
-from mitransient_lidar.transport.pixel_maps import MappedPixels
-from mitransient_lidar.transport.pixels import LayoutPixels, ShapedPixels
-from mitransient_lidar.transport.receiving import ViewSampler
-from mitransient_lidar.transport.streams import pass_streams
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.sensor.fov_shapes import Polygon, Rectangle, Sector, Strip
+from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
+from mitransient_lidar.transport.sensor.pixel_lookup import FovLookup
+from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
+from mitransient_lidar.transport.sensor.pixels import LayoutPixels, ShapedPixels
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MRAD = 1e-3
 SHAPES = {
@@ -42,8 +42,8 @@ def area_by_cells(field, gx_edges, gy_edges, fine=40):
     sub = (np.arange(fine) + 0.5) / fine
     x = (gx_edges[:-1, None] + np.diff(gx_edges)[:, None] * sub).ravel()
     y = (gy_edges[:-1, None] + np.diff(gy_edges)[:, None] * sub).ravel()
-    gx, gy = np.meshgrid(x, y, indexing="ij")
-    inside = np.array(field.contains(mi.Float(gx.ravel()), mi.Float(gy.ravel()))).reshape(len(x), len(y))
+    angle_x, angle_y = np.meshgrid(x, y, indexing="ij")
+    inside = np.array(field.contains(mi.Float(angle_x.ravel()), mi.Float(angle_y.ravel()))).reshape(len(x), len(y))
     cells = inside.reshape(len(gx_edges) - 1, fine, len(gy_edges) - 1, fine).mean(axis=(1, 3))
     return cells * np.diff(gx_edges)[:, None] * np.diff(gy_edges)[None, :]
 
@@ -51,16 +51,16 @@ def area_by_cells(field, gx_edges, gy_edges, fine=40):
 @pytest.mark.parametrize("name", SHAPES)
 def test_samples_are_uniform_inside_and_the_area_is_right(name):
     field = SHAPES[name]
-    gx, gy = field.sample(random_points())
-    inside = np.array(field.contains(gx * (1 - 1e-6), gy * (1 - 1e-6)))
+    angle_x, angle_y = field.sample(random_points())
+    inside = np.array(field.contains(angle_x * (1 - 1e-6), angle_y * (1 - 1e-6)))
     assert inside.mean() > 1 - 1e-4  # edges to rounding
-    gx_min, gx_max, gy_min, gy_max = field.bounds()
-    edges = np.linspace(gx_min, gx_max, 13), np.linspace(gy_min, gy_max, 13)
+    angle_x_min, angle_x_max, angle_y_min, angle_y_max = field.bounds()
+    edges = np.linspace(angle_x_min, angle_x_max, 13), np.linspace(angle_y_min, angle_y_max, 13)
     area = area_by_cells(field, *edges)
     assert area.sum() == pytest.approx(field.area, rel=3e-3)
     whole = area > 0.999 * area.max()
     # Cells that the border cuts are known to the fineness of their count; whole ones exactly.
-    counts = np.histogram2d(np.array(gx), np.array(gy), bins=edges)[0]
+    counts = np.histogram2d(np.array(angle_x), np.array(angle_y), bins=edges)[0]
     expected = COUNT * area / field.area
     statistic = np.sum((counts - expected)[whole] ** 2 / expected[whole])
     assert chi2.sf(statistic, whole.sum()) > 1e-4
@@ -79,7 +79,7 @@ def test_strip_is_part_of_the_circle():
 
 
 def test_layout_follows_the_convention():
-    """Row 0 is the far edge (+gx), column 0 the -gy edge; red and green are far, red on the -gy side."""
+    """Row 0 is the far edge (+angle_x), column 0 the -angle_y edge; red and green are far, red on the -angle_y side."""
     pixels = LayoutPixels("2x2", 30 * MRAD, "circle")
     centres = dict(zip(pixels.names, np.sign(pixels.centres()).tolist(), strict=True))
     assert centres == {"red": [1, -1], "green": [1, 1], "blue": [-1, -1], "black": [-1, 1]}
@@ -93,8 +93,8 @@ def test_layout_follows_the_convention():
 @pytest.mark.parametrize("layout", ["2x2", "1x4", "5x3"])
 def test_every_point_of_the_field_has_one_pixel(layout):
     pixels = LayoutPixels(layout, 30 * MRAD, "circle")
-    gx, gy = pixels.sample(random_points())
-    pixel, count = pixels.pixel_at(gx, gy, mi.Float(0.5))
+    angle_x, angle_y = pixels.sample(random_points())
+    pixel, count = pixels.pixel_at(angle_x, angle_y, mi.Float(0.5))
     inside = np.array(count)
     assert np.mean(inside == 1) > 1 - 1e-5
     shares = np.bincount(np.array(pixel), minlength=pixels.count) / COUNT
@@ -108,9 +108,9 @@ def test_overlapping_pixels_each_get_their_whole_field(caplog):
     with caplog.at_level(logging.WARNING):
         pixels = ShapedPixels([Sector(5 * MRAD), Sector(5 * MRAD, centre=(4 * MRAD, 0.0))], ["a", "b"])
     assert "'a' and 'b' overlap" in caplog.text
-    gx, gy = pixels.sample(random_points())
+    angle_x, angle_y = pixels.sample(random_points())
     rng = mi.PCG32(COUNT, initstate=5)
-    pixel, count = pixels.pixel_at(gx, gy, rng.next_float32())
+    pixel, count = pixels.pixel_at(angle_x, angle_y, rng.next_float32())
     # Weight of a sample: pixels there over density, and the density is their number over the area.
     weight = np.array(dr.select(count > 0, count / (count / pixels.area), 0))
     for index, field in enumerate(pixels.fields):
@@ -162,14 +162,14 @@ def many_fields():
 @pytest.mark.parametrize("symbolic", [True, False])
 def test_the_lookup_finds_what_the_fields_themselves_say(symbolic):
     fields = many_fields()
-    lookup = FieldLookup(fields)
+    lookup = FovLookup(fields)
     rng = np.random.default_rng(5)
-    gx, gy = (mi.Float(rng.uniform(-20, 20, 2**14) * MRAD) for _ in range(2))
+    angle_x, angle_y = (mi.Float(rng.uniform(-20, 20, 2**14) * MRAD) for _ in range(2))
     u = mi.Float(rng.uniform(0, 1, 2**14))
     flags = dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicCalls
     with dr.scoped_set_flag(flags[0], symbolic), dr.scoped_set_flag(flags[1], symbolic):
-        chosen, count = (np.array(a) for a in lookup.find(gx, gy, u))
-    holds = np.array([np.array(field.contains(gx, gy)) for field in fields])
+        chosen, count = (np.array(a) for a in lookup.find(angle_x, angle_y, u))
+    holds = np.array([np.array(field.contains(angle_x, angle_y)) for field in fields])
     np.testing.assert_array_equal(count, holds.sum(axis=0))
     assert count.max() > 5
     held = count > 0
@@ -186,7 +186,7 @@ def test_the_lookup_finds_what_the_fields_themselves_say(symbolic):
 
 
 def hexagon_outline(centre, side):
-    """Return the corners of a hexagon with two of them along gx."""
+    """Return the corners of a hexagon with two of them along angle_x."""
     angles = np.radians(60 * np.arange(6))
     return [(centre[0] + side * np.cos(a), centre[1] + side * np.sin(a)) for a in angles]
 
@@ -194,10 +194,10 @@ def hexagon_outline(centre, side):
 @pytest.mark.parametrize("fill_factor", [1.0, 0.4])
 def test_hexagons_are_those_of_a_drawing(fill_factor):
     """Each of 19 against a polygon with its corners; alike in area, uniform inside."""
-    pixels = HexagonPixels("hex19", 30 * MRAD, fill_factor)
+    pixels = HexPixels("hex19", 30 * MRAD, fill_factor)
     side = 15 * MRAD / np.sqrt(19) * np.sqrt(fill_factor)
-    gx, gy = pixels.sample(random_points())
-    pixel, count = (np.array(a) for a in pixels.pixel_at(gx, gy, mi.Float(0)))
+    angle_x, angle_y = pixels.sample(random_points())
+    pixel, count = (np.array(a) for a in pixels.pixel_at(angle_x, angle_y, mi.Float(0)))
     assert np.mean(count == 1) > 1 - 1e-5
     shares = np.bincount(pixel, minlength=19)
     assert chi2.sf(np.sum((shares - COUNT / 19) ** 2 / (COUNT / 19)), 18) > 1e-4
@@ -211,8 +211,8 @@ def test_hexagons_are_those_of_a_drawing(fill_factor):
         assert polygon.area * 19 == pytest.approx(pixels.area, rel=1e-6)
         drawn[np.array(polygon.contains(x, y))] = index
         # Uniform: quarters of the hexagon, and its middle.
-        inside = np.array(polygon.contains(gx, gy))
-        here = np.stack([np.array(gx)[inside] - centre[0], np.array(gy)[inside] - centre[1]], axis=1)
+        inside = np.array(polygon.contains(angle_x, angle_y))
+        here = np.stack([np.array(angle_x)[inside] - centre[0], np.array(angle_y)[inside] - centre[1]], axis=1)
         parts = [np.mean(here[:, 0] > 0), np.mean(here[:, 1] > 0), np.mean(np.abs(here[:, 0]) < 0.5 * side)]
         assert np.abs(np.array(parts) - [0.5, 0.5, 2 / 3]).max() < 5 * 0.5 / np.sqrt(inside.sum())
     assert np.mean(drawn != np.where(count > 0, pixel.astype(int), -1)) < 1e-5
@@ -221,15 +221,15 @@ def test_hexagons_are_those_of_a_drawing(fill_factor):
 @pytest.mark.parametrize("layout", ["hex1", "hex7", "hex1027"])
 def test_hexagons_fill_the_same_share_of_their_circle_whatever_their_number(layout):
     """3 sqrt(3) / (2 pi) of it, and the farthest corners lie on the circle."""
-    pixels = HexagonPixels(layout, 30 * MRAD)
+    pixels = HexPixels(layout, 30 * MRAD)
     assert pixels.area == pytest.approx(1.5 * np.sqrt(3) * (15 * MRAD) ** 2)
-    gx, gy = (np.array(g, dtype=np.float64) for g in pixels.sample(random_points()))
-    assert 14.9 * MRAD < np.hypot(gx, gy).max() <= 15.0001 * MRAD
+    angle_x, angle_y = (np.array(g, dtype=np.float64) for g in pixels.sample(random_points()))
+    assert 14.9 * MRAD < np.hypot(angle_x, angle_y).max() <= 15.0001 * MRAD
     centres = pixels.centres()
     pixel, count = pixels.pixel_at(*(mi.Float(g) for g in centres.T), mi.Float(0))
     np.testing.assert_array_equal(np.array(pixel), np.arange(pixels.count))
     assert np.all(np.array(count) == 1)
-    # Rows from far to near, and in a row from -gy to +gy.
+    # Rows from far to near, and in a row from -angle_y to +angle_y.
     order = np.lexsort((np.round(centres[:, 1], 9), -np.round(centres[:, 0], 9)))
     np.testing.assert_array_equal(order, np.arange(pixels.count))
 
@@ -244,11 +244,11 @@ def test_cells_that_leave_gaps_are_smaller_about_the_same_centre(layout, shape):
     ticks = (np.arange(1500) + 0.5) / 1500
     x, y = ticks * rows, ticks * columns
     inside = (np.abs(x % 1 - 0.5) < 0.3)[:, None] & (np.abs(y % 1 - 0.5) < 0.3)
-    gx, gy = np.meshgrid(15 * MRAD * (1 - 2 * ticks), 15 * MRAD * (2 * ticks - 1), indexing="ij")
+    angle_x, angle_y = np.meshgrid(15 * MRAD * (1 - 2 * ticks), 15 * MRAD * (2 * ticks - 1), indexing="ij")
     if shape == "circle":
-        inside &= np.hypot(gx, gy) <= 15 * MRAD
+        inside &= np.hypot(angle_x, angle_y) <= 15 * MRAD
     number = (x.astype(int)[:, None] * columns + y.astype(int)).ravel()
-    pixel, count = pixels.pixel_at(mi.Float(gx.ravel()), mi.Float(gy.ravel()), mi.Float(0))
+    pixel, count = pixels.pixel_at(mi.Float(angle_x.ravel()), mi.Float(angle_y.ravel()), mi.Float(0))
     pixel, count = np.array(pixel), np.array(count).reshape(inside.shape) > 0
     assert np.mean(inside != count) < 1e-4
     assert np.all((pixel == number)[inside.ravel()])
@@ -265,22 +265,24 @@ def test_cells_that_leave_gaps_are_smaller_about_the_same_centre(layout, shape):
     # Of each pixel the centre of gravity, which the circle moves.
     for index, centre in enumerate(pixels.centres()):
         here = inside.ravel() & (number == index)
-        np.testing.assert_allclose([gx.ravel()[here].mean(), gy.ravel()[here].mean()], centre, atol=0.05 * MRAD)
+        np.testing.assert_allclose(
+            [angle_x.ravel()[here].mean(), angle_y.ravel()[here].mean()], centre, atol=0.05 * MRAD
+        )
 
 
 def test_a_map_has_a_pixel_for_each_label():
-    """Labels 2, 5 and 9 in cells of 10 mrad x 7.5 mrad: row 0 is far, column 0 on the -gy side."""
+    """Labels 2, 5 and 9 in cells of 10 mrad x 7.5 mrad: row 0 is far, column 0 on the -angle_y side."""
     labels = np.array([[5, 5, 0, 2], [0, 9, 0, 2], [9, 9, 0, 0]])
     pixels = MappedPixels(labels, 30 * MRAD)
     assert pixels.names == ["label2", "label5", "label9"]
     assert pixels.area == pytest.approx(7 * 75 * MRAD**2)
     centres = [[5, 11.25], [10, -7.5], [-10 + 10 / 3, -3.75 - 2.5]]
     np.testing.assert_allclose(pixels.centres(), np.array(centres) * MRAD, atol=1e-12)
-    gx, gy = pixels.sample(random_points())
-    pixel, count = (np.array(a) for a in pixels.pixel_at(gx, gy, mi.Float(0)))
+    angle_x, angle_y = pixels.sample(random_points())
+    pixel, count = (np.array(a) for a in pixels.pixel_at(angle_x, angle_y, mi.Float(0)))
     assert np.mean(count == 1) > 1 - 1e-5
     edges = np.linspace(-15, 15, 7) * MRAD, np.linspace(-15, 15, 9) * MRAD
-    counts = np.histogram2d(np.array(gx), np.array(gy), bins=edges)[0]
+    counts = np.histogram2d(np.array(angle_x), np.array(angle_y), bins=edges)[0]
     expected = COUNT / 28 * np.repeat(np.repeat(labels[::-1] > 0, 2, axis=0), 2, axis=1)
     lit = expected > 0
     assert counts[~lit].sum() <= 1e-5 * COUNT
@@ -292,12 +294,12 @@ def test_a_map_has_a_pixel_for_each_label():
 
 
 @pytest.mark.parametrize("view_mrad", [2.0, 15.0, 30.0, 60.0])
-@pytest.mark.parametrize("shot_x", [0.0, 1.0, 50.0])
-def test_view_weights_add_up_to_the_solid_angle(view_mrad, shot_x):
+@pytest.mark.parametrize("aim_x", [0.0, 1.0, 50.0])
+def test_view_weights_add_up_to_the_solid_angle(view_mrad, aim_x):
     """Half the samples follow the laser's footprint, centred or beside or outside of the view: no bias from it."""
     receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": view_mrad}).receiver
-    transmitter = mi.load_dict({"type": "lidar_transmitter", "shot_x": shot_x})
-    view = ViewSampler(receiver, transmitter)
+    transmitter = mi.load_dict({"type": "lidar_transmitter", "aim_x": aim_x})
+    view = SensorSampler(receiver, transmitter)
     start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(5, 0, COUNT))
     half = 0.5e-3 * view_mrad
     solid_angle = 2 * np.pi * (1 - 1 / np.sqrt(1 + half**2))
@@ -312,9 +314,9 @@ def test_view_weights_add_up_to_the_solid_angle(view_mrad, shot_x):
 @pytest.mark.parametrize("profile", ["gaussian", "top_hat"])
 def test_beam_samples_follow_its_density(profile):
     beam = mi.load_dict({"type": "lidar_transmitter", "beam_profile": profile, "divergence_mrad": 10.0})
-    gx, gy = (np.array(g) for g in beam.sample_tangent(random_points()))
+    angle_x, angle_y = (np.array(g) for g in beam.sample_tangent(random_points()))
     edges = np.linspace(-12, 12, 25) * MRAD
-    counts = np.histogram2d(gx, gy, bins=(edges, edges))[0]
+    counts = np.histogram2d(angle_x, angle_y, bins=(edges, edges))[0]
     middle = (edges[:-1] + edges[1:]) / 2
     sub = (np.arange(8) + 0.5) / 8 - 0.5
     fine = (middle[:, None] + sub * (edges[1] - edges[0])).ravel()
@@ -333,9 +335,9 @@ def test_intensity_integrates_to_the_energy(profile):
     """Over solid angle, at a divergence where (1 + g^2)^(-3/2) matters: 5 mJ times the efficiency of 0.9."""
     beam = mi.load_dict({"type": "lidar_transmitter", "beam_profile": profile, "divergence_mrad": 400.0})
     ticks = (np.arange(1500) + 0.5) / 1500 * 2.6 - 1.3
-    gx, gy = (g.ravel() for g in np.meshgrid(ticks, ticks))
-    intensity = np.array(beam.intensity(beam.pose.direction(mi.Float(gx), mi.Float(gy))), dtype=np.float64)
-    energy = np.sum(intensity * (1 + gx**2 + gy**2) ** -1.5) * (ticks[1] - ticks[0]) ** 2
+    angle_x, angle_y = (g.ravel() for g in np.meshgrid(ticks, ticks))
+    intensity = np.array(beam.intensity(beam.pose.direction(mi.Float(angle_x), mi.Float(angle_y))), dtype=np.float64)
+    energy = np.sum(intensity * (1 + angle_x**2 + angle_y**2) ** -1.5) * (ticks[1] - ticks[0]) ** 2
     assert energy == pytest.approx(4.5e-3, rel=1e-3)
 
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from mitransient_lidar.optics.water import WaterColumn
-from mitransient_lidar.transport.flight import LayeredFlight
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 
 RNG = np.random.default_rng(4)
 COLUMNS = {

@@ -72,7 +72,7 @@ def test_volpath_sees_layers_as_mitsubas_grid():
             "to_world": mi.ScalarTransform4f().translate([-4, -4, -3]).scale([8, 8, 3]),
         }
 
-    layers = {"tops": "0, 1", "attenuation": "0.3, 0.9", "scattering": "0.25, 0.4", "backscattering": 0.01}
+    layers = {"layer_tops": "0, 1", "attenuation": "0.3, 0.9", "scattering": "0.25, 0.4", "backscattering": 0.01}
     # The grid's first value is the lowest metre.
     reference = {
         "type": "heterogeneous",
@@ -102,7 +102,7 @@ BLEND = {"type": "blendphase", "weight": 0.3, "phase_0": {"type": "hg", "g": 0.5
 def test_every_layer_scatters_by_its_own_phase_function(lidar_scene, passes):
     """Henyey-Greenstein above, a blend with Rayleigh below: 0.0177 and 0.048 /sr backwards; one for all would show."""
     above, below = {"type": "hg", "g": 0.5}, BLEND
-    layered = single_scattering(lidar_scene, passes, {"tops": "0, 3", "phase_0": above, "phase_1": below})
+    layered = single_scattering(lidar_scene, passes, {"layer_tops": "0, 3", "phase_0": above, "phase_1": below})
     for gate, phase in enumerate((above, below)):
         whole = single_scattering(lidar_scene, passes, {"phase": phase})[:, gate]
         error = np.hypot(*(e.std(ddof=1) for e in (whole, layered[:, gate]))) / np.sqrt(24)
@@ -141,7 +141,7 @@ def test_profile_file_is_its_layers(lidar_scene, passes, tmp_path):
     depth = 0.05 + 0.1 * np.arange(80)
     c, b, bb = 0.2 + 0.05 * depth, 0.1 + 0.025 * depth, 0.002 + 0.00125 * depth
     layers = {
-        "tops": ", ".join(f"{top:.2f}" for top in 0.1 * np.arange(80)),
+        "layer_tops": ", ".join(f"{top:.2f}" for top in 0.1 * np.arange(80)),
         "attenuation": ", ".join(f"{value:.6f}" for value in c),
         "scattering": ", ".join(f"{value:.6f}" for value in b),
         "backscattering": ", ".join(f"{value:.8f}" for value in bb),

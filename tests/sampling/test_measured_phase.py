@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.optics.phase import henyey_greenstein
+from mitransient_lidar.physics.water.phase import henyey_greenstein
 
 G = 0.9
 WI = np.array([0.3, -0.5, 0.8124]) / np.linalg.norm([0.3, -0.5, 0.8124])

@@ -4,12 +4,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.optics.sea import cox_munk
-from mitransient_lidar.optics.spectra import ElfouhailySpectrum
+from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
 CELLS = 32
 #: A patch of one period, without surround.
-PATCH = {"size": 32.0, "extent": 32.0, "cell_size": 32.0 / CELLS}
+PATCH = {"refined_size": 32.0, "size": 32.0, "cell_size": 32.0 / CELLS}
 
 
 def surface(**parameters):
@@ -33,12 +33,12 @@ def facet_slopes(shape):
     return -normal[:, 0] / normal[:, 2], -normal[:, 1] / normal[:, 2]
 
 
-@pytest.mark.parametrize("extent", [32.0, 500.0])
-def test_inner_edges_join_two_facets(extent):
+@pytest.mark.parametrize("size", [32.0, 500.0])
+def test_inner_edges_join_two_facets(size):
     """An edge with one facet, or with two of one sense, is a crack or a flipped facet through which light leaks."""
-    vertices, faces = buffers(surface(**PATCH | {"extent": extent})[1])
+    vertices, faces = buffers(surface(**PATCH | {"size": size})[1])
     side = round(np.sqrt(len(vertices))) - 1
-    assert (side == CELLS) == (extent == 32.0)
+    assert (side == CELLS) == (size == 32.0)
     assert len(vertices) == (side + 1) ** 2
     assert len(faces) == 2 * side**2
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -49,7 +49,7 @@ def test_inner_edges_join_two_facets(extent):
 
 
 def test_patch_is_periodic_and_centred():
-    vertices, _ = buffers(surface(size=20.0, extent=20.0, period=20.0, cell_size=20.0 / CELLS)[1])
+    vertices, _ = buffers(surface(refined_size=20.0, size=20.0, period=20.0, cell_size=20.0 / CELLS)[1])
     grid = vertices.reshape(CELLS + 1, CELLS + 1, 3)
     np.testing.assert_array_equal(grid[0, :, 2], grid[-1, :, 2])
     np.testing.assert_array_equal(grid[:, 0, 2], grid[:, -1, 2])
@@ -151,7 +151,9 @@ def heights_by_position(shape):
 def test_the_sea_is_the_same_wherever_the_patch_lies():
     """Sea of 64 m period: patches 20 m apart agree where they overlap, and a whole period apart everywhere."""
     here, there, far = (
-        heights_by_position(surface(size=48.0, cell_size=0.25, centre_x=x, centre_y=y, period=64.0, extent=48.0)[1])
+        heights_by_position(
+            surface(refined_size=48.0, cell_size=0.25, centre_x=x, centre_y=y, period=64.0, size=48.0)[1]
+        )
         for x, y in ((0.0, 0.0), (20.1, -3.0), (64.0, -128.0))
     )
     shared = here.keys() & there.keys()
@@ -160,8 +162,8 @@ def test_the_sea_is_the_same_wherever_the_patch_lies():
     np.testing.assert_array_equal(list(here.values()), list(far.values()))
 
 
-def test_cells_grow_outside_the_patch_up_to_the_extent():
-    vertices, faces = buffers(surface(size=32.0, cell_size=0.25)[1])
+def test_cells_grow_outside_the_patch_up_to_the_size():
+    vertices, faces = buffers(surface(refined_size=32.0, cell_size=0.25)[1])
     lines = np.unique(vertices[:, 0])
     assert lines[0] <= -500
     assert lines[-1] >= 500
@@ -169,7 +171,7 @@ def test_cells_grow_outside_the_patch_up_to_the_extent():
     inside = np.abs(lines[:-1] + 0.5 * lengths) < 16
     np.testing.assert_array_equal(lengths[inside], 0.25)
     ratio = lengths[1:] / lengths[:-1]
-    # The last cell ends with the extent.
+    # The last cell ends with the surface.
     assert np.all(ratio[1:-1] < 2.001)
     assert np.all(ratio[1:-1] > 1 / 2.001)
     # All of 1 km^2 for twice the triangles of 32 m x 32 m.
@@ -177,7 +179,7 @@ def test_cells_grow_outside_the_patch_up_to_the_extent():
 
 
 def test_far_rays_meet_the_sea_from_above_and_below():
-    scene, _ = surface(size=32.0, cell_size=0.25, wind_speed=6.0)
+    scene, _ = surface(refined_size=32.0, cell_size=0.25, wind_speed=6.0)
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-499, 499, (50_000, 2)), rng.uniform(-30, 30, (50_000, 2))])
     for height, down in ((20.0, -1.0), (-20.0, 1.0)):
@@ -196,12 +198,12 @@ def test_cells_are_chosen_by_footprint_and_range():
     lidar = {"altitude": 200.0, "off_nadir_deg": 20.0, "divergence_mrad": 10.0, "field_of_view_mrad": 30.0}
     sea = surface(**lidar)[1].sea
     assert 0.8 * 0.25 * 1.064 < sea.cell_size <= 0.25 * 1.064
-    assert 2 * 3.44 < sea.size < 32
+    assert 2 * 3.44 < sea.refined_size < 32
     near = surface(**lidar | {"altitude": 20.0})[1].sea
     assert 0.8 * 0.25 * 0.1064 < near.cell_size <= 0.25 * 0.1064
     mast = surface(**lidar | {"altitude": 10.0, "off_nadir_deg": 84.6, "field_of_view_mrad": 10.0})[1].sea
     # The field of view reaches from 97 to 116 m, and 1.5 times the beam's divergence from 93 to 126 m.
-    assert 2 * 20 < mast.size < 80
+    assert 2 * 20 < mast.refined_size < 80
 
 
 def test_height_maps_become_surfaces(tmp_path):
@@ -209,7 +211,7 @@ def test_height_maps_become_surfaces(tmp_path):
     x = np.linspace(-10, 10, 81)
     np.save(tmp_path / "plane.npy", np.tile(0.1 * x, (81, 1)))
     scene, shape = surface(
-        spectrum="height_map", filename=str(tmp_path / "plane.npy"), map_size=20.0, slope_variance="0.02", extent=60.0
+        spectrum="height_map", filename=str(tmp_path / "plane.npy"), map_size=20.0, slope_variance="0.02", size=60.0
     )
     assert shape.sea.resolved_variance == pytest.approx((0.01, 0.0), abs=1e-6)
     assert shape.ripple_variance == pytest.approx((1e-5, 0.01), abs=1e-5)
@@ -219,23 +221,25 @@ def test_height_maps_become_surfaces(tmp_path):
 
 
 def test_swell_and_wake_lie_on_the_sea():
-    flat = {"wind_speed": 0.0, "size": 32.0, "cell_size": 0.5, "extent": 200.0}
+    flat = {"wind_speed": 0.0, "refined_size": 32.0, "cell_size": 0.5, "size": 200.0}
     swell = surface(swell_height=0.8, swell_wavelength=20.0, period=512.0, **flat)[1]
     grid = swell.sea.waves.heights
     assert 4 * grid.std() == pytest.approx(0.8, rel=0.15)  # one sea of a narrow spectrum
-    wake = surface(spectrum="flat", wake_speed=5.0, wake_length=20.0, size=32.0, cell_size=0.5, extent=200.0)[1]
+    wake = surface(spectrum="flat", wake_speed=5.0, wake_length=20.0, refined_size=32.0, cell_size=0.5, size=200.0)[1]
     vertices, _ = buffers(wake)
     behind, ahead = vertices[vertices[:, 0] < -15], vertices[vertices[:, 0] > 15]
     assert np.abs(behind[:, 2]).max() > 0.02
     assert np.abs(ahead[:, 2]).max() < 0.001
-    both = surface(wake_speed=5.0, wake_length=20.0, size=32.0, cell_size=0.5, extent=200.0)[1]
-    alone = surface(size=32.0, cell_size=0.5, extent=200.0)[1]
+    both = surface(wake_speed=5.0, wake_length=20.0, refined_size=32.0, cell_size=0.5, size=200.0)[1]
+    alone = surface(refined_size=32.0, cell_size=0.5, size=200.0)[1]
     np.testing.assert_allclose(buffers(both)[0][:, 2] - buffers(alone)[0][:, 2], vertices[:, 2], atol=1e-6)
 
 
 def test_time_moves_the_sea_downwind():
     """After 0.5 s waves of the peak have moved by 1.8 m: shifting the first sea by that fits better than not at all."""
-    seas = [surface(time=time, wind_speed=3.0, size=32.0, extent=32.0, cell_size=0.25)[1].sea for time in (0.0, 0.5)]
+    seas = [
+        surface(time=time, wind_speed=3.0, refined_size=32.0, size=32.0, cell_size=0.25)[1].sea for time in (0.0, 0.5)
+    ]
     first, later = (sea.waves.heights for sea in seas)
     correlation = [np.sum(later * np.roll(first, shift, axis=1)) for shift in range(-16, 17)]
     moved = 0.25 * (np.argmax(correlation) - 16)
@@ -244,7 +248,13 @@ def test_time_moves_the_sea_downwind():
 
 def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
     """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
-    sea = {"spectrum": "elfouhaily", "slope_variance": "cox_munk", "size": 16.0, "cell_size": 0.25, "extent": 100.0}
+    sea = {
+        "spectrum": "elfouhaily",
+        "slope_variance": "cox_munk",
+        "refined_size": 16.0,
+        "cell_size": 0.25,
+        "size": 100.0,
+    }
     own = lidar_scene(sea=sea, integrator={"paths_per_pass": 2**14})
     shape = next(shape for shape in own.shapes() if hasattr(shape, "sea"))
     shape.write_ply(str(tmp_path / "sea.ply"))

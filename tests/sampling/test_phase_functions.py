@@ -6,7 +6,7 @@ import pytest
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import chi2
 
-from mitransient_lidar.optics import phase as closed_form
+from mitransient_lidar.physics.water import phase as closed_form
 
 PLUGINS = {
     "fournier_forand": {"type": "fournier_forand", "backscatter_ratio": 0.04},

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.transport import phase
+from mitransient_lidar.transport.medium import tabulated_phase
 
 FRAME_WI = np.array([0.48, -0.6, 0.64])
 
@@ -77,7 +77,9 @@ def test_fournier_forand_by_index_and_slope(index, slope, ratio):
 
 def test_petzold_at_every_tabulated_angle():
     """All 55 rows over the 0.9929 that they integrate to; linear interpolation would divide by 1.0200."""
-    text = resources.files("mitransient_lidar.optics").joinpath("petzold_average_particle.csv").read_text("utf-8")
+    text = (
+        resources.files("mitransient_lidar.physics.water").joinpath("petzold_average_particle.csv").read_text("utf-8")
+    )
     degrees, tabulated = np.loadtxt(text.splitlines(), delimiter=",", unpack=True)
     assert len(degrees) == 55
     # Rows of the paper, so that the file itself is checked.
@@ -127,8 +129,8 @@ def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monk
     """The series against logarithm and exponential, whose own rounding grows where an exponent is close to 1."""
     series = mi.load_dict(description).tabulated
     assert series._short
-    monkeypatch.setattr(phase, "_is_short", lambda table: False)
-    law = phase.TabulatedPhase(series.table)
+    monkeypatch.setattr(tabulated_phase, "_is_short", lambda table: False)
+    law = tabulated_phase.TabulatedPhase(series.table)
     count = 2**20
     rng = mi.PCG32(count, initstate=3)
     u, v = rng.next_float32(), rng.next_float32()

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.transport.plume import BubblePlume
+from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 
 PLUME = BubblePlume(0.8, 3.0, -2.0, np.radians(35), 20.0, 6.0, 2.5)
 

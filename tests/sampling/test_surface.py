@@ -8,15 +8,15 @@ import pytest
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import chi2
 
-from mitransient_lidar.optics.refraction import refracted_path
-from mitransient_lidar.transport.connection import SurfaceLobe
+from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
     transmitter = SimpleNamespace(pose=Pose.from_angles(altitude, angle))
-    parts = {"transmitter": transmitter, "refractive_index": 1.34, "slope_variance": slope_variance, "strata": None}
-    return SurfaceLobe(SimpleNamespace(**parts))
+    parts = {"refractive_index": 1.34, "slope_variance": slope_variance, "index_layers": None}
+    return RefractedLaserSampler(SimpleNamespace(transmitter=transmitter, **parts))
 
 
 def chi_squared(sample, density):
@@ -57,13 +57,13 @@ def lobe_p_value(lobe, density, laser, reach=0.25, cells=40, fine=16):
 @pytest.mark.parametrize("depth", [0.0, 8.0])
 def test_lobe_samples_follow_its_density(angle, depth):
     lobe = lobe_at(angle)
-    assert lobe_p_value(lobe, lobe, lobe.towards_laser(mi.Point3f(0.5, -0.2, -depth))) > 1e-3
+    assert lobe_p_value(lobe, lobe, lobe.direction_from(mi.Point3f(0.5, -0.2, -depth))) > 1e-3
 
 
 def test_lobe_of_another_variance_is_told_apart():
     """Negative control: 1 % of slope variance is seen."""
     lobe = lobe_at(20.0)
-    assert lobe_p_value(lobe, lobe_at(20.0, 0.0202), lobe.towards_laser(mi.Point3f(0, 0, -4))) < 1e-6
+    assert lobe_p_value(lobe, lobe_at(20.0, 0.0202), lobe.direction_from(mi.Point3f(0, 0, -4))) < 1e-6
 
 
 @pytest.mark.parametrize("altitude", [5.0, 200.0, 3000.0])
@@ -73,7 +73,7 @@ def test_laser_is_seen_where_snells_law_says(altitude, angle, depth):
     """Against bisection in double precision; at 5 m altitude and 40 m depth the small-angle guess is far off."""
     lobe = lobe_at(angle, altitude=altitude)
     point = np.array([0.7, 0.4, -depth])
-    laser = lobe.towards_laser(mi.Point3f(point.tolist()))
+    laser = lobe.direction_from(mi.Point3f(point.tolist()))
     origin = Pose.from_angles(altitude, angle).origin
     radius = float(np.hypot(*(origin - point)[:2]))
     theta, phi = refracted_path(radius, altitude, depth, 1.34)
@@ -139,7 +139,7 @@ def test_mesh_has_the_slopes_that_it_says():
     """Facet slopes over 24 seas at 6 m/s: their variance is what the ripples are reduced by."""
     along, across = [], []
     for seed in range(24):
-        _, shape = surface(wind_speed=6.0, surface_seed=seed, size=64.0, cell_size=0.5, extent=64.0, period=64.0)
+        _, shape = surface(wind_speed=6.0, surface_seed=seed, refined_size=64.0, cell_size=0.5, size=64.0, period=64.0)
         normals = np.array(shape.face_normal(mi.UInt32(np.arange(shape.face_count()))))
         assert np.all(normals[2] > 0)
         along.append(np.var(normals[0] / normals[2]))
@@ -154,9 +154,9 @@ def test_mesh_has_the_slopes_that_it_says():
 def test_same_seed_is_the_same_sea_and_a_coarser_one_is_smoother():
     heights = {}
     for cell_size in (0.5, 0.25):
-        _, shape = surface(surface_seed=9, cell_size=cell_size, size=32.0, extent=32.0)
+        _, shape = surface(surface_seed=9, cell_size=cell_size, refined_size=32.0, size=32.0)
         heights[cell_size] = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)[:, 2]
-    _, again = surface(surface_seed=9, cell_size=0.25, size=32.0, extent=32.0)
+    _, again = surface(surface_seed=9, cell_size=0.25, refined_size=32.0, size=32.0)
     np.testing.assert_array_equal(np.array(mi.traverse(again)["vertex_positions"]).reshape(-1, 3)[:, 2], heights[0.25])
     fine = heights[0.25].reshape(129, 129)[::2, ::2]
     coarse = heights[0.5].reshape(65, 65)

@@ -9,16 +9,16 @@ import pytest
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import norm
 
-from mitransient_lidar.transport.connection import SurfaceLobe
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
 COUNT = 2**20
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
     transmitter = SimpleNamespace(pose=Pose.from_angles(altitude, angle))
-    parts = {"transmitter": transmitter, "refractive_index": 1.34, "slope_variance": slope_variance, "strata": None}
-    return SurfaceLobe(SimpleNamespace(**parts))
+    parts = {"refractive_index": 1.34, "slope_variance": slope_variance, "index_layers": None}
+    return RefractedLaserSampler(SimpleNamespace(transmitter=transmitter, **parts))
 
 
 def random_points(seed):
@@ -31,7 +31,7 @@ def random_points(seed):
 def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
     """At z = 0, and in a crest above it: the line to the laser, refracted where the point is."""
     lobe = lobe_at(angle)
-    laser = lobe.towards_laser(mi.Point3f(*point))
+    laser = lobe.direction_from(mi.Point3f(*point))
     line = Pose.from_angles(200.0, angle).origin - np.array([point[0], point[1], 0.0])
     line /= np.linalg.norm(line)
     np.testing.assert_allclose(np.array(laser.in_air).ravel(), line, atol=2e-6)
@@ -44,7 +44,7 @@ def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
 def test_density_integrates_to_the_lit_share(angle, variance):
     """Facets that turn away from the laser make no direction: what they lack is the share of samples of density 0."""
     lobe = lobe_at(angle, variance)
-    laser = lobe.towards_laser(mi.Point3f(0.0, 0.0, -4.0))
+    laser = lobe.direction_from(mi.Point3f(0.0, 0.0, -4.0))
     lit = np.array(lobe.sample(laser, random_points(8))[1]) > 0
     # Slope of a facet along the azimuth of the laser, of variance s^2 / 2, beyond which it sees the laser's back.
     in_air = np.array(laser.in_air, dtype=np.float64).ravel()
@@ -66,7 +66,7 @@ def test_density_integrates_to_the_lit_share(angle, variance):
 def test_sampled_directions_are_those_of_snells_law_at_their_facet(angle):
     """n (w x m) = i x m for the facet m that is drawn, and w points up through it."""
     lobe = lobe_at(angle, 0.03)
-    laser = lobe.towards_laser(mi.Point3f(0.0, 0.0, -4.0))
+    laser = lobe.direction_from(mi.Point3f(0.0, 0.0, -4.0))
     direction, pdf = (np.array(a, dtype=np.float64) for a in lobe.sample(laser, random_points(9)))
     in_air = np.array(laser.in_air, dtype=np.float64).ravel()
     lit = pdf > 0

@@ -40,8 +40,8 @@ def test_chi_squared_sees_the_missing_jacobian(tmp_path, monkeypatch):
     beam = laser(divergence_mrad=2e3 * SIGMA)
 
     def density(d):
-        gx, gy, cos_axis = beam.pose.tangent(d)
-        return dr.select(cos_axis > 0, beam.tangent_density(gx, gy), 0)
+        angle_x, angle_y, cos_axis = beam.pose.tangent(d)
+        return dr.select(cos_axis > 0, beam.tangent_density(angle_x, angle_y), 0)
 
     assert not sphere_test(beam, density).run(quiet=True)
 
@@ -49,7 +49,7 @@ def test_chi_squared_sees_the_missing_jacobian(tmp_path, monkeypatch):
 @pytest.mark.parametrize("profile", ["gaussian", "top_hat"])
 @pytest.mark.parametrize("angle", [0.0, 20.0, 60.0])
 def test_rays_leave_the_laser_about_its_axis(profile, angle):
-    """Mean and width of the tangent-plane angles; +gx is away from nadir, i.e. the ray rises with gx."""
+    """Mean and width of the tangent-plane angles; +angle_x is away from nadir, i.e. the ray rises with angle_x."""
     half = 5e-3
     beam = laser(altitude=200.0, off_nadir_deg=angle, beam_profile=profile, divergence_mrad=2e3 * half)
     origin, direction, weight = sample_rays(beam)
@@ -58,15 +58,15 @@ def test_rays_leave_the_laser_about_its_axis(profile, angle):
     np.testing.assert_allclose(np.linalg.norm(direction, axis=0), 1, atol=3e-7)
     np.testing.assert_allclose(weight, 4.5e-3, rtol=1e-6)
     along = np.array([sin, 0, -cos]) @ direction
-    gx, gy = np.array([cos, 0, sin]) @ direction / along, direction[1] / along
-    count = gx.size
+    angle_x, angle_y = np.array([cos, 0, sin]) @ direction / along, direction[1] / along
+    count = angle_x.size
     # E[g^2] of a disc of this radius is half^2 / 4; fourth moments half^4 / 8 (disc) and 3 sigma^4.
     square, fourth = (half**2, 3 * half**4) if profile == "gaussian" else (half**2 / 4, half**4 / 8)
-    for g in (gx, gy):
+    for g in (angle_x, angle_y):
         assert abs(g.mean()) < 4 * np.sqrt(square / count)
         assert abs(np.mean(g**2) - square) < 4 * np.sqrt((fourth - square**2) / count)
-    assert abs(np.mean(gx * gy)) < 4 * square / np.sqrt(count)
-    radius = np.hypot(gx, gy) / half
+    assert abs(np.mean(angle_x * angle_y)) < 4 * square / np.sqrt(count)
+    radius = np.hypot(angle_x, angle_y) / half
     if profile == "gaussian":
         assert kstest(radius, lambda r: -np.expm1(-0.5 * r**2)).pvalue > 1e-4
     else:

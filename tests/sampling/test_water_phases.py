@@ -5,10 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitransient_lidar.optics import phase as closed_form
-from mitransient_lidar.optics.phase_table import PowerLawTable
-from mitransient_lidar.optics.seawater import water_phase_function
-from mitransient_lidar.transport.phase import NumberedPhase
+from mitransient_lidar.physics.water import phase as closed_form
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.physics.water.seawater import water_phase_function
+from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
 
 THETA = np.radians([0.1, 1.0, 5.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0])
 
@@ -49,7 +49,7 @@ def test_water_without_particles_scatters_as_water():
 
 
 def test_each_layer_has_its_function_in_the_table():
-    water = mi.load_dict({"type": "layered_water", "tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"})
+    water = mi.load_dict({"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"})
     many = water.phases.at(mi.UInt32([0, 1, 2]))
     assert isinstance(many, NumberedPhase)
     assert many.functions.count == 2
@@ -62,7 +62,7 @@ def test_samples_of_the_table_follow_each_function():
     """Backscatter ratio and value by z-test: a wrong offset into the table would take a neighbour's segments."""
     ratios = (0.04, 0.01, 0.02)
     backscattering = ", ".join(str(0.15 * ratio) for ratio in ratios)
-    water = mi.load_dict({"type": "layered_water", "tops": "0, 1, 2", "backscattering": backscattering})
+    water = mi.load_dict({"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": backscattering})
     count = 2**20
     for layer, ratio in enumerate(ratios):
         rng = mi.PCG32(count, initstate=3)
@@ -82,7 +82,7 @@ def test_functions_without_a_common_table_are_called_by_pointer():
     water = mi.load_dict(
         {
             "type": "layered_water",
-            "tops": "0, 1",
+            "layer_tops": "0, 1",
             "phase_0": {"type": "hg", "g": 0.9},
             "phase_1": {"type": "petzold"},
         }
@@ -96,8 +96,10 @@ def test_functions_without_a_common_table_are_called_by_pointer():
 def test_layers_with_many_ratios_share_functions_within_two_percent():
     ratios = np.geomspace(0.005, 0.05, 500)
     text = ", ".join(f"{0.15 * ratio:.8f}" for ratio in ratios)
-    tops = ", ".join(f"{0.01 * layer:.2f}" for layer in range(500))
-    water = mi.load_dict({"type": "layered_water", "tops": tops, "backscattering": text, "water_scattering": 0.001})
+    layer_tops = ", ".join(f"{0.01 * layer:.2f}" for layer in range(500))
+    water = mi.load_dict(
+        {"type": "layered_water", "layer_tops": layer_tops, "backscattering": text, "water_scattering": 0.001}
+    )
     assert len({id(phase) for phase in water.phases.phases}) < 500
     share = 0.001 / 0.15
     for layer in (0, 250, 499):

@@ -4,7 +4,8 @@ import pytest
 from significance import FALSE_ALARM, largest_z
 
 import mitransient_lidar
-from mitransient_lidar import comparison, resources
+from mitransient_lidar.analysis import comparison
+from mitransient_lidar.loading import catalogue
 
 #: Parameters that say what is recorded, not what is there.
 RECORD = {"time_start_ns", "bin_width_ns", "bin_count"}
@@ -28,7 +29,7 @@ IMAGES = {"gated_mine", "gated_waves"}
 PASSIVE = {"passive_sea"}
 
 
-@pytest.mark.parametrize("name", [name for name in resources.scene_names() if name not in {*ZOOMS, *PASSIVE}])
+@pytest.mark.parametrize("name", [name for name in catalogue.scene_names() if name not in {*ZOOMS, *PASSIVE}])
 def test_integrators_agree_in_every_shipped_scene(name):
     bins = dict(SHORT_BINS if name in ZOOMS.values() else BINS)
     if name in IMAGES:
@@ -49,6 +50,6 @@ def test_integrators_agree_in_every_shipped_scene(name):
 
 @pytest.mark.parametrize(("zoom", "whole"), ZOOMS.items())
 def test_zooms_show_the_same_scene(zoom, whole):
-    first, second = (resources.scene_parameters(resources.scene_path(name)) for name in (zoom, whole))
+    first, second = (catalogue.scene_parameters(catalogue.scene_path(name)) for name in (zoom, whole))
     assert {name for name in first if first[name] != second[name]} <= RECORD
     assert first.keys() == second.keys()

@@ -9,11 +9,11 @@ renders' errors, must lie above 1.2 and 1.5; with many renders the gains are 1.4
 import numpy as np
 import pytest
 
-from mitransient_lidar.detection import describe_detection, detect
-from mitransient_lidar.optics.detectors import LinearDetector
-from mitransient_lidar.optics.receivers import ReceiverChain
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.studies.detection import describe_detection, detect
 
-NEAR = {"surface_extent": 60, "time_start_ns": 1410, "bin_count": 120}
+NEAR = {"surface_size": 60, "time_start_ns": 1410, "bin_count": 120}
 FEW = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 OPTIONS = {"renders": 3, "shots": 2000, "integrator": FEW}
 

@@ -1,4 +1,4 @@
-"""The page for gate stacks, in a real browser: what it shows, and that it asks the network for nothing."""
+"""Page of gate stacks in a real browser: displayed values, controls, and no access to the network."""
 
 import os
 import re
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mitransient_lidar.gate_page import write_page
+from mitransient_lidar.plots.gate_viewer.page import write_page
 
 METRES_PER_NS = 0.0299792458 * 5 / 1.364 * 0.967  # the depth axis at 20 degrees off nadir
 SURFACE_NS = 1420.0
@@ -24,8 +24,8 @@ def scene_of(size, gates=40, seed=3):
     rng = np.random.default_rng(seed)
     time = 1411.0 + np.arange(120)
     angles = (np.arange(size) + 0.5) / size * 30 - 15
-    gy, gx = np.meshgrid(angles, angles[::-1])
-    x, y = 0.21 * gx[..., np.newaxis], 0.21 * gy[..., np.newaxis]
+    angle_y, angle_x = np.meshgrid(angles, angles[::-1])
+    x, y = 0.21 * angle_x[..., np.newaxis], 0.21 * angle_y[..., np.newaxis]
     depth = (time - SURFACE_NS) * METRES_PER_NS
     ripples = np.sin(2 * np.pi * (0.8 * x + 0.25 * y) / 0.7)
     floor, reflectance = 8 + 0.06 * ripples + 0.04 * x, 0.1 + 0.035 * ripples + 0.01 * np.sin(1.7 * x - 0.9 * y)
@@ -45,7 +45,10 @@ def scene_of(size, gates=40, seed=3):
     start = 1412.0 + 2.5 * np.arange(gates)
     opened = np.clip(np.minimum(time[:, None] + 0.5, start + 5) - np.maximum(time[:, None] - 0.5, start), 0, 1)
     energy = 1e-9 * power @ opened
-    centres = {"gx": (("row", "column"), gx, {"units": "mrad"}), "gy": (("row", "column"), gy, {"units": "mrad"})}
+    centres = {
+        "angle_x": (("row", "column"), angle_x, {"units": "mrad"}),
+        "angle_y": (("row", "column"), angle_y, {"units": "mrad"}),
+    }
     attributes = {
         "scene": "sphere & <b>plate",
         "note": "</script><script>document.title = 'broken'</script>",
@@ -92,7 +95,7 @@ def browser():
     for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    # With the driver's path given, nothing is looked for or downloaded.
+    # A given path of the driver avoids a search and a download.
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
     yield driver
     driver.quit()
@@ -100,7 +103,7 @@ def browser():
 
 @pytest.fixture
 def show(browser, tmp_path):
-    """Function that writes the page of a stack and opens it; in the end nothing must have gone wrong in the browser."""
+    """Function that writes the page of a stack and opens it; fails if the browser has logged an error."""
 
     def open_page(stack, result=None, **options):
         write_page(stack, tmp_path / "page.html", result, **options)
@@ -115,7 +118,7 @@ def show(browser, tmp_path):
 
 
 class Page:
-    """What a person does with the page and sees of it."""
+    """Actions of a user on the page, and its visible contents."""
 
     def __init__(self, browser):
         self.browser = browser
@@ -128,7 +131,7 @@ class Page:
             clock.sleep(0.02)
 
     def settle(self):
-        """Wait until what has just changed is drawn: after a change of size that takes three frames."""
+        """Wait until changes are drawn: three frames after a change of size."""
         self.browser.execute_async_script(
             "const wait = (more) => (more ? requestAnimationFrame(() => wait(more - 1)) : arguments[0]()); wait(3)"
         )
@@ -179,7 +182,7 @@ class Page:
         """Return the image's colours, array of shape (row, column, 3), read from the middles of its pixels."""
         colours = self.run(
             "const [rows, columns] = arguments, canvas = document.getElementById('pixels'), found = [];"
-            # Chromium complains of a canvas that is read again and again, unless it is made for that.
+            # Chromium warns about repeated reading of a canvas without willReadFrequently.
             "const copy = new OffscreenCanvas(canvas.width, canvas.height);"
             "const context = copy.getContext('2d', { willReadFrequently: true }); context.drawImage(canvas, 0, 0);"
             "const dots = context.getImageData(0, 0, canvas.width, canvas.height);"
@@ -205,8 +208,8 @@ class Page:
             ".map((line) => line.getAttribute('d'))"
         )
         (first, low), (last, high) = ticks[0], ticks[-1]
-        tops = [min(float(y) for y in re.findall(r" ([-\d.]+)", path)) for path in paths]
-        shares = [(top - first) / (last - first) for top in tops]
+        layer_tops = [min(float(y) for y in re.findall(r" ([-\d.]+)", path)) for path in paths]
+        shares = [(top - first) / (last - first) for top in layer_tops]
         if self.run("return document.getElementById('curve-log').checked"):
             return [low * (high / low) ** share for share in shares]
         return [low + (high - low) * share for share in shares]
@@ -228,7 +231,7 @@ def test_gates(show, scene):
     # It opens at the brightest gate.
     brightest = int(energy.sum((0, 1)).argmax())
     assert page.text("number") == f"{brightest} / 39"
-    assert page.text("summary") == "64 × 64 pixels · 40 gates · 1 pulse · 200 m high · 20° off nadir"
+    assert page.text("summary") == "64 × 64 pixels · 40 gates · 1 pulse · altitude 200 m · 20° off nadir"
 
     # One range for all gates, from 0 to the largest value.
     page.choose(slider=20, log=False)
@@ -267,7 +270,7 @@ def test_records(show, scene):
     page.point_at(PLATE)
     assert page.peaks() == pytest.approx([1e9 * power[PLATE].max()], rel=0.01)
     value, error = energy[PLATE][22], stack["gate_energy_stderr"].values[PLATE][22]
-    assert page.text("reading").startswith("row 40, column 37 · gx −3.98, gy 2.58 mrad: ")
+    assert page.text("reading").startswith("row 40, column 37 · angle_x −3.98, angle_y 2.58 mrad: ")
     shown, shown_error = re.search(r"mrad: ([\d.]+) ± ([\d.]+) aJ", page.text("reading")).groups()
     assert float(shown) == pytest.approx(1e18 * value, rel=0.01)
     assert float(shown_error) == pytest.approx(1e18 * error, rel=0.06)
@@ -282,8 +285,12 @@ def test_records(show, scene):
     assert page.peaks()[:2] == pytest.approx([1e9 * power[place].max() for place in (PLATE, BALL)], rel=0.01)
     lines = page.text("list").splitlines()
     assert [line for line in lines if line.startswith("row")] == [
-        f"row {row}, column {column} · gx {gx}, gy {gy} mrad"
-        for row, column, gx, gy in ((40, 37, "−3.98", "2.58"), (23, 22, "3.98", "−4.45"), (32, 32, "−0.23", "0.23"))
+        f"row {row}, column {column} · angle_x {angle_x}, angle_y {angle_y} mrad"
+        for row, column, angle_x, angle_y in (
+            (40, 37, "−3.98", "2.58"),
+            (23, 22, "3.98", "−4.45"),
+            (32, 32, "−0.23", "0.23"),
+        )
     ]
 
     # A click on the record goes to the gate of that time.
@@ -366,7 +373,11 @@ def test_blocks(show, scene, limit, block, waveform_block):
     rows, columns = (slice(start, start + waveform_block) for start in (24, 20))
     power = result["waveform"].values[rows, columns].mean((0, 1))
     assert page.peaks()[0] == pytest.approx(1e9 * power.max(), rel=0.01)
-    place = "row 24, column 21 · gx 3.52, gy −4.92" if block == 1 else "block (12, 10) · gx 3.28, gy −5.16"
+    place = (
+        "row 24, column 21 · angle_x 3.52, angle_y −4.92"
+        if block == 1
+        else "block (12, 10) · angle_x 3.28, angle_y −5.16"
+    )
     assert page.text("reading").startswith(f"{place} mrad: ")
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar import loading
-from mitransient_lidar.optics.water import C0
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.loading import scenes
 
 GRAZING = math.radians(5.4)
 IN_WATER = math.asin(math.cos(GRAZING) / 1.34)
@@ -20,12 +20,12 @@ def test_target_echoes_at_its_distance_and_no_light_leaks_beside_the_sea(height)
     due = 2e9 / C0 * (height / math.sin(GRAZING) + 1.34 / math.cos(IN_WATER))
     change = {"altitude": height, "time_start_ns": due - 80, "bin_count": 160}
     with_target, without = (
-        mitransient_lidar.render("fig04_mast", params={**change, "target_reflectivity": value}, passes=16)
+        mitransient_lidar.render("fig04_mast", params={**change, "target_reflectance": value}, passes=16)
         for value in (0.3, 0.001)
     )
     for shot in (with_target, without):
-        assert shot.attrs["lost_at_surface_border"] < 1e-3
-        assert shot.attrs["beam_beside_surface"] < 1e-3
+        assert shot.attrs["surface_edge_loss"] < 1e-3
+        assert shot.attrs["beam_outside_surface"] < 1e-3
     echo = (with_target - without).waveform.sum("pixel")
     found = float(echo.idxmax("time"))
     # A wave of 0.1 m under the beam is 1 m nearer along the ray.
@@ -36,7 +36,7 @@ def test_target_echoes_at_its_distance_and_no_light_leaks_beside_the_sea(height)
 
 def test_waves_hide_what_geometry_says():
     """Rays from the sea to the mast against the horizon of height profiles in plain NumPy, towards -x."""
-    scene, _, _ = loading.load_scene("fig04_mast", {"wind_speed": 6})
+    scene, _, _ = scenes.load_scene("fig04_mast", {"wind_speed": 6})
     sea = next(shape.sea for shape in scene.shapes() if hasattr(shape, "sea"))
     mast = scene.sensors()[0].receiver.pose.origin
     rows = np.arange(-20, 20) * 4 * sea.cell_size

@@ -40,10 +40,10 @@ def test_wheel_holds_every_module_plugin_scene_and_data_file(wheel):
 
 
 def test_every_plugin_file_is_registered():
-    from mitransient_lidar import variants
+    from mitransient_lidar.loading import variants
 
-    files = {path.stem for path in (ROOT / "plugins").glob("*.py")} - {"__init__"}
-    assert files == set(variants._PLUGIN_MODULES)
+    files = [path.relative_to(ROOT / "plugins").with_suffix("") for path in (ROOT / "plugins").rglob("*.py")]
+    assert {".".join(file.parts) for file in files if file.name != "__init__"} == set(variants._PLUGIN_MODULES)
 
 
 def test_import_loads_nothing_heavy():

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar import loading, shots
-from mitransient_lidar.optics.water import C0
-from mitransient_lidar.survey import highest_points
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.loading import scenes as loading
+from mitransient_lidar.studies import find_shots
+from mitransient_lidar.studies.shot_statistics import highest_points
 
 #: Depth that a nanosecond stands for on the depth axis, at 20 degrees and index 1.34.
 METRES_PER_NS = 1e-9 * C0 / (2 * 1.34) * np.sqrt(1 - (np.sin(np.radians(20)) / 1.34) ** 2)
@@ -48,7 +49,7 @@ def test_echoes_are_closest_in_shot_1_and_furthest_apart_in_shot_3(surface_echoe
 def test_red_comes_before_green_as_the_sideways_slope_says(surface_echoes):
     """The sea falls to the left, where green looks: red's face is higher, and nearer."""
     scene, _, _ = loading.load_scene("fig10_shot1")
-    along, across = shots.SeaMap.of_scene(scene).slope_at(25.15, -47.56)
+    along, across = find_shots.SeaMap.of_scene(scene).slope_at(25.15, -47.56)
     assert np.degrees(np.arctan([along, across])) == pytest.approx([1.6, -2.8], abs=0.1)
     red, green = surface_echoes[0][1][:2]
     assert 0.5 < green - red < 2

@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 
 import mitransient_lidar
-from mitransient_lidar import accuracy, loading, rendering, resources, results
-from mitransient_lidar.errors import UserError
-from mitransient_lidar.interruption import InterruptAfterPass
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading import scenes as loading
+from mitransient_lidar.rendering import accuracy
+from mitransient_lidar.rendering import render as rendering
+from mitransient_lidar.rendering.interruption import DeferredInterrupt
+from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT
 from mitransient_lidar.transport.path import Path as LightPath
 
 SMALL = {"type": "lidar_volpath", "paths_per_pass": 2**14}
@@ -24,10 +29,10 @@ def small(scene="table1", **options):
     return mitransient_lidar.render(scene, integrator=SMALL, **options)
 
 
-@pytest.mark.parametrize("name", resources.scene_names())
+@pytest.mark.parametrize("name", catalogue.scene_names())
 def test_every_shipped_scene_renders_and_its_files_read_back(name, tmp_path):
     # Files of images in full are a matter of the gates' tests.
-    image = "x" in (layout := resources.scene_parameters(resources.scene_path(name))["layout"]) and len(layout) > 5
+    image = "x" in (layout := catalogue.scene_parameters(catalogue.scene_path(name))["layout"]) and len(layout) > 5
     shot = small(name, seed=5, params={"layout": "8x8"} if image else {})
     assert shot.sizes["time"] == int(shot.attrs["scene.bin_count"])
     assert float(shot.impulse_response.sum()) > 0
@@ -49,12 +54,12 @@ def test_parameters_have_the_same_names_in_every_scene():
         *("pulse_energy_mj", "pulse_fwhm_ns", "divergence_mrad", "field_of_view_mrad", "layout", "aperture_area"),
         *("altitude", "off_nadir_deg", "wind_speed", "wind_direction_deg", "spectrum", "slope_variance"),
         *("surface_seed", "refractive_index", "group_index", "attenuation", "scattering", "backscattering"),
-        *("phase", "phase_g", "bottom_depth", "bottom_reflectivity", "time_start_ns", "bin_width_ns", "bin_count"),
+        *("phase", "phase_g", "bottom_depth", "bottom_reflectance", "time_start_ns", "bin_width_ns", "bin_count"),
     }
-    for name in resources.scene_names():
+    for name in catalogue.scene_names():
         # Its bottom is a stair.
-        missing = {"bottom_depth", "bottom_reflectivity"} if name == "gated_waves" else set()
-        assert wanted - missing <= set(resources.scene_parameters(resources.scene_path(name)))
+        missing = {"bottom_depth", "bottom_reflectance"} if name == "gated_waves" else set()
+        assert wanted - missing <= set(catalogue.scene_parameters(catalogue.scene_path(name)))
 
 
 @pytest.mark.parametrize("phase", ["fournier_forand", "petzold", "hg"])
@@ -103,7 +108,7 @@ def test_dict_and_loaded_scenes_render_like_the_file():
 
 
 def test_plain_mitsuba_renders_the_scene():
-    energy = np.array(mi.render(mi.load_file(str(resources.scene_path("table1"))), spp=2**12, seed=1))
+    energy = np.array(mi.render(mi.load_file(str(catalogue.scene_path("table1"))), spp=2**12, seed=1))
     assert energy.shape == (4, 150)
     assert 3e-12 < energy.sum() < 7e-12  # closed forms of PHYSICS G bracket it: 2.1e-12 (K = c) to 5.4e-12 J
 
@@ -118,7 +123,7 @@ def test_stops_at_the_target_and_reports_progress():
     reports = []
     shot = mitransient_lidar.render("table1", target_error=0.2, max_time=60, progress=reports.append)
     assert shot.attrs["error_p95"] <= 0.2
-    assert shot.attrs["passes"] == len(reports) == reports[-1].passes_done >= rendering.SMALLEST_PASS_COUNT
+    assert shot.attrs["passes"] == len(reports) == reports[-1].done >= SMALLEST_PASS_COUNT
     assert reports[-1].error_p95 == shot.attrs["error_p95"]
     assert reports[-1].target_error == 0.2
 
@@ -132,7 +137,7 @@ def test_max_time_ends_the_passes():
 
 def test_interruption_keeps_what_was_rendered():
     def stop(progress):
-        if progress.passes_done == 4:
+        if progress.done == 4:
             raise KeyboardInterrupt
 
     shot = small(passes=100, progress=stop)
@@ -166,7 +171,7 @@ def test_ctrl_c_in_the_midst_of_a_pass_keeps_what_was_rendered(default_ctrl_c, m
 
 def test_second_ctrl_c_acts_at_once(default_ctrl_c):
     def press(times):
-        with InterruptAfterPass():
+        with DeferredInterrupt():
             for _ in range(times):
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(0.01)
@@ -178,16 +183,17 @@ def test_second_ctrl_c_acts_at_once(default_ctrl_c):
 
 
 def test_ctrl_c_that_mitsuba_wraps_while_loading_is_no_mistake_of_the_users():
-    with pytest.raises(KeyboardInterrupt), loading.readable_errors(loading=True):
+    with pytest.raises(KeyboardInterrupt), loading.as_user_error():
         raise RuntimeError("could not instantiate plugin: KeyboardInterrupt: ")
-    with pytest.raises(KeyboardInterrupt), loading.readable_errors():
+    with pytest.raises(KeyboardInterrupt), loading.as_user_error():
         raise RuntimeError("while_loop(): encountered an exception") from KeyboardInterrupt()
 
 
 #: The command line, with Ctrl-C pressed when the third pass has been added.
 INTERRUPTED_COMMAND = """
 import os, signal
-from mitransient_lidar import accuracy, cli
+from mitransient_lidar.rendering import accuracy
+from mitransient_lidar.cli import app
 add = accuracy.PassStatistics.add
 def add_and_interrupt(statistics, values):
     add(statistics, values)
@@ -195,7 +201,7 @@ def add_and_interrupt(statistics, values):
         os.kill(os.getpid(), signal.SIGINT)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 accuracy.PassStatistics.add = add_and_interrupt
-cli.main()
+app.main()
 """
 
 
@@ -240,12 +246,9 @@ def test_twice_the_paths_half_the_variance(integrator):
         photons = {"photons_per_pass": paths} if integrator == "lidar_merging" else {}
         engine = mi.load_dict({"type": integrator, "paths_per_pass": paths, **photons})
         scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
-        film = scene.sensors()[0].film()
-        total = []
-        for seed in range(64):
-            engine.render(scene, 0, seed=seed, develop=False)
-            # Late light only: surface echo and early column are stratified and fall faster.
-            total.append(film.energy()[:, 60:].sum())
+        renderer = engine.prepare(scene, scene.sensors()[0])
+        # Late light only: surface echo and early column are stratified and fall faster.
+        total = [renderer.render_pass(seed).histogram.energy()[:, 60:].sum() for seed in range(64)]
         totals.append(np.var(total, ddof=1))
     from scipy.stats import f
 
@@ -289,7 +292,7 @@ def test_mistakes_are_told_in_one_sentence(options, message):
 
 
 def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
-    text = resources.scene_text("table1")
+    text = catalogue.scene_text("table1")
     for wrong, right, message in (
         ("lidar_transmiter", "lidar_transmitter", "lidar_transmiter"),
         ('name="pulse_enrgy_mj"  ', 'name="pulse_energy_mj" ', "pulse_enrgy_mj"),
@@ -328,12 +331,12 @@ def test_bottom_through_the_waves_is_refused_and_a_target_is_told(caplog):
 
 
 def test_small_patch_warns_of_the_light_that_it_loses(caplog):
-    small(params={"surface_extent": 4, "surface_cell_size": 0.25})
+    small(params={"surface_size": 4, "surface_cell_size": 0.25})
     assert "smaller than the footprint" in caplog.text
     caplog.clear()
     # The field of view (1.6 m about the axis) meets the patch, but the water spreads light of the whole beam into it.
     scattering = {"field_of_view_mrad": 15, "attenuation": 1, "scattering": 0.9}
-    small(params={**scattering, "surface_extent": 4, "surface_cell_size": 0.25})
+    small(params={**scattering, "surface_size": 4, "surface_cell_size": 0.25})
     assert "smaller than the footprint" not in caplog.text
     assert "smaller than the spread of the light in the water" in caplog.text
     caplog.clear()
@@ -342,24 +345,26 @@ def test_small_patch_warns_of_the_light_that_it_loses(caplog):
 
 
 @pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
-def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, passes, integrator):
+def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, integrator):
     """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %."""
     water = {"attenuation": 0.5, "scattering": 0.45, "backscattering": 0.018}
     energies, lost, received = [], 0.0, 0.0
     for size in (4.0, 400.0):
         scene = lidar_scene(
             rx={"field_of_view_mrad": 15.0},
-            sea={"extent": size, "slope_variance": "0.02"},
+            sea={"size": size, "slope_variance": "0.02"},
             water=water,
             film={"bin_count": 250},
             integrator={"type": integrator, "paths_per_pass": 2**17},
             bottom=12.0,
         )
         totals = []
+        renderer = scene.integrator().prepare(scene, scene.sensors()[0])
         for seed in range(12 if integrator == "lidar_merging" else 24):
-            totals.append(passes(scene, 1, seed).sum())
+            record = renderer.render_pass(seed)
+            totals.append(record.histogram.energy().sum())
             if size == 4.0:
-                received, lost = received + totals[-1], lost + np.array(scene.integrator().lost).item()
+                received, lost = received + totals[-1], lost + float(record.edge_loss[0])
         energies.append(np.array(totals))
     small_patch, large_patch = energies
     missing = (large_patch - small_patch) / large_patch.mean()

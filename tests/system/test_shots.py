@@ -5,19 +5,21 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import assert_refused, run
 
 import mitransient_lidar
-from mitransient_lidar import loading, shots, survey
-from mitransient_lidar.cli import app
-from mitransient_lidar.errors import UserError
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import scenes
+from mitransient_lidar.plots.find_shots import plot_found_shots
+from mitransient_lidar.studies import find_shots as shots
+from mitransient_lidar.studies import shot_statistics
 
 WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}
 
 
 @pytest.fixture(scope="module")
 def sea():
-    return shots.SeaMap.of_scene(loading.load_scene("fig09_2x2", WAVES)[0])
+    return shots.SeaMap.of_scene(scenes.load_scene("fig09_2x2", WAVES)[0])
 
 
 def test_slopes_are_means_over_the_footprint(sea):
@@ -35,7 +37,7 @@ def test_slopes_are_means_over_the_footprint(sea):
 
 
 def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
-    found = shots.find_shots("fig09_2x2", WAVES, steepness=1.5, count=3)
+    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=3)
     assert [shot.kind for shot in found] == [kind for kind in shots.KINDS for _ in range(3)]
     spread = sea.along.std(), sea.across.std()
     for shot in found:
@@ -48,17 +50,31 @@ def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
             assert math.hypot(first.x - second.x, first.y - second.y) > 4
 
 
-def test_a_face_towards_the_lidar_shines_and_gathers_its_echoes(tmp_path):
+def test_a_face_towards_the_lidar_shines_and_gathers_its_echoes():
     """The published effects: a stronger surface echo, whose far pair comes sooner after the near pair."""
-    found = shots.find_shots("fig09_2x2", WAVES, steepness=1.5)
-    towards, level, away, _ = shots.plot_shots("fig09_2x2", found, tmp_path / "shots.png", WAVES)
-    assert (tmp_path / "shots.png").stat().st_size > 50_000
+    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5)
+    rendered = shots.render_found_shots("fig09_2x2", found, WAVES)
+    towards, level, away, _ = rendered.results
     peaks = [float(shot.waveform.sel(time=slice(1405, 1435)).max("time").sum()) for shot in (towards, level, away)]
     assert peaks[0] > 4 * peaks[1]
     assert peaks[1] > peaks[2]
     # The surface tilts with its face: over the two pairs' distance of 1.2 m that is nanoseconds.
     bottom = [shot.waveform.sel(time=slice(1450, 1480)).idxmax("time").values for shot in (towards, level, away)]
     assert bottom[2].mean() < bottom[1].mean() < bottom[0].mean()
+    # Quarters of a circle of 15 mrad full angle on a level sea 212.8 m away: 1.596 m across, and along the azimuth
+    # 200 m (tan(20 deg + 7.5 mrad) - tan(20 deg)) on the far side.
+    mapped = [np.argwhere(rendered.pixel_map == pixel) for pixel in range(rendered.pixel_count)]
+    pitch = rendered.pixel_lines[1] - rendered.pixel_lines[0]
+    extents = [pitch * np.ptp(nodes, axis=0) for nodes in mapped]
+    np.testing.assert_allclose(extents, [(1.596, x) for x in (1.703, 1.703, 1.694, 1.694)], atol=2 * pitch, rtol=0)
+    middles = [rendered.pixel_lines[0] + pitch * nodes.mean(axis=0) for nodes in mapped]
+    # Far pixels, red and green, lie at +x, and green and black at +y.
+    assert [(x > 0, y > 0) for y, x in middles] == [(True, False), (True, True), (False, False), (False, True)]
+    assert (rendered.azimuth, rendered.scene) == (0.0, "fig09_2x2")
+    assert rendered.beam_spread == pytest.approx((1.064 / math.cos(math.radians(20)), 1.064), rel=1e-3)
+    panels = [ax for ax in plot_found_shots(rendered).axes if ax.get_ylabel() == "power (mW)"]
+    assert [ax.get_title().split()[0] for ax in panels] == list(shots.KINDS)
+    np.testing.assert_allclose(panels[0].lines[2].get_ydata(), 1e3 * towards.waveform[2])
 
 
 def test_depth_bias_is_that_of_a_ray_through_the_slope():
@@ -70,14 +86,14 @@ def test_depth_bias_is_that_of_a_ray_through_the_slope():
         down = ray / 1.34 + (cosine / 1.34 - math.sqrt(1 - (1 - cosine**2) / 1.34**2)) * normal
         level = math.cos(math.asin(math.sin(0.35) / 1.34))
         expected = 5.0 / -down[1] * level - 5.0
-        assert survey.depth_bias(np.array([slope]), 5.0, 0.35, 1.34)[0] == pytest.approx(expected, abs=1e-12)
-    assert survey.depth_bias(np.array([-0.1]), 5.0, 0.35, 1.34)[0] < -0.03
+        assert shot_statistics.depth_bias(np.array([slope]), 5.0, 0.35, 1.34)[0] == pytest.approx(expected, abs=1e-12)
+    assert shot_statistics.depth_bias(np.array([-0.1]), 5.0, 0.35, 1.34)[0] < -0.03
 
 
 def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
     options = [part for name, value in WAVES.items() for part in ("-D", f"{name}={value}")]
     target = tmp_path / "out" / "survey.png"
-    done = CliRunner().invoke(app, ["survey", "fig09_2x2", *options, "--count", "5", "-q", "-o", str(target)])
+    done = run("shot-statistics", "fig09_2x2", *options, "--count", 5, "-q", "-o", target)
     assert done.exit_code == 0, done.output
     assert done.stdout.splitlines()[:2] == [str(target), str(target.with_suffix(".nc"))]
     assert "correlation of strength with the slope" in done.stdout
@@ -85,7 +101,7 @@ def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
 
     with xr.open_dataset(target.with_suffix(".nc")) as found:
         assert dict(found.sizes) == {"shot": 5, "pixel": 4}
-        place = {**WAVES, "shot_x": float(found.shot_x[2]), "shot_y": float(found.shot_y[2])}
+        place = {**WAVES, "aim_x": float(found.aim_x[2]), "aim_y": float(found.aim_y[2])}
         again = mitransient_lidar.render("fig09_2x2", params=place, passes=8, seed=2)
         peak = again.waveform.sel(time=slice(1409.9, 1429.9)).max("time")
         known = np.isfinite(found.surface_peak[2].values)
@@ -97,25 +113,22 @@ def test_mistakes_are_told():
     with pytest.raises(UserError, match="every shot on a flat sea is the same"):
         shots.find_shots("fig09_2x2", {"spectrum": "flat"})
     with pytest.raises(UserError, match="must hold 14"):
-        survey.survey("fig09_2x2", {**WAVES, "bin_count": 40}, count=2)
-    run = CliRunner().invoke
+        shot_statistics.shot_statistics("fig09_2x2", {**WAVES, "bin_count": 40}, count=2)
     for arguments, message in (
-        (["shots", "fig09_2x2", "--at", "3;4"], "--at 3;4 is not of the form x,y"),
-        (["shots", "fig09_2x2", "--steepness", "-1"], "--steepness -1.0 is out of range"),
-        (["shots", "fig09_2x2", "--count", "0"], "--count 0 is out of range"),
-        (["survey", "fig09_2x2", "--count", "1"], "--count 1 is out of range"),
-        (["survey", "fig09_2x2", "-o", "survey.txt"], "must end in"),
+        (["find-shots", "fig09_2x2", "--at", "3;4"], "--at 3;4 is not of the form 2,5"),
+        (["find-shots", "fig09_2x2", "--slope-sigmas", "-1"], "slope_sigmas = -1 must be"),
+        (["find-shots", "fig09_2x2", "--count", "0"], "count = 0 must lie between 1 and 100"),
+        (["shot-statistics", "fig09_2x2", "--count", "1"], "count = 1 must lie between 2 and 100000"),
+        (["shot-statistics", "fig09_2x2", "-o", "survey.txt"], "must end in"),
+        (["find-shots", "fig09_2x2", "-o", "shots.txt"], "must end in"),
     ):
-        done = run(app, arguments)
-        assert done.exit_code == 2
-        assert message in done.stderr
-        assert done.stdout == ""
+        assert_refused(run(*arguments), message)
 
 
 def test_shots_command_lists_places():
-    done = CliRunner().invoke(app, ["shots", "fig09_2x2", "-D", "wind_speed=6", "--at", "1.5,-2", "--at", "3,4"])
+    done = run("find-shots", "fig09_2x2", "-D", "wind_speed=6", "--at", "1.5,-2", "--at", "3,4")
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
-    assert lines[0].split()[:3] == ["kind", "shot_x", "shot_y"]
+    assert lines[0].split()[:3] == ["kind", "aim_x", "aim_y"]
     assert lines[1].split()[:4] == ["shot", "1", "1.50", "-2.00"]
     assert len(lines) == 3

@@ -137,7 +137,7 @@ def test_estimates_meet_the_truth(printed):
         assert abs(truth) < 0.1
         assert abs(estimate - truth) < 2 * error
     assert number_after("depth (m):", text) == pytest.approx(8.0, abs=0.15)
-    assert number_after("reflectivity:", text) == pytest.approx(0.1, rel=0.06)
+    assert number_after("reflectance:", text) == pytest.approx(0.1, rel=0.06)
     assert number_after("a (1/m):", text) == pytest.approx(0.15, rel=0.06)
     assert number_after("bb (1/m):", text) == pytest.approx(0.006, rel=0.08)
     low, high = (float(one) for one in re.search(r"([\d.]+) to ([\d.]+)", text).groups())

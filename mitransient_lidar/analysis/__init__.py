@@ -1,0 +1,1 @@
+"""Analysis of results: datasets in, datasets out, without Mitsuba."""

@@ -1,0 +1,143 @@
+"""Agreement of two results: differences in standard errors, bin by bin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+
+#: Probability of a difference between two results of the same scene.
+SIGNIFICANCE = 0.01
+
+#: Neighbouring bins over which relative errors are averaged: over few passes of an estimator with rare large
+#: contributions, the error of a bin without them is too small and its value too low, like a difference.
+_NEIGHBOURS = 5
+
+#: Largest relative error of a bin: the spread of few passes is a poor estimate of larger ones.
+LARGEST_RELATIVE_ERROR = 0.3
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences between two results.
+
+    Attributes
+    ----------
+    z
+        Difference of the impulse responses in its standard errors, second minus first, shape (pixel, time), converted
+        to the normal distribution for few passes; NaN in excluded bins.
+    limit
+        Critical ``abs(z)`` of the largest difference of all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
+    energy_ratio, energy_ratio_stderr
+        Energy of the included bins, second over first, and its standard error for independent bins.
+    """
+
+    z: FloatArray
+    limit: float
+    energy_ratio: float
+    energy_ratio_stderr: float
+
+    @property
+    def bin_count(self) -> int:
+        """Number of included bins."""
+        return int(np.isfinite(self.z).sum())
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of z, 1 for results that agree."""
+        return float(np.sqrt(np.nanmean(self.z**2)))
+
+    @property
+    def largest(self) -> float:
+        """Largest ``abs(z)``."""
+        return float(np.nanmax(np.abs(self.z)))
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the largest difference is not significant."""
+        return self.largest <= self.limit
+
+
+def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
+    """Compare the impulse responses of two results with the same pixels and time bins, bin by bin.
+
+    Bins from the surface echo to the end of the bottom echo with a relative error below 30 % in both are included.
+
+    Raises
+    ------
+    UserError
+        If pixels or bins differ, or no bin is included.
+    """
+    values = [_by_pixel(result, "impulse_response") for result in (first, second)]
+    errors = [_by_pixel(result, "impulse_response_stderr") for result in (first, second)]
+    times = [result["time"].values for result in (first, second)]
+    if values[0].shape != values[1].shape or not np.allclose(times[0], times[1]):
+        shapes = " and ".join(
+            f"{len(value)} pixels x {len(time)} bins" for value, time in zip(values, times, strict=True)
+        )
+        raise UserError(f"the results have {shapes}: they must have the same pixels and time bins")
+    variances = [error**2 for error in errors]
+    counts = [int(result.attrs.get("passes", 0)) for result in (first, second)]
+    if min(counts) < 2:
+        raise UserError(f"the results have {counts[0]} and {counts[1]} passes: both must have at least 2")
+    known = [error < LARGEST_RELATIVE_ERROR * value for value, error in zip(values, errors, strict=True)]
+    inside = np.ones(len(times[0]), dtype=bool)
+    for result in (first, second):
+        start, end = (result.attrs.get(f"window_{name}_ns") for name in ("start", "end"))
+        if start is not None and end is not None:
+            inside &= (times[0] >= start) & (times[0] <= end)
+    counted = known[0] & known[1] & inside & (variances[0] + variances[1] > 0)
+    if not counted.any():
+        raise UserError("the results share no bin with a relative error below 30 %: render more passes")
+    difference = np.where(counted, values[1] - values[0], np.nan)
+    relative = [pooled_relative_variance(value, variance) for value, variance in zip(values, variances, strict=True)]
+    # If the results agree, both have the errors of their common mean.
+    weight = np.where(counted, relative[0] + relative[1], np.nan)
+    common = (relative[1] * values[0] + relative[0] * values[1]) / weight
+    # At least its own error: where rare paths are missing in one result, the common mean is too small.
+    parts = [np.maximum(part * common**2, own) for part, own in zip(relative, variances, strict=True)]
+    total = parts[0] + parts[1]
+    freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
+    z = _as_normal(difference / np.sqrt(total), freedom)
+    sums = [float(value[counted].sum()) for value in values]
+    spread = float(np.sqrt(np.nansum(total))) / sums[0]
+    return Comparison(z, sidak_limit(int(counted.sum())), sums[1] / sums[0], spread)
+
+
+def sidak_limit(count: int, significance: float = SIGNIFICANCE) -> float:
+    """Return the ``abs(z)`` that the largest of `count` normal numbers exceeds with probability `significance`."""
+    from scipy.special import ndtri
+
+    # log1p and expm1 keep the digits of a probability of 1e-6.
+    return float(-ndtri(-0.5 * np.expm1(np.log1p(-significance) / count)))
+
+
+def pooled_relative_variance(values: FloatArray, variances: FloatArray) -> FloatArray:
+    """Return the larger of the relative variances of each bin and of its neighbours [1], shape (pixel, time).
+
+    The arguments are means and the variances of the means, shape (pixel, time).
+    """
+    from scipy.ndimage import convolve1d
+
+    mean, variance = np.nan_to_num(values), np.nan_to_num(variances)
+    box = np.full(_NEIGHBOURS, 1 / _NEIGHBOURS)
+    around = convolve1d(variance, box, axis=1) / np.maximum(convolve1d(mean, box, axis=1), 1e-150) ** 2
+    # At the beginning of an echo, the error of a bin may exceed that of its neighbours.
+    return np.asarray(np.maximum(around, variance / np.maximum(mean, 1e-150) ** 2))
+
+
+def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:
+    values = result[name].values
+    return np.asarray(values.reshape(-1, values.shape[-1]), dtype=np.float64)
+
+
+def _as_normal(t: FloatArray, freedom: FloatArray) -> FloatArray:
+    """Return the normal quantiles of Student's t (Welch 1947, doi:10.1093/biomet/34.1-2.28)."""
+    from scipy.special import ndtri, stdtr
+
+    tail: FloatArray = stdtr(freedom, -np.abs(t))
+    return np.asarray(-np.sign(t) * ndtri(np.maximum(tail, 1e-300)))

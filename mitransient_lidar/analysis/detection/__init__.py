@@ -1,0 +1,1 @@
+"""Detection of a target in noise and clutter."""

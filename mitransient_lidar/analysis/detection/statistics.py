@@ -1,0 +1,346 @@
+"""Detection of a known echo in noise and clutter by the best weighted sum of samples.
+
+`sample_moments` gives mean and covariance of the samples of a receiver. `Cases` holds them without and with a target,
+for one sea or several; `Cases.statistic` returns the weights of the samples and the distribution of their weighted sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.constants import ELEMENTARY_CHARGE
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array
+from mitransient_lidar.physics.receiver.detectors import photons_per_joule
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+
+_HEADROOM = 6.0  # standard deviations between the largest sample and the end of the range
+
+
+class SampleMoments(NamedTuple):
+    """Mean, shape (..., sample), and covariance, shape (..., sample, sample), of the samples of a shot."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+def sample_moments(
+    chain: ReceiverChain,
+    power: npt.ArrayLike,
+    bin_width_ns: float,
+    samples: slice,
+    background: npt.ArrayLike = 0.0,
+) -> SampleMoments:
+    """Return mean and covariance of some samples of a shot in closed form, in `chain.units` and their square.
+
+    Parameters
+    ----------
+    chain : ReceiverChain
+        The receiver.
+    power : array_like, shape (..., time)
+        Mean optical power of the signal on the detector in each bin [W], not negative.
+    bin_width_ns : float
+        Width of the bins [ns], positive.
+    samples : slice
+        Indices of the samples, without a step.
+    background : array_like
+        Steady power in addition to the signal [W], not negative: a number, or one per record.
+
+    Raises
+    ------
+    UserError
+        As `ReceiverChain.expected`, and without such samples.
+
+    Notes
+    -----
+    Mean and variance are those of `ReceiverChain.expected`. The correlation of samples is that of the detector's charge
+    behind the low-pass, which a logarithm hardly changes; rounding errors are assumed independent.
+    """
+    expected = chain.expected(power, bin_width_ns, background)
+    chosen = range(*samples.indices(expected.mean.shape[-1]))
+    if len(chosen) == 0 or chosen.step != 1:
+        raise UserError(f"samples = {samples} must choose one or more of {expected.mean.shape[-1]} without a step")
+    light = np.asarray(power, dtype=np.float64)
+    sky = np.asarray(background, dtype=np.float64)[..., None]
+    bins = chain.stride(bin_width_ns) * np.array(chosen)
+    if chain.amplifier is None:
+        first, weights, white, gain = 0, np.ones(1), 0.0, 1.0
+    else:
+        first, weights = chain.amplifier.kernel(bin_width_ns)
+        white = chain.amplifier.white_noise(bin_width_ns)
+        gain = chain.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * bin_width_ns)
+    before, after = first + weights.size - 1, -first
+    padded = np.pad(light, [(0, 0)] * (light.ndim - 1) + [(before, after)]) + sky
+    photons = padded * 1e-9 * bin_width_ns * photons_per_joule(chain.wavelength_nm)
+    reach = int(bins[-1] - bins[0]) + weights.size
+    _, lags = chain.detector.moments(chain.detector.event_means(photons, bin_width_ns), bin_width_ns, reach)
+    # Covariance of the charges in the bins that the samples depend on, and weights of these bins in each sample.
+    charge = np.zeros((*light.shape[:-1], reach, reach))
+    for lag, one in enumerate(lags[:reach]):
+        i = np.arange(reach - lag)
+        charge[..., i, i + lag] = charge[..., i + lag, i] = one[..., bins[0] : bins[0] + reach - lag]
+    mixing = np.zeros((len(chosen), reach))
+    for row, start in enumerate(bins - bins[0]):
+        mixing[row, start : start + weights.size] = weights[::-1]
+    covariance = gain**2 * (mixing @ charge @ mixing.T) + white**2 * (mixing @ mixing.T)
+    deviation = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    rounding = np.zeros_like(deviation)
+    if chain.digitiser is not None:
+        rounding = chain.digitiser.step_v**2 / 12 * (1 - expected.saturation[..., samples])
+    known = np.sqrt(np.maximum(expected.variance[..., samples] - rounding, 0))
+    scale = np.divide(known, deviation, out=np.zeros_like(known), where=deviation > 0)
+    covariance = covariance * scale[..., :, None] * scale[..., None, :] + rounding[..., None] * np.eye(len(chosen))
+    return SampleMoments(expected.mean[..., samples], covariance)
+
+
+def within_range(
+    chain: ReceiverChain, power: npt.ArrayLike, bin_width_ns: float, samples: slice, background: npt.ArrayLike = 0.0
+) -> ReceiverChain:
+    """Return the chain with the transimpedance reduced, if necessary, for samples in the range of its electronics.
+
+    The arguments and errors are those of `sample_moments`. Samples with 6 standard deviations of noise are in range;
+    other samples, such as a surface echo, may be clipped.
+    """
+    if chain.amplifier is None:
+        return chain
+    linear = replace(chain, amplifier=replace(chain.amplifier, limit_v=None), logarithm=None)
+    if chain.digitiser is not None:
+        linear = replace(linear, digitiser=replace(chain.digitiser, bits=24, low_v=-1e6, full_scale_v=2e6))
+    found = linear.expected(power, bin_width_ns, background)
+    highest = float(np.max((found.mean + _HEADROOM * np.sqrt(found.variance))[..., samples]))
+    top = np.inf if chain.amplifier.limit_v is None else chain.amplifier.limit_v
+    if chain.digitiser is not None:
+        end = chain.digitiser.top_v
+        top = min(top, float(chain.logarithm.expand(end)) if chain.logarithm is not None else end)
+    if highest <= top:
+        return chain
+    ohm = chain.amplifier.transimpedance_ohm * top / highest
+    return replace(chain, amplifier=replace(chain.amplifier, transimpedance_ohm=ohm))
+
+
+class Statistic(NamedTuple):
+    """A weighted sum of samples, and its distribution without and with the target.
+
+    Attributes
+    ----------
+    weights, offsets : ndarray, shape (cases, samples) and (cases,)
+        Weights of the samples of each case, and the offset that is subtracted from their sum.
+    null_mean, null_sd, target_mean, target_sd : float
+        Mean and standard deviation over shots and cases; the weighted sum is assumed normally distributed.
+    """
+
+    weights: FloatArray
+    offsets: FloatArray
+    null_mean: float
+    null_sd: float
+    target_mean: float
+    target_sd: float
+
+    @property
+    def deflection(self) -> float:
+        """Increase by the target, in standard deviations without it."""
+        return (self.target_mean - self.null_mean) / self.null_sd
+
+    def threshold(self, false_alarm: npt.ArrayLike) -> FloatArray:
+        """Return the threshold for a probability of false alarm, above 0 and below 1."""
+        from scipy.special import ndtri
+
+        return np.asarray(self.null_mean - self.null_sd * ndtri(false_alarm))
+
+    def quantile(self, false_alarm: npt.ArrayLike) -> FloatArray:
+        """Return the mean with a target above the threshold, in standard deviations with it."""
+        return np.asarray((self.target_mean - self.threshold(false_alarm)) / self.target_sd)
+
+    def detection(self, false_alarm: npt.ArrayLike) -> FloatArray:
+        """Return the probability of detection at a probability of false alarm, above 0 and below 1."""
+        from scipy.special import ndtr
+
+        return np.asarray(ndtr(self.quantile(false_alarm)))
+
+    def area(self) -> float:
+        """Return the area under the receiver operating characteristic."""
+        from scipy.special import ndtr
+
+        return float(ndtr((self.target_mean - self.null_mean) / np.hypot(self.null_sd, self.target_sd)))
+
+
+@dataclass(frozen=True)
+class Cases:
+    """Samples without and with a target, on one sea or several.
+
+    Parameters
+    ----------
+    null_mean, target_mean, null_covariance, target_covariance : ndarray
+        Mean over the shots of each case, shape (cases, samples), and covariance of the receiver's noise, shape (cases,
+        samples, samples).
+    detectors : int
+        Number of detectors, each with an equal, contiguous part of the samples.
+    """
+
+    null_mean: FloatArray
+    null_covariance: FloatArray
+    target_mean: FloatArray
+    target_covariance: FloatArray
+    detectors: int = 1
+
+    def combined(self, matrix: FloatArray, detectors: int = 1) -> Cases:
+        """Return the cases of new samples, `matrix` (new samples, samples) times the samples."""
+        return Cases(
+            self.null_mean @ matrix.T,
+            matrix @ self.null_covariance @ matrix.T,
+            self.target_mean @ matrix.T,
+            matrix @ self.target_covariance @ matrix.T,
+            detectors,
+        )
+
+    def others(self, case: int) -> Cases:
+        """Return all cases but one."""
+        rest = np.arange(len(self.null_mean)) != case
+        kept = {name: values[rest] for name, values in vars(self).items() if name != "detectors"}
+        return replace(self, **kept)
+
+    def rise(self) -> FloatArray:
+        """Return the increase of the samples by the target, the mean over the cases."""
+        return np.asarray((self.target_mean - self.null_mean).mean(axis=0))
+
+    def covariance(self, with_target: bool = False) -> FloatArray:
+        """Return the covariance for the weights of each detector by itself, shape (samples, samples).
+
+        It is that of the noise, with the target or else the mean of that without and with it. For several cases it
+        includes, for each detector, the strongest principal component of its samples without the target: mostly the
+        level of the backscatter.
+        """
+        covariance = self.target_covariance.mean(axis=0)
+        if not with_target:
+            covariance = (self.null_covariance.mean(axis=0) + covariance) / 2
+        count = len(self.null_mean)
+        if count > 1:
+            for own in np.split(np.arange(len(covariance)), self.detectors):
+                centred = self.null_mean[:, own] - self.null_mean[:, own].mean(axis=0)
+                _, sizes, shapes = np.linalg.svd(centred, full_matrices=False)
+                covariance[np.ix_(own, own)] += sizes[0] ** 2 / (count - 1) * np.outer(shapes[0], shapes[0])
+        return np.asarray(covariance)
+
+    def weights(self) -> FloatArray:
+        """Return the best weights of the samples, shape (samples,), scaled as those of `matched_weights`."""
+        rise, covariance = self.rise(), self.covariance()
+        if len(self.null_mean) == 1:
+            return matched_weights(rise, covariance)
+        filters = np.zeros((self.detectors, rise.size))
+        for i, own in enumerate(np.split(np.arange(rise.size), self.detectors)):
+            filters[i, own] = _solved(covariance[np.ix_(own, own)], rise[own])
+        each = self.combined(filters)
+        noise = (each.null_covariance.mean(axis=0) + each.target_covariance.mean(axis=0)) / 2
+        return np.asarray(matched_weights(each.rise(), noise + clutter_covariance(each.null_mean)) @ filters)
+
+    def statistic(self) -> Statistic:
+        """Return the best weighted sum of the samples, and its distribution.
+
+        For one case, it is that against its noise alone; for several, against noise and clutter, with the weights of
+        each case from the other cases only. Since few seas do not determine a weight for every sample, each detector's
+        samples are weighted against its noise and the strongest component of its clutter, and then the detectors
+        against noise and their common clutter.
+
+        Raises
+        ------
+        UserError
+            If the target changes no sample, or if there are two cases: clutter requires at least three.
+
+        Notes
+        -----
+        With the mean increase s and the covariance C the weights C^-1 s are the matched filter, the Neyman-Pearson test
+        for normal noise that is the same without and with the target (H. L. Van Trees, Detection, Estimation, and
+        Modulation Theory, part I, 1968, section 4.3). Otherwise, the mean of both covariances gives the largest
+        separation among weighted sums (Hotelling's observer: H. H. Barrett and K. J. Myers, Foundations of Image
+        Science, 2004, section 13.2.12).
+        """
+        count = len(self.null_mean)
+        if count == 2:
+            raise UserError("cases = 2 must be 1 or at least 3: the weights of each come from the others")
+        training = [self] if count == 1 else [self.others(i) for i in range(count)]
+        weights, offsets = np.empty_like(self.null_mean), np.empty(count)
+        for i, cases in enumerate(training):
+            weights[i] = cases.weights()
+            offsets[i] = weights[i] @ cases.null_mean.mean(axis=0)
+        null, target = (np.sum(weights * mean, axis=1) - offsets for mean in (self.null_mean, self.target_mean))
+        null_variance, target_variance = (
+            np.einsum("ni,nij,nj->n", weights, covariance, weights)
+            for covariance in (self.null_covariance, self.target_covariance)
+        )
+        spread = [0.0, 0.0] if count == 1 else [np.var(null, ddof=1), np.var(target, ddof=1)]
+        return Statistic(
+            weights,
+            offsets,
+            float(np.mean(null)),
+            float(np.sqrt(np.mean(null_variance) + spread[0])),
+            float(np.mean(target)),
+            float(np.sqrt(np.mean(target_variance) + spread[1])),
+        )
+
+
+def matched_weights(signal: npt.ArrayLike, covariance: npt.ArrayLike) -> FloatArray:
+    """Return C^-1 s / (s C^-1 s), the weights of the matched filter of a signal s with noise of the covariance C.
+
+    Samples without variance get no weight.
+
+    Raises
+    ------
+    UserError
+        If shapes disagree, a value is not finite, the covariance is not positive, or no sample with noise has a signal.
+    """
+    s, c = finite_array("signal", signal), finite_array("covariance", covariance)
+    if s.ndim != 1 or c.shape != (s.size, s.size):
+        raise UserError(f"covariance of shape {c.shape} must be ({s.size}, {s.size}) for a signal of shape {s.shape}")
+    filtered = _solved(c, s)
+    square = float(s @ filtered)
+    if square <= 0:
+        raise UserError("signal must not be 0 in every sample that has noise, and covariance must be positive")
+    return filtered / square
+
+
+def _solved(covariance: FloatArray, signal: FloatArray) -> FloatArray:
+    """Return the inverse of the covariance times the signal, 0 without variance."""
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
+    noisy = np.flatnonzero(deviation > 0)
+    # In units of each sample's standard deviation: samples may differ by orders of magnitude.
+    correlation = covariance[np.ix_(noisy, noisy)] / np.outer(deviation[noisy], deviation[noisy])
+    found = np.zeros_like(signal)
+    try:
+        found[noisy] = np.linalg.solve(correlation, signal[noisy] / deviation[noisy]) / deviation[noisy]
+    except np.linalg.LinAlgError:
+        raise UserError("covariance must be positive definite among the samples with a variance") from None
+    return found
+
+
+def clutter_covariance(samples: npt.ArrayLike) -> FloatArray:
+    """Return the covariance of samples (cases, samples) over few cases, with correlations shrunk towards 0.
+
+    Raises
+    ------
+    UserError
+        If there are fewer than two cases or values that are not finite.
+
+    Notes
+    -----
+    J. Schaefer and K. Strimmer, Stat. Appl. Genet. Mol. Biol. 4, 32 (2005), doi:10.2202/1544-6115.1175, table 2,
+    target D with unequal variances: the shrinkage is the estimated variance of the correlations over their sum of
+    squares. With few cases, the sample covariance is singular, and weights would ignore the clutter in its null space.
+    """
+    values = finite_array("samples", samples)
+    if values.ndim != 2 or len(values) < 2:
+        raise UserError(f"samples of shape {values.shape} must be (cases, samples) with 2 or more cases")
+    n = len(values)
+    deviation = values.std(axis=0, ddof=1)
+    unit = np.divide(values - values.mean(axis=0), deviation, out=np.zeros_like(values), where=deviation > 0)
+    products = unit.T @ unit / n
+    correlation = n / (n - 1) * products
+    variance = n / (n - 1) ** 3 * ((unit**2).T @ unit**2 - n * products**2)
+    beside = ~np.eye(values.shape[1], dtype=bool)
+    total = float(np.sum(correlation[beside] ** 2))
+    share = min(1.0, float(np.sum(variance[beside])) / total) if total > 0 else 1.0
+    correlation[beside] *= 1 - share
+    return np.asarray(correlation * np.outer(deviation, deviation))

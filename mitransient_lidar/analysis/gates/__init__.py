@@ -1,0 +1,1 @@
+"""Gates cut from waveforms, and range images from gates."""

@@ -1,0 +1,93 @@
+"""Gates cut from the waveforms of a result."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.results.gate_stack import build_gates, check_train
+
+_LOG = logging.getLogger(__name__)
+
+_INFLATION = ("error_inflation_bins", "error_inflation")
+
+
+def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
+    """Cut gates from the waveforms of a result.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A result with ``waveform`` and ``waveform_stderr`` [W] over (row, column, time) or (pixel, time).
+    train : GateTrain
+        The gates, within the record.
+
+    Returns
+    -------
+    xarray.Dataset
+        The gate stack.
+
+    Raises
+    ------
+    UserError
+        If the dataset has no waveforms, the train ends before the surface echo, or a gate is not within the record.
+
+    Notes
+    -----
+    The waveform is the mean power in each bin: the energy of a gate is the sum of power times bin width times the exact
+    mean of the gate over the bin. The errors of bins are correlated, since bins of a pass share light, which the pulse
+    spreads over several bins. The standard error is the quadrature sum times the inflation of the error of a sum over
+    as many bins, measured over the passes of the render (attributes ``error_inflation_bins`` and ``error_inflation``;
+    linear in the logarithm of the number of bins, and beyond the last one in proportion to the square root). A gate
+    with weights w counts as (sum w)^2 / sum w^2 bins. The upper bound is the sum of the errors, which is used if the
+    inflation is unknown.
+    """
+    if missing := [name for name in ("waveform", "waveform_stderr") if name not in dataset]:
+        raise UserError(
+            f"the stack has no {missing[0]}: gates can be cut only from a result that kept its histogram, so render "
+            "the scene again with other gates"
+        )
+    dims, time = results.record_dims(dataset, "waveform"), results.time_axis(dataset)
+    check_train(train, dataset.attrs, time)
+    inflation = _inflation(dataset.attrs)
+    if inflation is None:
+        _LOG.info("the result has no error_inflation: the errors of the gates are upper bounds")
+    power, error = dataset["waveform"].values, dataset["waveform_stderr"].transpose(*dims).values
+    energy = np.zeros((*power.shape[:-1], train.count))
+    stderr = np.zeros_like(energy)
+    for gate in range(train.count):
+        first, weights = train.gate_bins(gate, time.start_ns, time.bin_width_ns, time.bin_count)
+        # Only the bins of the gate: a NaN in another bin must not spread to it.
+        inside = slice(first, first + weights.size)
+        energy[..., gate] = power[..., inside] @ weights
+        bound = error[..., inside] @ weights
+        if inflation is None:
+            stderr[..., gate] = bound
+        else:
+            equivalent = float(weights.sum() ** 2 / np.sum(weights**2))
+            quadrature = np.sqrt(error[..., inside] ** 2 @ weights**2)
+            stderr[..., gate] = np.minimum(quadrature * _inflation_at(inflation, equivalent), bound)
+    joules = train.pulses * time.bin_width_ns * 1e-9
+    return build_gates(joules * energy, joules * stderr, train, coords=dataset.coords, attributes=dataset.attrs)
+
+
+def _inflation(attributes: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+    """Return numbers of bins and the inflation of the error of their sum over the quadrature sum, if known."""
+    bins, inflation = (np.atleast_1d(np.asarray(attributes.get(name, []), np.float64)) for name in _INFLATION)
+    return None if bins.size == 0 or bins.shape != inflation.shape else (bins, inflation)
+
+
+def _inflation_at(inflation: tuple[FloatArray, FloatArray], bins: float) -> float:
+    """Return the inflation of the error for a real number of bins."""
+    known, values = inflation
+    beyond = math.sqrt(max(bins / known[-1], 1))
+    return float(np.interp(math.log(bins), np.log(known), values)) * beyond

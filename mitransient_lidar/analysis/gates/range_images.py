@@ -1,0 +1,231 @@
+"""Contrast of regions or gates, and the range of the echo in every pixel, from gated images."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer
+
+_COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
+_SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most significant gate
+_BLOCK = 8192  # pixels per block: a few tens of MB for 64 gates
+
+
+class Contrast(NamedTuple):
+    """Contrast of a against b with standard errors, NaN where undefined."""
+
+    michelson: FloatArray
+    michelson_stderr: FloatArray
+    weber: FloatArray
+    weber_stderr: FloatArray
+
+
+class RangeImage(NamedTuple):
+    """Depth of the echo in every pixel.
+
+    Attributes
+    ----------
+    depth, sigma : ndarray
+        Centroid of the echo and its standard error, in the unit of the gates' middles; NaN where no gate exceeds the
+        column.
+    confidence : ndarray
+        Probability, 0 to 1, that noise alone would not exceed the column as much.
+    """
+
+    depth: FloatArray
+    sigma: FloatArray
+    confidence: FloatArray
+
+
+def contrast(
+    a: npt.ArrayLike,
+    b: npt.ArrayLike,
+    a_stderr: npt.ArrayLike,
+    b_stderr: npt.ArrayLike,
+    correlation: float = 0.0,
+) -> Contrast:
+    """Return Michelson's contrast (a - b) / (a + b) and Weber's (a - b) / b, with errors to first order.
+
+    Parameters
+    ----------
+    a, b, a_stderr, b_stderr : array_like
+        Mean energies of two regions, such as target and background, or gates, and their standard errors, at least 0, in
+        one unit; they broadcast.
+    correlation : float
+        Correlation of the errors of a and b, -1 to 1. Overlapping gates share light: their correlation is at most the
+        shared fraction of the open time.
+
+    Raises
+    ------
+    UserError
+        If a value is not finite, an error negative or the correlation out of range.
+    """
+    x, y = finite_array("a", a), finite_array("b", b)
+    sx, sy = finite_array("a_stderr", a_stderr), finite_array("b_stderr", b_stderr)
+    for name, error in (("a_stderr", sx), ("b_stderr", sy)):
+        if np.any(error < 0):
+            raise UserError(f"{name} = {error.min():g} must not be negative")
+    covariance = in_range("correlation", correlation, -1, 1) * sx * sy
+    total = np.where(x + y == 0, np.nan, x + y)
+    y_known = np.where(y == 0, np.nan, y)
+    # Rounding may leave a variance of fully correlated errors just below 0.
+    michelson_variance = np.maximum((y * sx) ** 2 + (x * sy) ** 2 - 2 * x * y * covariance, 0)
+    weber_variance = np.maximum(sx**2 + (x / y_known * sy) ** 2 - 2 * x / y_known * covariance, 0)
+    return Contrast(
+        np.asarray((x - y) / total),
+        np.asarray(2 * np.sqrt(michelson_variance) / total**2),
+        np.asarray((x - y) / y_known),
+        np.asarray(np.sqrt(weber_variance) / np.abs(y_known)),
+    )
+
+
+def range_from_gates(
+    energy: npt.ArrayLike, stderr: npt.ArrayLike, gate_mid: npt.ArrayLike, *, reach: int | None = None
+) -> RangeImage:
+    """Find the echo of every pixel above the backscatter of the water column.
+
+    Parameters
+    ----------
+    energy, stderr : array_like, shape (..., gate)
+        Energy in each of at least 3 gates, and its standard error, at least 0.
+    gate_mid : array_like, shape (gate,)
+        Middles of the gates, strictly increasing: depths [m] or times [ns].
+    reach : int, optional
+        Largest extent of an echo on each side of its strongest gate [gates], 0 to (gates - 3) // 2, at least the
+        number of overlapping gates. By default 2, less with fewer than 7 gates.
+
+    Returns
+    -------
+    RangeImage
+        Arrays of shape (...); pixels with non-finite energies have NaN depth and confidence 0.
+
+    Raises
+    ------
+    UserError
+        If shapes disagree or a value is out of range.
+
+    Notes
+    -----
+    Column: the signal of water falls exponentially. In each gate it is the larger of the exponential extrapolated from
+    the (up to) 4 gates before the echo, and of that interpolated between these and the 2 gates behind the echo; behind
+    the echo, where a target may have ended the column, it is at most the level of the 2 gates after it. Energies below
+    their error are replaced by it: the column is never below the noise.
+
+    Echo: the gate with the largest excess over the column, of those at least half as significant as the most
+    significant one, which excludes the noise of the bright column near the surface. The depth is the centroid of the
+    excess within `reach`. Its error holds for gates not wider than the pulse, so that an echo fills more than one; with
+    wider gates the place of the echo within the gate is unknown. Errors of different gates count as independent.
+
+    The confidence is Phi(z)^m for an excess of z standard errors, the largest of m gates.
+
+    The first `reach` + 2 gates only serve to estimate the column: start the train between surface and target. A train
+    that contains the surface echo mostly finds the surface.
+    """
+    e, s = np.asarray(energy, dtype=np.float64), np.asarray(stderr, dtype=np.float64)
+    mid = finite_array("gate_mid", gate_mid)
+    if e.ndim == 0 or e.shape != s.shape or mid.shape != e.shape[-1:]:
+        raise UserError(
+            f"energy of shape {e.shape} and stderr of shape {s.shape} must be equal, with the {mid.size} gates of "
+            "gate_mid last"
+        )
+    if mid.size < 3:
+        raise UserError(f"energy has {mid.size} gates and must have at least 3: two define the column")
+    if np.any(np.diff(mid) <= 0):
+        raise UserError("gate_mid must increase strictly")
+    if np.any(s < 0):
+        raise UserError(f"stderr = {s[s < 0][0]:g} must not be negative")
+    largest = (mid.size - 3) // 2
+    half = min(2, largest) if reach is None else integer("reach", reach, 0, largest)
+    column = _ColumnModel(mid, half)
+    flat, flat_error = e.reshape(-1, mid.size), s.reshape(-1, mid.size)
+    found = np.empty((3, flat.shape[0]))
+    for start in range(0, flat.shape[0], _BLOCK):
+        pixels = slice(start, start + _BLOCK)
+        found[:, pixels] = _ranges(flat[pixels], flat_error[pixels], column)
+    depth, sigma, confidence = found.reshape(3, *e.shape[:-1])
+    return RangeImage(depth, sigma, confidence)
+
+
+class _ColumnModel:
+    """Linear maps from the logarithms of a pixel's energies to those of the column under an echo in each gate.
+
+    An echo fills `half` gates on each side of its strongest one and is found from the gate `first` on. The logarithms
+    times column k of `mean` and `slope` give the line through the gates before an echo in gate k, which lies `lever`
+    behind their middle; times that of `between`, the line between the gates before and behind it in gate k. Energies
+    times column k of `deep` give the mean of the gates behind, if `has_deep`.
+    """
+
+    def __init__(self, mid: FloatArray, half: int) -> None:
+        count = mid.size
+        self.mid, self.half, self.first = mid, half, half + 2
+        self.lever = np.zeros(count)
+        self.mean, self.slope, self.between, self.deep = (np.zeros((count, count)) for _ in range(4))
+        self.has_deep = np.arange(count) + half + 1 < count
+        for k in range(self.first, count):
+            near = np.arange(max(k - half - _COLUMN_GATES, 0), k - half)
+            behind = np.arange(k + half + 1, min(k + half + 1 + _DEEP_GATES, count))
+            x = mid[near] - mid[near].mean()
+            self.lever[k] = mid[k] - mid[near].mean()
+            self.mean[near, k] = 1 / near.size
+            self.slope[near, k] = x / np.sum(x**2)
+            if behind.size:
+                last = near[-2:]
+                share = (mid[k] - mid[last].mean()) / (mid[behind].mean() - mid[last].mean())
+                self.between[last, k] = (1 - share) / last.size
+                self.between[behind, k] = share / behind.size
+                self.deep[behind, k] = 1 / behind.size
+
+
+def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> FloatArray:
+    """Return depth, sigma and confidence of pixels, shape (3, pixel), from energies of shape (pixel, gate)."""
+    from scipy.special import ndtr
+
+    known = np.asarray(np.isfinite(energy + stderr).all(axis=1))
+    e, s = np.where(known[:, None], energy, 0), np.where(known[:, None], stderr, 0)
+    # A floor far below every signal keeps logarithms finite without light and noise.
+    floor = np.maximum(s, np.maximum(1e-15 * e.max(axis=1, initial=0), 1e-300)[:, None])
+    clipped = np.maximum(e, floor)
+    log, log_variance = np.log(clipped), (s / clipped) ** 2
+    slope = np.minimum(log @ column.slope, 0)
+    before = log @ column.mean + slope * column.lever
+    between = np.where(column.has_deep, log @ column.between, -np.inf)
+    background = np.exp(np.maximum(before, between))
+    variance_before = log_variance @ (column.mean + column.slope * column.lever) ** 2
+    background_variance = np.where(before >= between, variance_before, log_variance @ column.between**2)
+    excess = e - background
+    error = np.sqrt(s**2 + background**2 * background_variance)
+
+    eligible = slice(column.first, None)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(excess > 0, excess / error, 0)[:, eligible]
+    significant = z >= _SIGNIFICANT * z.max(axis=1, keepdims=True)
+    peak = column.first + np.argmax(np.where(significant, excess[:, eligible], -np.inf), axis=1)
+    at_peak = peak[:, None]
+    z_peak = np.take_along_axis(z, at_peak - column.first, axis=1)[:, 0]
+
+    window = at_peak + np.arange(-column.half, column.half + 1)
+    inside = window < column.mid.size
+    window = np.minimum(window, column.mid.size - 1)
+    place = column.mid[window]
+    away = place - column.mid[at_peak]
+    level = np.take_along_axis(background, at_peak, 1) * np.exp(np.take_along_axis(slope, at_peak, 1) * away)
+    deep = np.maximum(np.take_along_axis(e @ column.deep, at_peak, 1), 0)
+    limited = np.asarray((away > 0) & (level > deep))
+    level = np.where(limited, deep, level)
+    weight = np.where(inside, np.maximum(np.take_along_axis(e, window, 1) - level, 0), 0)
+    total = weight.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.sum(weight * place, axis=1) / total
+        lever = np.where(inside, place - depth[:, None], 0) / total[:, None]
+        variance = np.sum((lever * np.take_along_axis(s, window, 1)) ** 2, axis=1)
+        shift = np.sum(np.where(limited | (weight == 0), 0, lever * level), axis=1)
+        variance += shift**2 * np.take_along_axis(background_variance, at_peak, 1)[:, 0]
+    found = known & (z_peak > 0)
+    confidence = ndtr(z_peak) ** (column.mid.size - column.first)
+    return np.stack(
+        [np.where(found, depth, np.nan), np.where(found, np.sqrt(variance), np.nan), np.where(found, confidence, 0)]
+    )

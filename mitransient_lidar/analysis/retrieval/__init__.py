@@ -1,0 +1,1 @@
+"""Sea slope, depth, bottom and water from echoes."""

@@ -1,0 +1,1 @@
+"""Echoes and columns measured in waveforms."""

@@ -1,0 +1,335 @@
+"""Waveform records, the shape of an ideal echo, and detection of the echoes in records.
+
+All times are arrivals of light: an estimator that reads another point of the echo is calibrated with the transmitted
+pulse, so that all estimators give the same time for an echo of the pulse's shape. Samples are means over their bins, at
+the centres of the bins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntFlag
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite, finite_array, positive
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+
+IntArray = npt.NDArray[np.intp]
+BoolArray = npt.NDArray[np.bool_]
+
+_FINE = 15  # points of a template per bin; odd, so that one of them is the centre of the bin
+_NOISE_FLOOR = 1e-6  # smallest noise, relative to the largest sample of a record
+_SMOOTHING = 0.5  # width of the detection filter in echo widths
+_SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
+_FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
+_REACH = 1.5  # distance from an echo to the signal around it, in echo widths
+GAUSSIAN_AREA = float(np.sqrt(np.pi / np.log(16)))  # area of a Gaussian of unit height and unit width at half maximum
+
+
+class EchoFlag(IntFlag):
+    """Problems of an echo; 0 if there are none."""
+
+    NO_ECHO = 1  # no signal above the noise; the values are NaN
+    SATURATED = 2  # the detector or the digitiser was at its limit
+    MERGED = 4  # less than an echo width from another echo
+    CUT = 8  # extends beyond an end of the record
+    POOR_FIT = 16  # too few usable samples, or a fit that has not converged
+
+
+def has_echo(flags: IntArray) -> BoolArray:
+    """Return where flags do not include `EchoFlag.NO_ECHO`."""
+    return np.asarray((flags & int(EchoFlag.NO_ECHO)) == 0)
+
+
+@dataclass(frozen=True)
+class Records:
+    """Waveforms with their noise.
+
+    Attributes
+    ----------
+    power
+        Samples less the baseline, shape (n, time); any unit, W where energies are to be J.
+    time_ns
+        Centres of the bins [ns], evenly spaced, shape (time,).
+    noise
+        Standard deviation of each sample, independent between bins, shape (n, time) or (n, 1).
+    """
+
+    power: FloatArray
+    time_ns: FloatArray
+    noise: FloatArray
+
+    @classmethod
+    def of(cls, waveforms: npt.ArrayLike, time_ns: npt.ArrayLike, noise: npt.ArrayLike = 0.0) -> Records:
+        """Check waveforms, shape (n, time), at bin centres [ns], at least 8, evenly spaced and increasing.
+
+        The standard deviation of the samples, shape (), (n,) or (n, time), not negative, is raised to a millionth of
+        the largest sample of the record, for the weights of records without noise.
+
+        Raises
+        ------
+        UserError
+            If an array has another shape or is out of range.
+        """
+        power, time, sigma = (
+            finite_array(name, values)
+            for name, values in (("waveforms", waveforms), ("time_ns", time_ns), ("noise", noise))
+        )
+        if time.ndim != 1 or time.size < 8:
+            raise UserError(f"time_ns of shape {time.shape} must be a list of at least 8 times")
+        steps = np.diff(time)
+        if steps[0] <= 0 or np.any(np.abs(steps - steps[0]) > 1e-4 * steps[0] + 1e-9 * np.abs(time).max()):
+            raise UserError("time_ns must increase in equal steps")
+        if power.ndim != 2 or power.shape[1] != time.size:
+            raise UserError(f"waveforms of shape {power.shape} must have the shape (n, {time.size})")
+        if sigma.ndim == 1:
+            sigma = sigma[:, np.newaxis]
+        if sigma.ndim > 2 or (sigma.ndim == 2 and sigma.shape not in (power.shape, (len(power), 1))):
+            raise UserError(f"noise of shape {np.shape(noise)} must be a number, one per waveform, or one per sample")
+        if np.any(sigma < 0):
+            raise UserError(f"noise = {sigma.min():g} must not be negative")
+        least = _NOISE_FLOOR * np.max(np.abs(power), axis=1, initial=0.0)[:, np.newaxis]
+        floored = np.maximum(sigma, np.where(least > 0, least, 1.0))
+        return cls(power, time, np.asarray(np.broadcast_to(floored, (len(power), floored.shape[-1]))))
+
+    @property
+    def bin_ns(self) -> float:
+        """Width of the bins [ns]."""
+        return float(self.time_ns[-1] - self.time_ns[0]) / (self.time_ns.size - 1)
+
+    def time_of(self, bins: IntArray) -> FloatArray:
+        """Return the centres of bins [ns]; of bins outside the record, that of the nearest one inside."""
+        return np.asarray(self.time_ns[np.clip(bins, 0, self.time_ns.size - 1)])
+
+    def around(self, bins: IntArray, lags: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return samples, noise and whether they are inside the record, at lags from a bin of each record."""
+        places = bins[:, np.newaxis] + lags
+        inside = (places >= 0) & (places < self.time_ns.size)
+        clipped = np.clip(places, 0, self.time_ns.size - 1)
+        power = np.take_along_axis(self.power, clipped, axis=1)
+        noise = np.take_along_axis(np.broadcast_to(self.noise, self.power.shape), clipped, axis=1)
+        return power, noise, inside
+
+
+@dataclass(frozen=True)
+class Template:
+    """Shape of an ideal echo in the record, with its arrival at time 0.
+
+    Attributes
+    ----------
+    time_ns, power
+        Points of the shape [ns], 15 per bin, and its height there, 1 at the peak; shape (points,).
+    fwhm_ns
+        Full width at half maximum [ns].
+    """
+
+    time_ns: FloatArray
+    power: FloatArray
+    fwhm_ns: float
+
+    @classmethod
+    def of(cls, pulse: Pulse, bin_width_ns: float, response_time_ns: float = 0.0) -> Template:
+        """Return the shape of a pulse averaged over bins of a width [ns], above 0.
+
+        The receiver's response is a single pole with a time constant [ns] of at least 0.
+
+        Raises
+        ------
+        UserError
+            If a number is out of range.
+        """
+        step = positive("bin_width_ns", bin_width_ns) / _FINE
+        first, weights = pulse.kernel(step, response_time_ns)
+        shares = np.convolve(weights, np.full(_FINE, 1.0))
+        time = np.asarray((first - (_FINE - 1) / 2 + np.arange(shares.size)) * step, dtype=np.float64)
+        power = shares / shares.max()
+        above = np.flatnonzero(power >= 0.5)
+        left, right = above[0], above[-1]
+        rise = np.interp(0.5, power[left - 1 : left + 1], time[left - 1 : left + 1]) if left > 0 else time[0]
+        fall = np.interp(-0.5, -power[right : right + 2], time[right : right + 2])
+        return cls(time, power, float(fall - rise))
+
+    def rise(self, level: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the time [ns] at which the edge crosses a level (0 to 1, of the peak), and its derivative."""
+        edge = slice(0, int(np.argmax(self.power)) + 1)
+        heights, kept = np.unique(self.power[edge], return_index=True)
+        wanted = np.clip(level, 1e-6, 0.999)
+        time = np.interp(wanted, heights, self.time_ns[edge][kept])
+        ahead = np.interp(np.minimum(wanted * 1.001, 1.0), heights, self.time_ns[edge][kept])
+        return time, (ahead - time) / (0.001 * wanted)
+
+
+@dataclass(frozen=True)
+class DetectedEchoes:
+    """Surface, target and bottom of each record: bins of their peaks, -1 without an echo, and sums of `EchoFlag`."""
+
+    bins: IntArray  #: Shape (3, n).
+    flags: IntArray  #: Shape (3, n).
+
+    @property
+    def surface(self) -> IntArray:
+        """Bins of the surface peaks, shape (n,)."""
+        return np.asarray(self.bins[0])
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Measured quantities of one echo of each record, NaN without an echo; shape (n,) each.
+
+    Attributes
+    ----------
+    time_ns, amplitude, energy, width_ns
+        Arrival [ns], height above the surrounding signal [unit of the record], integral over time [unit times s] and
+        full width at half maximum [ns].
+    time_stderr, amplitude_stderr, energy_stderr, width_stderr
+        Their standard errors from the noise of the records.
+    flags
+        Sums of `EchoFlag`.
+    """
+
+    time_ns: FloatArray
+    amplitude: FloatArray
+    energy: FloatArray
+    width_ns: FloatArray
+    time_stderr: FloatArray
+    amplitude_stderr: FloatArray
+    energy_stderr: FloatArray
+    width_stderr: FloatArray
+    flags: IntArray
+
+    def known_only(self, known: BoolArray) -> Echoes:
+        """Return the echoes with NaN where they are not known."""
+        numbers = {name: np.where(known, value, np.nan) for name, value in vars(self).items() if name != "flags"}
+        return replace(self, **numbers)
+
+    def delayed(self, delay_ns: float) -> Echoes:
+        """Return the echoes with a delay [ns] added to their times."""
+        return replace(self, time_ns=self.time_ns + delay_ns)
+
+
+def smooth(records: Records, width_ns: float) -> tuple[FloatArray, FloatArray]:
+    """Return records after a Gaussian filter of a full width at half maximum [ns], and their noise."""
+    from scipy.ndimage import correlate1d
+
+    sigma = max(width_ns / FWHM_PER_SIGMA / records.bin_ns, 0.3)
+    lags = np.arange(-int(4 * sigma + 1), int(4 * sigma + 1) + 1)
+    weights = np.exp(-0.5 * (lags / sigma) ** 2)
+    weights /= weights.sum()
+    # Zero beyond the ends: the noise of a repeated sample would not be averaged.
+    if records.noise.shape[1] == 1:
+        noise = records.noise * np.linalg.norm(weights)
+    else:
+        noise = np.sqrt(correlate1d(records.noise**2, weights**2, axis=1, mode="nearest"))
+    return np.asarray(correlate1d(records.power, weights, axis=1, mode="constant")), noise
+
+
+def find_echoes(
+    records: Records,
+    echo_fwhm_ns: float,
+    *,
+    threshold: float = 5.0,
+    contrast: float = 0.05,
+    earliest_ns: float = -np.inf,
+) -> DetectedEchoes:
+    """Find surface, target and bottom.
+
+    The surface echo is the first peak above the noise. Behind it, a peak stands out from the water column if the
+    smoothed signal w exceeds both w(t-d)^2/w(t-2d), the extrapolated column before it, and sqrt(w(t-d) w(t+d)), the
+    column interpolated between both sides. Both are exact for an exponential: neither the column nor a step down in it
+    is a peak. Where they would reach the surface echo, the signal must rise again after a dip. The last peak is the
+    bottom, the strongest before it a target; peaks below a fiftieth of the strongest are ignored.
+
+    Parameters
+    ----------
+    records : Records
+        The waveforms.
+    echo_fwhm_ns : float
+        Expected full width of an echo at half maximum [ns], above 0: pulse, response and spread over the footprint.
+    threshold : float
+        Detection threshold of the smoothed signal [standard deviations of the noise], above 0.
+    contrast : float
+        Smallest excess of a peak behind the surface over the column, relative to the signal, 0 to 1.
+    earliest_ns : float
+        Earliest time of the surface echo [ns].
+
+    Raises
+    ------
+    UserError
+        If a number is out of range.
+    """
+    width = positive("echo_fwhm_ns", echo_fwhm_ns)
+    threshold, contrast = positive("threshold", threshold), finite("contrast", contrast)
+    if not 0 <= contrast < 1:
+        raise UserError(f"contrast = {contrast:g} must be at least 0 and below 1")
+    power, noise = smooth(records, _SMOOTHING * width)
+    count = power.shape[1]
+    bins = np.arange(count)
+    surface = _first_peak(power, noise, threshold, records.time_ns >= earliest_ns)
+
+    reach = max(round(_REACH * width / records.bin_ns), 1)
+    behind = bins > surface[:, np.newaxis]
+    stands_out = _above_column(np.maximum(power, 0), reach)
+    # Near the surface, without a column to compare with, a rise after a dip stands out.
+    lowest = np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
+    apart = width / records.bin_ns
+    near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart)
+    stands_out = np.where(near, power - lowest, stands_out)
+    dip = np.minimum.accumulate(np.where(behind, np.maximum(stands_out, 0), np.inf), axis=1)
+    excess = np.where(behind & (surface >= 0)[:, np.newaxis], stands_out, -np.inf)
+    excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
+    peaks = np.zeros(power.shape, dtype=bool)
+    peaks[:, 1:-1] = (stands_out[:, 1:-1] > stands_out[:, :-2]) & (stands_out[:, 1:-1] >= stands_out[:, 2:])
+    # The signal and the two samples that it is compared with are all noisy.
+    peaks &= (excess > 1.5 * threshold * noise) & (excess > contrast * power)
+    # A far weaker peak behind a strong echo belongs to its tail.
+    peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
+
+    bottom = np.where(peaks.any(axis=1), count - 1 - np.argmax(peaks[:, ::-1], axis=1), -1)
+    before = peaks & (bins < (bottom - apart)[:, np.newaxis])
+    target = np.where(before.any(axis=1), np.argmax(np.where(before, excess, -np.inf), axis=1), -1)
+    places = np.stack([surface, target, bottom])
+    flags = np.where(places < 0, int(EchoFlag.NO_ECHO), 0)
+    for first, second in combinations(range(3), 2):
+        near = (places[first] >= 0) & (places[second] >= 0) & (places[second] - places[first] < apart)
+        flags[[first, second]] |= np.where(near, int(EchoFlag.MERGED), 0)
+    flags[[0, 2]] |= np.where(_hides_bottom(records, power, width, surface) & (bottom < 0), int(EchoFlag.MERGED), 0)
+    return DetectedEchoes(places, flags)
+
+
+def _first_peak(power: FloatArray, noise: FloatArray, threshold: float, allowed: BoolArray) -> IntArray:
+    """Return the bin of the first peak after the signal exceeds the noise, -1 if it never does; shape (n,)."""
+    level = np.maximum(threshold * noise, _SURFACE_LEVEL * power.max(axis=1, keepdims=True, initial=0.0))
+    above = (power > level) & allowed
+    start = np.argmax(above, axis=1)
+    falls = np.zeros(power.shape, dtype=bool)
+    falls[:, :-1] = power[:, 1:] < power[:, :-1]
+    falls[:, -1] = True
+    falls &= np.arange(power.shape[1]) >= start[:, np.newaxis]
+    return np.where(above.any(axis=1), np.argmax(falls, axis=1), -1)
+
+
+def _above_column(power: FloatArray, reach: int) -> FloatArray:
+    """Return the excess of a signal, shape (n, time), over the column around it."""
+    padded = np.pad(power, ((0, 0), (2 * reach, reach)), mode="edge")
+    size = power.shape[1]
+    earlier, before, after = padded[:, :size], padded[:, reach : reach + size], padded[:, 3 * reach : 3 * reach + size]
+    falls_by = np.divide(before, earlier, out=np.ones_like(before), where=earlier > before)
+    return np.asarray(power - np.maximum(before * falls_by, np.sqrt(before * after)))
+
+
+def _hides_bottom(records: Records, power: FloatArray, width: float, surface: IntArray) -> BoolArray:
+    """Return where a surface echo without a column behind it is too wide for one echo: it includes the bottom."""
+    rows = np.arange(len(power))
+    place = np.maximum(surface, 0)
+    half = power >= 0.5 * power[rows, place][:, np.newaxis]
+    bins = np.arange(power.shape[1])
+    start = np.max(np.where(~half & (bins < place[:, np.newaxis]), bins, -1), axis=1)
+    end = np.min(np.where(~half & (bins > place[:, np.newaxis]), bins, power.shape[1]), axis=1)
+    single = width * np.sqrt(1 + _SMOOTHING**2)
+    wide = (end - start - 1) * records.bin_ns > 1.1 * single
+    tail = power[rows, np.minimum(end + int(_REACH * width / records.bin_ns), power.shape[1] - 1)]
+    return np.asarray((surface >= 0) & wide & (tail < 0.05 * power[rows, place]))

@@ -1,0 +1,299 @@
+"""Gaussian decomposition: joint fits of echoes and the water column around them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.analysis.waveforms.echo_detection import (
+    BoolArray,
+    Echoes,
+    EchoFlag,
+    IntArray,
+    Records,
+    has_echo,
+)
+from mitransient_lidar.core.validation import FloatArray, finite_array, positive
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
+
+Model = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+_ITERATIONS = 30
+_SIGNIFICANT = 9.0  # decrease of the squared residuals by which a surface height is distinct from the column's onset
+_CLEAR = 10.0  # standard errors of a height above which it is not tested
+_HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
+
+
+def gaussian_surface(
+    records: Records, bins: IntArray, echo_fwhm_ns: float, decay: npt.ArrayLike, flags: IntArray
+) -> Echoes:
+    """Fit a surface echo together with the water column that begins at it.
+
+    The model is A exp(-u^2/(2 s^2)) plus a column C exp(-k u) from u = 0 on, blurred by the same Gaussian, where u is
+    the time since the surface: both have the same time and width s. It is fitted from two echo widths before the peak
+    to two after it, and finds the surface even where the peak is that of the column.
+
+    The fit of a surface that is low beside its column is nearly as good without A and one or two nanoseconds earlier.
+    Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to 0.45 of the
+    peak, weighted with their likelihood and a prior probability of one half for A = 0; the errors include the spread of
+    these fits.
+
+    Amplitude, energy and width are those of the Gaussian A, the echo of the surface itself.
+
+    Parameters
+    ----------
+    records, bins, flags : Records and ndarray of int, shape (n,)
+        The waveforms, and the bins of the surface peaks and `EchoFlag` of the echoes.
+    echo_fwhm_ns : float
+        Expected width of the echo [ns], above 0.
+    decay : array_like, shape () or (n,)
+        Rate k of decay of the column [1/ns], at least 0.
+    """
+    data = _Data.of(records, bins, positive("echo_fwhm_ns", echo_fwhm_ns), decay, (-2, 2))
+    width, peak = data.width, data.peak()
+    sigma = np.full(peak.shape, width / FWHM_PER_SIGMA)
+    start = np.stack([np.full(peak.shape, -0.3 * width), sigma, 0.5 * peak, 0.7 * peak], axis=1)
+
+    def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+        from scipy.special import ndtr
+
+        time, s, height, level = (p[:, i : i + 1] for i in range(4))
+        v = u - time
+        z = v / s
+        gauss = np.exp(-0.5 * z**2)
+        onset = np.exp(0.5 * (k * s) ** 2 - k * v) * ndtr(z - k * s)
+        # d/dv of the blurred column is its Gaussian edge less k of itself.
+        edge = gauss / (np.sqrt(2 * np.pi) * s)
+        by_time = height * gauss * z / s + level * (k * onset - edge)
+        by_s = height * gauss * z**2 / s + level * (k**2 * s * onset - edge * (z + k * s))
+        return height * gauss + level * onset, np.stack([by_time, by_s, gauss, onset], axis=1)
+
+    exists = has_echo(flags)
+    fit = _fit(model, start, data, peak, exists)
+    error = np.sqrt(fit.covariance[:, 2, 2])
+    weak = exists & ~(fit.good & (fit.values[:, 2] > _CLEAR * error))
+    some = fit.good & (fit.values[:, 2] > error)
+    tried: list[_Fit] = []
+    for share in _HEIGHTS:
+        if not weak.any():
+            return _echoes(records, bins, fit, flags)
+        tried.append(_fit(model, start, data, peak, weak, np.where(weak, share * peak, np.nan)))
+        start = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, start)
+        weak &= ~some | (tried[0].cost <= fit.cost + _SIGNIFICANT)
+    return _echoes(records, bins, fit.replaced(weak, _mean(tried)), flags)
+
+
+def gaussian_echo(
+    records: Records,
+    bins: IntArray,
+    echo_fwhm_ns: float,
+    decay: npt.ArrayLike,
+    flags: IntArray,
+    *,
+    after: IntArray | None = None,
+) -> Echoes:
+    """Fit an echo at which the column ends.
+
+    The model is A exp(-u^2/(2 s^2)) plus a column with one level before and another one behind the echo, both decaying
+    as exp(-k u), with a step between them that is blurred like the echo. It is fitted from two echo widths before the
+    peak to one and a half after it, without samples less than an echo width behind the surface peaks, the bins `after`,
+    shape (n,). The other arguments are those of `gaussian_surface`.
+    """
+    data = _Data.of(records, bins, positive("echo_fwhm_ns", echo_fwhm_ns), decay, (-2, 1.5))
+    width = data.width
+    if after is not None:
+        first = (np.minimum(after + width / records.bin_ns, 0.5 * (after + bins)) - bins) * records.bin_ns
+        data = replace(data, usable=data.usable & (data.u >= first[:, np.newaxis]))
+    peak = data.peak()
+    early = np.argmax(data.usable, axis=1)
+    before = np.maximum(np.take_along_axis(data.power, early[:, np.newaxis], axis=1)[:, 0], 0)
+    before = np.minimum(before, 0.5 * peak)
+    start = np.stack([0 * peak, np.full(peak.shape, width / FWHM_PER_SIGMA), peak, before, 0 * peak], axis=1)
+
+    def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+        from scipy.special import ndtr
+
+        time, s, height, level, behind = (p[:, i : i + 1] for i in range(5))
+        v = u - time
+        z = v / s
+        gauss, passed, fall = np.exp(-0.5 * z**2), ndtr(z), np.exp(-k * v)
+        column = fall * (level + (behind - level) * passed)
+        edge = fall * (behind - level) * gauss / (np.sqrt(2 * np.pi) * s)
+        by_time = height * gauss * z / s + k * column - edge
+        by_s = height * gauss * z**2 / s - edge * z
+        jacobian = np.stack([by_time, by_s, gauss, fall * (1 - passed), fall * passed], axis=1)
+        return height * gauss + column, jacobian
+
+    return _echoes(records, bins, _fit(model, start, data, peak, has_echo(flags)), flags)
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Samples about the peaks: times from them (bins,), samples and noise (n, bins), and decay rates (n, 1)."""
+
+    u: FloatArray
+    power: FloatArray
+    noise: FloatArray
+    usable: BoolArray
+    rate: FloatArray
+    width: float
+
+    @classmethod
+    def of(
+        cls, records: Records, bins: IntArray, width: float, decay: npt.ArrayLike, span: tuple[float, float]
+    ) -> _Data:
+        """Return the samples in a span of echo widths about the peaks."""
+        rate = np.broadcast_to(finite_array("decay", decay), bins.shape)[:, np.newaxis]
+        low, high = (end * width / records.bin_ns for end in span)
+        lags = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
+        power, noise, inside = records.around(bins, lags)
+        return cls(np.asarray(lags * records.bin_ns, dtype=np.float64), power, noise, inside, rate, width)
+
+    def peak(self) -> FloatArray:
+        """Return the largest sample within half an echo width, shape (n,)."""
+        return np.asarray(np.max(np.where(self.usable & (np.abs(self.u) < 0.5 * self.width), self.power, 0), axis=1))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Parameters (n, p), their covariance (n, p, p), squared residuals and convergence of the fits (n,)."""
+
+    values: FloatArray
+    covariance: FloatArray
+    cost: FloatArray
+    good: BoolArray
+
+    def replaced(self, where: BoolArray, fit: _Fit) -> _Fit:
+        """Return this fit with another one in some rows."""
+        return _Fit(
+            np.where(where[:, np.newaxis], fit.values, self.values),
+            np.where(where[:, np.newaxis, np.newaxis], fit.covariance, self.covariance),
+            np.where(where, fit.cost, self.cost),
+            np.where(where, fit.good, self.good),
+        )
+
+
+def _mean(tried: list[_Fit]) -> _Fit:
+    """Return the mean of fits at the heights `_HEIGHTS`, each weighted with its likelihood."""
+    cost = np.stack([np.where(fit.good, fit.cost, np.inf) for fit in tried])
+    good = np.isfinite(cost).any(axis=0)
+    likelihood = np.exp(-0.5 * (cost - np.where(good, cost.min(axis=0), 0)))
+    # A prior of one half for no height, and of one half spread evenly over the heights.
+    prior = np.gradient(_HEIGHTS)
+    prior[[0, -1]] *= 0.5
+    prior /= prior.sum()
+    prior[0] += 1
+    weight = prior[:, np.newaxis] * likelihood
+    weight /= np.where(good, weight.sum(axis=0), 1.0)
+    values = np.stack([fit.values for fit in tried])
+    mean = np.einsum("jn,jnp->np", weight, values)
+    apart = values - mean
+    within = np.stack([np.where(fit.good[:, np.newaxis, np.newaxis], fit.covariance, 0) for fit in tried])
+    covariance = np.einsum("jn,jnpq->npq", weight, within + apart[..., :, np.newaxis] * apart[..., np.newaxis, :])
+    return _Fit(mean, covariance, cost.min(axis=0), good)
+
+
+def _fit(
+    model: Model,
+    start: FloatArray,
+    data: _Data,
+    scale: FloatArray,
+    wanted: BoolArray,
+    held: FloatArray | None = None,
+) -> _Fit:
+    """Fit a model to many windows at once by damped least squares (Levenberg and Marquardt).
+
+    Heights that are not NaN in `held`, shape (n,), are fixed.
+    """
+    u, power, usable, rate, width = data.u, data.power, data.usable, data.rate, data.width
+    count, size = start.shape
+    held = np.full(count, np.nan) if held is None else held
+    fixed = np.isfinite(held)
+    wanted = wanted & (np.count_nonzero(usable, axis=1) > size + 1) & (scale > 0)
+    scale = np.where(scale > 0, scale, 1.0)
+    values = start.copy()
+    values[fixed, 2] = held[fixed]
+    covariance = np.full((count, size, size), np.nan)
+    good = np.zeros(count, dtype=bool)
+    damping = np.full(count, 1e-3)
+    # Fits with fixed heights are only compared, and none of their parameters is as poorly determined.
+    enough = np.where(fixed, 1e-3, 1e-9)
+    weights = np.where(usable, 1 / data.noise, 0.0)
+    unit = np.ones((count, size))
+    unit[:, :2] = width
+    unit[:, 2:] = scale[:, np.newaxis]
+    active = np.flatnonzero(wanted)
+    cost = np.full(count, np.inf)
+    found, jacobian = model(values[active], u, rate[active])
+    cost[active] = np.sum((weights[active] * (power[active] - found)) ** 2, axis=1)
+    for _ in range(_ITERATIONS):
+        if not active.size:
+            break
+        w, x, y, k = weights[active], values[active], power[active], rate[active]
+        weighted = jacobian * (w[:, np.newaxis, :] * unit[active][..., np.newaxis])
+        weighted[fixed[active], 2] = 0
+        normal = weighted @ weighted.transpose(0, 2, 1)
+        right = (weighted @ (w * (y - found))[..., np.newaxis])[..., 0]
+        diagonal = np.einsum("nii->ni", normal)
+        # A parameter that the samples do not constrain keeps its value.
+        ridge = damping[active][:, np.newaxis] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
+        damped = normal + ridge[:, :, np.newaxis] * np.eye(size)
+        step = np.linalg.solve(damped, right[..., np.newaxis])[..., 0]
+        trial = x + np.clip(step, -1, 1) * unit[active]
+        trial[:, 0] = np.clip(trial[:, 0], -1.2 * width, 1.2 * width)
+        trial[:, 1] = np.clip(trial[:, 1], 0.1 * width / FWHM_PER_SIGMA, 3 * width / FWHM_PER_SIGMA)
+        trial[:, 2] = np.where(fixed[active], held[active], np.maximum(trial[:, 2], 0))
+        tried, changed = model(trial, u, k)
+        new = np.sum((w * (y - tried)) ** 2, axis=1)
+        better = new <= cost[active]
+        settled = better & (cost[active] - new <= 1e-7 * new + enough[active])
+        small = np.max(np.abs(trial - x) / unit[active], axis=1) < 1e-7
+        values[active] = np.where(better[:, np.newaxis], trial, x)
+        cost[active] = np.where(better, new, cost[active])
+        damping[active] = np.clip(np.where(better, 0.1, 8.0) * damping[active], 1e-12, 1e6)
+        good[active] = settled | small
+        found[better], jacobian[better] = tried[better], changed[better]
+        if (done := settled | small).any():
+            active, found, jacobian = (of_each[~done] for of_each in (active, found, jacobian))
+    if good.any():
+        _, jacobian = model(values[good], u, rate[good])
+        weighted = jacobian * (weights[good][:, np.newaxis, :] * unit[good][..., np.newaxis])
+        normal = weighted @ weighted.transpose(0, 2, 1)
+        # A fixed height has no correlation; its error is that of a fit of the height alone.
+        still = fixed[good]
+        normal[still, 2, :2] = normal[still, :2, 2] = 0
+        normal[still, 2, 3:] = normal[still, 3:, 2] = 0
+        trace = np.einsum("nii->n", normal)[:, np.newaxis, np.newaxis]
+        inverse = np.linalg.inv(normal + 1e-13 * trace * np.eye(size))
+        covariance[good] = inverse * unit[good][:, :, np.newaxis] * unit[good][:, np.newaxis, :]
+    good &= fixed | (values[:, 2] > 0)
+    return _Fit(values, covariance, cost, good)
+
+
+def _echoes(records: Records, bins: IntArray, fit: _Fit, flags: IntArray) -> Echoes:
+    """Return the echoes of fits whose first parameters are time, sigma and height."""
+    time, s, height = fit.values[:, 0], fit.values[:, 1], fit.values[:, 2]
+    variance = np.einsum("nii->ni", fit.covariance)
+    area = np.sqrt(2 * np.pi) * 1e-9
+    mixed = s**2 * variance[:, 2] + height**2 * variance[:, 1] + 2 * s * height * fit.covariance[:, 1, 2]
+    middle = records.time_of(bins)
+    half = 0.5 * FWHM_PER_SIGMA * s
+    cut = (middle + time - half < records.time_ns[0]) | (middle + time + half > records.time_ns[-1])
+    exists = has_echo(flags)
+    flags = flags | np.where(exists & ~fit.good, int(EchoFlag.POOR_FIT), 0)
+    flags = flags | np.where(exists & cut, int(EchoFlag.CUT), 0)
+    found = Echoes(
+        middle + time,
+        height,
+        area * height * s,
+        FWHM_PER_SIGMA * s,
+        np.sqrt(variance[:, 0]),
+        np.sqrt(variance[:, 2]),
+        area * np.sqrt(np.maximum(mixed, 0)),
+        FWHM_PER_SIGMA * np.sqrt(variance[:, 1]),
+        flags,
+    )
+    return found.known_only(exists & fit.good)

@@ -1,0 +1,352 @@
+"""Tables of the surface, column, target and bottom echoes of every pixel and shot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.waveforms import deconvolution, echo_estimators, echo_fits
+from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_points, column_fit
+from mitransient_lidar.analysis.waveforms.echo_detection import (
+    DetectedEchoes,
+    Echoes,
+    EchoFlag,
+    IntArray,
+    Records,
+    find_echoes,
+)
+from mitransient_lidar.analysis.waveforms.records import Waveforms
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, integer
+from mitransient_lidar.physics.lidar.pulse import Pulse
+
+ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
+ECHOES = ("surface", "column", "target", "bottom")
+_TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
+_FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
+_QUANTITIES = {
+    "time_ns": "arrival of the echo",
+    "depth_m": "depth of the echo below the surface",
+    "amplitude": "height of the echo",
+    "energy": "integral of the echo over time",
+    "width_ns": "full width of the echo at half maximum",
+}
+_PER_WAVEFORM = {
+    "attenuation": ("1/m", "effective attenuation of the column along the path"),
+    "attenuation_stderr": ("1/m", "standard error of the effective attenuation"),
+    "attenuation_chi2": ("1", "squared residuals of the column's fit over its degrees of freedom"),
+    "layer_depth_m": ("m", "depth of a change in the column"),
+    "layer_p_value": ("1", "probability that noise causes as strong a change"),
+    "layer_step": ("1", "logarithm of the signal below the change over that above it"),
+    "layer_attenuation_above": ("1/m", "attenuation above the change along the path"),
+    "layer_attenuation_below": ("1/m", "attenuation below the change along the path"),
+}
+
+
+def extract(
+    dataset: xr.Dataset,
+    estimators: str | Sequence[str] = "gaussian",
+    *,
+    pulse: Pulse | None = None,
+    noise: float | npt.ArrayLike | None = None,
+    threshold: float = 5.0,
+    contrast: float = 0.05,
+    echo_fwhm_ns: float | None = None,
+    saturation_level: float | None = None,
+    layers: int = 0,
+    depth_from: Literal["echo", "mean"] = "echo",
+    iterations: int = 50,
+    block: int = 2048,
+) -> xr.Dataset:
+    """Measure the echoes in waveforms.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A result with ``waveform`` [W], or a receiver's record with ``signal``, which takes precedence; over (pixel,
+        time) or (row, column, time), optionally after ``shot``. A signal behind a logarithm (attributes
+        ``receiver.logarithm.volts_per_decade`` and ``.knee_v`` of `receiver.detect_waveforms`) is first expanded to the
+        voltage before it, in which all quantities are given.
+    estimators : str or sequence of str
+        Estimators of time: ``threshold`` (the leading edge crosses `threshold` standard deviations of the noise, or a
+        fiftieth of the echo if that is more), ``leading_edge`` (it crosses half the amplitude), ``peak`` (Gaussian
+        through the summit), ``centroid``, ``gaussian`` (decomposition into Gaussians on the column: the only estimator
+        that separates the surface from the column behind it), or ``deconvolution`` (Richardson-Lucy).
+    pulse : Pulse, optional
+        The transmitted pulse. By default, a Gaussian of the attribute ``pulse_fwhm_ns``.
+    noise : float or array-like, optional
+        Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
+        ``waveform_stderr`` times the attribute ``error_inflation``, or ``signal_deviation``, or the spread before the
+        surface echo. That of a signal is at least this spread, times the ratio of the standard deviation of means over
+        a pulse to that of independent bins, from 20 or more shots of one result, or else before the surface echo.
+    threshold, contrast
+        As for `echo_detection.find_echoes`.
+    echo_fwhm_ns : float, optional
+        Expected full width of an echo [ns]. By default, that of pulse, response and the beam's spread over the surface.
+    saturation_level : float, optional
+        Smallest saturated sample, as recorded; the samples of the variable ``saturated`` are saturated, too.
+    layers : int
+        Number of changes in the column to test for, 0 to 8; see `column_fits.change_points`.
+    depth_from : {'echo', 'mean'}
+        Depths from the surface echo of each waveform, or from the mean surface (attribute ``surface_time_ns``).
+    iterations : int
+        Iterations of the deconvolution, 1 to 10 000.
+    block : int
+        Number of waveforms in memory at a time, at least 1.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
+        ``echo`` (surface, column, target, bottom): ``time_ns``, ``depth_m``, ``amplitude``, ``energy`` and ``width_ns``
+        with ``_stderr``, and ``flags``, sums of `echo_detection.EchoFlag`. Over the dimensions of the waveforms alone:
+        ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``:
+        ``layer_depth_m``, ``layer_p_value``, ``layer_step`` and the attenuations ``layer_attenuation_above`` and
+        ``_below``.
+
+    Raises
+    ------
+    UserError
+        If the dataset has other dimensions, lacks a coordinate or an attribute, holds values that are not finite, or an
+        argument is out of range.
+
+    Notes
+    -----
+    Depth is (t - t_surface) c0 cos(theta_water) / (2 n_g), with the angle of the lidar's axis. Time, depth and energy
+    of the column are those of the samples between the surface echo and the next one, its amplitude is its level
+    extrapolated to the surface, and its width the time of decay to one half.
+
+    The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction. Bins of rendered
+    waveforms are correlated: without ``error_inflation`` the errors are too small.
+    """
+    several = not isinstance(estimators, str)
+    names = tuple(estimators) if several else (str(estimators),)
+    if not names or (unknown := [name for name in names if name not in ESTIMATORS]):
+        raise UserError(f"estimator {unknown[0] if names else ''!r} must be one of {', '.join(ESTIMATORS)}")
+    if depth_from not in ("echo", "mean"):
+        raise UserError(f"depth_from = {depth_from!r} must be 'echo' or 'mean'")
+    layers, block = integer("layers", layers, 0, 8), integer("block", block, 1, 10**9)
+    waveforms = Waveforms.from_dataset(dataset, pulse, noise, echo_fwhm_ns, saturation_level)
+    settings = _Settings(names, threshold, contrast, layers, depth_from, iterations)
+    starts = range(0, waveforms.count, block)
+    parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
+    table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _label(dataset, waveforms, table, settings, several)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    estimators: tuple[str, ...]
+    threshold: float
+    contrast: float
+    layers: int
+    depth_from: str
+    iterations: int
+
+
+def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
+    """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
+    records, geometry = waveforms.records(rows), waveforms.geometry
+    width = waveforms.echo_fwhm_ns
+    found = find_echoes(
+        records,
+        width,
+        threshold=settings.threshold,
+        contrast=settings.contrast,
+        earliest_ns=waveforms.quiet_until_ns,
+    )
+    time = records.time_ns
+    surface, target, bottom = found.bins
+    start = np.where(surface >= 0, time[surface] + 1.75 * width, np.nan)
+    following = np.where(target >= 0, target, bottom)
+    # The last bins lack the pulses of light that arrives after the end of the record.
+    end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
+    reference = time[surface]
+    column = column_fit(records, start, end, reference, waveforms.gain)
+    found = replace(found, flags=found.flags | _saturation(waveforms, rows, records, found.bins))
+    sharp = None
+    if "deconvolution" in settings.estimators:
+        sharp = deconvolution.richardson_lucy(
+            records.power, waveforms.kernel, offset=records.noise, iterations=settings.iterations
+        )
+    quantities = []
+    for estimator in settings.estimators:
+        echoes = _estimate(estimator, waveforms, records, found, column, sharp, settings)
+        # The detected peak replaces a surface time that the estimator cannot determine.
+        surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
+        body = _column(records, column, start, end, surface_ns - reference)
+        quantities.append(_with_depths([echoes[0], body, *echoes[1:]], waveforms, settings.depth_from))
+    table = {name: np.stack([one[name] for one in quantities], axis=1) for name in quantities[0]}
+    attenuation_per_decay = 0.5 / geometry.metres_per_ns
+    table["attenuation"] = column.decay * attenuation_per_decay
+    table["attenuation_stderr"] = column.decay_stderr * attenuation_per_decay
+    table["attenuation_chi2"] = column.chi2
+    if settings.layers:
+        changes = change_points(records, start, end, waveforms.gain, layers=settings.layers, blur_ns=width)
+        first = table["time_ns"][:, 0, 0]
+        from_echo = settings.depth_from == "echo"
+        zero = np.where(np.isfinite(first), first, reference) if from_echo else geometry.surface_time_ns
+        table["layer_depth_m"] = (changes.time_ns - np.reshape(zero, (-1, 1))) * geometry.depth_per_ns
+        table["layer_p_value"], table["layer_step"] = changes.p_value, changes.step
+        table["layer_attenuation_above"] = changes.decay_before * attenuation_per_decay
+        table["layer_attenuation_below"] = changes.decay_after * attenuation_per_decay
+    return table
+
+
+def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatArray, delay: FloatArray) -> Echoes:
+    """Return the columns between two times as echoes, with their level at a delay [ns] from the fits' reference."""
+    known = np.isfinite(column.level)
+    inside = (records.time_ns >= start[:, np.newaxis]) & (records.time_ns <= end[:, np.newaxis])
+    power = np.where(inside, records.power, 0)
+    noise = np.where(inside, records.noise, 0)
+    total = np.sum(power, axis=1)
+    safe = np.where(known & (total > 0), total, 1.0)
+    seconds = records.bin_ns * 1e-9
+    time = np.sum(power * records.time_ns, axis=1) / safe
+    time_error = np.sqrt(np.sum((noise * (records.time_ns - time[:, np.newaxis])) ** 2, axis=1)) / safe
+    level = column.level * np.exp(-column.decay * delay)
+    relative = column.level_stderr / column.level
+    mixed = 2 * column.correlation * relative * delay * column.decay_stderr
+    level_error = level * np.sqrt(np.maximum(relative**2 + (delay * column.decay_stderr) ** 2 - mixed, 0))
+    # The width of a column that does not decay is unknown.
+    decay = np.where(column.decay > 0, column.decay, np.nan)
+    half = np.log(2) / decay
+    return Echoes(
+        time,
+        level,
+        total * seconds,
+        half,
+        time_error,
+        level_error,
+        np.sqrt(np.sum(noise**2, axis=1)) * seconds,
+        half * column.decay_stderr / decay,
+        np.where(known, 0, int(EchoFlag.NO_ECHO)),
+    ).known_only(known)
+
+
+def _with_depths(echoes: list[Echoes], waveforms: Waveforms, depth_from: str) -> dict[str, npt.NDArray[Any]]:
+    """Return the quantities of all echoes of one estimator with their depths, shape (waveforms, echo)."""
+    table = {name: np.stack([getattr(one, name) for one in echoes], axis=1) for name in vars(echoes[0])}
+    time, error = table["time_ns"], table["time_stderr"]
+    table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
+    if depth_from == "echo":
+        depth, spread = time - time[:, :1], np.hypot(error, error[:, :1])
+        spread[:, 0] = np.where(np.isfinite(time[:, 0]), 0.0, np.nan)
+    else:
+        depth, spread = time - waveforms.geometry.surface_time_ns, error
+    metres = waveforms.geometry.depth_per_ns
+    return table | {"depth_m": depth * metres, "depth_m_stderr": spread * metres}
+
+
+def _label(
+    dataset: xr.Dataset, waveforms: Waveforms, table: dict[str, npt.NDArray[Any]], settings: _Settings, several: bool
+) -> xr.Dataset:
+    """Return the table with its dimensions, units and provenance."""
+    dims, shape = waveforms.dims[:-1], waveforms.shape[:-1]
+    per_second = f"{waveforms.unit} s".strip() if waveforms.unit != "W" else "J"
+    units = {"time_ns": "ns", "depth_m": "m", "width_ns": "ns", "amplitude": waveforms.unit, "energy": per_second}
+
+    def of_echoes(values: npt.NDArray[Any], described: dict[str, Any]) -> tuple[Any, ...]:
+        inner = ("estimator", "echo") if several else ("echo",)
+        return (*dims, *inner), values.reshape(*shape, *values.shape[3 - len(inner) :]), described
+
+    data: dict[str, Any] = {}
+    for name, description in _QUANTITIES.items():
+        for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
+            described = {"units": units[name], "long_name": of + description}
+            data[name + suffix] = of_echoes(table[name + suffix], described)
+    meanings = {
+        "long_name": "problems of the echo",
+        "flag_masks": [int(flag) for flag in EchoFlag],
+        "flag_meanings": " ".join(str(flag.name).lower() for flag in EchoFlag),
+    }
+    data["flags"] = of_echoes(table["flags"].astype(np.int64), meanings)
+    for name, (unit, description) in _PER_WAVEFORM.items():
+        if name in table:
+            values = table[name]
+            layer = ("layer",) if values.ndim > 1 else ()
+            values = values.reshape(*shape, *values.shape[1:])
+            data[name] = ((*dims, *layer), values, {"units": unit, "long_name": description})
+    coords: dict[str, Any] = {
+        str(name): coordinate for name, coordinate in dataset.coords.items() if set(coordinate.dims) <= set(dims)
+    }
+    coords["echo"] = list(ECHOES)
+    if several:
+        coords["estimator"] = list(settings.estimators)
+    provenance = {
+        "estimators": list(settings.estimators),
+        "echo_fwhm_ns": waveforms.echo_fwhm_ns,
+        "echo_threshold": settings.threshold,
+        "echo_contrast": settings.contrast,
+    }
+    return xr.Dataset(data, coords, {**dataset.attrs, **provenance})
+
+
+def _saturation(waveforms: Waveforms, rows: slice, records: Records, bins: IntArray) -> IntArray:
+    """Return `EchoFlag.SATURATED` of echoes with saturated samples near their peaks, shape (echo, waveforms)."""
+    baseline = waveforms.baseline[np.arange(rows.start, rows.stop) % waveforms.baseline.size, np.newaxis]
+    high = records.power + baseline >= waveforms.saturation_level
+    if waveforms.saturated is not None:
+        high |= waveforms.saturated[rows]
+    sums = np.cumsum(np.pad(high, ((0, 0), (1, 0))), axis=1)
+    half = int(np.ceil(waveforms.echo_fwhm_ns / records.bin_ns))
+    low, top = np.clip(bins - half, 0, high.shape[1]), np.clip(bins + half + 1, 0, high.shape[1])
+    lines = np.arange(len(high))
+    return np.where((bins >= 0) & (sums[lines, top] > sums[lines, low]), int(EchoFlag.SATURATED), 0)
+
+
+def _estimate(
+    estimator: str,
+    waveforms: Waveforms,
+    records: Records,
+    found: DetectedEchoes,
+    column: ColumnFit,
+    sharp: FloatArray | None,
+    settings: _Settings,
+) -> list[Echoes]:
+    """Return surface, target and bottom of one estimator."""
+    width, template = waveforms.echo_fwhm_ns, waveforms.template
+    decay = np.where(np.isfinite(column.decay), np.maximum(column.decay, 0), _TYPICAL_DECAY)
+    places = list(zip(found.bins, found.flags, strict=True))
+    if sharp is not None and estimator == "deconvolution":
+        bias = deconvolution.deconvolution_offset(
+            template, waveforms.kernel, records.bin_ns, width, settings.iterations
+        )
+        return [
+            deconvolution.deconvolved_echo(records, sharp, place, template, flag, width).delayed(-bias)
+            for place, flag in places
+        ]
+
+    def time_of(window: echo_estimators.Window, top: Echoes) -> tuple[FloatArray, FloatArray]:
+        if estimator == "centroid":
+            return echo_estimators.centroid(window, top.time_ns, width)
+        if estimator == "leading_edge":
+            return echo_estimators.leading_edge(window, top, template)
+        if estimator == "threshold":
+            level = np.maximum(settings.threshold * window.noise[:, 0], _FAINT * np.nan_to_num(top.amplitude))
+            return echo_estimators.crossing(window, top, level, np.zeros_like(level), template)
+        return top.time_ns, top.time_stderr
+
+    bias = 0.0
+    if estimator in ("peak", "centroid", "gaussian"):
+        bias = echo_estimators.calibrate(time_of, template, records.bin_ns, width)
+    if estimator == "gaussian":
+        echoes = [echo_fits.gaussian_surface(records, found.surface, width, decay, found.flags[0])]
+        for place, flag in places[1:]:
+            echoes.append(echo_fits.gaussian_echo(records, place, width, decay, flag, after=found.surface))
+        return [one.delayed(-bias) for one in echoes]
+    echoes = []
+    for number, (place, flag) in enumerate(places):
+        after = found.surface if number else None
+        window = echo_estimators.Window.around(records, place, width, after=after, decay=decay)
+        top = echo_estimators.summit(window, flag)
+        time, error = time_of(window, top)
+        energy, energy_error = echo_estimators.gate_energy(window, top.time_ns, width)
+        measured = replace(top, time_ns=time - bias, time_stderr=error, energy=energy, energy_stderr=energy_error)
+        echoes.append(measured.known_only(np.isfinite(top.time_ns)))
+    return echoes

@@ -1,0 +1,246 @@
+"""Waveforms of a dataset, prepared for measurement: baseline, noise and lidar geometry."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.waveforms.echo_detection import Records, Template
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.physics.receiver.electronics import LogAmplifier
+from mitransient_lidar.results import netcdf
+from mitransient_lidar.results.formats import input_format
+from mitransient_lidar.results.geometry import LidarGeometry, required_number
+
+_MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
+_FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
+_LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
+
+
+def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a dataset with ``waveform`` or ``signal`` into memory: a result, or a receiver's records.
+
+    The file is one of `results.save`, or of `xarray.Dataset.to_netcdf` in the format NetCDF-4.
+
+    Raises
+    ------
+    UserError
+        If the file is missing or damaged, or has neither variable.
+    """
+    if input_format(path) == "exr":
+        return results.open(path)
+    try:
+        dataset = netcdf.read_netcdf(path)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(f"{path} is not of mitransient-lidar: {error}") from error
+    if not {"signal", "waveform"} & set(dataset):
+        raise UserError(f"{path} holds neither a signal nor a waveform over time.")
+    return dataset
+
+
+@dataclass(frozen=True)
+class Waveforms:
+    """Waveforms of a dataset with the quantities that their measurement needs.
+
+    Attributes
+    ----------
+    dims, shape, unit
+        Dimensions, their sizes and the unit of the variable.
+    samples
+        Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal behind a
+        logarithm, the voltages before it.
+    time_ns
+        Centres of the bins [ns], shape (time,).
+    baseline, noise
+        Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
+        or (pixels, 1).
+    saturated, saturation_level
+        Samples at a limit, of the shape of `samples`, and the least such sample.
+    kernel, template
+        Pulse and response in bins, and the shape of an ideal echo.
+    echo_fwhm_ns, quiet_until_ns
+        Expected width of an echo, and end of the part of the record without echoes [ns].
+    geometry
+        Lidar geometry.
+    gain
+        Signal over that at the surface by distance and refraction, shape (1, time).
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    unit: str
+    samples: npt.NDArray[Any]
+    time_ns: FloatArray
+    baseline: FloatArray
+    noise: FloatArray
+    saturated: npt.NDArray[np.bool_] | None
+    saturation_level: float
+    kernel: tuple[int, FloatArray]
+    template: Template
+    echo_fwhm_ns: float
+    quiet_until_ns: float
+    geometry: LidarGeometry
+    gain: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of waveforms."""
+        return len(self.samples)
+
+    @classmethod
+    def from_dataset(
+        cls,
+        dataset: xr.Dataset,
+        pulse: Pulse | None,
+        noise: float | npt.ArrayLike | None,
+        echo_fwhm_ns: float | None,
+        saturation_level: float | None,
+    ) -> Waveforms:
+        """Read a dataset; the arguments are those of `echo_table.extract`.
+
+        Raises
+        ------
+        UserError
+            If the dataset lacks a variable, coordinate or attribute, or an argument is out of range.
+        """
+        name = next((name for name in ("signal", "waveform") if name in dataset), None)
+        if name is None:
+            raise UserError("the dataset has neither signal nor waveform: it must be a result with a record in time")
+        dims = results.record_dims(dataset, name, shots=True)
+        logarithm = _logarithm(dataset) if name == "signal" else None
+        if logarithm is not None:
+            dataset = _expanded(dataset, logarithm)
+            saturation_level = None if saturation_level is None else float(logarithm.expand(saturation_level))
+        time = np.asarray(dataset["time"].values, dtype=np.float64)
+        samples = dataset[name].values.reshape(-1, time.size)
+        if not np.isfinite(samples).all():
+            raise UserError(f"{name} holds values that are not finite: render or record it again")
+        geometry = LidarGeometry.from_attributes(dataset.attrs)
+        shape = pulse or Pulse.gaussian(required_number(dataset.attrs, "pulse_fwhm_ns"))
+        step = results.time_axis(dataset).bin_width_ns
+        response = float(dataset.attrs.get("response_time_ns", 0.0))
+        template = Template.of(shape, step, response)
+        # Two-way time per angle from the axis, in the plane of incidence.
+        ns_per_mrad = 2e6 * geometry.height * math.sin(geometry.off_nadir) / (C0 * math.cos(geometry.off_nadir) ** 2)
+        if echo_fwhm_ns is None:
+            width = _echo_width(dataset, template, ns_per_mrad)
+        else:
+            width = positive("echo_fwhm_ns", echo_fwhm_ns)
+        half_view = 0.5 * float(dataset.attrs.get("field_of_view_mrad", 0.0))
+        quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
+        pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
+        quiet = time < quiet_until
+        baseline = np.zeros(pixels)
+        if name == "signal":
+            if np.count_nonzero(quiet) < _FEWEST_QUIET:
+                raise UserError(
+                    f"the record must hold at least {_FEWEST_QUIET} bins before {quiet_until:.1f} ns for its baseline"
+                )
+            baseline = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
+        return cls(
+            dims,
+            dataset[name].shape,
+            str(dataset[name].attrs.get("units", "")),
+            samples,
+            time,
+            baseline,
+            _noise(dataset, name, samples, baseline, quiet, noise, max(int(template.fwhm_ns / step), 1)),
+            dataset["saturated"].values.reshape(-1, time.size).astype(bool) if "saturated" in dataset else None,
+            math.inf if saturation_level is None else float(saturation_level),
+            shape.kernel(step, response),
+            template,
+            width,
+            quiet_until,
+            geometry,
+            geometry.spreading(geometry.path_of_time(time))[np.newaxis],
+        )
+
+    def records(self, rows: slice) -> Records:
+        """Return some of the waveforms less their baseline."""
+        pixel = np.arange(rows.start, rows.stop) % self.baseline.size
+        return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, self.noise[pixel])
+
+
+def _logarithm(dataset: xr.Dataset) -> LogAmplifier | None:
+    """Return the logarithmic amplifier of a recorded signal."""
+    names = [f"receiver.logarithm.{field.name}" for field in fields(LogAmplifier)]
+    if not set(names) & set(dataset.attrs):
+        return None
+    return LogAmplifier(*(required_number(dataset.attrs, name) for name in names))
+
+
+def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
+    """Return a dataset with the signal before the logarithm, and its standard deviation to first order."""
+    signal = dataset["signal"]
+    replaced = {"signal": signal.copy(data=logarithm.expand(signal.values))}
+    if "signal_deviation" in dataset:
+        deviation = dataset["signal_deviation"]
+        mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean({"shot"} & set(signal.dims))
+        replaced["signal_deviation"] = deviation * logarithm.expansion(mean.transpose(*deviation.dims).values)
+    return dataset.assign(replaced)
+
+
+def _echo_width(dataset: xr.Dataset, template: Template, ns_per_mrad: float) -> float:
+    """Return the width [ns] of an echo of the level sea over the footprint of the beam or of the field of view."""
+    sigma = 0.5 * float(dataset.attrs.get("divergence_mrad", 0.0))
+    if field := float(dataset.attrs.get("field_of_view_mrad", 0.0)):
+        sigma = min(sigma, 0.25 * field)
+    spread = math.sqrt(8 * math.log(2)) * sigma * ns_per_mrad
+    return min(math.hypot(template.fwhm_ns, spread), _LONGEST_ECHO * template.fwhm_ns)
+
+
+def _noise(
+    dataset: xr.Dataset,
+    name: str,
+    samples: npt.NDArray[Any],
+    baseline: FloatArray,
+    quiet: npt.NDArray[np.bool_],
+    noise: float | npt.ArrayLike | None,
+    run: int,
+) -> FloatArray:
+    """Return the noise of each pixel, shape (pixels, time) or (pixels, 1), for means of `run` samples."""
+    pixels, count = baseline.size, samples.shape[1]
+    if noise is not None:
+        given = np.asarray(noise, dtype=np.float64)
+        if given.size not in (1, pixels, pixels * count):
+            raise UserError(f"noise of shape {given.shape} must be a number, or one per pixel, or per pixel and bin")
+        return given.reshape(-1, 1) + np.zeros((pixels, 1)) if given.size <= pixels else given.reshape(pixels, count)
+    if name == "waveform" and "waveform_stderr" in dataset:
+        bins, inflation = (dataset.attrs.get(key, 1.0) for key in ("error_inflation_bins", "error_inflation"))
+        factor = np.interp(math.log(run), np.log(np.atleast_1d(bins)), np.atleast_1d(inflation))
+        return float(factor) * dataset["waveform_stderr"].values.reshape(-1, count)[-pixels:]
+    if np.count_nonzero(quiet) < _FEWEST_QUIET:
+        raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
+    rest = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
+    spread = np.sqrt(np.mean(rest**2, axis=(0, 2)))[:, np.newaxis]
+    if "signal_deviation" not in dataset:
+        return np.asarray(spread * _inflation(rest, run))
+    # A sample at a limit does not scatter, but has no smaller error.
+    deviation = np.maximum(dataset["signal_deviation"].values.reshape(-1, count), spread)
+    shots = samples[: _MOST_SHOTS * pixels].reshape(-1, pixels, count)
+    if len(shots) < _FEWEST_SHOTS:
+        return np.asarray(deviation * _inflation(rest, run))
+    # Shots differ by noise only, which a filter correlates more under an echo than in the dark.
+    floored = np.where(deviation > 0, deviation, 1.0)
+    return np.asarray(deviation * _inflation((shots - shots.mean(axis=0)) / floored, run))
+
+
+def _inflation(rest: FloatArray, run: int) -> float:
+    """Return the standard deviation of means of `run` neighbouring samples over that of independent samples."""
+    run = min(run, rest.shape[-1])
+    blocks = rest.shape[-1] // run
+    means = rest[..., : blocks * run].reshape(*rest.shape[:-1], blocks, run).mean(axis=-1)
+    variance = float(np.mean(rest**2))
+    return math.sqrt(max(run * float(np.mean(means**2)) / variance, 1.0)) if variance > 0 else 1.0

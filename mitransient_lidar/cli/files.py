@@ -1,0 +1,136 @@
+"""Output files of the commands: checks before long work, figures with their data, and the files of a gate stack."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def check_writable(folder: Path, targets: list[Path]) -> None:
+    """Check before a long render, and without a trace, that the results can be written."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise UserError(f"cannot write to folder {folder}: {error.strerror}.") from error
+    for target in targets:
+        if target.is_dir():
+            raise UserError(f"cannot write {target}: it is a folder.")
+
+
+def check_figure(path: Path | None) -> None:
+    """Check before long work that a figure, and the NetCDF file beside it, can be written."""
+    if path is None:
+        return
+    from mitransient_lidar.plots.drawing import check_format
+
+    check_writable(path.parent, [path, path.with_suffix(".nc")])
+    check_format(path)
+
+
+def check_suffix(option: str, path: Path, suffix: str) -> None:
+    """Check that a file can be written and that its name ends with a suffix."""
+    if path.suffix.lower() != suffix:
+        raise UserError(f"{option} {path} must end in {suffix}.")
+    check_writable(path.parent, [path])
+
+
+def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
+    """Write a dataset to a NetCDF file and print its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf")
+    typer.echo(path)
+
+
+def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Dataset, Path], Any]) -> None:
+    """Write a figure and its data beside it, and print both paths; without a path do nothing."""
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot(dataset, path)
+    typer.echo(path)
+    write_netcdf(dataset, path.with_suffix(".nc"))
+
+
+@dataclass(frozen=True)
+class GateFiles:
+    """Files of a gate stack.
+
+    Parameters
+    ----------
+    folder, stem
+        Folder of the files, and beginning of their names.
+    wanted
+        Kinds of file beside the EXR stack: ``drawings`` (all gates, and the depths seen in them), ``sequence``,
+        ``gif``, ``mp4`` and ``html``.
+    """
+
+    folder: Path
+    stem: str
+    wanted: frozenset[str]
+
+    @classmethod
+    def of(cls, folder: Path, stem: str, **wanted: bool) -> GateFiles:
+        """Return the files of a gate stack; the options name the kinds of file."""
+        return cls(folder, stem, frozenset(kind for kind, on in wanted.items() if on))
+
+    def names(self) -> list[Path]:
+        """Return the paths of the files, without those of a sequence."""
+        endings = ["_gates.exr", *(["_gates.png", "_depth.png"] if "drawings" in self.wanted else [])]
+        endings += [f"_gates.{kind}" for kind in ("gif", "mp4", "html") if kind in self.wanted]
+        return [self.folder / f"{self.stem}{ending}" for ending in endings]
+
+    def write(self, stack: xr.Dataset, result: xr.Dataset | None, quiet: bool) -> None:
+        """Write the files and print their paths; `result` provides the waveforms of the page."""
+        from mitransient_lidar.plots.gate_viewer import page as gate_page
+        from mitransient_lidar.plots.gates import images
+        from mitransient_lidar.results import gate_files
+
+        for path in self.names():
+            if path.suffix in (".gif", ".mp4"):
+                # Before anything is written.
+                images.check_animation(stack, path)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for path in self.names():
+            if path.suffix == ".exr":
+                gate_files.save_stack(stack, path)
+            elif path.suffix == ".html":
+                gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
+            elif path.suffix != ".png":
+                images.animate_gates(stack, path)
+            elif path.name.endswith("_gates.png"):
+                images.plot_gates(stack, path)
+            elif not _draw_depths(stack, path, quiet):
+                continue
+            typer.echo(path)
+        if "sequence" in self.wanted:
+            for path in gate_files.save_sequence(stack, self.folder, self.stem):
+                typer.echo(path)
+
+
+def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> bool:
+    """Draw the depths seen in the gates; return False where too few gates lie below the surface."""
+    from mitransient_lidar.plots.gates.echoes import plot_depths
+
+    try:
+        plot_depths(stack, path)
+    except UserError as error:
+        if not quiet:
+            typer.echo(f"no drawing of depths: {error}", err=True)
+        return False
+    return True

@@ -1,0 +1,88 @@
+"""The command that cuts gates from a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mitransient_lidar.cli.files import GateFiles, check_writable
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.options import Quiet
+from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def gates(
+    stack: Annotated[Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result that kept its histogram.")],
+    start_ns: Annotated[float | None, typer.Option(help="Start of the first gate, at half height [ns].")] = None,
+    start_depth: Annotated[float | None, typer.Option(help="Depth of its start [m], instead of a time.")] = None,
+    width_ns: Annotated[float | None, typer.Option(help="Width of a gate between half heights [ns].")] = None,
+    step_ns: Annotated[float | None, typer.Option(help="Time from gate to gate [ns]; by default the width.")] = None,
+    count: Annotated[int, typer.Option(help="Number of gates.")] = 1,
+    rise_ns: Annotated[float, typer.Option(help="10-90 % time of the rising edge [ns].")] = 0.0,
+    fall_ns: Annotated[float, typer.Option(help="90-10 % time of the falling edge [ns].")] = 0.0,
+    profile: Annotated[
+        Path | None, typer.Option(help="Measured gate instead of width and edges: columns time [ns], transmission.")
+    ] = None,
+    pulses: Annotated[int, typer.Option(help="Pulses accumulated in a gate.")] = 1,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the files; by default that of STACK.")
+    ] = None,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw all gates, and the depths seen in them.")] = True,
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
+    ] = False,
+    gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie; needs ffmpeg.")] = False,
+    html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Cut gates from a result.
+
+    Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths. Without a start, the gates that STACK
+    already has are written and drawn.
+    """
+    folder, stem = output or stack.parent, stack.stem.removesuffix("_gates")
+    files = GateFiles.of(folder, stem, drawings=plot, sequence=sequence, gif=gif, mp4=mp4, html=html)
+    check_writable(folder, files.names())
+
+    from mitransient_lidar.analysis.gates import cut as gating
+    from mitransient_lidar.results import gate_stack
+
+    with reporting(quiet):
+        result = _open(stack)
+        if "gate_energy" in result and start_ns is None and start_depth is None:
+            files.write(result, result, quiet)
+            return
+        train = gate_stack.train_from_options(
+            result.attrs,
+            start_ns=start_ns,
+            start_depth_m=start_depth,
+            width_ns=width_ns,
+            step_ns=step_ns,
+            count=count,
+            rise_ns=rise_ns,
+            fall_ns=fall_ns,
+            profile_file=profile,
+            pulses=pulses,
+        )
+        cut = gating.cut_gates(result, train)
+        files.write(cut, result, quiet)
+
+
+def _open(path: Path) -> xr.Dataset:
+    """Open a result or a gate stack."""
+    from mitransient_lidar import results
+    from mitransient_lidar.results import gate_files
+
+    try:
+        return results.open(path)
+    except UserError as error:
+        try:
+            return gate_files.open_stack(path)
+        except UserError:
+            raise error from None

@@ -1,0 +1,130 @@
+"""Messages and exit codes, progress, and the summary of a render."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from rich.console import Console
+
+    from mitransient_lidar.rendering.passes import Progress
+
+_WRONG_USE = 2
+_INTERRUPTED = 130  # what shells report after Ctrl-C
+
+#: Most pixels with a line of their own in the summary.
+_LISTED_PIXELS = 12
+
+
+@contextlib.contextmanager
+def exit_on_error() -> Iterator[None]:
+    """Exit with one sentence and code 2 on invalid input and files that cannot be used, with 130 on Ctrl-C."""
+    try:
+        yield
+    except UserError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(_WRONG_USE) from error
+    except BrokenPipeError:
+        raise  # the reader of stdout has left; Typer ends quietly
+    except OSError as error:
+        place = f" {error.filename}" if error.filename else ""
+        typer.echo(f"cannot use{place}: {error.strerror or error}.", err=True)
+        raise typer.Exit(_WRONG_USE) from error
+    except KeyboardInterrupt as error:
+        typer.echo("interrupted.", err=True)
+        raise typer.Exit(_INTERRUPTED) from error
+
+
+def exit_if_interrupted(dataset: xr.Dataset) -> None:
+    """Exit with code 130 when Ctrl-C ended a render early, after its results have been written."""
+    if dataset.attrs.get("interrupted"):
+        typer.echo(f"interrupted after {dataset.attrs['passes']} passes; what was rendered is kept.", err=True)
+        raise typer.Exit(_INTERRUPTED)
+
+
+@contextlib.contextmanager
+def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
+    """Show log messages on stderr, and on a terminal a progress bar; yield the function that moves the bar."""
+    import logging
+
+    logger = logging.getLogger("mitransient_lidar")
+    if quiet:
+        logger.addHandler(logging.NullHandler())
+        logger.propagate = False
+        yield None
+        return
+
+    from rich.logging import RichHandler
+    from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as ProgressBar
+
+    console = _console()
+    handler = RichHandler(console=console, show_path=False, show_time=False)
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        with ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+            task = bar.add_task("preparing", total=None)
+
+            def show(state: Progress) -> None:
+                bar.update(task, description=_describe(state), completed=state.done, total=state.planned)
+
+            yield show
+    finally:
+        logger.removeHandler(handler)
+
+
+def _describe(state: Progress) -> str:
+    """Describe the state of long work in one line."""
+    planned = f"/{state.planned}" if state.planned is not None else ""
+    parts = [f"{state.unit} {state.done}{planned}"]
+    if state.error_median is not None:
+        goal = f" of {100 * state.target_error:.3g} %" if state.target_error is not None else ""
+        parts.append(f"error {100 * state.error_median:.3g} %{goal}")
+    if state.error_p95 is not None:
+        parts.append(f"p95 {100 * state.error_p95:.3g} %")
+    if state.remaining_s is not None:
+        parts.append(f"{state.remaining_s:.0f} s left")
+    return ", ".join(parts)
+
+
+def summarise(dataset: xr.Dataset) -> None:
+    """Print passes, time, error and the peak power of each pixel on stderr."""
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+
+    def add(name: str, key: str, form: str, scale: float = 1.0) -> None:
+        value: Any = dataset.attrs.get(key)
+        if isinstance(value, (int, float)):
+            table.add_row(name, format(scale * value, form))
+
+    add("passes", "passes", ".0f")
+    add("time (s)", "elapsed_s", ".2f")
+    add("median error (%)", "error_median", ".3g", 100.0)
+    add("95th percentile error (%)", "error_p95", ".3g", 100.0)
+    if "waveform" not in dataset:
+        table.add_row("gates", str(dataset.sizes["gate"]))
+        table.add_row("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}")
+    else:
+        peaks = dataset["waveform"].max("time")
+        if "pixel" in peaks.dims and peaks.size <= _LISTED_PIXELS:
+            for name, peak in zip(peaks["pixel"].values, peaks.values, strict=True):
+                table.add_row(f"peak power, {name} (W)", f"{peak:.4g}")
+        else:
+            table.add_row("highest peak power (W)", f"{float(peaks.max()):.4g}")
+    _console().print(table, markup=False)
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)

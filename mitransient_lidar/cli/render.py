@@ -1,0 +1,181 @@
+"""Commands that render a scene: by the laser, and by daylight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mitransient_lidar.cli.files import GateFiles, check_writable
+from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
+from mitransient_lidar.cli.options import (
+    Define,
+    Folder,
+    GoalPasses,
+    MaxTime,
+    Quiet,
+    Scene,
+    Seed,
+    TargetError,
+    Variant,
+    parameters,
+)
+from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def render(
+    scene: Scene,
+    define: Define = None,
+    output: Folder = Path("."),
+    integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
+    target_error: TargetError = None,
+    max_time: MaxTime = None,
+    passes: GoalPasses = None,
+    seed: Seed = 0,
+    variant: Variant = None,
+    max_memory: Annotated[
+        float | None, typer.Option(help="Memory for histograms [GB], 2 by default. With less, only gates are kept.")
+    ] = None,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
+    gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates; needs ffmpeg.")] = False,
+    html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render the waveforms and gates of a scene.
+
+    Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with gates
+    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short.
+    """
+    params = parameters(define)
+
+    from mitransient_lidar.loading.catalogue import scene_path, scene_text
+
+    name = scene_path(scene).stem
+    # Before a long render: a scene whose film has gates has the parameter gate_count.
+    if (gif or mp4 or html) and "gate_count" not in scene_text(scene):
+        raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
+    targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
+    gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
+    check_writable(output, [*targets, *gates.names()])
+
+    from mitransient_lidar.rendering import render as rendering
+
+    with reporting(quiet) as progress:
+        dataset = rendering.render(
+            scene,
+            params=params,
+            integrator=integrator,
+            target_error=target_error,
+            max_time=max_time,
+            passes=passes,
+            seed=seed,
+            max_memory=max_memory,
+            variant=variant,
+            progress=progress,
+        )
+    output.mkdir(parents=True, exist_ok=True)
+    if "waveform" not in dataset:
+        targets = [output / f"{name}.nc"]
+    for target in targets:
+        if _write(dataset, target):
+            typer.echo(target)
+    if "gate_energy" in dataset:
+        gates.write(dataset, dataset, quiet)
+    if not quiet:
+        summarise(dataset)
+    exit_if_interrupted(dataset)
+
+
+def _write(dataset: xr.Dataset, target: Path) -> bool:
+    """Write a result or a drawing of it; return False for a layout of pixels that do not look at the sea."""
+    from mitransient_lidar import results
+    from mitransient_lidar.results import gate_files
+
+    if target.suffix == ".exr":
+        results.save(dataset.drop_dims("gate", errors="ignore"), target)
+    elif target.suffix == ".nc":
+        (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
+    elif not target.stem.endswith("_layout"):
+        from mitransient_lidar.plots.waveforms import plot_waveforms
+
+        plot_waveforms(dataset, target)
+    else:
+        from mitransient_lidar.plots.layout import plot_layout
+
+        try:
+            plot_layout(dataset, target)
+        except UserError as error:
+            typer.echo(f"no drawing of the pixels: {error}", err=True)
+            return False
+    return True
+
+
+def passive(
+    scene: Scene,
+    define: Define = None,
+    output: Folder = Path("."),
+    frames: Annotated[int, typer.Option(help="Number of frames of a moving picture.")] = 1,
+    frame_step: Annotated[float, typer.Option(help="Time between frames [s], in which the waves move on.")] = 0.1,
+    filter_width_nm: Annotated[
+        float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")
+    ] = None,
+    target_error: TargetError = None,
+    max_time: MaxTime = None,
+    passes: GoalPasses = None,
+    seed: Seed = 0,
+    variant: Variant = None,
+    plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Render an image by daylight.
+
+    Writes DIR/<scene>_passive.nc, .exr and .png (.gif of frames), and prints the paths. The limits of error, time and
+    passes hold for each frame.
+    """
+    params = parameters(define)
+
+    from mitransient_lidar.loading.catalogue import scene_path
+
+    stem = f"{scene_path(scene).stem}_passive"
+    suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and frames > 1 else [])]
+    targets = [output / f"{stem}{suffix}" for suffix in suffixes]
+    check_writable(output, targets)
+
+    from mitransient_lidar.plots import passive as passive_plots
+    from mitransient_lidar.rendering.passive import render_passive
+    from mitransient_lidar.results.radiance import save_radiance
+
+    with reporting(quiet) as progress:
+        image = render_passive(
+            scene,
+            params,
+            target_error=target_error,
+            max_time=max_time,
+            passes=passes,
+            seed=seed,
+            frames=frames,
+            frame_step_s=frame_step,
+            filter_width_nm=filter_width_nm,
+            variant=variant,
+            progress=progress,
+        )
+    output.mkdir(parents=True, exist_ok=True)
+    writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
+        ".gif": passive_plots.animate_passive,
+        ".png": passive_plots.plot_passive,
+    }
+    for target in targets:
+        if target.suffix != ".gif" or "row" in image.dims:
+            writers.get(target.suffix, save_radiance)(image, target)
+            typer.echo(target)
+    if not quiet:
+        typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
+        if "background_power" in image:
+            typer.echo(f"mean power of a pixel: {float(image['background_power'].mean()):.4g} W")
+    exit_if_interrupted(image)

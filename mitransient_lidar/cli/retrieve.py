@@ -1,0 +1,81 @@
+"""The command that retrieves slopes, bottom and water from a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitransient_lidar.cli.files import check_suffix, write_netcdf
+from mitransient_lidar.cli.options import pair
+
+_WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd", "c": "attenuation"}
+
+
+def retrieve(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
+    slope_deviation: Annotated[
+        str | None,
+        typer.Option(metavar="ALONG,ACROSS", help="Standard deviations of the sea's slopes, as prior knowledge."),
+    ] = None,
+    efficiency: Annotated[
+        float | None, typer.Option(help="Two-way efficiency of optics and air; by default that of the scene.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
+) -> None:
+    """Retrieve slopes, bottom and water from a result.
+
+    Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of FILE.
+    """
+    deviations = None if slope_deviation is None else pair("--slope-deviation", slope_deviation)
+    if output is not None:
+        check_suffix("--output", output, ".nc")
+
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
+
+    found = retrieve_from(results.open(file), slope_deviation=deviations, efficiency=efficiency)
+    for line in _lines(found):
+        typer.echo(line)
+    if output is not None:
+        write_netcdf(found, output)
+
+
+def _lines(found: Any) -> list[str]:
+    """Return lines that describe the estimates."""
+    import numpy as np
+
+    value = {str(name): float(one) for name, one in found.data_vars.items() if one.ndim == 0}
+    lines = []
+    for name, positive in (("along", "a face towards the lidar"), ("across", "a rise to the left")):
+        slope, error = value[f"slope_{name}"], value[f"slope_{name}_stderr"]
+        text = (
+            "not observable with these pixels" if np.isnan(slope) else f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
+        )
+        lines.append(f"slope {name}: {text}")
+    height = value["surface_height"]
+    lines.append("surface: no echo" if np.isnan(height) else f"surface: {height:+.3f} m from the mean level")
+    lines += _bottom_lines(found["depth_m"].values, found)
+    if "kd" not in value:
+        return [*lines, "water: not observable, the field of view is too narrow"]
+    if np.isnan(value["kd"]):
+        return [*lines, "water: no column that can be fitted"]
+    lines.append("water (1/m): " + ", ".join(f"{name} {value[key]:.4g}" for name, key in _WATER.items()))
+    low, high = value["attenuation_low"], value["attenuation_high"]
+    return [*lines, f"c is a guess: {low:.2g} to {high:.2g} 1/m, as bb/b goes from 0.044 to 0.01"]
+
+
+def _bottom_lines(depth: Any, found: Any) -> list[str]:
+    import numpy as np
+
+    if np.isnan(depth[0]):
+        return ["bottom: no echo"]
+    lines = [f"bottom: {depth[1]:.3f} m deep, {depth[0]:.3f} m through a level sea"]
+    reflectance = found["reflectance"].values
+    if np.isnan(reflectance).all():
+        return [*lines, "bottom reflectance: no column that can be fitted"]
+    text = ", ".join(f"{by} {rho:.4f}" for by, rho in zip(found["correction"].values, reflectance, strict=True))
+    shares = zip(found["bottom_class"].values, found["class_probability"].values, strict=True)
+    classes = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares)
+    return [*lines, f"bottom reflectance: {text}", f"bottom class: {classes}"]

@@ -1,0 +1,287 @@
+"""Commands that study a scene, a sea or a water beyond one render."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitransient_lidar.cli.files import check_figure, write_figure
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.options import (
+    Define,
+    DrawingOnly,
+    Figure,
+    OptionalFigure,
+    Passes,
+    Quiet,
+    Scene,
+    Seed,
+    TargetId,
+    numbers,
+    pair,
+    parameters,
+)
+
+
+def find_shots(
+    scene: Scene,
+    define: Define = None,
+    at: Annotated[
+        list[str] | None, typer.Option(metavar="X,Y", help="A place [m], instead of a search. Repeatable.")
+    ] = None,
+    slope_sigmas: Annotated[float, typer.Option(help="Slopes to find, in standard deviations.")] = 2.0,
+    count: Annotated[int, typer.Option(help="Places of each kind.")] = 1,
+    output: DrawingOnly = None,
+    waveforms: Annotated[bool, typer.Option("--waveforms/--no-waveforms", help="Render the shots, too.")] = True,
+) -> None:
+    """Find places of the sea where the beam meets given slopes.
+
+    Lists places whose slope faces the lidar (towards, away), is level or sideways, and draws them.
+    """
+    params = parameters(define)
+    places = [pair("--at", text) for text in at or []]
+    if output is not None:
+        from mitransient_lidar.plots.drawing import check_format
+
+        check_format(output)
+
+    from mitransient_lidar.plots.find_shots import plot_found_shots
+    from mitransient_lidar.studies import find_shots as study
+
+    if places:
+        found = study.shots_at(scene, places, params)
+    else:
+        found = study.find_shots(scene, params, slope_sigmas=slope_sigmas, count=count)
+    typer.echo(f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}")
+    for shot in found:
+        along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
+        typer.echo(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
+    if output is not None:
+        plot_found_shots(study.render_found_shots(scene, found, params, waveforms=waveforms), output)
+        typer.echo(output)
+
+
+def shot_statistics(
+    scene: Scene,
+    define: Define = None,
+    count: Annotated[int, typer.Option(help="Number of shots.")] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of their places.")] = 1,
+    output: Figure = Path("shot_statistics.png"),
+    quiet: Quiet = False,
+) -> None:
+    """Correlate the echoes of random shots with the sea's slopes."""
+    params = parameters(define)
+    check_figure(output)
+
+    from mitransient_lidar.plots.shot_statistics import plot_shot_statistics
+    from mitransient_lidar.studies import shot_statistics as study
+
+    with reporting(quiet) as progress:
+        shots = study.shot_statistics(scene, params, count=count, seed=seed, progress=progress)
+    write_figure(shots, output, plot_shot_statistics)
+    for name, value in study.slope_correlations(shots).items():
+        typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
+
+
+def target_signal(
+    scene: Scene,
+    define: Define = None,
+    target_id: TargetId = "target",
+    grid: Annotated[int, typer.Option(help="Places of the target along each axis, 1 to 15.")] = 1,
+    max_offset: Annotated[float, typer.Option(help="Largest offset of these places along each axis [m].")] = 2.0,
+    passes: Passes = 64,
+    seed: Seed = 0,
+    output: OptionalFigure = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure the signal of a target in each pixel.
+
+    Renders the scene with and without the target on the same random numbers, and combines the pixels.
+    """
+    params = parameters(define)
+    check_figure(output)
+
+    from mitransient_lidar.plots.target_signal import plot_target_map, plot_target_signal
+    from mitransient_lidar.studies import target_signal as study
+
+    options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed}
+    with reporting(quiet) as progress:
+        if grid == 1:
+            found = study.target_signal(scene, params, progress=progress, **options)
+        else:
+            offsets = study.grid_offsets(grid, max_offset)
+            found = study.target_map(scene, params, x=offsets, y=offsets, progress=progress, **options)
+    write_figure(found, output, plot_target_signal if grid == 1 else plot_target_map)
+    _print(study.describe_target(found) if grid == 1 else study.describe_map(found))
+
+
+def detect(
+    scene: Scene,
+    define: Define = None,
+    receiver: Annotated[
+        str, typer.Option(help="Receiver of every pixel: ideal, photodiode, pmt, pmt_log, apd, sipm or spad.")
+    ] = "apd",
+    pfa: Annotated[float, typer.Option(help="Probability of false alarm.")] = 1e-3,
+    pd: Annotated[float, typer.Option(help="Required probability of detection.")] = 0.9,
+    depths: Annotated[
+        str | None, typer.Option(metavar="D1,D2,...", help="Further depths of the target [m], increasing.")
+    ] = None,
+    shots: Annotated[int, typer.Option(help="Number of simulated shots with and without the target.")] = 10_000,
+    clutter: Annotated[
+        int, typer.Option(help="Number of seas whose differences count as noise; 0: one known sea.")
+    ] = 0,
+    renders: Annotated[int, typer.Option(help="Renders of one sea; their spread gives the intervals.")] = 4,
+    target_id: TargetId = "target",
+    background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
+    passes: Passes = 16,
+    seed: Seed = 0,
+    output: Figure = Path("detection.png"),
+    quiet: Quiet = False,
+) -> None:
+    """Compute how well a target is detected.
+
+    Compares one pixel, the sum and the best combination of pixels.
+    """
+    params = parameters(define)
+    places = numbers("--depths", depths) if depths else []
+    check_figure(output)
+
+    from mitransient_lidar.plots.detection import plot_detection
+    from mitransient_lidar.studies import detection as study
+
+    with reporting(quiet) as progress:
+        found = study.detect(
+            scene,
+            params,
+            receiver=receiver,
+            pfa=pfa,
+            pd=pd,
+            depths=places,
+            shots=shots,
+            clutter=clutter,
+            renders=renders,
+            target_id=target_id,
+            background_power_w=background_power_w,
+            passes=passes,
+            seed=seed,
+            progress=progress,
+        )
+    write_figure(found, output, plot_detection)
+    _print(study.describe_detection(found))
+
+
+def beam_spread(
+    scene: Scene,
+    depths: Annotated[str, typer.Option(metavar="D1,D2,...", help="Depths below the mean sea level [m].")],
+    define: Define = None,
+    passes: Passes = 8,
+    seed: Seed = 0,
+    output: Figure = Path("beam_spread.png"),
+    quiet: Quiet = False,
+) -> None:
+    """Measure the spread of the laser's light at depths.
+
+    The spread in space and in time, and the share of the light within the field of view.
+    """
+    params = parameters(define)
+    wanted = numbers("--depths", depths)
+    check_figure(output)
+
+    from mitransient_lidar.plots.beam_spread import plot_beam_spread
+    from mitransient_lidar.studies import beam_spread as study
+
+    with reporting(quiet) as progress:
+        found = study.beam_spread(scene, wanted, params, passes=passes, seed=seed, progress=progress)
+    write_figure(found, output, plot_beam_spread)
+    if not quiet:
+        _print(study.describe_spread(found))
+
+
+def fov_sweep(
+    scene: Scene,
+    define: Define = None,
+    fov_mrad: Annotated[
+        str, typer.Option(metavar="F1,F2,...", help="Full angles of the fields of view [mrad].")
+    ] = "2,5,10,20,50,100",
+    min_depth: Annotated[float, typer.Option(help="Depth where the slope of the signal begins [m].")] = 1.0,
+    max_depth: Annotated[float, typer.Option(help="Depth where it ends [m].")] = 5.0,
+    passes: Passes = 48,
+    seed: Seed = 0,
+    output: Figure = Path("fov_sweep.png"),
+    quiet: Quiet = False,
+) -> None:
+    """Measure the water's attenuation for several fields of view."""
+    params = parameters(define)
+    wanted = numbers("--fov-mrad", fov_mrad)
+    check_figure(output)
+
+    from mitransient_lidar.plots.fov_sweep import plot_fov_sweep
+    from mitransient_lidar.studies import fov_sweep as study
+
+    depths = {"min_depth": min_depth, "max_depth": max_depth}
+    with reporting(quiet) as progress:
+        found = study.fov_sweep(scene, wanted, params, **depths, passes=passes, seed=seed, progress=progress)
+    write_figure(found, output, plot_fov_sweep)
+    _print(study.describe_fov_sweep(found))
+
+
+def scattering_orders(
+    scene: Scene,
+    define: Define = None,
+    orders: Annotated[int, typer.Option(help="Number of orders to separate.")] = 8,
+    passes: Passes = 32,
+    seed: Seed = 0,
+    output: OptionalFigure = None,
+    quiet: Quiet = False,
+) -> None:
+    """Separate the received light by the number of scatterings.
+
+    Each order is also separated by the number of reversals of the vertical direction: one, or several.
+    """
+    params = parameters(define)
+    check_figure(output)
+
+    from mitransient_lidar.plots.scattering_orders import plot_scattering_orders
+    from mitransient_lidar.studies import scattering_orders as study
+
+    with reporting(quiet) as progress:
+        found = study.scattering_orders(scene, params, orders=orders, passes=passes, seed=seed, progress=progress)
+    write_figure(found, output, plot_scattering_orders)
+    _print(study.describe_orders(found))
+
+
+def water(
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="jerlov, chlorophyll, kd, secchi, petzold, profile or pure.")
+    ],
+    value: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="VALUE",
+            help="Jerlov type, chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m], Petzold's clear, coastal or turbid, "
+            "or a profile's .csv or .nc file.",
+        ),
+    ] = None,
+    wavelength: Annotated[float, typer.Option(help="Wavelength [nm].")] = 532.0,
+    temperature: Annotated[float, typer.Option(help="Temperature [degrees Celsius], for the indices.")] = 20.0,
+    salinity: Annotated[float, typer.Option(help="Salinity [per mille], for the indices.")] = 35.0,
+    tolerance: Annotated[float, typer.Option(help="Largest relative error of layers that replace a profile.")] = 0.01,
+    output: DrawingOnly = None,
+) -> None:
+    """Print the optical properties of a water and its parameters."""
+    from mitransient_lidar.plots.water import plot_water
+    from mitransient_lidar.studies import water_report as study
+
+    lines = study.describe_water(kind, value, wavelength, temperature, salinity, tolerance)
+    if output is not None:
+        plot_water(kind, value, wavelength, temperature, salinity, tolerance, output)
+        lines.append(str(output))
+    _print(lines)
+
+
+def _print(lines: list[str]) -> None:
+    for line in lines:
+        typer.echo(line)

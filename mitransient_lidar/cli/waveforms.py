@@ -1,0 +1,141 @@
+"""The command that lists the echoes in a result's waveforms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitransient_lidar.cli.files import check_suffix
+from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_LISTED = 200  # lines of a table that someone reads
+_LISTED_COLUMNS = 16  # waveforms whose layers are listed
+
+
+def waveforms(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, or NetCDF file of recorded shots.")
+    ],
+    table: Annotated[bool, typer.Option("--table/--no-table", help="Print the echoes.")] = True,
+    output: Annotated[Path | None, typer.Option("--csv", metavar="OUT", help="CSV file to write.")] = None,
+    estimator: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--estimator",
+            help="threshold, leading_edge, peak, centroid, gaussian (the default) or deconvolution; repeat it for "
+            "several estimators.",
+        ),
+    ] = None,
+    threshold: Annotated[
+        float, typer.Option(help="Standard deviations of the noise above which a signal counts.")
+    ] = 5.0,
+    contrast: Annotated[float, typer.Option(help="Share of the signal that an echo in the water must add.")] = 0.05,
+    layers: Annotated[int, typer.Option(help="Number of changes in the column to test for.")] = 0,
+    mean_surface: Annotated[
+        bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
+    ] = False,
+) -> None:
+    """Measure the echoes in the waveforms of a result.
+
+    Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel.
+    """
+    if output is not None:
+        check_suffix("--csv", output, ".csv")
+    elif not table:
+        raise UserError("--no-table leaves nothing to do: give --csv OUT, too.")
+
+    from mitransient_lidar.analysis.waveforms import csv_tables, records
+    from mitransient_lidar.analysis.waveforms import echo_table as measuring
+
+    found = measuring.extract(
+        records.open_waveforms(file),
+        estimator or ["gaussian"],
+        threshold=threshold,
+        contrast=contrast,
+        layers=layers,
+        depth_from="mean" if mean_surface else "echo",
+    )
+    if table:
+        _print(found)
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        csv_tables.save_csv(found, output)
+        typer.echo(output)
+
+
+def _print(found: xr.Dataset) -> None:
+    """Print the echoes that are there, and what is known of the columns."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mitransient_lidar.analysis.waveforms import csv_tables
+
+    names, lines = csv_tables.rows(found)
+    labels = [name for name in names[: names.index("echo") + 1] if name != "estimator" or found.sizes["estimator"] > 1]
+    unit = {"amplitude": found["amplitude"].attrs["units"], "energy": found["energy"].attrs["units"]}
+    heads = {"time_ns": "time (ns)", "depth_m": "depth (m)", "width_ns": "width (ns)"}
+    heads |= {name: f"{name} ({of})" if of else name for name, of in unit.items()}
+    table = Table(box=None, padding=(0, 1), header_style=None)
+    for name in labels:
+        table.add_column(name)
+    for name in csv_tables.NUMBERS:
+        table.add_column(heads[name], justify="right")
+    table.add_column("flags")
+    left_out = 0
+    for line in lines:
+        cells = dict(zip(names, line, strict=True))
+        # No target, or no bottom within the record, is nothing to report.
+        if cells["flags"] == "no_echo" and cells["echo"] != "surface":
+            continue
+        if table.row_count >= _LISTED:
+            left_out += 1
+            continue
+        numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in csv_tables.NUMBERS]
+        table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"])
+    # Lines are never folded: what is too wide for a terminal is still a table in a file.
+    Console(highlight=False, width=200, markup=False).print(table)
+    if left_out:
+        typer.echo(f"{left_out} more lines: write them all with --csv OUT.")
+    _print_columns(found)
+
+
+def _print_columns(found: xr.Dataset) -> None:
+    """Print attenuations, and changes in the columns where they were sought."""
+    import numpy as np
+
+    values = found["attenuation"].values.ravel()
+    if np.isfinite(values).any():
+        text = f"attenuation of the column (1/m): median {np.nanmedian(values):.4f}"
+        if values.size > 1:
+            text += f", from {np.nanmin(values):.4f} to {np.nanmax(values):.4f}"
+        typer.echo(text)
+    if "layer" not in found.dims or values.size > _LISTED_COLUMNS:
+        return
+    layers: Any = found[["layer_depth_m", "layer_p_value", "layer_step"]]
+    dims = list(found["attenuation"].dims)
+    for place in np.ndindex(*(found.sizes[dim] for dim in dims)):
+        one = layers.isel(dict(zip(dims, place, strict=True)))
+        label = " ".join(str(found[dim].values[index]) for dim, index in zip(dims, place, strict=True))
+        for depth, chance, step in zip(*(one[name].values for name in one.data_vars), strict=True):
+            if np.isfinite(depth):
+                change = f"signal {100 * np.expm1(step):+.0f} %, p = {max(chance, 1e-99):.1e}"
+                typer.echo(f"{label}: change at {depth:.2f} m, {change}")
+
+
+def _with_error(value: float, error: float) -> str:
+    """Return a number with its standard error, or a dash."""
+    import math
+
+    if math.isnan(value):
+        return "-"
+    if not math.isfinite(error) or error <= 0:
+        return f"{value:.5g}"
+    small = abs(value) < 1e-3 or abs(value) >= 1e6
+    if small:
+        return f"{value:.3e} +- {error:.0e}"
+    return f"{value:.{min(max(1 - math.floor(math.log10(error)), 0), 3)}f} +- {error:.2g}"

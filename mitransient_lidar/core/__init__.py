@@ -1,0 +1,1 @@
+"""Validation, errors and constants that every layer uses."""

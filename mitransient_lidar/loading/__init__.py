@@ -1,0 +1,1 @@
+"""Scenes by name or path, their parameters, and Mitsuba variants."""

@@ -1,0 +1,139 @@
+"""Shipped scenes: names, texts, parameters and copies.
+
+A scene is a Mitsuba XML file in ``mitransient_lidar.scenes``; its name is the file's name without the suffix. Files
+whose names begin with an underscore are parts that scenes include, and no scenes themselves.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib.resources
+import os
+import re
+import shutil
+from pathlib import Path
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.includes import flat_text, parse_scene, read_scene
+
+_COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
+
+
+def scene_names() -> list[str]:
+    """Return the names of the shipped scenes in alphabetical order."""
+    return sorted(path.stem for path in _folder().glob("*.xml") if not path.name.startswith("_"))
+
+
+def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
+    """Find a scene.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        Name of a shipped scene, or path of an XML file. A shipped scene wins over a file of the same name.
+
+    Returns
+    -------
+    pathlib.Path
+        An existing file.
+
+    Raises
+    ------
+    UserError
+        If there is no such scene; the sentence lists shipped scenes of similar names.
+    """
+    names = scene_names()
+    if str(name_or_path) in names:
+        return _folder() / f"{name_or_path}.xml"
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise UserError(f"scene {str(name_or_path)!r} is a folder; give an XML file or the name of a shipped scene.")
+    close = difflib.get_close_matches(path.stem, names, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(close)}" if close else f"shipped scenes are {', '.join(names) or 'none'}"
+    raise UserError(f"scene {str(name_or_path)!r} is neither a file nor a shipped scene; {hint}.")
+
+
+def scene_text(name: str | os.PathLike[str]) -> str:
+    """Return the self-contained XML text of a scene, with included files in place.
+
+    Name as in `scene_path`; format and further errors as in `loading.includes.flat_text`.
+    """
+    return flat_text(scene_path(name))
+
+
+def scene_summary(name: str | os.PathLike[str]) -> str:
+    """Return the first line of a scene's first comment, empty without a comment; name and errors as in `scene_path`."""
+    comment = _COMMENT.search(read_scene(scene_path(name)))
+    lines = comment[1].strip().splitlines() if comment else []
+    return lines[0].strip() if lines else ""
+
+
+def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
+    """Return the parameters of a scene, the ``<default>`` tags of its XML and of the files that it includes.
+
+    Parameters
+    ----------
+    name : str or path
+        As in `scene_path`.
+
+    Returns
+    -------
+    dict of str to str
+        Parameter names and default values, in the order of `scene_text`.
+
+    Raises
+    ------
+    UserError
+        If there is no such scene, an included file is missing, or a file is not well-formed XML.
+    """
+    path = scene_path(name)
+    parameters: dict[str, str] = {}
+    for tag in parse_scene(flat_text(path), path).getElementsByTagName("default"):
+        parameters.setdefault(tag.getAttribute("name"), tag.getAttribute("value"))
+    return parameters
+
+
+def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".") -> Path:
+    """Write a scene as one self-contained file to edit, with copies of the data files beside it that it names.
+
+    Parameters
+    ----------
+    name : str or path
+        As in `scene_path`.
+    destination : path
+        Folder to write into, or path of the new file.
+
+    Returns
+    -------
+    pathlib.Path
+        The new XML file.
+
+    Raises
+    ------
+    UserError
+        If there is no such scene, a file would be overwritten, or one cannot be read or written.
+    """
+    source = scene_path(name)
+    text = flat_text(source)
+    destination = Path(destination)
+    target = destination / source.name if destination.is_dir() else destination
+    neighbours = (file for file in source.parent.iterdir() if file.is_file() and file != source)
+    copies = {target.parent / file.name: file for file in neighbours if f'"{file.name}"' in text}
+    for copy in (target, *copies):
+        if copy.exists():
+            raise UserError(f"{copy} exists already and is not overwritten.")
+    copy = target
+    try:
+        target.write_text(text, encoding="utf-8")
+        for copy, original in copies.items():
+            shutil.copyfile(original, copy)
+    except OSError as error:
+        raise UserError(f"cannot write {copy}: {error.strerror}.") from error
+    return target
+
+
+def _folder() -> Path:
+    """Return the folder of the shipped scenes."""
+    return Path(str(importlib.resources.files("mitransient_lidar.scenes")))

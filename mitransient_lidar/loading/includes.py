@@ -1,0 +1,160 @@
+"""Self-contained text of scene files that include others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.dom import minidom
+from xml.parsers.expat import ExpatError
+from xml.sax.saxutils import quoteattr
+
+from mitransient_lidar.core.errors import UserError
+
+
+@dataclass
+class _Default:
+    """A parameter's ``<default>`` with the comments above it ("" for a blank line) and beside it."""
+
+    element: minidom.Element
+    above: list[str]
+    beside: str = ""
+
+
+def read_scene(path: Path) -> str:
+    """Return the text of a scene file; raise UserError if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"scene {path} is not a UTF-8 text file.") from error
+    except OSError as error:
+        raise UserError(f"cannot read scene {path}: {error.strerror}.") from error
+
+
+def parse_scene(text: str, path: Path) -> minidom.Element:
+    """Return the root element of a scene file's text; raise UserError if it is not well-formed XML."""
+    try:
+        root = minidom.parseString(text).documentElement
+    except ExpatError as error:
+        raise UserError(f"scene {path} is not well-formed XML: {error}.") from error
+    assert root is not None
+    return root
+
+
+def flat_text(path: Path) -> str:
+    """Return the text of a scene file with all included files in place.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Scene file. Names of included files are relative to the file that names them and contain no parameters.
+
+    Returns
+    -------
+    str
+        The file's own text if it includes no other. Otherwise indented XML with parameters before objects. Each
+        parameter has one ``<default>``: at the place of its last declaration, with the value of its first one, which
+        is the one that Mitsuba uses, and with the first comment beside any of them.
+
+    Raises
+    ------
+    UserError
+        If a file is missing, unreadable, not well-formed XML, or includes itself.
+    """
+    text = read_scene(path)
+    if "<include" not in text:
+        return text
+    root = _expanded(path, text)
+    assert root.parentNode is not None
+    head = [node.toxml() for node in root.parentNode.childNodes if isinstance(node, minidom.Comment)]
+    defaults: list[_Default] = []
+    objects = _content(root, defaults)
+    parameters: list[str] = []
+    for default in _unique(defaults):
+        parameters += [*default.above, _element(default.element)[0] + default.beside]
+    if objects[:1] != [""]:
+        objects.insert(0, "")
+    return "\n".join([*head, *_element(root, [*parameters, *objects, ""]), ""])
+
+
+def _expanded(path: Path, text: str, includers: tuple[Path, ...] = ()) -> minidom.Element:
+    """Return the root element of a scene file, with includes replaced by what Mitsuba takes from them."""
+    root = parse_scene(text, path)
+    files = (path.resolve(), *includers)
+    for include in root.getElementsByTagName("include"):
+        name = include.getAttribute("filename")
+        part = next((found for file in files if (found := file.parent / name).is_file()), None)
+        if part is None:
+            raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
+        if part.resolve() in files:
+            raise UserError(f"scene {path} includes {name!r}, which includes it in turn.")
+        included = _expanded(part, read_scene(part), files)
+        content = list(included.childNodes)
+        if included.tagName != "scene":
+            included.removeAttribute("version")
+            if include.hasAttribute("name"):
+                included.setAttribute("name", include.getAttribute("name"))
+            content = [included]
+        parent = include.parentNode
+        assert isinstance(parent, minidom.Element)
+        for node in content:
+            parent.insertBefore(node, include)
+        parent.removeChild(include)
+    return root
+
+
+def _content(parent: minidom.Element, defaults: list[_Default]) -> list[str]:
+    """Return the lines within an element, "" for a blank one, and append its parameters to ``defaults`` instead."""
+    lines: list[str] = []
+    above: list[str] = []
+    latest: _Default | None = None
+    line_breaks = 0
+    for node in parent.childNodes:
+        if not isinstance(node, (minidom.Comment, minidom.Element)):
+            line_breaks += (node.nodeValue or "").count("\n")
+            continue
+        if line_breaks > 1:
+            above.append("")
+        if isinstance(node, minidom.Comment) and line_breaks == 0 and not above and (latest or lines):
+            if latest:
+                latest.beside += f"  {node.toxml()}"
+            else:
+                lines[-1] += f"  {node.toxml()}"
+        elif isinstance(node, minidom.Comment):
+            above.append(node.toxml())
+        else:
+            latest = None
+            if node.tagName == "default":
+                latest = _Default(node, above)
+                defaults.append(latest)
+            else:
+                lines += [*above, *_element(node, _content(node, defaults))]
+            above = []
+        line_breaks = 0
+    return lines + above
+
+
+def _unique(defaults: list[_Default]) -> list[_Default]:
+    """Return one default per parameter; see `flat_text` for its place, value and comment."""
+    # A value that refers to another parameter must stay behind the first declaration of that one.
+    in_order = any("$" in item.element.getAttribute("value") for item in defaults)
+    declarations: dict[str, list[_Default]] = {}
+    for item in defaults:
+        name = item.element.getAttribute("name")
+        earlier = declarations.get(name, []) if in_order else declarations.pop(name, [])
+        declarations[name] = [*earlier, item]
+    kept = []
+    for same in declarations.values():
+        first, last = same[0], same[-1]
+        beside = next((item.beside for item in same if item.beside), "")
+        above = first.above if first is last or in_order else [*last.above, *filter(None, first.above)]
+        kept.append(_Default(first.element, above, beside))
+    return kept
+
+
+def _element(element: minidom.Element, content: Sequence[str] = ()) -> list[str]:
+    """Return the lines of an element with its content indented."""
+    start = f"<{element.tagName}" + "".join(f" {name}={quoteattr(value)}" for name, value in element.attributes.items())
+    if not content:
+        return [f"{start}/>"]
+    return [f"{start}>", *(line and f"    {line}" for line in content), f"</{element.tagName}>"]

@@ -1,0 +1,227 @@
+"""Mitsuba variants: finding LLVM, choosing a variant, registering the plugins for it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+from pathlib import Path
+
+from mitransient_lidar.core.errors import UserError
+
+#: Variants that the plugins support, in the order of preference.
+SUPPORTED_VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
+
+#: LLVM releases that abort the process with Dr.Jit 1.5 (15, 16) or are refused by it (older ones).
+OLDEST_USABLE_LLVM = 17
+
+_LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
+_LLVM_WHEEL = "karellen-llvm-core"
+_PLUGIN_MODULES = (
+    "phase.tabulated",  # first: others derive from it
+    "phase.fournier_forand",
+    "phase.petzold",
+    "phase.sea_water",
+    "phase.measured_phase",
+    "phase.two_term_henyey_greenstein",
+    "layered_water",
+    "ocean_surface",
+    "seabed",
+    "retroreflector",
+    "lidar_transmitter",
+    "sun",
+    "sky",
+    "pixel_fov",
+    "multipixel_receiver",
+    "time_gated_film",
+    "lidar_integrator",  # before the integrators, which derive from it
+    "lidar_volpath",
+    "lidar_merging",
+    "passive_volpath",
+)
+
+_registered_for: str | None = None
+
+
+def find_llvm() -> Path | None:
+    """Return the shared LLVM library that the wheel in this environment carries, or None."""
+    try:
+        files = importlib.metadata.files(_LLVM_WHEEL) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    for file in files:
+        # libLLVM.so.23.1 is the library itself; libLLVM.so and libLLVM-23.so are links to it.
+        if re.fullmatch(r"libLLVM\.so\.\d+(\.\d+)*", file.name):
+            path = Path(str(file.locate())).resolve()
+            if path.is_file():
+                return path
+    return None
+
+
+def llvm_advice(problem: str) -> str:
+    """Return one sentence that says what is wrong with LLVM and what to install."""
+    return (
+        f"{problem}: install LLVM {OLDEST_USABLE_LLVM} or newer "
+        f"(pip install {_LLVM_WHEEL} on Linux x86-64, else the system's LLVM package) "
+        f"or point {_LLVM_VARIABLE} to its shared library"
+    )
+
+
+def check_llvm_path(path: str) -> None:
+    """Raise UserError when the name of an LLVM library says that Dr.Jit aborts with it.
+
+    Parameters
+    ----------
+    path
+        Path of a shared LLVM library, such as ``/usr/lib/llvm-19/lib/libLLVM.so.19.1``.
+
+    Raises
+    ------
+    UserError
+        When the file does not exist or its name tells a release older than 17.
+    """
+    if not Path(path).is_file():
+        raise UserError(llvm_advice(f"{_LLVM_VARIABLE} = {path!r} is not a file"))
+    resolved = Path(path).resolve().name
+    match = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", resolved)
+    if match and int(match.group(1)) < OLDEST_USABLE_LLVM:
+        raise UserError(llvm_advice(f"LLVM {match.group(1)} at {path!r} does not work with Dr.Jit"))
+
+
+def prepare_llvm() -> None:
+    """Tell Dr.Jit where LLVM is; a setting that the user made wins."""
+    if os.environ.get(_LLVM_VARIABLE):
+        return
+    path = find_llvm()
+    if path is not None:
+        os.environ[_LLVM_VARIABLE] = str(path)
+
+
+def loaded_llvm() -> tuple[int, ...] | None:
+    """Return the version of the LLVM that Dr.Jit has loaded, or None."""
+    import drjit as dr
+
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return None
+    return tuple(dr.detail.llvm_version())
+
+
+def check_llvm() -> None:
+    """Raise UserError when Dr.Jit has no LLVM, or one with which it aborts the process.
+
+    Dr.Jit looks for LLVM once, when it is first imported; a variable that is set later comes too late.
+    """
+    if os.environ.get(_LLVM_VARIABLE):
+        check_llvm_path(os.environ[_LLVM_VARIABLE])
+    version = loaded_llvm()
+    if version is not None and version[0] >= OLDEST_USABLE_LLVM:
+        return
+    problem = "Dr.Jit finds no LLVM" if version is None else f"LLVM {version[0]} does not work with Dr.Jit"
+    own = os.environ.get(_LLVM_VARIABLE)
+    if own and Path(own) != find_llvm():
+        raise UserError(llvm_advice(f"{problem} at {_LLVM_VARIABLE} = {own!r}"))
+    if find_llvm() is not None:
+        raise UserError(
+            f"{problem}, because mitsuba or drjit was imported before mitransient_lidar: "
+            "import mitransient_lidar first, so that Dr.Jit takes the LLVM of this environment"
+        )
+    raise UserError(llvm_advice(problem))
+
+
+def choose_variant() -> str:
+    """Return the fastest supported variant that works on this machine.
+
+    Raises
+    ------
+    UserError
+        When neither a GPU nor LLVM is usable.
+    """
+    import drjit as dr
+
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return "cuda_ad_mono"
+    check_llvm()
+    return "llvm_ad_mono"
+
+
+def set_variant(name: str | None = None) -> str:
+    """Set Mitsuba's variant, by default the fastest one that works here, and register the plugins.
+
+    Parameters
+    ----------
+    name
+        One of ``llvm_ad_mono`` and ``cuda_ad_mono``, or None.
+
+    Returns
+    -------
+    str
+        The variant now active.
+
+    Raises
+    ------
+    UserError
+        When the variant is not supported or does not work on this machine.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if name is None:
+        name = mi.variant() if mi.variant() in SUPPORTED_VARIANTS else choose_variant()
+    if name not in SUPPORTED_VARIANTS:
+        raise UserError(f"variant = {name!r} is not supported: allowed are {', '.join(SUPPORTED_VARIANTS)}")
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise UserError(f"variant = {name!r} needs an NVIDIA GPU and driver, and Dr.Jit finds none; use llvm_ad_mono")
+    if name.startswith("llvm"):
+        check_llvm()
+    mi.set_variant(name)
+    register_plugins(None, name)
+    return name
+
+
+def register_plugins(_old: str | None, new: str) -> None:
+    """Register every plugin for the variant ``new``; Mitsuba calls this when the variant changes.
+
+    Plugin classes derive from classes of the active variant, so their modules are run again for each one.
+    Variants that the plugins do not support are left alone.
+    """
+    global _registered_for
+    if new not in SUPPORTED_VARIANTS or new == _registered_for:
+        return
+    for name in _PLUGIN_MODULES:
+        module = f"mitransient_lidar.plugins.{name}"
+        if module in sys.modules:
+            importlib.reload(sys.modules[module])
+        else:
+            importlib.import_module(module)
+    _registered_for = new
+
+
+def versions() -> dict[str, str]:
+    """Return the variant and the versions that a result records."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return {"variant": mi.variant() or "none", "mitsuba_version": mi.__version__, "drjit_version": dr.__version__}
+
+
+def describe() -> dict[str, str]:
+    """Return what ``mitransient-lidar info`` prints: versions, variant, LLVM and GPU."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mitransient_lidar._version import __version__
+
+    llvm = loaded_llvm()
+    return {
+        "mitransient-lidar": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
+        "variant": mi.variant() or "none",
+        "LLVM": f"{'.'.join(map(str, llvm))} ({os.environ.get(_LLVM_VARIABLE, 'system')})" if llvm else "none",
+        "GPU": "usable" if dr.has_backend(dr.JitBackend.CUDA) else "none",
+        "threads": str(dr.thread_count()),
+    }

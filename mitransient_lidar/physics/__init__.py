@@ -1,0 +1,1 @@
+"""Physics of depth-sounding lidar in NumPy."""

@@ -1,0 +1,1 @@
+"""Pulse, gates, time bins, refraction, daylight, beam spread and the lidar equation."""

@@ -1,0 +1,141 @@
+"""Daylight at the sea at 532 nm: irradiance of sun and sky under a clear sky, and background power of a pixel.
+
+Irradiances and radiances are spectral, per nanometre; zenith angles are degrees from the vertical.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
+
+#: Angular radius of the sun [deg].
+SUN_RADIUS_DEG = 0.2666
+
+#: Largest zenith angle of the sun [deg].
+LARGEST_SUN_ZENITH_DEG = 89.0
+
+_WAVELENGTH_UM = 1e-3 * 532.0
+
+#: Extraterrestrial irradiance [W m^-2 nm^-1]: mean over 527 to 537 nm of the table of Gregg and Carder. Fraunhofer
+#: lines make it 4 % more or less within a nanometre.
+_SOLAR_CONSTANT = 1.90
+
+#: Absorption of ozone [1/cm], same table, at 532 nm.
+_OZONE_ABSORPTION = 0.0662
+
+#: Single-scattering albedo of maritime aerosol at a relative humidity of 80 % (their equation 36, air mass type 1).
+_AEROSOL_ALBEDO = 0.993
+
+#: Pressure [hPa] to which their Rayleigh optical depth belongs.
+_SEA_LEVEL_PRESSURE = 1013.25
+
+
+@dataclass(frozen=True)
+class ClearSkyIrradiance:
+    """Irradiance at the sea under a clear sky [W m^-2 nm^-1].
+
+    Attributes
+    ----------
+    direct_normal
+        Irradiance of the sun on a plane normal to its rays.
+    direct, diffuse
+        Irradiances of the sun and of the sky on a horizontal plane.
+    """
+
+    direct_normal: float
+    direct: float
+    diffuse: float
+
+
+def clear_sky_irradiance(
+    zenith_deg: float,
+    *,
+    aerosol_optical_depth: float = 0.1,
+    angstrom_exponent: float = 1.0,
+    ozone_cm: float = 0.3,
+    pressure_hpa: float = _SEA_LEVEL_PRESSURE,
+) -> ClearSkyIrradiance:
+    """Irradiance of sun and sky at 532 nm on the sea under a clear sky.
+
+    Parameters
+    ----------
+    zenith_deg : float
+        Zenith angle of the sun [deg], 0 to 89.
+    aerosol_optical_depth : float
+        Optical depth of the aerosol at 550 nm, 0 to 5.
+    angstrom_exponent : float
+        Exponent of its decrease with the wavelength, -1 to 3; it also sets the asymmetry of aerosol scattering.
+    ozone_cm : float
+        Ozone column [atm cm], 0 to 1.
+    pressure_hpa : float
+        Pressure at sea level [hPa], 0 (no Rayleigh scattering) to 1100.
+
+    Raises
+    ------
+    UserError
+        If a parameter is out of range.
+
+    Notes
+    -----
+    Model of Gregg and Carder (1990, doi:10.4319/lo.1990.35.8.1657) for cloudless maritime atmospheres, at one
+    wavelength and with the aerosol given by its optical depth instead of visibility and winds. Its rms error against
+    measured spectra is 6.6 %. Air mass of Kasten and Young (1989, doi:10.1364/AO.28.004735). Light reflected by the sea
+    and scattered back by the sky is left out, as in the original model; the sun is at its mean distance.
+    """
+    zenith = in_range("zenith_deg", zenith_deg, 0.0, LARGEST_SUN_ZENITH_DEG)
+    depth = in_range("aerosol_optical_depth", aerosol_optical_depth, 0.0, 5.0)
+    exponent = in_range("angstrom_exponent", angstrom_exponent, -1.0, 3.0)
+    ozone = in_range("ozone_cm", ozone_cm, 0.0, 1.0)
+    pressure = in_range("pressure_hpa", pressure_hpa, 0.0, 1100.0)
+    cosine = float(np.cos(np.radians(zenith)))
+    air_mass = 1 / (cosine + 0.50572 * (96.07995 - zenith) ** -1.6364)
+    ozone_mass = 1.0035 / np.sqrt(cosine**2 + 0.007)
+    lam = _WAVELENGTH_UM
+    rayleigh = np.exp(-air_mass * pressure / _SEA_LEVEL_PRESSURE / (115.6406 * lam**4 - 1.335 * lam**2))
+    aerosol = depth * (lam / 0.55) ** -exponent * air_mass
+    absorbed, scattered = np.exp(-(1 - _AEROSOL_ALBEDO) * aerosol), np.exp(-_AEROSOL_ALBEDO * aerosol)
+    below_ozone = _SOLAR_CONSTANT * np.exp(-_OZONE_ABSORPTION * ozone * ozone_mass)
+    normal = below_ozone * rayleigh * absorbed * scattered
+    from_air = 0.5 * (1 - rayleigh**0.95)
+    from_aerosol = rayleigh**1.5 * (1 - scattered) * _forward_fraction(cosine, exponent)
+    diffuse = below_ozone * cosine * absorbed * (from_air + from_aerosol)
+    return ClearSkyIrradiance(float(normal), float(normal * cosine), float(diffuse))
+
+
+def _forward_fraction(cosine: float, exponent: float) -> float:
+    """Fraction of aerosol scattering that is directed downwards (Gregg and Carder 1990, equations 20 to 26)."""
+    asymmetry = 0.65 if exponent > 1.2 else 0.82 - 0.14167 * max(exponent, 0.0)
+    log = np.log(1 - asymmetry)
+    first = log * (1.459 + log * (0.1595 + log * 0.4129))
+    second = log * (0.0783 + log * (-0.3824 - log * 0.5874))
+    return float(1 - 0.5 * np.exp((first + second * cosine) * cosine))
+
+
+def background_power(radiance: npt.ArrayLike, etendue: npt.ArrayLike, filter_width_nm: float) -> FloatArray:
+    """Power of daylight on a detector: P = L (A Omega eta) dlambda.
+
+    Parameters
+    ----------
+    radiance : array_like
+        Radiance L [W m^-2 sr^-1 nm^-1].
+    etendue : array_like
+        Open area of the aperture times solid angle of the pixel times transmittance of optics and air [m^2 sr].
+    filter_width_nm : float
+        Width dlambda [nm] of the filter, positive: its integral over its peak, which is part of the transmittance.
+
+    Returns
+    -------
+    ndarray
+        Power [W].
+
+    Raises
+    ------
+    UserError
+        If the width is not positive or a value not finite.
+    """
+    width = positive("filter_width_nm", filter_width_nm)
+    return np.asarray(finite_array("radiance", radiance) * finite_array("etendue", etendue) * width)

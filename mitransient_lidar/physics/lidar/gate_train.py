@@ -1,0 +1,291 @@
+"""Trains of gates: opening times of a gated receiver, and the weight of an echo in each gate.
+
+A gated receiver takes one image per gate and shifts the gate by one step from image to image. Gate k collects the
+energy int P(t) G_k(t) dt of the received power P of every pulse, where G_k(t) = G_0(t - k step).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import (
+    FloatArray,
+    finite,
+    finite_array,
+    in_range,
+    integer,
+    non_negative,
+    positive,
+)
+from mitransient_lidar.physics.lidar.gate_shape import GateShape
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+
+#: Points of a table of weights per shortest time scale, and largest number of points.
+_POINTS, _LONGEST_TABLE = 128, 2**18
+
+_MOST_BINS = 10**9
+
+
+class ResponseTable(NamedTuple):
+    """Weight of an ideal echo in the first gate against its arrival time.
+
+    Attributes
+    ----------
+    start_ns, step_ns : float
+        Arrival time of the first value and time between values [ns].
+    values : ndarray, shape (N,)
+        Weights, 0 to 1; 0 at both ends.
+    """
+
+    start_ns: float
+    step_ns: float
+    values: FloatArray
+
+    @property
+    def end_ns(self) -> float:
+        """Arrival time of the last value [ns]."""
+        return self.start_ns + (self.values.size - 1) * self.step_ns
+
+    def at(self, time_ns: npt.ArrayLike) -> FloatArray:
+        """Weights at arrival times [ns], linear between the values and 0 outside."""
+        times = self.start_ns + self.step_ns * np.arange(self.values.size)
+        return np.asarray(np.interp(np.asarray(time_ns, dtype=np.float64), times, self.values, left=0.0, right=0.0))
+
+
+@dataclass(frozen=True)
+class GateTrain:
+    """Gates of one shape at equal time steps.
+
+    Times count from the moment when the pulse's peak leaves the transmitter. Build a train of a measured gate with
+    `measured`.
+
+    Parameters
+    ----------
+    start_ns : float
+        Time of the half height of the first gate's rising edge [ns].
+    width_ns : float
+        Time between the half heights of a gate's edges [ns], greater than 0.
+    step_ns : float
+        Time from gate to gate [ns], greater than 0: gates overlap when it is below their width.
+    count : int
+        Number of gates, 1 to 100 000.
+    rise_ns, fall_ns : float
+        10-90 % times of the raised-cosine edges [ns], at least 0 and together at most 1.18 width_ns; 0 is sharp.
+    pulses : int
+        Pulses that each gate accumulates, 1 to 10^9.
+    profile : GateShape, optional
+        Measured gate instead of raised-cosine edges; `width_ns`, `rise_ns` and `fall_ns` must equal its own values.
+
+    Raises
+    ------
+    UserError
+        If a value is out of range.
+    """
+
+    start_ns: float
+    width_ns: float
+    step_ns: float
+    count: int
+    rise_ns: float = 0.0
+    fall_ns: float = 0.0
+    pulses: int = 1
+    profile: GateShape | None = None
+    shape: GateShape = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        shape = self.profile
+        if shape is None:
+            shape = GateShape.edges(self.width_ns, self.rise_ns, self.fall_ns)
+        elif (self.width_ns, self.rise_ns, self.fall_ns) != (shape.width_ns, shape.rise_ns, shape.fall_ns):
+            raise UserError(
+                f"width_ns = {self.width_ns:g}, rise_ns = {self.rise_ns:g} and fall_ns = {self.fall_ns:g} must be "
+                f"those of the profile, {shape.width_ns:g}, {shape.rise_ns:g} and {shape.fall_ns:g}"
+            )
+        checked = {
+            "start_ns": finite("start_ns", self.start_ns),
+            "width_ns": shape.width_ns,
+            "step_ns": positive("step_ns", self.step_ns),
+            "count": integer("count", self.count, 1, 100_000),
+            "rise_ns": shape.rise_ns,
+            "fall_ns": shape.fall_ns,
+            "pulses": integer("pulses", self.pulses, 1, 10**9),
+            "shape": shape,
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def measured(cls, profile: GateShape, start_ns: float, step_ns: float, count: int, pulses: int = 1) -> GateTrain:
+        """Train of measured gates (`GateShape.sampled` or `GateShape.from_file`); parameters as in the class."""
+        width, rise, fall = profile.width_ns, profile.rise_ns, profile.fall_ns
+        return cls(start_ns, width, step_ns, count, rise, fall, pulses, profile)
+
+    @property
+    def starts_ns(self) -> FloatArray:
+        """Times of the half heights of the rising edges [ns], shape (count,)."""
+        return np.asarray(self.start_ns + self.step_ns * np.arange(self.count))
+
+    @property
+    def middles_ns(self) -> FloatArray:
+        """Midpoints between the half heights of the gates [ns], shape (count,)."""
+        return np.asarray(self.starts_ns + 0.5 * self.width_ns)
+
+    @property
+    def spans_ns(self) -> FloatArray:
+        """First and last time at which the transmission of each gate is above 0 [ns], shape (count, 2)."""
+        return np.asarray(self.starts_ns[:, None] + np.array(self.shape.span_ns))
+
+    def gate_bins(self, gate: int, time_start_ns: float, bin_width_ns: float, bin_count: int) -> tuple[int, FloatArray]:
+        """Mean transmission of a gate in the bins of a record that it overlaps.
+
+        Parameters
+        ----------
+        gate : int
+            Index of the gate, 0 to count - 1.
+        time_start_ns, bin_width_ns : float
+            Start of the first bin and width of the bins [ns].
+        bin_count : int
+            Number of bins, 1 to 10^9.
+
+        Returns
+        -------
+        first : int
+            First bin that the gate overlaps.
+        weights : ndarray, shape (M,)
+            Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the record.
+
+        Raises
+        ------
+        UserError
+            If an argument is out of range.
+        """
+        start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
+        bins = integer("bin_count", bin_count, 1, _MOST_BINS)
+        opens = self.start_ns + self.step_ns * integer("gate", gate, 0, self.count - 1)
+        first, last = (opens + np.array(self.shape.span_ns) - start) / width
+        low, high = int(np.clip(np.floor(first), 0, bins)), int(np.clip(np.ceil(last), 0, bins))
+        edges = start - opens + width * np.arange(low, max(low, high) + 1)
+        return low, np.asarray(np.clip(np.diff(self.shape.open_time(edges)) / width, 0, 1))
+
+    def response_weights(
+        self, pulse: Pulse, response_time_ns: float = 0.0, step_ns: float | None = None
+    ) -> ResponseTable:
+        """Weight of an ideal echo in the first gate against its arrival time.
+
+        Pulse and receiver response spread an echo at t with the unit-area kernel h(tau). The first gate transmits
+        W(t) = int h(tau) G_0(t + tau) dtau of it, gate k W(t - k step_ns), for one pulse.
+
+        Parameters
+        ----------
+        pulse : Pulse
+            Transmitted pulse.
+        response_time_ns : float
+            Time constant of the receiver's single-pole response [ns], at least 0.
+        step_ns : float, optional
+            Time between the values of the table [ns], greater than 0. By default 1/128 of the shortest of pulse, edges
+            and width, with which linear interpolation is accurate to 1e-5.
+
+        Raises
+        ------
+        UserError
+            If a time is out of range, or the step would need more than 2^18 values.
+        """
+        from scipy.signal import fftconvolve
+
+        opens, closes = self.shape.span_ns
+        gaussian = pulse.shape == "gaussian"
+        pulse_length = 14 * pulse.fwhm_ns / FWHM_PER_SIGMA if gaussian else float(np.ptp(pulse.times_ns))
+        longest = closes - opens + pulse_length + 30 * non_negative("response_time_ns", response_time_ns)
+        if step_ns is None:
+            # Features of a sampled pulse may be shorter than its width.
+            shortest = pulse.fwhm_ns if gaussian else float(np.diff(pulse.times_ns).min())
+            times = (shortest, self.width_ns, self.rise_ns or shortest, self.fall_ns or shortest)
+            step = max(min(times) / _POINTS, 2 * longest / _LONGEST_TABLE)
+        else:
+            step = positive("step_ns", step_ns)
+        if longest / step > _LONGEST_TABLE:
+            raise UserError(
+                f"step_ns = {step:g} needs {longest / step:.0f} values but at most {_LONGEST_TABLE} are allowed"
+            )
+        lag, kernel = pulse.kernel(step, response_time_ns)
+        cells = int(np.ceil((closes - opens) / step)) + 3
+        # Mean transmission over cells of one step, with one cell of margin at each end.
+        edges = opens + step * (np.arange(cells + 1) - 1.5)
+        gate = np.diff(self.shape.open_time(edges)) / step
+        values = np.clip(fftconvolve(gate, kernel[::-1]), 0, 1)
+        values[0] = values[-1] = 0
+        start = self.start_ns + opens - step - step * (lag + kernel.size - 1)
+        return ResponseTable(start, step, values)
+
+
+def time_of_depth(depth_m: npt.ArrayLike, surface_time_ns: float, group_index: float, cos_water: float) -> FloatArray:
+    """Arrival time of an echo on the depth axis.
+
+    Parameters
+    ----------
+    depth_m : array_like
+        Depth below the surface [m]; negative above it, with the scale of the water.
+    surface_time_ns : float
+        Time of the surface echo [ns].
+    group_index : float
+        Group index of the water, 1 to 2.
+    cos_water : float
+        Cosine of the refracted angle of the receiver's axis from the vertical, greater than 0 and at most 1.
+
+    Returns
+    -------
+    ndarray
+        Time [ns], surface_time + 2 n_g depth / (c0 cos_water).
+
+    Raises
+    ------
+    UserError
+        If an argument is out of range.
+    """
+    delay = finite_array("depth_m", depth_m) / _speed(group_index, cos_water)
+    return np.asarray(finite("surface_time_ns", surface_time_ns) + delay)
+
+
+def depth_of_time(time_ns: npt.ArrayLike, surface_time_ns: float, group_index: float, cos_water: float) -> FloatArray:
+    """Depth [m] on the depth axis of an echo at `time_ns` [ns]; the inverse of `time_of_depth`."""
+    delay = finite_array("time_ns", time_ns) - finite("surface_time_ns", surface_time_ns)
+    return np.asarray(delay * _speed(group_index, cos_water))
+
+
+def _speed(group_index: float, cos_water: float) -> float:
+    """Depth per nanosecond of two-way time [m]."""
+    cosine = in_range("cos_water", positive("cos_water", cos_water), 0, 1)
+    return 0.5e-9 * C0 / in_range("group_index", group_index, 1, 2) * cosine
+
+
+@dataclass(frozen=True)
+class GatePlan:
+    """Gates of a scene: a train without its start, which is given in time or in depth.
+
+    Parameters
+    ----------
+    train
+        Shape, step and number of the gates and pulses; its start does not count.
+    start_ns
+        Half height of the first gate's rising edge [ns], or None.
+    start_depth
+        Depth of the echoes that arrive at that time [m], or None.
+    """
+
+    train: GateTrain
+    start_ns: float | None = None
+    start_depth: float | None = None
+
+    def placed(self, surface_time_ns: float, group_index: float, cos_water: float) -> GateTrain:
+        """Return the train with its start; the arguments are those of `time_of_depth`."""
+        start = self.start_ns
+        if start is None:
+            assert self.start_depth is not None
+            start = float(time_of_depth(self.start_depth, surface_time_ns, group_index, cos_water))
+        return replace(self.train, start_ns=start)

@@ -1,0 +1,198 @@
+"""Shape of the transmitted pulse, and its convolution with the receiver's response over the bins of a record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.text_tables import read_two_columns
+from mitransient_lidar.core.validation import FloatArray, non_negative, positive, time_samples
+from mitransient_lidar.physics.piecewise_linear import integral, locate, node_integrals
+
+FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
+_TAIL = 1e-10  # energy left out at each end of a kernel
+
+
+@dataclass(frozen=True, eq=False)
+class Pulse:
+    """Pulse of unit energy whose peak leaves the transmitter at t = 0.
+
+    Build one with `gaussian`, `sampled` or `from_file`.
+
+    Parameters
+    ----------
+    shape : {'gaussian', 'sampled'}
+        Selects which of the fields below apply.
+    fwhm_ns : float
+        Full width at half maximum [ns]; of a sampled pulse, the time from the first to the last sample above half.
+    times_ns : ndarray, shape (S,)
+        Times of the samples [ns] with the largest sample at 0.
+    power : ndarray, shape (S,)
+        Power at the samples [1/ns]: linear between them, 0 outside, unit area.
+    """
+
+    shape: Literal["gaussian", "sampled"]
+    fwhm_ns: float
+    times_ns: FloatArray
+    power: FloatArray
+
+    @classmethod
+    def gaussian(cls, fwhm_ns: float) -> Pulse:
+        """Gaussian pulse of full width at half maximum `fwhm_ns` [ns], positive."""
+        return cls("gaussian", positive("fwhm_ns", fwhm_ns), np.zeros(0), np.zeros(0))
+
+    @classmethod
+    def sampled(cls, times_ns: npt.ArrayLike, power: npt.ArrayLike) -> Pulse:
+        """Pulse given by samples.
+
+        Parameters
+        ----------
+        times_ns : array_like, shape (S,)
+            Strictly increasing times [ns], at least 2. They are shifted so that the (first) largest sample is at 0.
+        power : array_like, shape (S,)
+            Power in any unit, not negative, not all 0. It is scaled to unit area.
+
+        Raises
+        ------
+        UserError
+            If the samples do not have this form.
+        """
+        t, p = time_samples(times_ns, "power", power)
+        if np.any(p < 0):
+            raise UserError(f"power = {p.min():g} must not be negative")
+        area = np.sum(np.diff(t) * (p[1:] + p[:-1]) / 2)
+        if area <= 0:
+            raise UserError("power must be greater than 0 somewhere")
+        half = np.flatnonzero(p >= p.max() / 2)
+        return cls("sampled", float(t[half[-1]] - t[half[0]]), t - t[np.argmax(p)], p / area)
+
+    @classmethod
+    def from_file(cls, path: str | PathLike[str]) -> Pulse:
+        """Read a sampled pulse from a text file of two columns, time [ns] and power; # starts a comment.
+
+        Raises
+        ------
+        UserError
+            If the file does not hold two columns of numbers, or as for `sampled`.
+        """
+        table, _ = read_two_columns(path, "time in ns and power")
+        return cls.sampled(table[:, 0], table[:, 1])
+
+    def cumulative(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Fraction of the energy that has left the transmitter by the times `t_ns` [ns]."""
+        from scipy.special import ndtr
+
+        t = np.asarray(t_ns, dtype=np.float64)
+        if self.shape == "gaussian":
+            return np.asarray(ndtr(t * FWHM_PER_SIGMA / self.fwhm_ns))
+        return integral(self.times_ns, self.power, t)
+
+    def kernel(self, bin_width_ns: float, response_time_ns: float = 0.0) -> tuple[int, FloatArray]:
+        """Discrete impulse response of pulse and receiver for histograms of ideal echoes.
+
+        Parameters
+        ----------
+        bin_width_ns : float
+            Width of the bins [ns], positive.
+        response_time_ns : float
+            Time constant tau of a causal single-pole response exp(-t/tau)/tau [ns]; 0 for none.
+
+        Returns
+        -------
+        first_lag : int
+            Lag of the first weight in bins, usually negative.
+        weights : ndarray, shape (M,)
+            weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m: exact
+            integrals over the bins, truncated where less than 1e-10 lies outside, with the sum 1.
+
+        Raises
+        ------
+        UserError
+            If the bin width is not positive or the response time negative.
+        """
+        dt = positive("bin_width_ns", bin_width_ns)
+        tau = non_negative("response_time_ns", response_time_ns)
+        if self.shape == "gaussian":
+            start, end = -7 * self.fwhm_ns / FWHM_PER_SIGMA, 7 * self.fwhm_ns / FWHM_PER_SIGMA
+        else:
+            start, end = self.times_ns[0], self.times_ns[-1]
+        first, last = int(np.floor(start / dt - 0.5)), int(np.ceil((end + 30 * tau) / dt + 0.5))
+        edges = (np.arange(first, last + 2, dtype=np.float64) - 0.5) * dt
+        arrived = self.cumulative(edges) if tau == 0 else self._response(edges, tau)
+        kept = np.flatnonzero((arrived[1:] > _TAIL) & (arrived[:-1] < 1 - _TAIL))
+        weights = np.maximum(np.diff(arrived)[kept[0] : kept[-1] + 1], 0)
+        return first + int(kept[0]), weights / weights.sum()
+
+    def _response(self, t: FloatArray, tau: float) -> FloatArray:
+        """Cumulative energy after a single-pole response: F with tau F' = cumulative - F."""
+        if self.shape == "gaussian":
+            return _gaussian_response(t, self.fwhm_ns / FWHM_PER_SIGMA, tau)
+        # On a segment C is quadratic and F = q + (F_0 - q_0) exp(-x/tau), q = C - tau C' + tau^2 C''.
+        width = np.diff(self.times_ns)
+        slope = np.diff(self.power) / width
+        nodes = node_integrals(self.times_ns, self.power)
+        q_start = nodes[:-1] - tau * self.power[:-1] + tau**2 * slope
+        q_end = nodes[1:] - tau * self.power[1:] + tau**2 * slope
+        decay = np.exp(-width / tau)
+        at_node = np.zeros(nodes.size)
+        for j in range(width.size):
+            at_node[j + 1] = q_end[j] + (at_node[j] - q_start[j]) * decay[j]
+        i, x = locate(self.times_ns, t)
+        q = self.cumulative(t) - tau * (self.power[i] + slope[i] * x) + tau**2 * slope[i]
+        inside = q + (at_node[i] - q_start[i]) * np.exp(-x / tau)
+        late = np.maximum(t - self.times_ns[-1], 0)
+        after = 1 + (at_node[-1] - 1) * np.exp(-late / tau)
+        return np.where(t < self.times_ns[0], 0, np.where(late > 0, after, inside))
+
+
+def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, FloatArray]) -> FloatArray:
+    """Received power from the energies of ideal echoes.
+
+    Parameters
+    ----------
+    energy : array_like, shape (..., time)
+        Energy per bin [J].
+    bin_width_ns : float
+        Width of the bins [ns], that of the kernel.
+    kernel : (int, ndarray)
+        First lag and weights, from `Pulse.kernel`.
+
+    Returns
+    -------
+    ndarray, shape (..., time)
+        Mean power in each bin [W]. Energy that the kernel moves past either end of the record is lost.
+
+    Raises
+    ------
+    UserError
+        If the bin width is not positive or `energy` has no time axis.
+    """
+    from scipy.ndimage import convolve1d
+
+    seconds = positive("bin_width_ns", bin_width_ns) * 1e-9
+    record = np.asarray(energy, dtype=np.float64)
+    if record.ndim == 0 or record.shape[-1] == 0:
+        raise UserError(f"energy of shape {record.shape} must have a time axis")
+    first, weights = kernel
+    lags = first + np.arange(weights.size)
+    reach = min(int(np.max(np.abs(lags))), record.shape[-1] - 1)
+    centred = np.zeros(2 * reach + 1)
+    inside = np.abs(lags) <= reach
+    centred[lags[inside] + reach] = weights[inside]
+    return np.asarray(convolve1d(record, centred / seconds, axis=-1, mode="constant"))
+
+
+def _gaussian_response(t: FloatArray, sigma: float, tau: float) -> FloatArray:
+    """Cumulative distribution of an exponentially modified Gaussian."""
+    from scipy.special import erfcx, ndtr
+
+    z = t / sigma - sigma / tau
+    # exp(sigma^2/(2 tau^2) - t/tau) ndtr(z): its exponent overflows before the centre, erfcx after it.
+    before = 0.5 * erfcx(np.maximum(-z, 0) / np.sqrt(2)) * np.exp(-0.5 * (t / sigma) ** 2)
+    after = np.exp(-np.maximum(z, 0) * sigma / tau - 0.5 * (sigma / tau) ** 2) * ndtr(z)
+    return np.asarray(ndtr(t / sigma) - np.where(z < 0, before, after))

@@ -1,0 +1,124 @@
+"""Refraction at a level sea surface: angles, Fresnel transmission, focusing, and the time of the surface echo.
+
+Angles are from the vertical, `theta` in air and `phi` in water; n is the index of water relative to air.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, non_negative_array, positive
+
+
+def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
+    """Angle of refraction [rad] in water of relative index `n` >= 1 for angles `theta` [rad] in air."""
+    return np.asarray(np.arcsin(np.sin(_angles(theta)) / in_range("n", n, 1, np.inf)))
+
+
+def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
+    """Power reflectance and transmittance of a smooth interface for unpolarised light.
+
+    Parameters
+    ----------
+    theta : array_like
+        Angle of incidence [rad], 0 to pi/2.
+    n : float
+        Index behind the interface relative to that before it; below 1 from water to air.
+
+    Returns
+    -------
+    reflectance, transmittance : ndarray
+        They add up to 1; the reflectance is 1 beyond the critical angle.
+    """
+    angle = _angles(theta)
+    cos_i = np.cos(angle)
+    sin_t = np.sin(angle) / positive("n", n)
+    cos_t = np.sqrt(np.maximum(1 - sin_t**2, 0))
+    with np.errstate(invalid="ignore"):
+        s = (cos_i - n * cos_t) / (cos_i + n * cos_t)
+        p = (n * cos_i - cos_t) / (n * cos_i + cos_t)
+    reflectance = np.where(sin_t < 1, 0.5 * (s**2 + p**2), 1.0)
+    return reflectance, 1 - reflectance
+
+
+def refracted_path(
+    horizontal: npt.ArrayLike, height: npt.ArrayLike, depth: npt.ArrayLike, n: float
+) -> tuple[FloatArray, FloatArray]:
+    """Angles of the refracted ray between a point in air and a point in the water.
+
+    Parameters
+    ----------
+    horizontal : array_like
+        Horizontal distance rho [m]; the angles have its sign.
+    height : array_like
+        Height of the upper point above the surface [m], positive.
+    depth : array_like
+        Depth of the lower point [m], at least 0.
+    n : float
+        Refractive index of the water, at least 1.
+
+    Returns
+    -------
+    theta, phi : ndarray
+        Angles from the vertical [rad] in air and water that solve H tan(theta) + D tan(phi) = rho.
+
+    Raises
+    ------
+    UserError
+        If a height is not positive, a depth negative, or n below 1.
+    """
+    in_range("n", n, 1, np.inf)
+    rho, h, d = np.broadcast_arrays(
+        finite_array("horizontal", horizontal), finite_array("height", height), non_negative_array("depth", depth)
+    )
+    if np.any(h <= 0):
+        raise UserError(f"height = {h.min():g} must be greater than 0")
+    # The distance is a concave, increasing function of t = tan(theta): Newton's method from 0 cannot overshoot.
+    target = np.abs(rho)
+    t = np.zeros_like(target)
+    for _ in range(60):
+        root = np.sqrt(n**2 + (n**2 - 1) * t**2)
+        change = (target - h * t - d * t / root) / (h + d * n**2 / root**3)
+        t = t + change
+        if np.all(np.abs(change) <= 4e-16 * t):
+            break
+    theta = np.copysign(np.arctan(t), rho)
+    return theta, snell(theta, n)
+
+
+def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt.ArrayLike, n: float) -> FloatArray:
+    """Solid angle in water per receiver area, at a point on the refracted ray.
+
+    Parameters
+    ----------
+    height, depth : array_like
+        Height of the receiver and depth of the point [m].
+    theta : array_like
+        Angle of the ray in air [rad].
+    n : float
+        Refractive index of the water.
+
+    Returns
+    -------
+    ndarray
+        d(omega)/dA [sr/m^2] for an aperture normal to the ray: 1/(S_s S_t) with the sagittal and tangential distances
+        S_s = n H/cos(theta) + D/cos(phi) and S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
+    """
+    h, d = np.asarray(height, dtype=np.float64), np.asarray(depth, dtype=np.float64)
+    air, water = np.cos(_angles(theta)), np.cos(snell(theta, n))
+    sagittal = n * h / air + d / water
+    tangential = n * h * water / air**2 + d * air / water**2
+    return np.asarray(1 / (sagittal * tangential))
+
+
+def surface_time_ns(height: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
+    """Two-way time [ns] to the level surface from `height` [m] at the angle `theta` [rad]."""
+    return np.asarray(2e9 * np.asarray(height, dtype=np.float64) / (C0 * np.cos(_angles(theta))))
+
+
+def _angles(theta: npt.ArrayLike) -> FloatArray:
+    """Return finite angles."""
+    return finite_array("theta", theta)

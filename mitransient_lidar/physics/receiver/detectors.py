@@ -1,0 +1,346 @@
+"""Photodetectors: charge or counts in each time bin for a mean number of photons, as moments and realisations.
+
+`LinearDetector` represents photodiodes, avalanche photodiodes and photomultipliers, `SiliconPhotomultiplier` arrays of
+Geiger-mode cells, `SinglePhotonDetector` one such cell with a counter. Each has
+
+- `event_means`: mean primary events (photoelectrons, avalanches) per bin, dark events included;
+- `moments`: mean and covariances of the output in closed form;
+- `sample`: realisations of the output.
+
+The output is a charge in electrons per bin, of the single-photon detector a count per bin. Photons arrive as a Poisson
+process: speckle of the laser averages out over the many coherence cells of an airborne receiver (Goodman 1965).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitransient_lidar.core.constants import C0, ELEMENTARY_CHARGE, PLANCK
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import (
+    FloatArray,
+    IntArray,
+    finite_array,
+    in_range,
+    integer,
+    non_negative,
+    positive,
+)
+from mitransient_lidar.physics.receiver import dead_time
+
+Moments = tuple[FloatArray, list[FloatArray]]
+"""Mean, shape (..., time), and covariances of the bins k and k + l at index l, shape (..., time - l)."""
+
+
+def photons_per_joule(wavelength_nm: float) -> float:
+    """Return the number of photons in 1 J of light of a vacuum wavelength [nm], positive."""
+    return positive("wavelength_nm", wavelength_nm) * 1e-9 / (PLANCK * C0)
+
+
+def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
+    """Excess noise factor of an avalanche photodiode.
+
+    Parameters
+    ----------
+    gain : float
+        Mean multiplication M, at least 1.
+    ionisation_ratio : float
+        Effective ratio k of the ionisation coefficients, that of holes over that of electrons where electrons begin
+        the avalanche, 0 to 1.
+
+    Returns
+    -------
+    float
+        F = k M + (1 - k) (2 - 1/M).
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    R. J. McIntyre, IEEE Trans. Electron Devices 13, 164 (1966), doi:10.1109/T-ED.1966.15651.
+    """
+    multiplication, k = in_range("gain", gain, 1, np.inf), in_range("ionisation_ratio", ionisation_ratio, 0, 1)
+    return float(k * multiplication + (1 - k) * (2 - 1 / multiplication))
+
+
+def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
+    """Excess noise factor of a chain of dynodes with Poisson-distributed secondary electrons.
+
+    Parameters
+    ----------
+    dynode_gains : sequence of float
+        Mean secondary electrons per electron of each dynode, above 1.
+
+    Returns
+    -------
+    float
+        F = 1 + 1/d_1 + 1/(d_1 d_2) + ...; d/(d - 1) for many equal dynodes.
+
+    Raises
+    ------
+    UserError
+        If there is no dynode or a gain is not above 1.
+
+    Notes
+    -----
+    Variances of a cascade: W. Shockley and J. R. Pierce, Proc. IRE 26, 321 (1938).
+    """
+    gains = finite_array("dynode_gains", dynode_gains)
+    if gains.ndim != 1 or gains.size == 0 or np.any(gains <= 1):
+        raise UserError(f"dynode_gains = {list(dynode_gains)} must be a list of numbers above 1")
+    return float(1 + np.sum(1 / np.cumprod(gains)))
+
+
+@dataclass(frozen=True)
+class LinearDetector:
+    """Detector whose charge is proportional to the light: photodiode, avalanche photodiode or photomultiplier.
+
+    Parameters
+    ----------
+    quantum_efficiency : float
+        Primary events per photon, above 0, at most 1; of a photomultiplier times the collection efficiency.
+    gain : float
+        Mean charge per event in electrons, at least 1.
+    excess_noise : float
+        Mean square of the charge over the square of its mean, at least 1.
+    dark_current_na : float
+        Multiplied dark current, before the multiplication [nA]: the anode's dark current over the gain.
+    leakage_current_na : float
+        Unmultiplied dark current [nA], such as the surface current of an avalanche photodiode.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    The charge of n events is drawn from a gamma distribution of mean n gain and variance n gain^2 (excess_noise - 1),
+    the shot noise of the leakage from a normal one: mean and variance are exact, the shape of the tails is not.
+    """
+
+    quantum_efficiency: float
+    gain: float = 1.0
+    excess_noise: float = 1.0
+    dark_current_na: float = 0.0
+    leakage_current_na: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_efficiency(self.quantum_efficiency)
+        for name in ("gain", "excess_noise"):
+            in_range(name, getattr(self, name), 1, np.inf)
+        for name in ("dark_current_na", "leakage_current_na"):
+            non_negative(name, getattr(self, name))
+
+    @classmethod
+    def avalanche(
+        cls,
+        quantum_efficiency: float,
+        gain: float,
+        ionisation_ratio: float,
+        dark_current_na: float = 0.0,
+        leakage_current_na: float = 0.0,
+    ) -> LinearDetector:
+        """Avalanche photodiode below breakdown, its excess noise from `avalanche_excess_noise`."""
+        noise = avalanche_excess_noise(gain, ionisation_ratio)
+        return cls(quantum_efficiency, gain, noise, dark_current_na, leakage_current_na)
+
+    @classmethod
+    def photomultiplier(
+        cls, quantum_efficiency: float, dynode_gains: Sequence[float], dark_current_na: float = 0.0
+    ) -> LinearDetector:
+        """Photomultiplier tube, its gain and excess noise from the gains of its dynodes (`dynode_excess_noise`)."""
+        noise = dynode_excess_noise(dynode_gains)
+        return cls(quantum_efficiency, float(np.prod(dynode_gains)), noise, dark_current_na)
+
+    def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
+        """Mean events per bin for a mean number of photons per bin, of the same shape."""
+        return self.quantum_efficiency * photons + _electrons(self.dark_current_na, bin_width_ns)
+
+    def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
+        """Mean and covariances of the charge per bin; the bins are independent, so that only lag 0 is returned."""
+        leakage = _electrons(self.leakage_current_na, bin_width_ns)
+        return self.gain * events + leakage, [self.gain**2 * self.excess_noise * events + leakage]
+
+    def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
+        """Draw charges in electrons per bin, shape (shots, *events.shape)."""
+        count = random.poisson(events, (shots, *events.shape))
+        charge = _multiplied(count, self.gain, self.excess_noise - 1, random)
+        if leakage := _electrons(self.leakage_current_na, bin_width_ns):
+            charge += random.normal(leakage, np.sqrt(leakage), charge.shape)
+        return charge
+
+
+@dataclass(frozen=True)
+class SiliconPhotomultiplier:
+    """Array of Geiger-mode cells in parallel (SiPM, MPPC).
+
+    Parameters
+    ----------
+    quantum_efficiency : float
+        Photon detection efficiency, fill factor and avalanche probability included; above 0, at most 1.
+    cells : int
+        Number of cells, 1 to 10^9, evenly illuminated.
+    recovery_time_ns : float
+        Dead time of a cell that has fired [ns], at least the width of a bin.
+    crosstalk : float
+        Probability that an avalanche immediately triggers further ones, 0 to 0.5.
+    dark_count_rate_hz : float
+        Dark counts of all cells [1/s], without crosstalk.
+    gain : float
+        Mean charge of an avalanche in electrons, at least 1.
+    gain_spread : float
+        Standard deviation of the charge over its mean, at least 0.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    Cells without crosstalk are independent: a bin holds a binomial number of primary avalanches. Each makes a
+    Borel-distributed total number of avalanches, of mean 1/(1 - L) and variance L/(1 - L)^3, L = -ln(1 - crosstalk)
+    (S. Vinogradov, Nucl. Instrum. Methods A 695, 247 (2012), arXiv:1109.2014). Here L is multiplied by the mean
+    fraction of live cells; the dead time of cells fired by crosstalk is neglected, which matters where many cells fire.
+    A cell recovers instantaneously. Afterpulses are neglected: within some 100 ns after a strong surface echo the
+    signal is cleaner than that of a real device.
+    """
+
+    quantum_efficiency: float
+    cells: int
+    recovery_time_ns: float
+    crosstalk: float = 0.0
+    dark_count_rate_hz: float = 0.0
+    gain: float = 1.0
+    gain_spread: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_efficiency(self.quantum_efficiency)
+        integer("cells", self.cells, 1, 10**9)
+        positive("recovery_time_ns", self.recovery_time_ns)
+        in_range("crosstalk", self.crosstalk, 0, 0.5)
+        in_range("gain", self.gain, 1, np.inf)
+        for name in ("dark_count_rate_hz", "gain_spread"):
+            non_negative(name, getattr(self, name))
+
+    def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
+        """Mean events per bin, with all cells live, for a mean number of photons per bin, of the same shape."""
+        return self.quantum_efficiency * photons + 1e-9 * self.dark_count_rate_hz * bin_width_ns
+
+    def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
+        """Mean and covariances of the charge per bin for mean events per bin, shape (..., time)."""
+        dead = dead_time.dead_bins(self.recovery_time_ns, bin_width_ns)
+        per_cell = events / self.cells
+        fired, live = dead_time.firing_probability(per_cell, dead)
+        offspring = self._offspring(fired, live)
+        family, spread = 1 / (1 - offspring), offspring / (1 - offspring) ** 3
+        primaries = self.cells * fired
+        covariances = [
+            self.cells * self.gain**2 * one * family[..., : one.shape[-1]] * family[..., lag:]
+            for lag, one in enumerate(dead_time.pair_covariances(per_cell, fired, dead, lags))
+        ]
+        covariances[0] += self.gain**2 * primaries * (spread + self.gain_spread**2 * family)
+        return self.gain * primaries * family, covariances
+
+    def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
+        """Draw charges in electrons per bin, shape (shots, *events.shape)."""
+        dead = dead_time.dead_bins(self.recovery_time_ns, bin_width_ns)
+        per_cell = events / self.cells
+        count = dead_time.sample_cells(per_cell, self.cells, dead, shots, random)
+        if self.crosstalk > 0:
+            offspring = self._offspring(*dead_time.firing_probability(per_cell, dead)).ravel()
+            flat = count.reshape(-1)
+            parents = np.flatnonzero(flat)
+            born = flat[parents]
+            while born.size:
+                born = random.poisson(offspring[parents % offspring.size] * born)
+                parents, born = parents[born > 0], born[born > 0]
+                flat[parents] += born
+        return _multiplied(count, self.gain, self.gain_spread**2, random)
+
+    def _offspring(self, fired: FloatArray, live: FloatArray) -> FloatArray:
+        """Mean avalanches that one triggers directly."""
+        return np.asarray(-np.log1p(-self.crosstalk) * np.maximum(live - fired, 0))
+
+
+@dataclass(frozen=True)
+class SinglePhotonDetector:
+    """Single-photon avalanche diode with a counter in time bins.
+
+    Parameters
+    ----------
+    quantum_efficiency : float
+        Photon detection efficiency, above 0, at most 1.
+    dead_time_ns : float
+        Dead time after a count [ns], at least the width of a bin. One longer than the record leaves only the first
+        photon.
+    dark_count_rate_hz : float
+        Dark counts [1/s], at least 0.
+    paralyzable : bool
+        Whether an event in the dead time prolongs it.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    The detector is live at the first bin of the record, as if gated on there. Afterpulses are neglected.
+    """
+
+    quantum_efficiency: float
+    dead_time_ns: float
+    dark_count_rate_hz: float = 0.0
+    paralyzable: bool = False
+
+    def __post_init__(self) -> None:
+        _check_efficiency(self.quantum_efficiency)
+        positive("dead_time_ns", self.dead_time_ns)
+        non_negative("dark_count_rate_hz", self.dark_count_rate_hz)
+
+    def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
+        """Mean events per bin without dead time for a mean number of photons per bin, of the same shape."""
+        return self.quantum_efficiency * photons + 1e-9 * self.dark_count_rate_hz * bin_width_ns
+
+    def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
+        """Mean and covariances of the counts for mean events per bin, shape (..., time)."""
+        dead = dead_time.dead_bins(self.dead_time_ns, bin_width_ns)
+        if self.paralyzable:
+            fired = dead_time.firing_probability_paralyzable(events, dead)
+        else:
+            fired, _ = dead_time.firing_probability(events, dead)
+        return fired, dead_time.pair_covariances(events, fired, dead, lags, self.paralyzable)
+
+    def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
+        """Draw counts per bin, 0 or 1, shape (shots, *events.shape)."""
+        dead = dead_time.dead_bins(self.dead_time_ns, bin_width_ns)
+        return dead_time.sample_counter(events, dead, self.paralyzable, shots, random).astype(np.float64)
+
+
+Detector = LinearDetector | SiliconPhotomultiplier | SinglePhotonDetector
+
+
+def _check_efficiency(value: float) -> None:
+    """Reject an efficiency outside (0, 1]."""
+    if positive("quantum_efficiency", value) > 1:
+        raise UserError(f"quantum_efficiency = {value:g} must be above 0 and at most 1")
+
+
+def _electrons(current_na: float, bin_width_ns: float) -> float:
+    """Electrons per bin of a current."""
+    return current_na * 1e-9 * bin_width_ns * 1e-9 / ELEMENTARY_CHARGE
+
+
+def _multiplied(count: IntArray, gain: float, relative_variance: float, random: np.random.Generator) -> FloatArray:
+    """Random charge of `count` events, each with a mean `gain` and a relative variance."""
+    if relative_variance == 0:
+        return gain * count.astype(np.float64)
+    return gain * relative_variance * random.standard_gamma(count / relative_variance)

@@ -1,0 +1,1 @@
+"""Wave spectra, realised sea surfaces and their meshes."""

@@ -1,0 +1,185 @@
+"""Height maps: the elevation of a surface on a rectangular grid, read from a file."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.array_files import Array, read_exr, read_netcdf, read_npy, read_npz, readable_suffix
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray, positive
+from mitransient_lidar.physics.piecewise_linear import locate
+
+#: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
+_UNEVENNESS = 1e-3
+
+_NETCDF_NAMES = ("height", "elevation")
+_EXR_CHANNELS = ("Y", "R", "Z")
+
+_Contents = tuple[Array, dict[str, Array]]
+"""Heights, and positions by the names x and y as far as the file has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeightMap:
+    """Elevation of a surface on a rectangular grid.
+
+    Attributes
+    ----------
+    heights : ndarray, shape (rows, columns)
+        Elevation [m]; row 0 has the smallest y, column 0 the smallest x.
+    x, y : ndarray, shapes (columns,) and (rows,)
+        Positions of columns and rows [m], evenly spaced, increasing, at least 2 each.
+    """
+
+    heights: FloatArray
+    x: FloatArray
+    y: FloatArray
+
+    def sample(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Return the elevation on grid lines by bilinear interpolation.
+
+        Parameters
+        ----------
+        x, y : array_like, shapes (N,) and (M,)
+            Positions of the grid lines [m]. A point outside the map has the height of the nearest point of its edge.
+
+        Returns
+        -------
+        ndarray, shape (M, N)
+            Elevation [m] at (x[i], y[j]) for element [j, i].
+        """
+        (i, right), (j, up) = _cells(self.x, x), _cells(self.y, y)
+        columns = self.heights[:, i] * (1 - right) + self.heights[:, i + 1] * right
+        return np.asarray(columns[j] * (1 - up[:, None]) + columns[j + 1] * up[:, None])
+
+
+def read_height_map(path: str | os.PathLike[str], size: float | None = None) -> HeightMap:
+    """Read a height map from a file.
+
+    Parameters
+    ----------
+    path : path
+        File with heights in metres; its suffix selects the format:
+
+        ``.npy``
+            a two-dimensional array, ``heights[j, i]`` at the j-th y and the i-th x;
+        ``.npz``
+            such an array ``heights`` and, optionally, positions ``x`` and ``y`` [m];
+        ``.exr``
+            an image of one channel, or its channel Y, else R, else Z; its top row has the largest y;
+        ``.nc``
+            a variable ``height`` or ``elevation``, or the only one with two dimensions, of the dimensions (y, x) or
+            (x, y) with, optionally, the coordinates ``x`` and ``y`` [m]. Dimensions of other names count as (y, x).
+    size : float, optional
+        Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
+        squares. Required if the file has no positions, not allowed if it has.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, damaged or of another format; the map not two-dimensional, of fewer than 2 rows or
+        columns, or with holes; positions not increasing or not evenly spaced; or `size` not positive, missing or
+        superfluous.
+    """
+    path = Path(path)
+    readers = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": _read_netcdf}
+    values, positions = readers[readable_suffix(path, readers, "height map")](path)
+    heights = _numbers(path, "heights", values)
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns.")
+    holes = np.argwhere(~np.isfinite(heights))
+    if len(holes) > 0:
+        row, column = holes[0]
+        raise UserError(
+            f"{path} has holes, {len(holes)} of {heights.size} heights, the first in row {row} and column {column}"
+            " counted from 0 at the smallest y and x: every height must be finite."
+        )
+    rows, columns = heights.shape
+    if len(positions) == 1:
+        raise UserError(f"{path} has positions {next(iter(positions))} only: it must have both x and y, or none.")
+    if positions:
+        if size is not None:
+            raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
+        x, y = _even_positions(path, "x", positions["x"], columns), _even_positions(path, "y", positions["y"], rows)
+    elif size is None:
+        raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres.")
+    else:
+        cell = positive("size", size) / (columns - 1)
+        x, y = (np.asarray((np.arange(n) - (n - 1) / 2) * cell, dtype=np.float64) for n in (columns, rows))
+    return HeightMap(heights, x, y)
+
+
+def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatArray:
+    """Return `count` finite, increasing, evenly spaced positions."""
+    positions = _numbers(path, name, values)
+    if positions.shape != (count,):
+        raise UserError(f"{path} has {name} of shape {positions.shape}, but its heights need ({count},).")
+    for i in np.flatnonzero(~np.isfinite(positions))[:1]:
+        raise UserError(f"{path} has {name}[{i}] = {positions[i]:g}: positions must be finite.")
+    gaps = np.diff(positions)
+    for i in np.flatnonzero(gaps <= 0)[:1]:
+        raise UserError(
+            f"{path} has {name}[{i}] = {positions[i]:g} and {name}[{i + 1}] = {positions[i + 1]:g}:"
+            " positions must increase."
+        )
+    spacing = (positions[-1] - positions[0]) / (count - 1)
+    worst = int(np.argmax(np.abs(gaps - spacing)))
+    if abs(gaps[worst] - spacing) > _UNEVENNESS * spacing:
+        raise UserError(
+            f"{path} has {name}[{worst}] and {name}[{worst + 1}] {gaps[worst]:g} apart, but {spacing:g} on average:"
+            " positions must be evenly spaced."
+        )
+    return positions
+
+
+def _cells(positions: FloatArray, wanted: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
+    """Return the cells of the wanted positions, and the relative position in each, 0 to 1."""
+    index, distance = locate(positions, np.asarray(wanted, dtype=np.float64))
+    return index, distance / (positions[index + 1] - positions[index])
+
+
+def _numbers(path: Path, name: str, values: Array) -> FloatArray:
+    """Return real numbers in 64 bits."""
+    if values.dtype.kind not in "iuf":
+        raise UserError(f"{path} has {name} of type {values.dtype}, but they must be real numbers.")
+    return values.astype(np.float64)
+
+
+def _read_npy(path: Path) -> _Contents:
+    return read_npy(path), {}
+
+
+def _read_npz(path: Path) -> _Contents:
+    arrays = read_npz(path, ("heights", "x", "y"))
+    if "heights" not in arrays:
+        raise UserError(f"{path} must have an array heights, and may have x and y.")
+    return arrays.pop("heights"), arrays
+
+
+def _read_exr(path: Path) -> _Contents:
+    images = read_exr(path)
+    names = list(images) if len(images) == 1 else [name for name in _EXR_CHANNELS if name in images]
+    if not names:
+        channels = ", ".join(sorted(images))
+        raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z.")
+    return images[names[0]][::-1], {}
+
+
+def _read_netcdf(path: Path) -> _Contents:
+    variables = read_netcdf(path)
+    data = {name: variable for name, variable in variables.items() if not variable.is_coordinate}
+    flat = [name for name, variable in data.items() if variable.values.ndim == 2]
+    names = [name for name in _NETCDF_NAMES if name in data] or flat
+    if len(names) != 1:
+        raise UserError(
+            f"{path} has {len(names)} variables that may be the heights: it must have one called height or elevation,"
+            " or only one with two dimensions."
+        )
+    heights = data[names[0]]
+    values = heights.values.T if heights.dims == ("x", "y") else heights.values
+    return values, {name: variables[name].values for name in ("x", "y") if name in variables}

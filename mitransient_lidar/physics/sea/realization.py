@@ -1,0 +1,193 @@
+"""Realisations of a wave spectrum in space and time, and the slope variance that a mesh of them resolves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, positive
+from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY, SLOWEST_WAVENUMBER, WaveSpectrum, variances_along
+
+
+def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
+    """Angular frequency of gravity-capillary waves.
+
+    Parameters
+    ----------
+    k : array_like
+        Wavenumber [rad/m], not negative.
+    depth : float
+        Depth of the water [m], positive or infinite.
+
+    Returns
+    -------
+    ndarray
+        omega [rad/s], of the shape of `k`.
+
+    Raises
+    ------
+    UserError
+        If the depth is not greater than 0.
+
+    Notes
+    -----
+    Linear waves (Lamb 1932, Hydrodynamics, sections 229 and 267): omega^2 = (g k + (T/rho) k^3) tanh(k depth) with
+    T/rho = g/(370 rad/m)^2 = 7.17e-5 m^3/s^2, the surface tension of the Elfouhaily spectrum's slowest wave.
+    """
+    _check_depth(depth)
+    wavenumber = np.asarray(k, dtype=np.float64)
+    square = wavenumber * (GRAVITY + GRAVITY / SLOWEST_WAVENUMBER**2 * wavenumber**2)
+    if not math.isinf(depth):
+        square = square * np.tanh(wavenumber * depth)
+    return np.asarray(np.sqrt(square))
+
+
+def realise(
+    spectrum: WaveSpectrum,
+    period: float,
+    cells: int,
+    seed: int,
+    time: float = 0.0,
+    depth: float = math.inf,
+    current: tuple[float, float] = (0.0, 0.0),
+) -> FloatArray:
+    """Realise a periodic square patch of sea surface as a Gaussian random field.
+
+    Parameters
+    ----------
+    spectrum : WaveSpectrum
+        Waves to realise. They travel towards the half plane of their direction.
+    period : float
+        Side of the patch [m], positive. Longer waves are missing.
+    cells : int
+        Cells per side, even, at least 2.
+    seed : int
+        Any integer. A wave depends only on its wavenumber and the seed: with the same period, a coarser realisation
+        equals the finer one without its short waves.
+    time : float
+        Time [s]; equal seeds are the same sea at different times.
+    depth : float
+        Depth of the water [m], positive or infinite; it slows long waves.
+    current : tuple of float
+        Velocity (x, y) of the water [m/s], added to that of all waves.
+
+    Returns
+    -------
+    ndarray, shape (cells, cells)
+        Elevation [m] at x = (i - cells/2) d, y = (j - cells/2) d for heights[j, i], d = period/cells. Its mean is 0.
+
+    Raises
+    ------
+    UserError
+        If `period` or `depth` is not positive, `cells` not even and positive, or `time` or `current` not finite.
+    """
+    from scipy.fft import fftshift, irfft2
+
+    ix, iy, dk = _wave_grid(period, cells)
+    finite("time", time)
+    _check_depth(depth)
+    velocity = finite_array("current", current)
+    if velocity.shape != (2,):
+        raise UserError(f"current of shape {velocity.shape} must be two velocities, along x and y")
+    if time != 0:
+        drift = dk * (velocity[0] * ix + velocity[1] * iy[:, None]) * time
+        advance = angular_frequency(dk * np.sqrt(ix**2 + iy[:, None] ** 2), depth) * time
+    coefficients = np.zeros((iy.size, ix.size), dtype=np.complex128)
+    for number, waves in enumerate(spectrum.travelling_parts()):
+        square, phase = _noise(seed, number, ix, iy)
+        modulus = np.sqrt(np.multiply(square, waves.mode_variances(ix, iy, dk), out=square), out=square)
+        if time != 0:
+            along = np.cos(waves.direction) * ix + np.sin(waves.direction) * iy[:, None]
+            phase -= drift + np.where(along >= 0, advance, -advance)
+        coefficients.real += modulus * np.cos(phase)
+        coefficients.imag += modulus * np.sin(phase)
+    half = iy.size // 2
+    # Hermitian symmetry within the column kx = 0: its lower half is the conjugate of the upper one.
+    coefficients[half + 1 :, 0] = coefficients[half - 1 : 0 : -1, 0].conj()
+    coefficients[0, 0] = 0
+    # At the Nyquist wavenumber a grid cannot distinguish +k from -k.
+    coefficients[half, :] = coefficients[:, half] = 0
+    heights = irfft2(coefficients, s=(iy.size, iy.size), norm="forward", overwrite_x=True)
+    return np.asarray(fftshift(heights), dtype=np.float64)
+
+
+def mesh_slope_variance(
+    spectrum: WaveSpectrum, period: float, cells: int, direction: float | None = None
+) -> tuple[float, float]:
+    """Compute the expected slope variances of the triangles of a mesh from `realise`.
+
+    Parameters
+    ----------
+    spectrum, period, cells
+        As for `realise`.
+    direction : float, optional
+        Axis of the variances [rad], counter-clockwise from +x. Default: the direction of the spectrum.
+
+    Returns
+    -------
+    along, across : float
+        Slope variances [1] of the linear facets along and across the direction, reduced against those of the waves by
+        the facets' low-pass.
+
+    Notes
+    -----
+    The slopes of a facet are forward differences along x and y, each with the transfer function 2 sin(k d/2)/d. Their
+    covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles of a
+    cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the mesh.
+    """
+    ix, iy, dk = _wave_grid(period, cells)
+    axis = spectrum.direction if direction is None else direction
+    half = iy.size // 2
+    variance = spectrum.mode_variances(ix, iy, dk)
+    variance[half, :] = variance[:, half] = 0
+    variance[:, 1:] *= 2  # for the half plane kx < 0
+    # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
+    a, b = ix * np.pi / cells, iy * np.pi / cells
+    square_a, square_b = np.sin(a) ** 2, np.sin(b) ** 2
+    x, y = variance.sum(axis=0) @ square_a, variance.sum(axis=1) @ square_b
+    xy = np.sin(2 * b) @ variance @ np.sin(2 * a) / 4 + square_b @ variance @ square_a
+    return variances_along(np.array([[x, xy], [xy, y]]) * (2 * cells / period) ** 2, axis)
+
+
+def _check_depth(depth: float) -> None:
+    """Reject a depth that is not above 0; infinity is allowed."""
+    if not depth > 0:
+        raise UserError(f"depth = {depth:g} must be greater than 0")
+
+
+def _wave_grid(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
+    """Return indices of the columns and rows of a real FFT, shapes (cells/2 + 1,) and (cells,), and dk [rad/m]."""
+    positive("period", period)
+    if cells != int(cells) or cells < 2 or cells % 2:
+        raise UserError(f"cells = {cells} must be an even integer of at least 2")
+    half = int(cells) // 2
+    y = np.arange(2 * half, dtype=np.int64)
+    return np.arange(half + 1, dtype=np.int64), np.where(y < half, y, y - 2 * half), 2 * np.pi / period
+
+
+def _noise(seed: int, number: int, ix: IntArray, iy: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Squared moduli, of mean 1, and phases [rad] of complex Gaussian numbers, shape (iy, ix) (Box-Muller).
+
+    They are a function of the seed, the number of the travelling part, and the indices.
+    """
+    key = _mix(np.array([int(seed) & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64))
+    if number > 0:
+        # Hashed first: a small number would give the key of the first part's column ix = number.
+        key = _mix(key ^ _mix(np.array([number], dtype=np.uint64)))
+    key = _mix(_mix(key ^ ix.astype(np.uint64)) ^ iy.astype(np.uint64)[:, None])
+    # 53 bits each; the added half keeps the argument of the logarithm above 0.
+    first = ((key >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    phase = (_mix(key) >> np.uint64(11)).astype(np.float64)
+    phase *= 2 * np.pi * 2.0**-53
+    return -np.log(first, out=first), phase
+
+
+def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """SplitMix64: one step of its counter and the finaliser (Steele, Lea and Flood 2014)."""
+    x = x + np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))

@@ -1,0 +1,87 @@
+"""Triangle mesh of a sea surface: a fine square patch, surrounded by cells that grow towards the horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.validation import FloatArray, IntArray
+
+#: Ratio of the lengths of neighbouring cells outside the fine patch.
+_GROWTH = 1.3
+
+
+@dataclass(frozen=True)
+class SeaMesh:
+    """Triangle mesh of a height field.
+
+    Attributes
+    ----------
+    vertices
+        Positions [m], shape (vertices, 3).
+    faces
+        Indices of the corners, counter-clockwise seen from the air, shape (faces, 3).
+    texcoords
+        Coordinates along and across the wind [m], the axes of the ripples, shape (vertices, 2).
+    """
+
+    vertices: FloatArray
+    faces: npt.NDArray[np.uint32]
+    texcoords: FloatArray
+
+
+def grid_indices(cells: int, extent: int) -> IntArray:
+    """Return the positions of grid lines in cells of the fine patch, counted from its centre.
+
+    Parameters
+    ----------
+    cells
+        Cells per side of the fine patch, even.
+    extent
+        Side of the whole mesh in these cells, at least `cells`.
+
+    Returns
+    -------
+    ndarray of int
+        Symmetric about 0, one apart inside the patch; integers, so that all heights are points of the fine grid.
+    """
+    inner = np.arange(-(cells // 2), cells // 2 + 1, dtype=np.int64)
+    outer, step, end = [], 1.0, cells // 2
+    while end < extent / 2:
+        step *= _GROWTH
+        end = min(end + int(step), -(-extent // 2))
+        outer.append(end)
+    right = np.array(outer, dtype=np.int64)
+    return np.concatenate([-right[::-1], inner, right])
+
+
+def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_direction: float) -> SeaMesh:
+    """Return the triangle mesh of heights on grid lines.
+
+    Parameters
+    ----------
+    heights
+        Elevation [m], shape (len(y), len(x)).
+    x, y
+        Positions of the grid lines [m], increasing.
+    wind_direction
+        Direction of the first texture coordinate [rad], counter-clockwise from +x.
+
+    Returns
+    -------
+    SeaMesh
+        Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.mesh_slope_variance` assumes.
+    """
+    east, north = np.meshgrid(x, y)
+    vertices = np.stack([east, north, heights], axis=-1).reshape(-1, 3)
+    columns = len(x)
+    rows = columns * np.arange(len(y) - 1, dtype=np.uint32)
+    corner = (rows[:, None] + np.arange(columns - 1, dtype=np.uint32)).ravel()
+    faces = np.empty((len(corner), 2, 3), dtype=np.uint32)
+    faces[:, 0] = np.stack([corner, corner + 1, corner + columns], axis=-1)
+    faces[:, 1] = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=-1)
+    cos, sin = np.cos(wind_direction), np.sin(wind_direction)
+    texcoords = np.stack([cos * east + sin * north, cos * north - sin * east], axis=-1).reshape(-1, 2)
+    return SeaMesh(vertices, faces.reshape(-1, 3), texcoords)

@@ -1,0 +1,371 @@
+"""Sea surface of a scene from its parameters: waves, resolution of the mesh, and slope variance left to ripples."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitransient_lidar.core.array_files import read_npz, readable_suffix
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, non_negative, positive
+from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
+from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
+from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
+from mitransient_lidar.physics.sea.realization import mesh_slope_variance, realise
+from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, triangulate
+from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
+from mitransient_lidar.physics.sea.swell import SwellSpectrum
+from mitransient_lidar.physics.sea.tabulated_spectrum import TabulatedSpectrum
+from mitransient_lidar.physics.sea.wave_spectrum import CosineSpectrum, WaveSpectrum, variances_along
+from mitransient_lidar.physics.sea.wind_spectra import (
+    ElfouhailySpectrum,
+    JonswapSpectrum,
+    PiersonMoskowitzSpectrum,
+    inverse_wave_age,
+)
+
+logger = logging.getLogger(__name__)
+
+#: Smallest slope variance of the ripples along one axis: a perfectly smooth facet has no connection to a point laser.
+_SMALLEST_RIPPLE_VARIANCE = 1e-5
+
+#: Unit of the period of the sea [m], its least length in peak wavelengths, and its largest length [m]. The period does
+#: not depend on the resolution, so that a seed defines one sea.
+_PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
+
+#: Largest number of cells per side of a period and of the fine patch.
+_MOST_CELLS = 4096
+
+#: Sides of a cell and of the patch without a known footprint [m].
+_DEFAULT_CELL, _DEFAULT_SIZE = 0.25, 32.0
+
+#: Cells per standard deviation of the beam, and limits of the resulting cell size [m].
+_CELLS_PER_SPREAD, _SMALLEST_CELL, _LARGEST_CELL = 4.0, 0.02, 0.5
+
+#: Side of the patch: factor on the footprint, and margin [m] for scattered light.
+_SIZE_PER_FOOTPRINT, _SIZE_MARGIN = 1.25, 8.0
+
+_SPECTRA = ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat")
+
+Get = Callable[[str, Any], Any]
+
+
+@dataclass(frozen=True)
+class PeriodicHeights:
+    """Elevations [m] of waves from `realization.realise`, shape (cells, cells), and the spacing [m] of their grid."""
+
+    heights: FloatArray
+    cell_size: float
+
+    def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x))."""
+        count = len(self.heights)
+        i, j = ((np.rint(np.asarray(lines) / self.cell_size).astype(int) + count // 2) % count for lines in (x, y))
+        return np.asarray(self.heights[np.ix_(j, i)])
+
+
+@dataclass(frozen=True)
+class SeaSurface:
+    """A sea surface, ready to be triangulated.
+
+    Attributes
+    ----------
+    spectrum
+        Name of the source of the waves.
+    wind_speed, wind_direction
+        Wind at 10 m [m/s], and direction that it blows towards [rad], counter-clockwise from +x.
+    waves
+        Elevations, None for a flat sea.
+    cell_size
+        Side of the cells of the fine patch [m], infinite for a flat sea.
+    centre
+        Position of the patch [m].
+    refined_size, size
+        Sides of the patch and of the whole surface [m].
+    resolved_variance, ripple_variance
+        Slope variances of the facets and of the ripples, along and across the wind [1].
+    wake
+        Function from grid lines x and y [m] to the heights of a ship's wake [m], None without a ship.
+    """
+
+    spectrum: str
+    wind_speed: float
+    wind_direction: float
+    waves: PeriodicHeights | HeightMap | None
+    cell_size: float
+    centre: tuple[float, float]
+    refined_size: float
+    size: float
+    resolved_variance: tuple[float, float]
+    ripple_variance: tuple[float, float]
+    wake: Callable[[FloatArray, FloatArray], FloatArray] | None
+
+    @classmethod
+    def read(cls, get: Get) -> SeaSurface:
+        """Build a sea from parameters with the names and meanings of the plugin ``ocean_surface``.
+
+        Parameters
+        ----------
+        get
+            Function (name, default) -> value.
+
+        Raises
+        ------
+        UserError
+            If a parameter is out of range, or parameters contradict each other.
+        """
+        spectrum = get("spectrum", "elfouhaily")
+        if spectrum not in _SPECTRA:
+            raise UserError(f"spectrum = {spectrum!r} must be one of {', '.join(_SPECTRA)}")
+        wind_speed = in_range("wind_speed", get("wind_speed", 3.0), 0.0, MAX_WIND_SPEED)
+        wind_direction = _read_angle(get, "wind_direction_deg")
+        centre = finite("centre_x", get("centre_x", 0.0)), finite("centre_y", get("centre_y", 0.0))
+        state = _read_waves(get, spectrum, wind_speed, wind_direction)
+        slope_variance = get("slope_variance", "cox_munk")
+        seed = integer("surface_seed", get("surface_seed", 1), 0, 2**53)
+        wake = _read_wake(get)
+        spread, footprint = _read_footprint(get)
+        cell = _read_length(get, "cell_size") or min(max(spread / _CELLS_PER_SPREAD, _SMALLEST_CELL), _LARGEST_CELL)
+        refined_size = _read_length(get, "refined_size") or _SIZE_PER_FOOTPRINT * footprint + _SIZE_MARGIN
+        size = positive("size", get("size", 1000.0))
+        period = _read_length(get, "period")
+        time = finite("time", get("time", 0.0))
+        depth = positive("water_depth", get("water_depth", 1e4))
+        current = in_range("current_speed", get("current_speed", 0.0), 0.0, 10.0)
+        current_direction = _read_angle(get, "current_direction_deg")
+        map_size = _read_length(get, "map_size")
+        path = get("filename", "")
+
+        state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
+        waves: PeriodicHeights | HeightMap | None = None
+        resolved = (0.0, 0.0)
+        if state is not None:
+            period = period or _period(state)
+            cells = _cell_count(cell, period)
+            cell = period / cells
+            drift = current * math.cos(current_direction), current * math.sin(current_direction)
+            waves = PeriodicHeights(realise(state, period, cells, seed, time, depth, drift), cell)
+            resolved = mesh_slope_variance(state, period, cells, wind_direction)
+        elif spectrum == "height_map":
+            waves = terrain = read_height_map(_required(path, spectrum), map_size)
+            cell = float(terrain.x[1] - terrain.x[0])
+            refined_size = float(terrain.x[-1] - terrain.x[0])
+            resolved = _facet_variance(terrain, wind_direction)
+        elif wake is None:
+            cell = math.inf
+        along, across = (max(_SMALLEST_RIPPLE_VARIANCE, t - r) for t, r in zip(total, resolved, strict=True))
+        if math.isfinite(cell) and refined_size / cell > _MOST_CELLS:
+            raise UserError(
+                f"refined_size = {refined_size:g} with cell_size = {cell:g} needs {refined_size / cell:.0f} cells per "
+                f"side but at most {_MOST_CELLS} are allowed"
+            )
+        return cls(
+            spectrum if waves is not None else "flat",
+            wind_speed,
+            wind_direction,
+            waves,
+            cell,
+            centre,
+            min(refined_size, size),
+            size,
+            resolved,
+            (along, across),
+            wake,
+        )
+
+    @property
+    def slope_variance(self) -> float:
+        """Total slope variance of waves and ripples, both axes [1]."""
+        return sum(self.resolved_variance) + sum(self.ripple_variance)
+
+    def mesh(self) -> SeaMesh:
+        """Return the triangle mesh: the fine patch, surrounded by cells that grow out to the size."""
+        if not math.isfinite(self.cell_size):
+            edges = np.array([-0.5, 0.5]) * self.size
+            x, y = edges + self.centre[0], edges + self.centre[1]
+            return triangulate(np.zeros((2, 2)), x, y, self.wind_direction)
+        cells = max(2, 2 * math.ceil(0.5 * self.refined_size / self.cell_size))
+        indices = grid_indices(cells, math.ceil(self.size / self.cell_size))
+        # Integer cells: the sea does not depend on the position of the patch.
+        first = [round(centre / self.cell_size) for centre in self.centre]
+        x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
+        return triangulate(self.heights(x, y), x, y, self.wind_direction)
+
+    def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""
+        heights = np.zeros((len(y), len(x))) if self.waves is None else self.waves.sample(x, y)
+        return heights if self.wake is None else heights + self.wake(x, y)
+
+
+def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: float) -> WaveSpectrum | None:
+    """Return the sea state of the parameters, None for a flat sea or a height map."""
+    fetch = get("fetch", None)
+    age = get("inverse_wave_age", None)
+    peak_enhancement = positive("peak_enhancement", get("peak_enhancement", 3.3))
+    swell_height = non_negative("swell_height", get("swell_height", 0.0))
+    swell_wavelength = positive("swell_wavelength", get("swell_wavelength", 60.0))
+    swell_direction = _read_angle(get, "swell_direction_deg")
+    path = get("filename", "")
+    if fetch is not None and age is not None:
+        raise UserError(f"fetch = {fetch:g} and inverse_wave_age = {age:g} are alternatives: give one of them")
+    components: list[WaveSpectrum] = []
+    if spectrum == "table":
+        components.append(_read_table(_required(path, spectrum)))
+    elif spectrum in ("elfouhaily", "jonswap", "pierson_moskowitz"):
+        if wind_speed == 0:
+            logger.info("wind_speed = 0: the sea has no wind waves, only ripples")
+        elif spectrum == "elfouhaily":
+            omega = 0.84 if age is None else float(age)
+            omega = omega if fetch is None else inverse_wave_age(wind_speed, fetch)
+            components.append(ElfouhailySpectrum(wind_speed, omega, wind_direction))
+        elif spectrum == "jonswap":
+            if fetch is None:
+                raise UserError("fetch is missing: the spectrum 'jonswap' needs it, in metres")
+            components.append(JonswapSpectrum(wind_speed, fetch, peak_enhancement, wind_direction))
+        else:
+            components.append(PiersonMoskowitzSpectrum(wind_speed, wind_direction))
+    if swell_height > 0:
+        if spectrum in ("flat", "height_map"):
+            raise UserError(f"swell_height = {swell_height:g} needs a spectrum of waves, not {spectrum!r}")
+        components.append(SwellSpectrum(swell_height, swell_wavelength, swell_direction))
+    return _combined(components)
+
+
+def _combined(components: list[WaveSpectrum]) -> WaveSpectrum | None:
+    """Return the sum of wave systems, None without any."""
+    return SeaState(tuple(components)) if len(components) > 1 else components[0] if components else None
+
+
+def _components(state: WaveSpectrum) -> list[WaveSpectrum]:
+    """Return the wave systems of a sea state."""
+    return list(state.components) if isinstance(state, SeaState) else [state]
+
+
+def _with_total_variance(
+    state: WaveSpectrum | None, slope_variance: Any, wind_speed: float, wind_direction: float
+) -> tuple[WaveSpectrum | None, tuple[float, float]]:
+    """Return the sea state for a parameter ``slope_variance``, and its total slope variances along and across."""
+    if slope_variance == "cox_munk":
+        return _matched(state, wind_direction, *cox_munk(wind_speed))
+    if slope_variance == "spectrum":
+        waves = state or ElfouhailySpectrum(wind_speed)
+        return state, variances_along(waves.slope_covariance(), wind_direction)
+    try:
+        number = float(slope_variance)
+    except ValueError:
+        raise UserError(f"slope_variance = {slope_variance!r} must be 'cox_munk', 'spectrum' or a number") from None
+    half = 0.5 * in_range("slope_variance", number, 2 * _SMALLEST_RIPPLE_VARIANCE, 1.0)
+    return state, (half, half)
+
+
+def _matched(
+    state: WaveSpectrum | None, wind_direction: float, along: float, across: float
+) -> tuple[WaveSpectrum | None, tuple[float, float]]:
+    """Return a sea state whose wind waves have the given slope variances, and the total with swell.
+
+    Swell adds to the measured variances of the wind; a table is not changed.
+    """
+    if state is None:
+        return None, (along, across)
+    components = _components(state)
+    if isinstance(components[0], CosineSpectrum):
+        components[0] = MatchedSpectrum(components[0], along, across)
+    for swell in components:
+        if isinstance(swell, SwellSpectrum):
+            more = variances_along(swell.slope_covariance(), wind_direction)
+            along, across = along + more[0], across + more[1]
+    return _combined(components), (along, across)
+
+
+def _period(state: WaveSpectrum) -> float:
+    """Return the default period of the sea [m]."""
+    longest = max(2 * math.pi / component.peak_wavenumber for component in _components(state))
+    return min(_LONGEST_PERIOD, _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP))
+
+
+def _cell_count(cell: float, period: float) -> int:
+    """Return an even number of cells per period, not longer than `cell` [m], that is fast to transform."""
+    from scipy.fft import next_fast_len
+
+    cells = 2 * int(next_fast_len(max(2, math.ceil(0.5 * period / cell - 1e-9)), real=True))
+    if cells > _MOST_CELLS:
+        raise UserError(
+            f"cell_size = {cell:g} with period = {period:g} needs {cells} cells per side but at most {_MOST_CELLS} "
+            "are allowed"
+        )
+    return cells
+
+
+def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, float]:
+    """Return the mean-square slopes of a height map's facets along and across the wind."""
+    right = np.diff(terrain.heights, axis=1) / (terrain.x[1] - terrain.x[0])
+    up = np.diff(terrain.heights, axis=0) / (terrain.y[1] - terrain.y[0])
+    cos, sin = math.cos(wind_direction), math.sin(wind_direction)
+    # The two triangles of a cell, split from its lower right to its upper left corner.
+    pairs = ((right[:-1], up[:, :-1]), (right[1:], up[:, 1:]))
+    along = float(np.mean([np.mean((cos * x + sin * y) ** 2) for x, y in pairs]))
+    across = float(np.mean([np.mean((cos * y - sin * x) ** 2) for x, y in pairs]))
+    return along, across
+
+
+def _read_wake(get: Get) -> Callable[[FloatArray, FloatArray], FloatArray] | None:
+    """Return the wake of a ship as a function of grid lines, None without a ship."""
+    speed = in_range("wake_speed", get("wake_speed", 0.0), 0.0, 40.0)
+    bearing = _read_angle(get, "wake_bearing_deg")
+    length = in_range("wake_length", get("wake_length", 20.0), 1.0, 500.0)
+    x, y = finite("wake_x", get("wake_x", 0.0)), finite("wake_y", get("wake_y", 0.0))
+    if speed == 0:
+        return None
+    return partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
+
+
+def _read_footprint(get: Get) -> tuple[float, float]:
+    """Return the beam's standard deviation across range, and the side of the square of beam and field of view [m]."""
+    altitude, divergence = get("altitude", None), get("divergence_mrad", 10.0)
+    off_nadir = math.radians(in_range("off_nadir_deg", get("off_nadir_deg", 20.0), 0.0, 89.9))
+    field = 1e-3 * positive("field_of_view_mrad", get("field_of_view_mrad", 30.0))
+    sigma = 0.5e-3 * positive("divergence_mrad", divergence)
+    if altitude is None:
+        return _CELLS_PER_SPREAD * _DEFAULT_CELL, (_DEFAULT_SIZE - _SIZE_MARGIN) / _SIZE_PER_FOOTPRINT
+    altitude = positive("altitude", altitude)
+    slant = altitude / math.cos(off_nadir)
+    half = min(max(field / 2, 3 * sigma), math.pi / 4)
+    # Towards the horizon a footprint is unbounded; the patch is limited to four times the horizontal range.
+    far = min(math.tan(min(off_nadir + half, math.radians(89.9))), 4 * math.tan(off_nadir) + 1)
+    along = altitude * max(far - math.tan(off_nadir), math.tan(off_nadir) - math.tan(off_nadir - half))
+    return slant * sigma, 2 * max(along, slant * math.tan(half))
+
+
+def _read_angle(get: Get, name: str) -> float:
+    """Return an angle of a parameter in degrees [rad], 0 by default."""
+    return math.radians(finite(name, get(name, 0.0)))
+
+
+def _read_length(get: Get, name: str) -> float | None:
+    """Return a positive length [m], or None for ``auto``."""
+    value = get(name, "auto")
+    return None if value == "auto" else positive(name, value)
+
+
+def _read_table(path: str) -> TabulatedSpectrum:
+    """Return a spectrum from an ``.npz`` file with arrays ``kx``, ``ky`` and ``density``."""
+    names = ("kx", "ky", "density")
+    readable_suffix(Path(path), (".npz",), "tabulated spectrum")
+    arrays = read_npz(Path(path), names)
+    if len(arrays) < len(names):
+        raise UserError(f"{path} must have the arrays kx, ky and density")
+    return TabulatedSpectrum(arrays["kx"], arrays["ky"], arrays["density"])
+
+
+def _required(path: str, spectrum: str) -> str:
+    """Return the name of a file; reject an empty one."""
+    if not path:
+        raise UserError(f"filename is missing: the spectrum {spectrum!r} is read from it")
+    return path

@@ -1,0 +1,193 @@
+"""Base classes of directional wave spectra.
+
+A spectrum Psi(kx, ky) [m^4] is the variance density of a frozen surface: Psi(k) = Psi(-k), and its integral over the
+plane is the elevation variance. Psi does not contain the direction of travel; see `WaveSpectrum.travelling_parts`.
+Directions are those that wind and waves travel towards, in rad counter-clockwise from +x.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray
+
+GRAVITY = 9.81
+"""Acceleration of gravity [m/s^2]."""
+
+SLOWEST_WAVENUMBER = 370.0
+"""Wavenumber of the slowest gravity-capillary wave [rad/m], which defines the surface tension."""
+
+
+def phase_speed(k: npt.ArrayLike) -> FloatArray:
+    """Phase speed [m/s] of gravity-capillary waves of wavenumber `k` [rad/m], positive, in deep water."""
+    wavenumber = np.asarray(k, dtype=np.float64)
+    return np.asarray(np.sqrt(GRAVITY / wavenumber * (1 + (wavenumber / SLOWEST_WAVENUMBER) ** 2)))
+
+
+def variances_along(covariance: FloatArray, direction: float) -> tuple[float, float]:
+    """Slope variances along and across a `direction` [rad] from the covariance matrix in x and y, shape (2, 2)."""
+    axis = np.array([np.cos(direction), np.sin(direction)])
+    along = float(axis @ covariance @ axis)
+    return along, float(np.trace(covariance)) - along
+
+
+class TravellingWaves(Protocol):
+    """Waves that all travel towards the half plane of one direction."""
+
+    @property
+    def direction(self) -> float:
+        """Direction [rad] counter-clockwise from +x: a wave of wavenumber k travels along k if k . direction > 0."""
+
+    def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
+        """See `WaveSpectrum.mode_variances`."""
+
+
+class WaveSpectrum(ABC):
+    """Directional wave spectrum."""
+
+    direction: float
+
+    @property
+    @abstractmethod
+    def peak_wavenumber(self) -> float:
+        """Wavenumber of the spectral peak [rad/m]; infinite for a flat sea."""
+
+    @abstractmethod
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S [m^3] at wavenumbers `k` [rad/m], 0 at k <= 0.
+
+        Its integral over k > 0 is the elevation variance.
+        """
+
+    @abstractmethod
+    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
+        """Directional spectrum Psi [m^4] at wavenumber components `kx` and `ky` [rad/m], which broadcast.
+
+        It is equal for opposite waves, and its integral over the plane is the elevation variance.
+        """
+
+    @abstractmethod
+    def elevation_variance(self) -> float:
+        """Variance of the elevation [m^2]."""
+
+    @abstractmethod
+    def slope_covariance(self, k_max: float = np.inf) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2), of waves up to `k_max` [rad/m], above 0."""
+
+    def slope_variance(self, k_max: float = np.inf) -> tuple[float, float]:
+        """Slope variances [1] (along, across) the direction of all waves with wavenumbers up to `k_max` [rad/m]."""
+        return variances_along(self.slope_covariance(k_max), self.direction)
+
+    def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
+        """Elevation variances of the waves of a periodic patch.
+
+        Parameters
+        ----------
+        ix, iy : ndarray of int, shapes (I,) and (J,)
+            Numbers of wave periods along x and y over the patch.
+        dk : float
+            Spacing of the wavenumbers [rad/m]: 2 pi over the side of the patch.
+
+        Returns
+        -------
+        ndarray, shape (J, I)
+            Psi dk^2 [m^2] at k = (ix, iy) dk; spectra with features narrower than dk integrate Psi over the cell.
+        """
+        return np.asarray(self.directional(ix * dk, iy[:, None] * dk) * dk**2)
+
+    def travelling_parts(self) -> tuple[TravellingWaves, ...]:
+        """Independent parts of the sea, each with one half plane of directions of travel."""
+        return (self,)
+
+
+class AxialSpectrum(WaveSpectrum):
+    """Spectrum symmetric about its direction, whose integrals depend only on S(k) and the spreading Delta(k)."""
+
+    @abstractmethod
+    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+        """Anisotropy Delta(k) = 2 <cos 2 phi> [1], -2 to 2, at wavenumbers `k` [rad/m] above 0.
+
+        The slope variance is k^2 S (1/2 +- Delta/4) along and across the direction, from which phi is measured;
+        Elfouhaily et al. (1997) call Delta the upwind-crosswind ratio.
+        """
+
+    @property
+    @abstractmethod
+    def smooth_ranges(self) -> tuple[float, ...]:
+        """Ascending wavenumbers [rad/m] between which S is smooth; it is negligible beyond the first and last."""
+
+    def elevation_variance(self) -> float:
+        """Variance of the elevation [m^2]."""
+        k, weight = self.quadrature()
+        return float(np.sum(self.omnidirectional(k) * weight))
+
+    def slope_covariance(self, k_max: float = np.inf) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2), of waves up to `k_max` [rad/m], above 0."""
+        along, across = self.slope_variance(k_max)
+        cos, sin = np.cos(self.direction), np.sin(self.direction)
+        rotation = np.array([[cos, -sin], [sin, cos]])
+        return np.asarray(rotation @ np.diag([along, across]) @ rotation.T)
+
+    def slope_variance(self, k_max: float = np.inf) -> tuple[float, float]:
+        """Slope variances [1] (along, across) the direction of all waves with wavenumbers up to `k_max` [rad/m]."""
+        check_k_max(k_max)
+        k, weight = self.quadrature(k_max)
+        curvature = self.omnidirectional(k) * k**2 * weight
+        spreading = self.spreading(k)
+        return float(np.sum(curvature * (0.5 + spreading / 4))), float(np.sum(curvature * (0.5 - spreading / 4)))
+
+    def quadrature(self, k_max: float = np.inf) -> tuple[FloatArray, FloatArray]:
+        """Wavenumbers and weights [rad/m] of a midpoint rule in ln k over all waves up to `k_max` [rad/m]."""
+        count = 4000
+        nodes, weights = [np.ones(1)], [np.zeros(1)]
+        for low, end in pairwise(self.smooth_ranges):
+            high = min(end, k_max)
+            if low < high:
+                step = np.log(high / low) / count
+                k = low * np.exp(step * (np.arange(count) + 0.5))
+                nodes.append(k)
+                weights.append(k * step)
+        return np.concatenate(nodes), np.concatenate(weights)
+
+
+class CosineSpectrum(AxialSpectrum):
+    """Spectrum with the angular density (1 + Delta cos 2 phi)/(2 pi), |Delta| <= 1, defined by S(k) and Delta(k)."""
+
+    def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
+        """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`. It is 0 at the origin."""
+        k = np.hypot(kx, ky)
+        safe = np.where(k > 0, k, 1.0)
+        along = (np.cos(self.direction) * np.asarray(kx) + np.sin(self.direction) * np.asarray(ky)) / safe
+        angular = (1 + self.spreading(safe) * (2 * along**2 - 1)) / (2 * np.pi)
+        return np.asarray(np.where(k > 0, self.omnidirectional(k) * angular / safe, 0))
+
+    def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
+        """Elevation variances Psi dk^2 [m^2]; see `WaveSpectrum.mode_variances`."""
+        # S and Delta once for each integer ix^2 + iy^2 that occurs: a fifth of the waves of a large patch.
+        square = ix**2 + iy[:, None] ** 2
+        occurs = np.zeros(square.max() + 1, dtype=bool)
+        occurs[square] = True
+        occurs[0] = False
+        distinct = np.flatnonzero(occurs)
+        k = dk * np.sqrt(distinct)
+        mean, modulation = np.zeros(occurs.size), np.zeros(occurs.size)
+        mean[distinct] = self.omnidirectional(k) * dk**2 / (2 * np.pi * k)
+        modulation[distinct] = mean[distinct] * self.spreading(k) / distinct
+        # k^2 cos 2 phi in units of dk^2
+        cos, sin = np.cos(2 * self.direction), np.sin(2 * self.direction)
+        angle = (cos * ix**2 - cos * iy[:, None] ** 2) + (2 * sin * ix) * iy[:, None]
+        variances = mean[square] + modulation[square] * angle
+        # Where Delta is 1, rounding may make the density across the direction negative.
+        return np.asarray(np.maximum(variances, 0))
+
+
+def check_k_max(k_max: float) -> None:
+    """Reject an upper wavenumber that is not above 0; infinity is allowed."""
+    if not k_max > 0:
+        raise UserError(f"k_max = {k_max:g} must be greater than 0")

@@ -1,0 +1,277 @@
+"""Spectra of wind waves: Elfouhaily, Pierson-Moskowitz and JONSWAP.
+
+Wind speeds are at 10 m height. All share the directional spreading of Elfouhaily et al. (1997).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite, in_range, positive
+from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
+from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY, SLOWEST_WAVENUMBER, CosineSpectrum, phase_speed
+
+_DRAG_COEFFICIENT = 0.00144
+_SLOWEST_SPEED = 0.23  # phase speed of the slowest wave, rounded as in Elfouhaily et al., m/s
+_OLDEST, _YOUNGEST = 0.84, 5.0  # range of the inverse wave age
+_PIERSON_MOSKOWITZ_BETA = 0.74
+
+
+def inverse_wave_age(wind_speed: float, fetch: float) -> float:
+    """Inverse wave age of a fetch-limited sea.
+
+    Parameters
+    ----------
+    wind_speed : float
+        Wind speed at 10 m [m/s], 0 to 30.
+    fetch : float
+        Distance from the upwind shore [m], positive.
+
+    Returns
+    -------
+    float
+        Omega = U/c_p: 0.84 for a long fetch, 5 at most.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range, or the fetch is so short that Omega exceeds 5.
+
+    Notes
+    -----
+    Elfouhaily et al. (1997), doi:10.1029/97JC00467, eq. 37: 0.84 tanh((X/2.2e4)^0.4)^-0.75 with X = g fetch/U^2.
+    """
+    wind, distance = in_range("wind_speed", wind_speed, 0, MAX_WIND_SPEED), positive("fetch", fetch)
+    if wind == 0:
+        return _OLDEST
+    relative = GRAVITY * distance / wind**2 / 2.2e4
+    age = float(_OLDEST * np.tanh(relative**0.4) ** -0.75)
+    if age > _YOUNGEST:
+        shortest = 2.2e4 * wind**2 / GRAVITY * np.arctanh((_OLDEST / _YOUNGEST) ** (4 / 3)) ** 2.5
+        raise UserError(f"fetch = {distance:g} must be at least {shortest:.3g} m at a wind speed of {wind:g} m/s")
+    return age
+
+
+class WindSpectrum(CosineSpectrum):
+    """Spectrum of wind waves with the directional spreading of Elfouhaily et al. (1997) about its own peak."""
+
+    wind_speed: float
+
+    def __post_init__(self) -> None:
+        in_range("wind_speed", self.wind_speed, 0, MAX_WIND_SPEED)
+        finite("direction", self.direction)
+
+    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+        """Upwind-crosswind ratio Delta(k) [1], 0 to 1 (eq. 57); see `AxialSpectrum.spreading`."""
+        if self.wind_speed == 0:
+            return np.zeros(np.shape(k))
+        c = phase_speed(k)
+        friction = np.sqrt(_DRAG_COEFFICIENT) * self.wind_speed
+        long_waves = 4 * (c / phase_speed(self.peak_wavenumber)) ** 2.5
+        short_waves = 0.13 * friction / _SLOWEST_SPEED * (_SLOWEST_SPEED / c) ** 2.5
+        return np.asarray(np.tanh(np.log(2) / 4 + long_waves + short_waves))
+
+
+@dataclass(frozen=True)
+class ElfouhailySpectrum(WindSpectrum):
+    """Unified spectrum of wind-driven gravity and capillary waves.
+
+    Parameters
+    ----------
+    wind_speed : float
+        Wind speed at 10 m [m/s], 0 to 30. 0 gives a flat sea.
+    inverse_wave_age : float
+        Omega: 0.84 for a fully developed sea, up to 5 for a young one; see `inverse_wave_age` for a fetch.
+    direction : float
+        Direction the wind blows towards [rad], counter-clockwise from +x.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    Elfouhaily, Chapron, Katsaros and Vandemark (1997), J. Geophys. Res. 102, 15781, doi:10.1029/97JC00467, with the
+    drag coefficient 0.00144 and the low-frequency roll-off L_PM J_p also on the capillary branch, without which the
+    waves of light winds would be tens of metres high. A negative capillary amplitude of eq. 44 (below 2.2 m/s) is
+    replaced by 0.
+    """
+
+    wind_speed: float
+    inverse_wave_age: float = _OLDEST
+    direction: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        in_range("inverse_wave_age", self.inverse_wave_age, _OLDEST, _YOUNGEST)
+
+    @property
+    def peak_wavenumber(self) -> float:
+        """Wavenumber of the spectral peak [rad/m]; infinite without wind."""
+        if self.wind_speed == 0:
+            return np.inf
+        return GRAVITY * (self.inverse_wave_age / self.wind_speed) ** 2
+
+    @property
+    def smooth_ranges(self) -> tuple[float, ...]:
+        """First and last wavenumber [rad/m] with waves: the capillary peak has fallen to e^-90 at the last."""
+        return self.peak_wavenumber / 10, 20 * SLOWEST_WAVENUMBER
+
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
+        wavenumber = np.asarray(k, dtype=np.float64)
+        valid = wavenumber > 0
+        if self.wind_speed == 0:
+            return np.zeros_like(wavenumber)
+        k = np.where(valid, wavenumber, 1.0)
+        omega, peak = self.inverse_wave_age, self.peak_wavenumber
+        speed = phase_speed(k)
+        root = np.sqrt(k / peak)
+
+        # Roll-off below the peak and its enhancement, common to both branches
+        gamma = 1.7 + 6 * max(np.log10(omega), 0.0)
+        sigma = 0.08 * (1 + 4 * omega**-3)
+        exponent = np.log(gamma) * np.exp(-((root - 1) ** 2) / (2 * sigma**2)) - 1.25 * (peak / k) ** 2
+
+        # Long waves: B_l = alpha_p/2 (c_p/c) F_p
+        long_waves = 0.5 * 0.006 * np.sqrt(omega) * phase_speed(peak) / speed
+        long_waves = long_waves * np.exp(-omega / np.sqrt(10) * (root - 1))
+
+        # Short waves: B_h = alpha_m/2 (c_m/c) F_m
+        ratio = np.log(np.sqrt(_DRAG_COEFFICIENT) * self.wind_speed / _SLOWEST_SPEED)
+        amplitude = max(0.01 * (1 + (ratio if ratio <= 0 else 3 * ratio)), 0.0)
+        short_waves = 0.5 * amplitude * _SLOWEST_SPEED / speed * np.exp(-0.25 * (k / SLOWEST_WAVENUMBER - 1) ** 2)
+        return np.asarray(np.where(valid, np.exp(exponent) * (long_waves + short_waves) / k**3, 0))
+
+
+class SaturatedSpectrum(WindSpectrum):
+    """Wavenumber form of a frequency spectrum with the tail alpha g^2 omega^-5, up to the slowest wave.
+
+    S(omega) d omega = S(k) dk with omega^2 = g k gives the tail (alpha/2) k^-3, whose slope variance grows by
+    alpha/2 with every factor e in k. These spectra do not include capillary waves; they end at `CUT_OFF`, the limit of
+    gravity waves.
+    """
+
+    CUT_OFF: ClassVar[float] = SLOWEST_WAVENUMBER
+
+    @property
+    def smooth_ranges(self) -> tuple[float, ...]:
+        """First wavenumber with waves, the peak and the cut-off [rad/m]; the JONSWAP peak has a kink."""
+        if self.peak_wavenumber >= self.CUT_OFF:
+            return ()
+        return self.peak_wavenumber / 10, self.peak_wavenumber, self.CUT_OFF
+
+    def _saturated(self, k: npt.ArrayLike, alpha: float, enhancement: float) -> FloatArray:
+        """S(k) [m^3] with the Phillips constant `alpha` and the JONSWAP peak enhancement."""
+        wavenumber, peak = np.asarray(k, dtype=np.float64), self.peak_wavenumber
+        valid = (wavenumber > 0) & (wavenumber <= self.CUT_OFF)
+        if not peak < self.CUT_OFF:
+            return np.zeros_like(wavenumber)
+        k = np.where(valid, wavenumber, 1.0)
+        root = np.sqrt(k / peak)  # omega/omega_p
+        width = np.where(root <= 1, 0.07, 0.09)
+        exponent = np.log(enhancement) * np.exp(-((root - 1) ** 2) / (2 * width**2)) - 1.25 * (peak / k) ** 2
+        return np.asarray(np.where(valid, 0.5 * alpha / k**3 * np.exp(exponent), 0))
+
+
+@dataclass(frozen=True)
+class PiersonMoskowitzSpectrum(SaturatedSpectrum):
+    """Spectrum of the gravity waves of a fully developed sea.
+
+    Parameters
+    ----------
+    wind_speed, direction : float
+        As for `ElfouhailySpectrum`. Below 0.14 m/s there are no gravity waves and the sea is flat.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    Pierson and Moskowitz (1964), J. Geophys. Res. 69, 5181, doi:10.1029/JZ069i024p05181: alpha = 8.1e-3, beta = 0.74
+    and the wind at 19.5 m, here 1.026 times that at 10 m. Measured at 10 to 20 m/s.
+    """
+
+    wind_speed: float
+    direction: float = 0.0
+
+    @property
+    def peak_wavenumber(self) -> float:
+        """Wavenumber of the frequency spectrum's peak [rad/m]; infinite without wind."""
+        if self.wind_speed == 0:
+            return np.inf
+        return GRAVITY * math.sqrt(0.8 * _PIERSON_MOSKOWITZ_BETA) / (1.026 * self.wind_speed) ** 2
+
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
+        return self._saturated(k, 8.1e-3, 1.0)
+
+
+@dataclass(frozen=True)
+class JonswapSpectrum(SaturatedSpectrum):
+    """Spectrum of the gravity waves of a fetch-limited sea.
+
+    Parameters
+    ----------
+    wind_speed, direction : float
+        As for `ElfouhailySpectrum`, but with a wind speed above 0.
+    fetch : float
+        Distance from the upwind shore [m]: g fetch/U^2 from 0.1, the start of the measurements, to 17 000, where the
+        peak reaches that of the fully developed sea and the growth ends.
+    peak_enhancement : float
+        gamma, 1 to 7; the mean over the measurements is 3.3.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+
+    Notes
+    -----
+    Hasselmann et al. (1973), Dtsch. Hydrogr. Z. Suppl. A8 (12), with X = g fetch/U^2: alpha = 0.076 X^-0.22,
+    omega_p = 22 (g/U) X^(-1/3), widths 0.07 below and 0.09 above the peak.
+    """
+
+    wind_speed: float
+    fetch: float
+    peak_enhancement: float = 3.3
+    direction: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wind, distance = positive("wind_speed", self.wind_speed), positive("fetch", self.fetch)
+        unit = wind**2 / GRAVITY
+        shortest = 0.1 * unit
+        # The fetch at which omega_p is that of Pierson and Moskowitz
+        longest = (22 * 1.026 / (0.8 * _PIERSON_MOSKOWITZ_BETA) ** 0.25) ** 3 * unit
+        if distance > longest:
+            raise UserError(
+                f"fetch = {distance:g} must not exceed {longest:.3g} m at a wind speed of {wind:g} m/s, "
+                "where the sea is fully developed"
+            )
+        if distance < shortest:
+            raise UserError(f"fetch = {distance:g} must be at least {shortest:.3g} m at a wind speed of {wind:g} m/s")
+        in_range("peak_enhancement", self.peak_enhancement, 1, 7)
+
+    @property
+    def peak_wavenumber(self) -> float:
+        """Wavenumber of the frequency spectrum's peak [rad/m]."""
+        return GRAVITY * (22 / self.wind_speed) ** 2 / math.pow(self._relative_fetch, 2 / 3)
+
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
+        return self._saturated(k, 0.076 * self._relative_fetch**-0.22, self.peak_enhancement)
+
+    @property
+    def _relative_fetch(self) -> float:
+        """Fetch over U^2/g [1]."""
+        return GRAVITY * self.fetch / self.wind_speed**2

@@ -1,0 +1,1 @@
+"""Inherent optical properties and phase functions of water."""

@@ -1,0 +1,161 @@
+"""Horizontally stratified water: inherent optical properties and optical depths of layers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative_array
+
+LayerValues = float | str | Sequence[float] | FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class WaterColumn:
+    """Water in horizontal layers, each with constant properties.
+
+    Depth is positive downwards from the mean sea level. The first layer also fills everything above z = 0 (wave
+    crests); the last is unbounded below. A layer owns its upper edge.
+
+    Parameters
+    ----------
+    layer_tops : array_like, shape (L,)
+        Depth of the upper edge of each layer [m]. The first is 0 and they increase strictly.
+    attenuation : array_like, shape (L,)
+        Beam attenuation coefficient c [1/m], at least `scattering`.
+    scattering : array_like, shape (L,)
+        Scattering coefficient b [1/m], at least `backscattering`.
+    backscattering : array_like, shape (L,)
+        Backscattering coefficient bb [1/m], the part of b into the backward hemisphere, at least 0.
+
+    Raises
+    ------
+    UserError
+        If a value is not finite or negative, the lengths differ, the layers are out of order, or bb <= b <= c fails.
+    """
+
+    layer_tops: FloatArray
+    attenuation: FloatArray
+    scattering: FloatArray
+    backscattering: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("layer_tops", "attenuation", "scattering", "backscattering"):
+            values = non_negative_array(name, getattr(self, name))
+            if values.ndim != 1 or values.size == 0:
+                raise UserError(f"{name} of shape {values.shape} must be a list of one value per layer")
+            if values.size != np.size(self.layer_tops):
+                raise UserError(f"{name} has {values.size} values but layer_tops has {np.size(self.layer_tops)} layers")
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+        if self.layer_tops[0] != 0:
+            raise UserError(f"layer_tops starts at {self.layer_tops[0]:g} m but the first layer must start at 0 m")
+        if np.any(np.diff(self.layer_tops) <= 0):
+            raise UserError(
+                f"layer_tops = {self.layer_tops.tolist()} has layers out of order: depths must increase strictly"
+            )
+        _must_not_exceed("scattering", self.scattering, "attenuation", self.attenuation)
+        _must_not_exceed("backscattering", self.backscattering, "scattering", self.scattering)
+
+    @classmethod
+    def from_text(
+        cls, layer_tops: LayerValues, attenuation: LayerValues, scattering: LayerValues, backscattering: LayerValues
+    ) -> WaterColumn:
+        """Build from numbers, sequences, or strings of numbers separated by commas or spaces.
+
+        A single value of a coefficient applies to all layers. Parameters and units are those of the class.
+
+        Raises
+        ------
+        UserError
+            As for the class, or if a string does not hold numbers only.
+        """
+        edges = _parse("layer_tops", layer_tops)
+        coefficients = {"attenuation": attenuation, "scattering": scattering, "backscattering": backscattering}
+        columns = [_parse(name, values) for name, values in coefficients.items()]
+        return cls(edges, *(np.full(edges.size, c[0]) if c.size == 1 else c for c in columns))
+
+    @property
+    def count(self) -> int:
+        """Number of layers."""
+        return int(self.layer_tops.size)
+
+    @property
+    def absorption(self) -> FloatArray:
+        """Absorption coefficient a = c - b [1/m], shape (L,)."""
+        return self.attenuation - self.scattering
+
+    @property
+    def albedo(self) -> FloatArray:
+        """Single-scattering albedo b/c, shape (L,); 0 where c is 0."""
+        return _ratio(self.scattering, self.attenuation)
+
+    @property
+    def backscatter_ratio(self) -> FloatArray:
+        """Backscattered fraction bb/b, shape (L,); 0 where b is 0."""
+        return _ratio(self.backscattering, self.scattering)
+
+    @property
+    def edge_optical_depth(self) -> FloatArray:
+        """Vertical optical depth from z = 0 to each upper edge, shape (L,); the first is 0."""
+        return np.concatenate(([0.0], np.cumsum(self.attenuation[:-1] * np.diff(self.layer_tops))))
+
+    def layer_at(self, depth: npt.ArrayLike) -> npt.NDArray[np.intp]:
+        """Index of the layer at `depth` [m]; also 0 above the mean sea level."""
+        return np.maximum(np.searchsorted(self.layer_tops, np.asarray(depth, dtype=np.float64), side="right") - 1, 0)
+
+    def cumulative(self, depth: npt.ArrayLike) -> FloatArray:
+        """Vertical optical depth from z = 0 to `depth` [m]: piecewise linear, negative above the mean sea level."""
+        z = np.asarray(depth, dtype=np.float64)
+        layer = self.layer_at(z)
+        return np.asarray(self.edge_optical_depth[layer] + self.attenuation[layer] * (z - self.layer_tops[layer]))
+
+    def optical_depth(self, depth0: npt.ArrayLike, depth1: npt.ArrayLike, distance: npt.ArrayLike) -> FloatArray:
+        """Optical depth of straight segments.
+
+        Parameters
+        ----------
+        depth0, depth1 : array_like
+            Depths of the two ends [m], in any order.
+        distance : array_like
+            Length of the segment [m], at least abs(depth1 - depth0).
+
+        Returns
+        -------
+        ndarray
+            Optical depth, of the broadcast shape. A horizontal segment lies in the layer that owns its depth.
+        """
+        z0, z1, length = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (depth0, depth1, distance)))
+        upper, lower = np.minimum(z0, z1), np.maximum(z0, z1)
+        drop = lower - upper
+        # Path fractions by layer from clipped edges: differences of cumulative() cancel on nearly level segments.
+        starts = np.concatenate(([-np.inf], self.layer_tops[1:]))
+        ends = np.concatenate((self.layer_tops[1:], [np.inf]))
+        inside = np.maximum(np.minimum(lower[..., None], ends) - np.maximum(upper[..., None], starts), 0)
+        slanted = inside @ self.attenuation / np.where(drop > 0, drop, 1)
+        return np.asarray(np.where(drop > 0, slanted, self.attenuation[self.layer_at(upper)]) * length)
+
+
+def _parse(name: str, values: LayerValues) -> FloatArray:
+    """Return finite numbers, shape (L,)."""
+    words = values.replace(",", " ").split() if isinstance(values, str) else values
+    array = np.atleast_1d(finite_array(name, words))
+    if array.ndim != 1 or array.size == 0:
+        raise UserError(f"{name} = {values!r} must hold at least one number")
+    return array
+
+
+def _ratio(part: FloatArray, total: FloatArray) -> FloatArray:
+    """Return part/total, 0 where the total is 0."""
+    return np.divide(part, total, out=np.zeros_like(total), where=total > 0)
+
+
+def _must_not_exceed(name: str, part: FloatArray, total_name: str, total: FloatArray) -> None:
+    """Reject a part that exceeds its total."""
+    for layer in np.flatnonzero(part > total)[:1]:
+        where = f" in layer {layer}" if part.size > 1 else ""
+        raise UserError(f"{name} = {part[layer]:g} must not exceed {total_name} = {total[layer]:g}{where}")

@@ -1,0 +1,223 @@
+"""Scattering phase functions of particles in water: closed forms and Petzold's average particle.
+
+All are normalised to 2 pi int_0^pi p(theta) sin(theta) dtheta = 1, in 1/sr. In formulas s = sin^2(theta/2), so that
+cos(theta) = 1 - 2 s and the solid angle between two cones is 4 pi ds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite, in_range
+from mitransient_lidar.physics.water.data_tables import PhaseFunction, log_log_phase, read_columns
+
+_SLOPE_RANGE = (3.0001, 4.9999)
+"""Junge slopes mu of the one-parameter Fournier-Forand family."""
+
+
+def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
+    """Fournier-Forand phase function.
+
+    Parameters
+    ----------
+    theta : array_like
+        Scattering angle [rad], 0 to pi.
+    n : float
+        Real refractive index of the particles relative to water, above 1.
+    mu : float
+        Slope of the hyperbolic (Junge) size distribution, 3 < mu < 5.
+
+    Returns
+    -------
+    ndarray
+        Phase function [1/sr], of the shape of `theta`; infinite at theta = 0.
+
+    Raises
+    ------
+    UserError
+        If n or mu lies outside its range.
+
+    Notes
+    -----
+    Fournier and Forand (1994), Ocean Optics XII, Proc. SPIE 2258, 194, in the form of Fournier and Jonasz (1999),
+    Proc. SPIE 3821, 62. Near delta = 1 (theta about 10 degrees) both numerators vanish to second order and are replaced
+    by binomial series in delta - 1.
+    """
+    nu, scale = _ff_shape(n, mu)
+    s = _half_angle(theta)
+    delta = s / scale
+    back = 1 / scale  # delta at 180 degrees
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        power = delta**nu
+        core = nu * (1 - delta) - (1 - power) + (delta * (1 - power) - nu * (1 - delta)) / s
+        core = core / (1 - delta) ** 2
+        near = np.abs(delta - 1) < 0.05
+        eps = np.where(near, delta - 1, 0)
+        core = np.where(near, _binomial_tail(nu, eps) - _binomial_tail(nu + 1, eps) / s, core)
+        core = np.where(s > 0, core / (4 * np.pi * power), np.inf)
+    # 3 cos^2(theta) - 1 with cos(theta) = 1 - 2 s
+    tail = (1 - back**nu) * (3 * (1 - 2 * s) ** 2 - 1) / (16 * np.pi * (back - 1) * back**nu)
+    return np.asarray(core + tail)
+
+
+def fournier_forand_cdf(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
+    """Fraction of light scattered by less than `theta` with a Fournier-Forand phase function.
+
+    Parameters
+    ----------
+    theta : array_like
+        Scattering angle [rad], 0 to pi.
+    n, mu : float
+        As in `fournier_forand`.
+
+    Returns
+    -------
+    ndarray
+        Cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3821, 62.
+    """
+    nu, scale = _ff_shape(n, mu)
+    s = _half_angle(theta)
+    back = 1 / scale
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_delta = np.log(s / scale)
+        core = (_power_ratio(nu + 1, log_delta) - s * _power_ratio(nu, log_delta)) * np.exp(-nu * log_delta)
+    tail = (1 - back**nu) * (1 - 2 * s) * 4 * s * (1 - s) / (8 * (back - 1) * back**nu)
+    return np.asarray(np.where(s > 0, core + tail, 0))
+
+
+def fournier_forand_backscatter_ratio(n: float, mu: float) -> float:
+    """Backscattered fraction bb/b of a Fournier-Forand phase function, in closed form (Fournier and Jonasz 1999)."""
+    return float(1 - fournier_forand_cdf(np.pi / 2, n, mu))
+
+
+def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
+    """Index and slope of the Fournier-Forand phase function with a given bb/b.
+
+    Parameters
+    ----------
+    backscatter_ratio : float
+        bb/b, from 3.4e-8 to 0.4999, the range of slopes mu from 3.0001 to 4.9999.
+
+    Returns
+    -------
+    n, mu : float
+        Parameters for `fournier_forand`, on the line n = 1.01 + 0.1542 (mu - 3).
+
+    Raises
+    ------
+    UserError
+        If no member of the family has this ratio.
+
+    Notes
+    -----
+    The line is that of Mobley, Sundman and Boss (2002), Appl. Opt. 41, 1035, doi:10.1364/AO.41.001035.
+    """
+    from scipy.optimize import brentq
+
+    def ratio(mu: float) -> float:
+        return fournier_forand_backscatter_ratio(_ffbb_index(mu), mu)
+
+    low, high = _SLOPE_RANGE
+    wanted = in_range("backscatter_ratio", backscatter_ratio, ratio(low), ratio(high))
+    mu = float(brentq(lambda x: ratio(x) - wanted, low, high, xtol=1e-13))
+    return _ffbb_index(mu), mu
+
+
+def henyey_greenstein(theta: npt.ArrayLike, g: float) -> FloatArray:
+    """Henyey-Greenstein (1941) phase function [1/sr] at angles `theta` [rad] for a mean cosine -1 < `g` < 1."""
+    _check_cosine(g)
+    # 1 + g^2 - 2 g cos(theta), without its cancellation at small angles
+    spread = (1 - g) ** 2 + 4 * g * _half_angle(theta)
+    return np.asarray((1 - g * g) / (4 * np.pi * spread**1.5))
+
+
+def henyey_greenstein_backscatter_ratio(g: float) -> float:
+    """Backscattered fraction of a Henyey-Greenstein function: (1-g)/(2g) ((1+g)/sqrt(1+g^2) - 1), or 1/2 at g = 0."""
+    _check_cosine(g)
+    root = np.hypot(1, g)
+    # ((1+g) - root)/g = 2/((1+g) + root), which has no 0/0 at g = 0
+    return float((1 - g) / (root * (1 + g + root)))
+
+
+def two_term_henyey_greenstein(theta: npt.ArrayLike, weight: float, g_forward: float, g_backward: float) -> FloatArray:
+    """Mixture weight HG(g_forward) + (1 - weight) HG(-g_backward) of phase functions [1/sr].
+
+    Parameters
+    ----------
+    theta : array_like
+        Scattering angle [rad].
+    weight : float
+        Weight of the forward lobe, 0 to 1.
+    g_forward, g_backward : float
+        Asymmetry of the lobes, 0 <= g < 1 each; the backward lobe has mean cosine -g_backward.
+
+    Raises
+    ------
+    UserError
+        If a parameter lies outside its range.
+    """
+    w = in_range("weight", weight, 0, 1)
+    for name, g in (("g_forward", g_forward), ("g_backward", g_backward)):
+        if not 0 <= finite(name, g) < 1:
+            raise UserError(f"{name} = {g:g} must be at least 0 and below 1")
+    return np.asarray(w * henyey_greenstein(theta, g_forward) + (1 - w) * henyey_greenstein(theta, -g_backward))
+
+
+def petzold_average_particle() -> PhaseFunction:
+    """Petzold's average-particle phase function as a function of the angle [rad].
+
+    Returns
+    -------
+    callable
+        Function from angles [rad] to p [1/sr], normalised to 1. Between the tabulated angles ln p is linear in ln
+        theta; below 0.1 degree p ~ theta^-1.346.
+
+    Notes
+    -----
+    Table 2 of Mobley et al. (1993), Appl. Opt. 32, 7484, doi:10.1364/AO.32.007484, derived from Petzold (1972), SIO
+    Ref. 72-78. With this interpolation the raw table integrates to 0.9929, by which it is divided. The mean cosine is
+    0.9241 and bb/b = 0.01826; linear interpolation of p, as in the paper, integrates to 1.0200 instead.
+    """
+    degrees, values = read_columns("petzold_average_particle.csv")
+    return log_log_phase(degrees, values, power=-1.346)
+
+
+def _half_angle(theta: npt.ArrayLike) -> FloatArray:
+    """Return s = sin^2(theta/2)."""
+    return np.asarray(np.sin(np.asarray(theta, dtype=np.float64) / 2) ** 2)
+
+
+def _ff_shape(n: float, mu: float) -> tuple[float, float]:
+    """Return the exponent nu and the s at which delta = 1."""
+    if not 3 < finite("mu", mu) < 5:
+        raise UserError(f"mu = {mu:g} must lie between 3 and 5, both excluded")
+    if not 1 < finite("n", n) < 1 + 2 / np.sqrt(3):
+        raise UserError(f"n = {n:g} must be above 1 and below 2.15")
+    return (3 - mu) / 2, 0.75 * (n - 1) ** 2
+
+
+def _ffbb_index(mu: float) -> float:
+    """Return the index on the line of Mobley, Sundman and Boss."""
+    return 1.01 + 0.1542 * (mu - 3)
+
+
+def _binomial_tail(a: float, eps: FloatArray) -> FloatArray:
+    """((1 + eps)^a - 1 - a eps) / eps^2 as a series for abs(eps) < 0.05."""
+    total = np.zeros_like(eps)
+    for k in range(14, 1, -1):
+        binomial = float(np.prod([(a - j) / (j + 1) for j in range(k)]))
+        total = total * eps + binomial
+    return total
+
+
+def _power_ratio(a: float, log_delta: FloatArray) -> FloatArray:
+    """(1 - delta^a) / (1 - delta), which tends to a at delta = 1."""
+    return np.asarray(np.where(log_delta == 0, a, np.expm1(a * log_delta) / np.expm1(log_delta)))
+
+
+def _check_cosine(g: float) -> None:
+    """Reject a mean cosine outside (-1, 1)."""
+    if not -1 < finite("g", g) < 1:
+        raise UserError(f"g = {g:g} must lie between -1 and 1, both excluded")

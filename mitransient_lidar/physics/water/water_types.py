@@ -1,0 +1,301 @@
+"""Absorption, scattering and backscattering of water given by type, chlorophyll, Kd or Secchi depth.
+
+These are rough estimates: waters of the same Kd differ in scattering by a factor of 2, which changes the column signal
+of a lidar. `pure_seawater` and `chlorophyll` are valid from 400 to 700 nm, the others at 532 nm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import in_range, non_negative, positive
+from mitransient_lidar.physics.water.data_tables import read_columns
+from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption, water_scattering
+
+_CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, of the Case 1 model
+_SECCHI_RANGE = (0.5, 25.0)  # m; above about 30 m the rules give less absorption than that of pure water
+
+PETZOLD_BACKSCATTER_RATIO = 0.0183
+"""bb/b of Petzold's average particle (Mobley et al. 1993)."""
+
+GREEN_RANGE = (531.0, 533.0)
+"""Wavelengths [nm] accepted as 532 nm."""
+
+#: Diffuse attenuation Kd, and absorption and scattering where they were measured [1/m], by Jerlov's types.
+_JERLOV: dict[str, tuple[float, tuple[float, float] | None]] = {
+    "I": (0.0486, None),
+    "IA": (0.0533, None),
+    "IB": (0.0590, (0.0532, 0.124)),
+    "II": (0.0796, (0.0618, 0.179)),
+    "III": (0.1171, (0.0812, 0.290)),
+    "1C": (0.1272, (0.0951, 0.432)),
+    "3C": (0.1972, (0.128, 0.651)),
+    "5C": (0.3072, (0.168, 1.21)),
+    "7C": (0.4816, (0.222, 2.49)),
+    "9C": (0.738, (0.407, 3.31)),
+}
+
+
+@dataclass(frozen=True)
+class InherentProperties:
+    """Inherent optical properties of water at one wavelength.
+
+    Parameters
+    ----------
+    absorption : float
+        Absorption coefficient a [1/m], at least 0.
+    scattering : float
+        Scattering coefficient b [1/m], at least `backscattering`.
+    backscattering : float
+        Backscattering coefficient bb [1/m], the part of b into the backward hemisphere, at least 0.
+
+    Raises
+    ------
+    UserError
+        If a value is negative or not finite, or bb exceeds b.
+    """
+
+    absorption: float
+    scattering: float
+    backscattering: float
+
+    def __post_init__(self) -> None:
+        for name in ("absorption", "scattering", "backscattering"):
+            object.__setattr__(self, name, non_negative(name, getattr(self, name)))
+        if self.backscattering > self.scattering:
+            raise UserError(
+                f"backscattering = {self.backscattering:g} must not exceed scattering = {self.scattering:g}"
+            )
+
+    @property
+    def attenuation(self) -> float:
+        """Beam attenuation coefficient c = a + b [1/m]."""
+        return self.absorption + self.scattering
+
+    @property
+    def albedo(self) -> float:
+        """Single-scattering albedo b/c; 0 where c is 0."""
+        return self.scattering / self.attenuation if self.attenuation > 0 else 0.0
+
+    @property
+    def backscatter_ratio(self) -> float:
+        """Backscattered fraction bb/b; 0 where b is 0."""
+        return self.backscattering / self.scattering if self.scattering > 0 else 0.0
+
+    @property
+    def kd(self) -> float:
+        """Diffuse attenuation coefficient of downwelling irradiance [1/m], with the sun at the zenith.
+
+        a + 4.18 (1 - 0.52 exp(-10.8 a)) bb, the mean down to the depth of a tenth of the surface's irradiance, by Lee,
+        Du and Arnone (2005), J. Geophys. Res. 110, C02016, doi:10.1029/2004JC002275.
+        """
+        return _diffuse_attenuation(self.absorption, self.backscattering)
+
+
+def pure_seawater(
+    wavelength_nm: float = 532.0, temperature: float = 20.0, salinity: float = 35.0
+) -> InherentProperties:
+    """Sea water without particles and dissolved organic matter; half of its scattering is backscattering.
+
+    Parameters
+    ----------
+    wavelength_nm, temperature, salinity : float
+        As in `seawater.water_scattering`: [nm], [degrees C], [per mille].
+
+    Raises
+    ------
+    UserError
+        If a value lies outside its range.
+    """
+    b = float(water_scattering(wavelength_nm, temperature, salinity))
+    return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2)
+
+
+def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
+    """Water of one of Jerlov's optical types at 532 nm, with Jerlov's Kd.
+
+    Parameters
+    ----------
+    water_type : str
+        I, IA, IB, II or III of the open ocean, 1C, 3C, 5C, 7C or 9C of the coast.
+    wavelength_nm : float
+        Wavelength [nm], 531 to 533: the table is for 532 nm only.
+
+    Raises
+    ------
+    UserError
+        If there is no such type or the wavelength lies outside its range.
+
+    Notes
+    -----
+    Kd: Jerlov (1976), Marine Optics, Table XXVII. Absorption and scattering of IB to 5C: measurements compiled by
+    Williamson and Hollins (2022), Appl. Opt. 61, 9951; of 7C and 9C: Solonenko and Mobley (2015), Appl. Opt. 54, 5392,
+    doi:10.1364/AO.54.005392, who derived them from Kd. Types I and IA are `chlorophyll` of the same Kd. No source gives
+    the backscattering: it follows from Jerlov's Kd by Lee's formula (`InherentProperties.kd`), as a small difference,
+    so that bb/b, 0.016 to 0.038, is uncertain by half.
+    """
+    if water_type not in _JERLOV:
+        raise UserError(f"water_type = {water_type!r} must be one of {', '.join(_JERLOV)}")
+    low, high = GREEN_RANGE
+    if not low <= positive("wavelength_nm", wavelength_nm) <= high:
+        raise UserError(
+            f"wavelength_nm = {wavelength_nm:g} must lie between {low:g} and {high:g}: Jerlov's types are tabulated at"
+            " 532 nm only"
+        )
+    kd, measured = _JERLOV[water_type]
+    if measured is None:
+        kw, factor, exponent = _case1_terms(532.0)
+        return chlorophyll(((kd - kw) / factor) ** (1 / exponent))
+    a, b = measured
+    return InherentProperties(a, b, (kd - a) / _backscatter_weight(a))
+
+
+def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentProperties:
+    """Case 1 water (open ocean), whose particles and dissolved matter covary with chlorophyll.
+
+    Parameters
+    ----------
+    concentration : float
+        Chlorophyll concentration C [mg/m^3], 0.01 to 30.
+    wavelength_nm : float
+        Wavelength [nm], 400 to 700.
+
+    Raises
+    ------
+    UserError
+        If a value lies outside its range.
+
+    Notes
+    -----
+    Diffuse attenuation: Kd = aw + bw/2 + chi C^e of Morel and Maritorena (2001), J. Geophys. Res. 106, 7163,
+    doi:10.1029/2000JC000319. Particles: b_p = 0.416 C^0.766 (wavelength/550)^v of Loisel and Morel (1998), Limnol.
+    Oceanogr. 43, 847, doi:10.4319/lo.1998.43.5.0847, with v = (lg C - 0.3)/2 below 2 mg/m^3 and 0 above, and
+    bb_p/b_p(550 nm) = 0.002 + 0.01 (0.5 - 0.25 lg C) (wavelength/550)^v of the former paper. Absorption: from this Kd
+    by Lee's formula (`InherentProperties.kd`), but at least that of water, a limit that applies only below 0.02 mg/m^3.
+    Water: `pure_seawater` at 20 degrees C. In real waters of one C, b varies by a factor of 2.
+    """
+    c = in_range("concentration", concentration, *_CHLOROPHYLL_RANGE)
+    lam = in_range("wavelength_nm", wavelength_nm, *WAVELENGTH_RANGE)
+    water = pure_seawater(lam)
+    kw, factor, exponent = _case1_terms(lam)
+
+    log_c = np.log10(c)
+    colour = (lam / 550) ** (0.5 * (log_c - 0.3) if c < 2 else 0.0)
+    b_550 = 0.416 * c**0.766
+    b = water.scattering + b_550 * colour
+    bb = water.backscattering + b_550 * (0.002 + 0.01 * (0.5 - 0.25 * log_c) * colour)
+
+    a = _absorption_for(kw + factor * c**exponent, lambda _: bb)
+    return InherentProperties(max(a, water.absorption), float(b), float(bb))
+
+
+def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | None = None) -> InherentProperties:
+    """Water given by its diffuse attenuation at 532 nm.
+
+    Parameters
+    ----------
+    kd : float
+        Diffuse attenuation coefficient of downwelling irradiance [1/m], 0.0486 (Jerlov I) to 0.738 (Jerlov 9C).
+    albedo : float, optional
+        Single-scattering albedo b/c, 0 to 0.98. Default: interpolated between Jerlov types.
+    backscatter_ratio : float, optional
+        bb/b, 0.001 to 0.1. Default: interpolated between Jerlov types.
+
+    Raises
+    ------
+    UserError
+        If a value lies outside its range, or together they give less absorption than that of pure water.
+
+    Notes
+    -----
+    Albedo and bb/b are linear in ln Kd between those of `jerlov`, so that Kd = 0.0796 gives jerlov("II"). Absorption
+    follows by Lee's formula (`InherentProperties.kd`). Its error is about 15 %, that of scattering a factor of 2: at
+    Kd = 0.08 the two sources of `jerlov` have 0.18 and 0.38 1/m.
+    """
+    waters = [jerlov(name) for name in _JERLOV]
+    table = [kd for kd, _ in _JERLOV.values()]
+    wanted = in_range("kd", kd, table[0], table[-1])
+
+    def typical(values: list[float]) -> float:
+        return float(np.interp(np.log(wanted), np.log(table), values))
+
+    omega = typical([w.albedo for w in waters]) if albedo is None else in_range("albedo", albedo, 0, 0.98)
+    if backscatter_ratio is None:
+        ratio = typical([w.backscatter_ratio for w in waters])
+    else:
+        ratio = in_range("backscatter_ratio", backscatter_ratio, 0.001, 0.1)
+
+    per_absorption = omega / (1 - omega)
+    a = _absorption_for(wanted, lambda x: ratio * per_absorption * x)
+    _check_absorption(a, f"kd = {wanted:g} with albedo = {omega:g} and backscatter_ratio = {ratio:g}")
+    return InherentProperties(a, a * per_absorption, ratio * per_absorption * a)
+
+
+def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RATIO) -> InherentProperties:
+    """Water given by its Secchi depth, at which a white disk disappears, at 532 nm.
+
+    Parameters
+    ----------
+    depth : float
+        Secchi depth z [m], 0.5 to 25.
+    backscatter_ratio : float
+        bb/b, 0.001 to 0.04.
+
+    Raises
+    ------
+    UserError
+        If a value lies outside its range, or together they give less absorption than that of pure water.
+
+    Notes
+    -----
+    Kd = 1.7/z of Poole and Atkins (1929), J. Mar. Biol. Assoc. 16, 297, and c + Kd = 8.7/z of Tyler (1968), Limnol.
+    Oceanogr. 13, 1, doi:10.4319/lo.1968.13.1.0001; absorption then follows by Lee's formula (`InherentProperties.kd`).
+    In turbid coastal water Holmes (1970), Limnol. Oceanogr. 15, 688, found 1.44 and 9.42; the first constant was 1.2 to
+    3 in single waters. The error of the attenuation is about 20 %, that of Kd and absorption about 40 %. The eye is
+    assumed to see deepest at 532 nm.
+    """
+    z = in_range("depth", depth, *_SECCHI_RANGE)
+    ratio = in_range("backscatter_ratio", backscatter_ratio, 0.001, 0.04)
+    kd = 1.7 / z
+    c = 8.7 / z - kd
+    a = _absorption_for(kd, lambda x: ratio * (c - x))
+    _check_absorption(a, f"depth = {z:g} with backscatter_ratio = {ratio:g}")
+    return InherentProperties(a, c - a, ratio * (c - a))
+
+
+def _case1_terms(lam: float) -> tuple[float, float, float]:
+    """Kw [1/m], chi and e of Kd = Kw + chi C^e."""
+    water = pure_seawater(lam)
+    wavelengths, factors, exponents = read_columns("case1_waters.csv")
+    factor, exponent = (float(np.interp(lam, wavelengths, values)) for values in (factors, exponents))
+    return water.absorption + water.backscattering, factor, exponent
+
+
+def _check_absorption(absorption: float, given: str) -> None:
+    """Reject an absorption below that of pure water."""
+    least = water_absorption(532)
+    if absorption < least:
+        raise UserError(
+            f"{given} must give at least the absorption of pure water, {least:g} 1/m, but gives {absorption:g}"
+        )
+
+
+def _backscatter_weight(absorption: float) -> float:
+    """Return the factor of bb in Lee's formula."""
+    return float(4.18 * (1 - 0.52 * np.exp(-10.8 * absorption)))
+
+
+def _diffuse_attenuation(absorption: float, backscattering: float) -> float:
+    """Return Kd by Lee's formula [1/m]."""
+    return absorption + _backscatter_weight(absorption) * backscattering
+
+
+def _absorption_for(kd: float, backscattering: Callable[[float], float]) -> float:
+    """Absorption that gives `kd` by Lee's formula, for a backscattering that may depend on it."""
+    from scipy.optimize import brentq
+
+    return float(brentq(lambda a: _diffuse_attenuation(a, backscattering(a)) - kd, 0, kd, xtol=1e-14))

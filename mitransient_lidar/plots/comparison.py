@@ -1,0 +1,65 @@
+"""Figure of two results and their differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from mitransient_lidar.analysis.comparison import Comparison
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.plots import drawing
+
+
+def plot_comparison(
+    first: xr.Dataset, second: xr.Dataset, outcome: Comparison, path: drawing.FilePath | None = None
+) -> Figure:
+    """Draw two results with bands of two standard errors, and below them their difference in standard errors.
+
+    Parameters
+    ----------
+    first, second
+        Results with the same pixels and time bins.
+    outcome
+        Their comparison, from `mitransient_lidar.analysis.comparison.compare`.
+    path : path, optional
+        PNG, PDF or SVG file to write.
+
+    Raises
+    ------
+    UserError
+        If the file has another suffix or cannot be written.
+    """
+    figure = drawing.new_figure(path, 9.6, 6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
+    time = first["time"].values
+    palette = drawing.pixel_colours(len(outcome.z))
+    for result, style in ((first, "-"), (second, "--")):
+        label = str(result.attrs.get("integrator", "")) or str(result.attrs.get("scene", ""))
+        power, error = _by_pixel(result, "waveform"), 2 * _by_pixel(result, "waveform_stderr")
+        for i, colour in enumerate(palette):
+            curve = {"color": colour, "linestyle": style, "linewidth": 0.9, "label": "_" if i else label}
+            drawing.draw_band(upper, time, power[i], error[i], lowest=1e-30, **curve)
+    shown = _by_pixel(first, "waveform")[np.isfinite(outcome.z)]
+    upper.set_yscale("log")
+    upper.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown.max())
+    upper.set_xlim(drawing.time_limits(first))
+    upper.set_ylabel("received power (W)")
+    upper.legend(frameon=False)
+    for z, colour in zip(outcome.z, palette, strict=True):
+        lower.plot(time, z, ".", color=colour, markersize=3)
+    for level in (-outcome.limit, outcome.limit):
+        lower.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
+    largest = 1.5 * max(outcome.limit, outcome.largest)
+    lower.set(ylim=(-largest, largest), xlabel=drawing.TIME_LABEL, ylabel="difference (standard errors)")
+    for ax in (upper, lower):
+        drawing.add_grid(ax)
+    text = f"{outcome.bin_count} bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f} standard errors"
+    text += f" (limit of chance {outcome.limit:.1f})"
+    figure.suptitle(drawing.titled(first.attrs, text), fontsize="medium")
+    return drawing.save(figure, path)
+
+
+def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:
+    values = result[name].values
+    return np.asarray(values.reshape(-1, values.shape[-1]))

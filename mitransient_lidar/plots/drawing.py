@@ -1,0 +1,147 @@
+"""Elements shared by all figures: file, colours, units, titles, axes and images.
+
+Every drawing returns a `matplotlib.figure.Figure` that is independent of pyplot and needs no closing. With a path it
+also writes a PNG, PDF or SVG file.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.axis import XAxis
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.results.geometry import optional_number
+
+FilePath = str | os.PathLike[str]
+
+TIME_LABEL = "time since the pulse left the transmitter (ns)"
+ANGLE_X_LABEL, ANGLE_Y_LABEL = "away from nadir, angle_x (mrad)", "across, angle_y (mrad)"
+
+#: Most pixels that a legend lists by name.
+LISTED_PIXELS = 12
+
+_FORMATS = (".png", ".pdf", ".svg")
+_DPI = 160
+_FOUR = ("#d81e1e", "#17963f", "#1f5fd6", "#111111")  # red, green, blue, black: the published pixels
+_PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p", -15: "f", -18: "a"}
+
+
+def check_format(path: FilePath) -> None:
+    """Raise a `UserError` unless the suffix of `path` is that of a figure."""
+    if Path(path).suffix.lower() not in _FORMATS:
+        raise UserError(f"cannot write {path}: the file name must end in {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]}.")
+
+
+def new_figure(path: FilePath | None, width: float, height: float) -> Figure:
+    """Check the format of the file to write, and return an empty figure of a size in inches."""
+    if path is not None:
+        check_format(path)
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: Figure, path: FilePath | None) -> Figure:
+    """Write a figure if there is a path, replacing an existing file only on success; return the figure."""
+    if path is not None:
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=_DPI)
+    return figure
+
+
+def pixel_colours(count: int) -> list[Any]:
+    """Return a colour for each pixel; for four pixels the red, green, blue and black of the published figures."""
+    if count == 1:
+        return [_FOUR[3]]
+    if count == 4:
+        return list(_FOUR)
+    if count <= 10:
+        return [matplotlib.colormaps["tab10"](index) for index in range(count)]
+    return list(matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, count)))
+
+
+def si_prefix(largest: float) -> tuple[float, str]:
+    """Return the power of 1000, and its SI prefix, that scales a number to between 1 and 1000."""
+    exponent = 3 * math.floor(math.log10(largest) / 3) if largest > 0 else 0
+    exponent = min(max(exponent, min(_PREFIXES)), max(_PREFIXES))
+    return 10.0**exponent, _PREFIXES[exponent]
+
+
+def scene_name(attributes: Mapping[str, Any]) -> str:
+    """Return the name of the scene without the suffix of its file; empty if unknown."""
+    return Path(str(attributes.get("scene", ""))).stem
+
+
+def titled(attributes: Mapping[str, Any], text: str) -> str:
+    """Return a title that begins with the name of the scene, if known."""
+    scene = scene_name(attributes)
+    return f"{scene}: {text}" if scene else text
+
+
+def time_limits(dataset: xr.Dataset) -> tuple[float, float]:
+    """Return the echo window with a margin [ns], or the whole time axis if the window is unknown."""
+    time, attributes = dataset["time"].values, dataset.attrs
+    half = 0.5 * (optional_number(attributes, "bin_width_ns") or 1.0)
+    first, last = float(time[0]) - half, float(time[-1]) + half
+    start, end = (optional_number(attributes, f"window_{name}_ns") for name in ("start", "end"))
+    if start is None or end is None or not first < end or not start < last or not start < end:
+        return first, last
+    margin = 0.06 * (end - start)
+    return max(first, start - margin), min(last, end + margin)
+
+
+def add_grid(ax: Axes, axis: Literal["both", "x", "y"] = "both", hide: tuple[str, ...] = ()) -> None:
+    """Draw light grid lines at the major ticks, below all curves, and hide sides of the frame."""
+    ax.grid(True, which="major", axis=axis, color="0.9", linewidth=0.7)
+    ax.set_axisbelow(True)
+    for side in hide:
+        ax.spines[side].set_visible(False)
+
+
+def add_top_axis(ax: Axes, offset: float, slope: float, label: str) -> XAxis:
+    """Add an axis on top with the values `offset` + `slope` x, and return it."""
+    functions = (lambda x: offset + slope * x, lambda value: (value - offset) / slope)
+    top = ax.secondary_xaxis("top", functions=functions)
+    top.set_xlabel(label)
+    return top.xaxis
+
+
+def draw_band(
+    ax: Axes, x: FloatArray, y: FloatArray, error: FloatArray, *, lowest: float = -np.inf, **style: Any
+) -> None:
+    """Draw a curve with a band of +-`error`, cut off at `lowest`, since a logarithmic axis holds no values below 0."""
+    (line,) = ax.plot(x, y, **style)
+    ax.fill_between(x, np.maximum(y - error, lowest), y + error, color=line.get_color(), alpha=0.22, linewidth=0)
+
+
+def draw_image(ax: Axes, values: FloatArray, dataset: xr.Dataset, *, label: bool = True, **style: Any) -> AxesImage:
+    """Draw values of shape (row, column) over the angles of the pixels, with the far edge on top."""
+    if label:
+        ax.set(xlabel=ANGLE_Y_LABEL, ylabel=ANGLE_X_LABEL)
+    return ax.imshow(values, extent=image_extent(dataset), origin="upper", interpolation="nearest", **style)
+
+
+def image_extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
+    """Return the edges of an image [mrad]: left, right, near and far."""
+    angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
+    along, across = (0.5 * pitch for pitch in pixel_pitch(dataset))
+    left, right = float(angle_y.min() - across), float(angle_y.max() + across)
+    return left, right, float(angle_x.min() - along), float(angle_x.max() + along)
+
+
+def pixel_pitch(dataset: xr.Dataset) -> tuple[float, float]:
+    """Return the distance of rows and of columns [mrad]; the pixels of a single row or column count as square."""
+    spans = (dataset["angle_x"].isel(column=0).values, dataset["angle_y"].isel(row=0).values)
+    along, across = (float(np.ptp(values)) / max(values.size - 1, 1) for values in spans)
+    return along or across or 1.0, across or along or 1.0

@@ -1,0 +1,85 @@
+"""Figure of shots on a sea: footprints over the elevation, and the waveforms received from each."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from mitransient_lidar.plots import drawing
+from mitransient_lidar.studies.find_shots import RenderedShots, Shot
+
+
+def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the sea with the footprints of beam and pixels at each shot, and the waveforms of the shots.
+
+    Parameters
+    ----------
+    rendered
+        A result of `mitransient_lidar.studies.find_shots.render_found_shots`.
+    path : path, optional
+        PNG, PDF or SVG file to write.
+
+    Raises
+    ------
+    UserError
+        If the file has another suffix or cannot be written.
+    """
+    columns = min(2, len(rendered.results))
+    rows = -(-len(rendered.results) // columns) if columns else 1
+    figure = drawing.new_figure(path, 6.0 + 3.6 * columns, max(5.4, 2.7 * rows))
+    grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[1.5, *[1.0] * columns])
+    _draw_sea(figure.add_subplot(grid[:, 0]), rendered)
+    for index, (shot, result) in enumerate(zip(rendered.shots, rendered.results, strict=False)):
+        _draw_waveforms(figure.add_subplot(grid[index // columns, 1 + index % columns]), shot, result)
+    figure.suptitle(rendered.scene)
+    return drawing.save(figure, path)
+
+
+def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
+    """Draw elevations about the shots, and the outlines of pixels and beam at each shot on the mean sea level."""
+    sea, shots = rendered.sea, rendered.shots
+    along, across = rendered.beam_spread
+    x, y = np.array([shot.x for shot in shots]), np.array([shot.y for shot in shots])
+    margin = max(6 * along, 0.1 * max(np.ptp(x), np.ptp(y)))
+    spacing = sea.x[1] - sea.x[0]
+    windows = []
+    for places, lines in ((x, sea.x), (y, sea.y)):
+        first = math.floor((places.min() - margin - lines[0]) / spacing)
+        last = math.ceil((places.max() + margin - lines[0]) / spacing)
+        windows.append(np.arange(first, last + 1))
+    # The sea repeats itself.
+    heights = sea.heights[np.ix_(windows[1] % len(sea.y), windows[0] % len(sea.x))]
+    left, right = sea.x[0] + windows[0][[0, -1]] * spacing
+    near, far = sea.y[0] + windows[1][[0, -1]] * spacing
+    image = ax.imshow(
+        heights, origin="lower", extent=(left, right, near, far), cmap="Blues_r", interpolation="bilinear"
+    )
+    ax.figure.colorbar(image, ax=ax, label="elevation (m)", shrink=0.6)
+    palette = drawing.pixel_colours(rendered.pixel_count)
+    for number, shot in enumerate(shots, start=1):
+        for pixel in np.unique(rendered.pixel_map[rendered.pixel_map >= 0]):
+            lines, mask = rendered.pixel_lines, (rendered.pixel_map == pixel).astype(np.float64)
+            ax.contour(lines + shot.x, lines + shot.y, mask, [0.5], colors=[palette[pixel]], linewidths=1.2)
+        angle = math.degrees(rendered.azimuth)
+        ax.add_patch(Ellipse((shot.x, shot.y), 2 * along, 2 * across, angle=angle, fill=False, color="gold"))
+        ax.annotate(f"{number}", (shot.x, shot.y), color="gold", ha="center", va="center", fontweight="bold")
+    ax.set_aspect("equal")
+    ax.set_xlabel("x (m), away from the lidar" if abs(rendered.azimuth) < 1e-6 else "x (m)")
+    ax.set_ylabel("y (m)")
+
+
+def _draw_waveforms(ax: Axes, shot: Shot, result: xr.Dataset) -> None:
+    """Draw the waveforms of a shot, with the slopes that the beam meets."""
+    power = result["waveform"].values.reshape(-1, result.sizes["time"])
+    for values, colour in zip(power, drawing.pixel_colours(len(power)), strict=True):
+        ax.plot(result["time"].values, 1e3 * values, color=colour, linewidth=1.1)
+    ax.set_xlim(drawing.time_limits(result))
+    ax.set_ylim(0, None)
+    slopes = f"{math.degrees(math.atan(shot.along)):+.1f}°, {math.degrees(math.atan(shot.across)):+.1f}°"
+    ax.set_title(f"{shot.kind} ({slopes})", fontsize="small")
+    ax.set(xlabel="time (ns)", ylabel="power (mW)")

@@ -1,0 +1,1 @@
+"""Self-contained web page that shows a gate stack."""

@@ -1,0 +1,298 @@
+"""Contact sheet and animation of the gates of a stack, on one common scale of colours."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CalledProcessError
+from typing import Any, Literal, NamedTuple
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.plots import drawing
+from mitransient_lidar.results.gate_files import check_stack
+from mitransient_lidar.results.geometry import optional_number
+
+SIGNIFICANT = 3.0  #: Standard errors above which a value counts.
+
+_BRIGHT = 99.0  # percentile of the pixels of a gate within the colours: a small bright target may be clipped
+_DECADES = 3.0  # of a logarithmic colour scale
+_SHOWN_GATES = 36  # on a contact sheet
+_FRAMES_PER_SECOND = 8
+_FRAME_DPI = 100
+_PIXEL_DECADES = 5  # at most, on the logarithmic axis of a few pixels
+
+
+class ColourScale(NamedTuple):
+    """Common colours of all gates of a stack."""
+
+    factor: float  #: Energy of one unit [J].
+    unit: str  #: Name of the unit, such as "aJ".
+    norm: Normalize  #: From energies in that unit to colours.
+    label: str  #: Label of the colour bar, with the share of values above the brightest colour.
+    extend: Literal["neither", "min", "max", "both"]  #: Ends beyond which values lie.
+
+    def draw(self, ax: Axes, energy: FloatArray, stack: xr.Dataset, *, label: bool = True) -> AxesImage:
+        """Draw the energies [J] of one gate; pixels with non-finite values are grey."""
+        colours = matplotlib.colormaps["magma"].with_extremes(bad="0.6")
+        return drawing.draw_image(ax, energy / self.factor, stack, label=label, norm=self.norm, cmap=colours)
+
+    def add_bar(self, figure: Figure, image: AxesImage, axes: Any, label: str, **options: Any) -> Colorbar:
+        """Draw the colour bar beside some axes, with plain numbers on a logarithmic scale too."""
+        bar = figure.colorbar(image, ax=axes, extend=self.extend, label=label, **options)
+        if isinstance(self.norm, LogNorm):
+            bar.locator = LogLocator(subs=(1.0, 2.0, 5.0))
+            bar.formatter = FuncFormatter(lambda value, _: f"{value:g}")
+            bar.minorformatter = NullFormatter()
+            bar.update_ticks()
+        return bar
+
+
+def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: bool = False) -> Figure:
+    """Draw a contact sheet of the gates on one common scale; of pixels without an image, their energy against depth.
+
+    Of more than 36 gates every second, third, ... one is drawn. The colours end at the brightest gate below the surface
+    (at its 99th percentile), so that the surface echo does not darken the rest; the label of the colour bar gives the
+    share of brighter values.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A gate stack, see `mitransient_lidar.results.gate_files`.
+    path : path, optional
+        PNG, PDF or SVG file to write.
+    log : bool
+        Logarithmic scale of the colours, or of the energy axis.
+
+    Raises
+    ------
+    UserError
+        If the dataset is no gate stack, the file has another suffix, or it cannot be written.
+    """
+    figure = drawing.new_figure(path, 9.6, 4.6)
+    stack = check_stack(dataset)
+    (_draw_pixel_gates if "pixel" in stack.dims else _draw_sheet)(figure, stack, log=log)
+    return drawing.save(figure, path)
+
+
+def check_animation(stack: xr.Dataset, path: Path) -> None:
+    """Raise a `UserError` if the stack has no images, or the file is an MP4 and ffmpeg is not installed."""
+    if "pixel" in stack.dims:
+        raise UserError(
+            f"cannot write {path}: an animation needs images, but this stack has {stack.sizes['pixel']} single pixels; "
+            "draw its contact sheet."
+        )
+    if path.suffix.lower() == ".mp4" and not FFMpegWriter.isAvailable():
+        raise UserError(f"cannot write {path}: .mp4 needs the program ffmpeg, which is not installed; choose .gif.")
+
+
+def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False) -> None:
+    """Write an animation with one frame a gate, beside the mean energy against depth.
+
+    The colours are those of `plot_gates`.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A gate stack of an imager.
+    path : path
+        File to write, ending in ``.gif`` or, if the program ffmpeg is installed, ``.mp4``.
+    log : bool
+        Logarithmic scale of the colours.
+
+    Raises
+    ------
+    UserError
+        If the dataset is no gate stack of an imager, the file has another suffix, ffmpeg is missing or fails, or the
+        file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise UserError(f"cannot write {path}: the file name of an animation must end in .gif or .mp4.")
+    stack = check_stack(dataset)
+    check_animation(stack, path)
+    figure, show = _animated_figure(stack, log=log)
+    # The layout is computed once, so that frames do not shift against each other.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    kind: type[AbstractMovieWriter] = PillowWriter if suffix == ".gif" else FFMpegWriter
+    writer = kind(fps=_FRAMES_PER_SECOND)
+    with replacing(path) as temporary:
+        try:
+            with writer.saving(figure, os.fspath(temporary), _FRAME_DPI):
+                for index in range(stack.sizes["gate"]):
+                    show(index)
+                    writer.grab_frame()
+        except CalledProcessError as error:
+            raise UserError(f"cannot write {path}: ffmpeg ended with the error {error.returncode}.") from error
+
+
+def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
+    """Return the common colours of the gates of an imager.
+
+    They end at the largest of the 99th percentiles of the gates below the surface echo. If the time of that echo is
+    unknown, they end at the value that the 99th percentile exceeds in one gate of ten.
+    """
+    energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
+    finite = np.where(np.isfinite(energy), energy, 0.0)
+    bright = np.percentile(finite, _BRIGHT, axis=(0, 1))
+    below = ~reached_by_surface(stack)
+    if "surface_time_ns" not in stack.attrs:
+        top = float(np.percentile(bright, 90))
+    else:
+        top = float(bright[below].max() if below.any() else bright.max())
+    if top <= 0:
+        top = float(finite.max()) if finite.max() > 0 else 1.0
+    brighter = np.count_nonzero(finite > top) / finite.size
+    factor, prefix = drawing.si_prefix(top)
+    label = f"energy in the gate ({prefix}J)"
+    if brighter:
+        surface = "" if below.all() else ", including the surface echo,"
+        label += f"; {100 * brighter:.2g} % of the values{surface} are brighter"
+    if not log:
+        return ColourScale(factor, f"{prefix}J", Normalize(0.0, top / factor), label, "max" if brighter else "neither")
+    significant = finite[(finite > SIGNIFICANT * stderr) & (finite > 0)]
+    bottom = max(top * 10.0**-_DECADES, float(np.percentile(significant, 1)) if significant.size else 0.0)
+    # Clipped, so that values of 0 and below are dark and not missing.
+    norm = LogNorm(min(bottom, 0.5 * top) / factor, top / factor, clip=True)
+    return ColourScale(factor, f"{prefix}J", norm, label, "both" if brighter else "min")
+
+
+def reached_by_surface(stack: xr.Dataset) -> npt.NDArray[np.bool_]:
+    """Return which gates open before the end of the surface echo; none if its time is unknown."""
+    surface = optional_number(stack.attrs, "surface_time_ns")
+    if surface is None:
+        return np.zeros(stack.sizes["gate"], dtype=bool)
+    # Waves and the width of the image lengthen the echo beyond the pulse.
+    names = ("pulse_fwhm_ns", "response_time_ns", "gate_rise_ns")
+    length = 1.5 * sum(optional_number(stack.attrs, name) or 0.0 for name in names)
+    return np.asarray(stack["gate_start"].values < surface + length)
+
+
+def known_depths(stack: xr.Dataset) -> FloatArray | None:
+    """Return the depths of the middles of the gates [m], None if they are unknown."""
+    if "gate_depth" not in stack.coords or not np.isfinite(stack["gate_depth"].values).all():
+        return None
+    return np.asarray(stack["gate_depth"].values, dtype=np.float64)
+
+
+def _caption(stack: xr.Dataset, index: int) -> tuple[str, str]:
+    """Return the number and the depth of a gate, and the time during which it is open."""
+    start, width = (float(stack[name].values[index]) for name in ("gate_start", "gate_width"))
+    depths = known_depths(stack)
+    depth = "" if depths is None else f"  {depths[index]:.2f} m"
+    return f"#{index}{depth}", f"{start:.1f} to {start + width:.1f} ns"
+
+
+def _title(stack: xr.Dataset, shown: int) -> str:
+    count, width = stack.sizes["gate"], float(stack["gate_width"].values[0])
+    gates = f"{count} gates" if shown == count else f"{shown} of {count} gates"
+    pulses = int(stack.attrs.get("pulses", 1))
+    return drawing.titled(stack.attrs, f"{gates} of {width:g} ns" + (f", {pulses} pulses" if pulses > 1 else ""))
+
+
+def _draw_sheet(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
+    energy = stack["gate_energy"].values
+    shown = range(0, stack.sizes["gate"], math.ceil(stack.sizes["gate"] / _SHOWN_GATES))
+    columns = _columns(len(shown))
+    rows = math.ceil(len(shown) / columns)
+    left, right, near, far = drawing.image_extent(stack)
+    panel = 8.7 / columns * min(max((far - near) / (right - left), 0.3), 2.0)  # height in inches
+    figure.set_figheight(rows * (panel + 0.34) + 1.5)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    scale = colour_scale(stack, log=log)
+    for ax in axes.flat[len(shown) :]:
+        ax.set_axis_off()
+    for place, (index, ax) in enumerate(zip(shown, axes.flat, strict=False)):
+        image = scale.draw(ax, energy[..., index], stack, label=False)
+        ax.set_title("\n".join(_caption(stack, index)), fontsize=8.5, linespacing=1.15, pad=3)
+        ax.tick_params(labelsize=8, labelleft=place % columns == 0, labelbottom=place + columns >= len(shown))
+        ax.locator_params(nbins=4)
+    figure.supxlabel(drawing.ANGLE_Y_LABEL, fontsize=10)
+    figure.supylabel(drawing.ANGLE_X_LABEL, fontsize=10)
+    figure.suptitle(_title(stack, len(shown)), fontsize=12)
+    scale.add_bar(figure, image, axes, scale.label, location="top", fraction=0.05, aspect=60, shrink=0.8)
+
+
+def _columns(count: int) -> int:
+    """Return the number of images in a row: at most 6, fewer if that leaves fewer gaps."""
+    if count <= 3:
+        return count
+    return min(range(3, 7), key=lambda columns: -count % columns + 1.2 * abs(columns - min(6.0, 1.3 * count**0.5)))
+
+
+def _animated_figure(stack: xr.Dataset, *, log: bool) -> tuple[Figure, Callable[[int], None]]:
+    """Return the figure of an animation, and the function that shows a gate in it."""
+    energy = stack["gate_energy"].values
+    scale = colour_scale(stack, log=log)
+    figure = drawing.new_figure(None, 8.4, 5.4)
+    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
+    image = scale.draw(left, energy[..., 0], stack)
+    scale.add_bar(figure, image, left, scale.label.replace("; ", "\n"), location="bottom", aspect=40, shrink=0.9)
+    depths = known_depths(stack)
+    axis = stack["gate_start"].values if depths is None else depths
+    mean = energy.mean(axis=(0, 1)) / scale.factor
+    right.plot(mean, axis, color="0.25", linewidth=1.2)
+    (marker,) = right.plot([], [], "o", color="#d4472e", markersize=8, clip_on=False)
+    top = float(np.nanmax(mean, initial=0.0))
+    if top > 0:
+        right.set_xscale("log")
+        right.set_xlim(max(1e-4 * top, 0.5 * float(np.nanmin(mean[mean > 0]))), 2 * top)
+    right.invert_yaxis()
+    right.yaxis.set(ticks_position="right", label_position="right")
+    right.set_ylabel("start of the gate (ns)" if depths is None else "depth (m)")
+    right.set_xlabel(f"mean over the image ({scale.unit})")
+    drawing.add_grid(right)
+    title = figure.suptitle("gate", fontsize=12)
+
+    def show(index: int) -> None:
+        image.set_data(energy[..., index] / scale.factor)
+        # The marker of a mean below the logarithmic axis lies at its edge.
+        marker.set_data([max(mean[index], right.get_xlim()[0])], [axis[index]])
+        gate, time = _caption(stack, index)
+        text = f"gate {gate.removeprefix('#').replace('  ', '  ·  ')}  ·  {time}"
+        title.set_text(drawing.titled(stack.attrs, text))
+
+    show(0)
+    return figure, show
+
+
+def _draw_pixel_gates(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
+    names = [str(name) for name in stack["pixel"].values]
+    energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
+    top = float(np.nanmax(energy, initial=0.0))
+    factor, prefix = drawing.si_prefix(top)
+    significant = energy[energy > SIGNIFICANT * stderr]
+    floor = max(0.5 * float(significant.min(initial=top)), top * 10.0**-_PIXEL_DECADES) / factor
+    depths = known_depths(stack)
+    axis = stack["gate_start"].values if depths is None else depths
+    ax = figure.subplots()
+    for i, (name, colour) in enumerate(zip(names, drawing.pixel_colours(len(names)), strict=True)):
+        style = {"color": colour, "linewidth": 1.3, "marker": "o", "markersize": 3.5, "label": name}
+        lowest = 1e-3 * floor if log else -np.inf
+        drawing.draw_band(ax, axis, energy[i] / factor, stderr[i] / factor, lowest=lowest, **style)
+    if log and top > 0:
+        ax.set_yscale("log")
+        ax.set_ylim(floor, 2 * top / factor)
+    if len(names) <= drawing.LISTED_PIXELS:
+        ax.legend(title="pixel", frameon=False)
+    ax.set_xlabel("start of the gate (ns)" if depths is None else "depth of the gate's middle (m)")
+    ax.set_ylabel(f"energy in the gate ({prefix}J)")
+    drawing.add_grid(ax)
+    ax.set_title(_title(stack, stack.sizes["gate"]))

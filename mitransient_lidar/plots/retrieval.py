@@ -1,0 +1,102 @@
+"""Figure of retrieved surface slopes against the true ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.plots import drawing
+
+_COLOURS = {"along": "#1f5fd6", "across": "#d8821e"}
+_NAMES = {"along": "towards the lidar", "across": "to the left"}
+
+
+def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | None = None) -> Figure:
+    """Draw retrieved slopes against true ones, one panel for each receiver; the legends give `slope_statistics`.
+
+    Parameters
+    ----------
+    receivers
+        By the name of the receiver: a result of `mitransient_lidar.analysis.retrieval.retrieve.surface_slopes`,
+        with ``true_slope_along`` and ``true_slope_across`` [1] over ``shot``.
+    path : path, optional
+        PNG, PDF or SVG file to write.
+
+    Raises
+    ------
+    UserError
+        If there is no receiver, the file has another suffix, or it cannot be written.
+
+    Examples
+    --------
+    ``docs/slope.png``, in about five minutes on two cores::
+
+        found = {}
+        for layout in ("2x2", "1x4"):
+            sea = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15, "layout": layout}
+            shots = shot_series.render_shots("fig09_2x2", sea, count=200)
+            slopes = retrieve.surface_slopes(shots, slope_deviation=shots.attrs["slope_deviation"])
+            found[layout] = slopes.merge(shots[["true_slope_along", "true_slope_across"]])
+        plot_slopes(found, "slope.png")
+    """
+    figure = drawing.new_figure(path, 4.6 * max(len(receivers), 1), 4.8)
+    if not receivers:
+        raise UserError("receivers = {} must hold at least one")
+    axes = figure.subplots(1, len(receivers), sharex=True, sharey=True, squeeze=False)[0]
+    for ax, (name, found) in zip(axes, receivers.items(), strict=True):
+        for direction, colour in _COLOURS.items():
+            truth, retrieved = (found[f"{kind}slope_{direction}"].values for kind in ("true_", ""))
+            finite = retrieved[np.isfinite(retrieved)]
+            if finite.size < 4 or np.ptp(finite) == 0:
+                continue
+            one = slope_statistics(truth, retrieved)
+            label = f"{_NAMES[direction]}: r = {one['correlation']:.2f}, bias {one['bias_deg']:+.1f}°, "
+            label += f"RMS {one['rms_deg']:.1f}°"
+            degrees = (np.degrees(np.arctan(values)) for values in (truth, retrieved))
+            ax.plot(*degrees, ".", color=colour, markersize=4, label=label)
+        ax.axline((0, 0), slope=1, color="0.5", linewidth=0.9)
+        ax.set_title(f"{name}, {found.sizes['shot']} shots", fontsize="medium")
+        ax.set_xlabel("true mean slope over the footprint (deg)")
+        ax.set_aspect("equal")
+        drawing.add_grid(ax)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize="small", handletextpad=0.2)
+    axes[0].set_ylabel("slope retrieved from the surface echoes of one shot (deg)")
+    return drawing.save(figure, path)
+
+
+def slope_statistics(truth: FloatArray, retrieved: FloatArray) -> dict[str, float]:
+    """Compare slopes [1] over shots, leaving out NaN.
+
+    Returns
+    -------
+    dict
+        ``correlation`` with the ends ``low`` and ``high`` of its 95 % interval (Fisher's z), ``bias_deg``, ``rms_deg``
+        and ``median_deg`` of the errors [degree], and ``shots``.
+
+    Raises
+    ------
+    UserError
+        If fewer than 4 shots have both slopes.
+    """
+    known = np.isfinite(truth) & np.isfinite(retrieved)
+    count = int(np.count_nonzero(known))
+    if count < 4:
+        raise UserError(f"slopes of {count} shots are known and must be at least 4 to be compared")
+    correlation = float(np.corrcoef(truth[known], retrieved[known])[0, 1])
+    z, width = math.atanh(correlation), 1.96 / math.sqrt(count - 3)
+    error = np.degrees(np.arctan(retrieved[known]) - np.arctan(truth[known]))
+    return {
+        "correlation": correlation,
+        "low": math.tanh(z - width),
+        "high": math.tanh(z + width),
+        "bias_deg": float(error.mean()),
+        "rms_deg": float(np.sqrt(np.mean(error**2))),
+        "median_deg": float(np.median(np.abs(error))),
+        "shots": float(count),
+    }

@@ -1,0 +1,194 @@
+"""Figures of a result: waveforms of a few pixels, or the image and the summed waveform of an imager."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Patch, Rectangle
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.plots import drawing
+from mitransient_lidar.results.geometry import LidarGeometry, optional_number
+
+Scale = Literal["both", "linear", "log"]
+
+_DECADES = 7  # at most, on a logarithmic axis
+
+
+def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
+    """Draw the waveforms of a result; of an imager the total energy of each pixel and the summed waveform.
+
+    Bands are +-1 standard error. The depth axis holds along the axis of the receiver,
+    depth = (t - t_surface) c0 / (2 n_g) cos(theta_water). The depth axis and the layout of the pixels are left out if
+    the result lacks their attributes.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A result of `mitransient_lidar.results.dataset`.
+    path : path, optional
+        PNG, PDF or SVG file to write.
+    scale : {'both', 'linear', 'log'}
+        Scale of the power axis; 'both' draws two panels.
+
+    Raises
+    ------
+    UserError
+        If `scale` is unknown, the file has another suffix, or it cannot be written.
+    """
+    if scale not in get_args(Scale):
+        raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}.")
+    panels = ["linear", "log"] if scale == "both" else [scale]
+    figure = drawing.new_figure(path, 9.6, 4.3 if len(panels) == 1 else 6.0)
+    is_image = "pixel" not in dataset.dims
+    grid = figure.add_gridspec(len(panels), 2, width_ratios=(1.6, 1.0) if is_image else (4.2, 1.3))
+    axes: list[Axes] = []
+    for row in range(len(panels)):
+        axes.append(figure.add_subplot(grid[row, 0], sharex=axes[0] if axes else None))
+    side = figure.add_subplot(grid[:, 1])
+
+    if is_image:
+        power = dataset["waveform"].sum(("row", "column")).values[np.newaxis]
+        # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.
+        error = np.zeros_like(power)
+        _draw_image(side, dataset)
+    else:
+        power, error = dataset["waveform"].values, dataset["waveform_stderr"].values
+        _draw_pixels(side, dataset)
+    for ax, panel in zip(axes, panels, strict=True):
+        _draw_waveforms(ax, dataset, power, error, log=panel == "log")
+    for ax in axes[:-1]:
+        ax.tick_params(labelbottom=False)
+    axes[-1].set_xlabel(drawing.TIME_LABEL)
+    _add_depth_axis(axes[0], dataset.attrs)
+    figure.suptitle(_title(dataset.attrs), fontsize="large")
+    return drawing.save(figure, path)
+
+
+def _draw_waveforms(ax: Axes, dataset: xr.Dataset, power: FloatArray, error: FloatArray, *, log: bool) -> None:
+    """Draw power and error [W], shape (pixel, time), in a suitable unit."""
+    time, limits = dataset["time"].values, drawing.time_limits(dataset)
+    inside = (time >= limits[0]) & (time <= limits[1])
+    shown = power[:, inside]
+    # A logarithmic axis ends where the signal falls below three standard errors.
+    significant = shown[np.isfinite(shown) & (shown > 0) & ~(shown < 3.0 * error[:, inside])]
+    top = float(significant.max()) if significant.size else 1.0
+    factor, prefix = drawing.si_prefix(top)
+    floor = top * 1e-3
+    if significant.size:
+        floor = max(0.5 * float(np.quantile(significant, 0.01)), top * 10.0**-_DECADES)
+    for values, spread, colour in zip(power / factor, error / factor, drawing.pixel_colours(len(power)), strict=True):
+        if len(power) <= drawing.LISTED_PIXELS:
+            lowest = 1e-3 * floor / factor if log else -np.inf
+            drawing.draw_band(ax, time, values, spread, lowest=lowest, color=colour, linewidth=1.3)
+        else:
+            ax.plot(time, values, color=colour, linewidth=0.6)
+    ax.set_xlim(limits)
+    if log:
+        ax.set_yscale("log")
+        ax.set_ylim(floor / factor, top / factor * 2.0)
+    else:
+        ax.set_ylim(min(0.0, float(np.nanmin(shown, initial=0.0))) / factor, top / factor * 1.08)
+    ax.set_ylabel(f"received power ({prefix}W)")
+    drawing.add_grid(ax, hide=("right",))
+
+
+def _add_depth_axis(ax: Axes, attributes: dict[str, Any]) -> None:
+    try:
+        geometry = LidarGeometry.from_attributes(attributes, surface="measured")
+    except UserError:
+        return
+    metres_per_ns = geometry.depth_per_ns
+    drawing.add_top_axis(ax, -geometry.surface_time_ns * metres_per_ns, metres_per_ns, "depth (m)")
+
+
+def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
+    """Draw the pixels in the field of view: far from nadir on top, +angle_y to the right."""
+    attributes, names = dataset.attrs, [str(name) for name in dataset["pixel"].values]
+    colours = drawing.pixel_colours(len(names))
+    ax.set_axis_off()
+    if len(names) <= drawing.LISTED_PIXELS:
+        legend = ax.legend(
+            handles=[Patch(color=colour, label=name) for name, colour in zip(names, colours, strict=True)],
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.08),
+            ncols=1 if len(names) <= 4 else 2,
+            frameon=False,
+            handlelength=1.0,
+        )
+        legend.set_in_layout(False)  # it fits into the room below the square axes
+    ax.set_anchor("N")
+    angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
+    width = optional_number(attributes, "field_of_view_mrad")
+    if width is None or width <= 0:
+        if len(names) > 1:
+            ax.scatter(angle_y, angle_x, c=colours, s=24)
+            ax.set_aspect("equal", "datalim")
+        return
+    sides = tuple(attributes.get("field_of_view_sides_mrad") or (width, width))
+    outline: Patch
+    if attributes.get("field_of_view_shape", "circle") == "circle":
+        outline = Circle((0, 0), width / 2)
+    else:
+        outline = Rectangle((-sides[1] / 2, -sides[0] / 2), sides[1], sides[0])
+    outline.set(facecolor="none", edgecolor="0.25", linewidth=1.2)
+    ax.add_patch(outline)
+    cells = _cells(str(attributes.get("layout", "")), angle_x, angle_y, sides)
+    if cells is None:
+        ax.scatter(angle_y, angle_x, c=colours, s=12)
+    else:
+        for (left, bottom, cell_width, cell_height), colour in zip(cells, colours, strict=True):
+            cell = Rectangle((left, bottom), cell_width, cell_height, facecolor=colour, edgecolor="white", alpha=0.9)
+            ax.add_patch(cell)
+            cell.set_clip_path(outline)
+    edge = 0.56 * width
+    ax.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
+    for y, text, side in ((edge, "far", "bottom"), (-edge, f"near · {width:g} mrad", "top")):
+        ax.text(0, y, text, ha="center", va=side, fontsize="small", color="0.3")
+
+
+def _cells(
+    layout: str, angle_x: FloatArray, angle_y: FloatArray, sides: Sequence[float]
+) -> list[tuple[float, float, float, float]] | None:
+    """Return the rectangle (left, bottom, width, height) of each pixel in a layout of equal cells, else None.
+
+    The layout counts cells in both directions; the centres of the pixels show which count is along range.
+    """
+    first, separator, second = layout.lower().partition("x")
+    if not (separator and first.isdecimal() and second.isdecimal() and int(first) * int(second) == len(angle_x) > 0):
+        return None
+    for along, across in {(int(first), int(second)), (int(second), int(first))}:
+        height, breadth = sides[0] / along, sides[1] / across
+        rows = np.floor((sides[0] / 2 - angle_x) / height).astype(int)
+        columns = np.floor((angle_y + sides[1] / 2) / breadth).astype(int)
+        inside = ((rows >= 0) & (rows < along) & (columns >= 0) & (columns < across)).all()
+        places = list(zip(rows.tolist(), columns.tolist(), strict=True))
+        if inside and len(set(places)) == len(angle_x):
+            return [
+                (column * breadth - sides[1] / 2, sides[0] / 2 - (row + 1) * height, breadth, height)
+                for row, column in places
+            ]
+    return None
+
+
+def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
+    """Draw the energy that each pixel has received."""
+    energy = dataset["impulse_response"].sum("time").values
+    factor, prefix = drawing.si_prefix(float(energy[np.isfinite(energy)].max(initial=0.0)))
+    image = drawing.draw_image(ax, energy / factor, dataset, cmap="viridis")
+    ax.set_anchor("N")
+    scale = ax.inset_axes((0.0, -0.24, 1.0, 0.05))
+    scale.set_in_layout(False)  # it fits into the room below the square pixels
+    ax.figure.colorbar(image, cax=scale, orientation="horizontal", label=f"total energy ({prefix}J)")
+
+
+def _title(attributes: dict[str, Any]) -> str:
+    error = optional_number(attributes, "error_median")
+    accuracy = f"median standard error {100 * error:.2g} %" if error is not None else ""
+    return "  ·  ".join(part for part in (drawing.scene_name(attributes) or "received power", accuracy) if part)

@@ -1,0 +1,1 @@
+"""Rendering in independent passes until a result is accurate enough."""

@@ -1,0 +1,269 @@
+"""Accumulation over the passes of a render: histograms and waveforms, or gates alone when memory is short."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.pulse import waveform
+from mitransient_lidar.rendering.accuracy import ErrorInflation, ErrorWindow, PassStatistics
+from mitransient_lidar.results.gate_stack import build_gates, check_train
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
+    from mitransient_lidar.transport.scene import LidarScene
+
+logger = logging.getLogger(__name__)
+
+#: Memory of a bin [bytes] for the means and errors over the passes, of energy and power, and their computation.
+_BYTES_PER_KEPT_BIN = 96
+#: Memory of a bin when a pass is converted to gates, and of a gate that is kept, with its weights in the film.
+_BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE = 8, 64
+
+#: Pixels from which the error of a gate is estimated.
+_ERROR_PIXELS = 4096
+
+#: A pixel is lit in a gate with this share of the energy of the gate's brightest pixels (99th percentile).
+_LIT = 0.05
+
+
+class PassAccumulator(ABC):
+    """Means and standard errors over the passes of a render.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene.
+    window
+        Bins in which errors count.
+    train
+        Gates, or None.
+    """
+
+    #: Gates that a pass sums instead of time bins, or None.
+    gate_weights: GateWeights | None = None
+
+    def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None) -> None:
+        self.scene, self.window, self.train = scene, window, train
+        self.gates = PassStatistics()
+
+    @property
+    @abstractmethod
+    def received(self) -> float:
+        """Energy received in all passes [J]."""
+
+    @abstractmethod
+    def add(self, histogram: TransientHistogram) -> None:
+        """Add the histogram of a pass."""
+
+    def errors(self) -> FloatArray:
+        """Return the relative standard errors that decide the end of the render, any number of them.
+
+        The error of a gate is the median over its lit pixels. Gates count whose middle lies between the surface echo
+        and the end of the bottom echo of some pixel.
+        """
+        middles = self._train.middles_ns
+        start, end = float(self.window.start_ns.min()), float(self.window.end_ns.max())
+        chosen = np.flatnonzero((middles >= start) & (middles <= end))
+        found: list[float] = []
+        # A sample of the pixels is enough, and ten times as fast.
+        sample = slice(None, None, max(1, len(self.gates.mean) // _ERROR_PIXELS))
+        mean, errors = self.gates.mean[sample], self.gates.stderr_of(sample)
+        for gate in chosen if chosen.size else range(middles.size):
+            energy, stderr = mean[:, gate], errors[:, gate]
+            lit = energy > _LIT * np.nanpercentile(energy, 99)
+            found.append(float(np.median(stderr[lit] / energy[lit])) if lit.any() else np.inf)
+        return np.array(found)
+
+    @abstractmethod
+    def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
+        """Return the labelled result."""
+
+    @property
+    def _train(self) -> GateTrain:
+        assert self.train is not None
+        return self.train
+
+    def _gate_stack(self, coords: Mapping[Any, Any], attributes: dict[str, Any]) -> xr.Dataset:
+        """Return the labelled gates."""
+        pixels = self.scene.receiver.pixels
+        shape = (*(pixels.grid or (pixels.count,)), self._train.count)
+        mean, stderr = (values.reshape(shape) for values in (self.gates.mean, self.gates.stderr))
+        if invalid := np.count_nonzero(~np.isfinite(mean).all(axis=-1)):
+            logger.warning("gates of %d of %d pixels hold values that are not finite", invalid, mean[..., 0].size)
+        return build_gates(mean, stderr, self._train, coords=coords, attributes=attributes)
+
+
+class WaveformAccumulator(PassAccumulator):
+    """Keeps energy and power of every bin, and the gates cut from them."""
+
+    def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None) -> None:
+        super().__init__(scene, window, train)
+        response = scene.receiver.optics.response_time_ns
+        self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
+        self._energy, self._power, self._inflation = PassStatistics(), PassStatistics(), ErrorInflation()
+        self._weights = None if train is None else _weights(scene, train)
+
+    @property
+    def received(self) -> float:
+        """Energy received in all passes [J]."""
+        return float(np.nansum(self._energy.mean)) * self._energy.count
+
+    def add(self, histogram: TransientHistogram) -> None:
+        """Add the histogram of a pass."""
+        energy = histogram.energy().reshape(self.scene.receiver.pixels.count, -1)
+        power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
+        self._energy.add(energy)
+        self._power.add(power)
+        self._inflation.add(power)
+        if self._weights is not None:
+            self.gates.add(energy @ self._weights)
+
+    def errors(self) -> FloatArray:
+        """Return the relative standard errors of the gates, or without gates of the bins that count."""
+        if self.train is not None:
+            return super().errors()
+        return self.window.relative_errors(self._power.mean, self._power.stderr)
+
+    def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
+        """Return the labelled result; gates are two more variables."""
+        axis, pixels = self.scene.axis, self.scene.receiver.pixels
+        bins, inflation = self._inflation.over(self._power.mean, self._power.stderr)
+        built = results.build(
+            self._energy.mean,
+            self._energy.stderr,
+            self._power.mean,
+            self._power.stderr,
+            time=axis,
+            pixel_names=pixels.names,
+            pixel_centres_mrad=1e3 * pixels.centres(),
+            grid=pixels.grid,
+            attributes={**attributes, "error_inflation_bins": bins, "error_inflation": inflation},
+        )
+        if self.train is None:
+            return built
+        stack = self._gate_stack(built.coords, dict(built.attrs))
+        return built.merge(stack, combine_attrs="override").assign_attrs(stack.attrs)
+
+
+class GateAccumulator(PassAccumulator):
+    """Keeps gates alone, cut from each pass's histogram or summed in the pass."""
+
+    def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain, direct: bool) -> None:
+        super().__init__(scene, window, train)
+        self._weights = None if direct else _weights(scene, train).astype(np.float32)
+        if direct:
+            from mitransient_lidar.transport.histogram import GateWeights
+
+            response = scene.receiver.optics.response_time_ns
+            self.gate_weights = GateWeights(train, train.response_weights(scene.transmitter.pulse, response))
+
+    @property
+    def received(self) -> float:
+        """Energy in the gates of all passes [J]; where gates overlap it counts several times."""
+        return float(np.nansum(self.gates.mean)) * self.gates.count
+
+    def add(self, histogram: TransientHistogram) -> None:
+        """Add the histogram of a pass."""
+        count = self.scene.receiver.pixels.count
+        if self._weights is None:
+            self.gates.add(histogram.energy().reshape(count, -1))
+        else:
+            # The sums of one pass in 32 bits, those over the passes in 64.
+            self.gates.add((histogram.rounded_energy().reshape(count, -1) @ self._weights).astype(np.float64))
+
+    def dataset(self, attributes: dict[str, Any]) -> xr.Dataset:
+        """Return the labelled gates."""
+        pixels = self.scene.receiver.pixels
+        coords = results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid)
+        return self._gate_stack(coords, results.provenance(attributes))
+
+
+def choose_accumulator(
+    scene: LidarScene, window: ErrorWindow, surface_time_ns: float | None, max_memory: float
+) -> PassAccumulator:
+    """Return the accumulator that keeps most within the memory.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene.
+    window
+        Bins in which errors count.
+    surface_time_ns
+        Mean time of the surface echo [ns], from which the depth of gates is counted; None when none is seen.
+    max_memory
+        Memory for film, means and errors [GB].
+
+    Raises
+    ------
+    UserError
+        When not even a single gate fits, when a histogram without gates does not, or when gates by depth have no
+        surface to count from.
+    """
+    from mitransient_lidar.transport.histogram import TransientHistogram
+
+    pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
+    bins, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
+    train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
+    film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
+    everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + gates
+    if everything <= limit:
+        return WaveformAccumulator(scene, window, train)
+    size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
+    if train is None:
+        raise UserError(
+            f"{size}: more than max_memory = {max_memory:g} GB allows; "
+            "take fewer bins or pixels, or gates (gate_count), which do not need it"
+        )
+    if film_bytes + _BYTES_PER_PASSING_BIN * bins + gates <= limit:
+        logger.warning("%s, more than max_memory = %g GB: gates are kept, histograms are not", size, max_memory)
+        return GateAccumulator(scene, window, train, direct=False)
+    each = (per_bin + _BYTES_PER_KEPT_GATE) * pixels
+    if each * train.count > limit:
+        fitting = int(limit // each)
+        room = f"room for {fitting} of them" if fitting else "less than one gate needs"
+        raise UserError(
+            f"max_memory = {max_memory:g} GB is {room}: {train.count} gates of {pixels} pixels take "
+            f"{1e-9 * each * train.count:.2g} GB, so allow that much, or fewer gates or pixels"
+        )
+    logger.warning("%s, more than max_memory = %g GB: gates are summed directly", size, max_memory)
+    return GateAccumulator(scene, window, train, direct=True)
+
+
+def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
+    """Return the scene's gates at their time, None without any."""
+    plan = scene.gates
+    if plan is None:
+        return None
+    if plan.start_ns is None and surface_time_ns is None:
+        raise UserError(
+            f"gate_start_depth = {plan.start_depth:g} m counts from the surface echo, and the receiver sees no "
+            "surface: give gate_start_ns"
+        )
+    sine = np.sqrt(max(0.0, 1 - float(scene.receiver.pose.axis[2]) ** 2)) / scene.refractive_index
+    surface = 0.0 if surface_time_ns is None else surface_time_ns
+    train = plan.placed(surface, scene.group_index, float(np.sqrt(1 - sine**2)))
+    seen = {} if surface_time_ns is None else {"surface_time_ns": surface, "window_start_ns": float(start_ns)}
+    check_train(train, seen, scene.axis)
+    return train
+
+
+def _weights(scene: LidarScene, train: GateTrain) -> FloatArray:
+    """Return the weight of light that arrives in each bin in each gate, pulses included, shape (bin, gate)."""
+    table = train.response_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns)
+    times = table.start_ns + table.step_ns * np.arange(table.values.size)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (table.values[1:] + table.values[:-1]) * table.step_ns)])
+    shifts = train.step_ns * np.arange(train.count)
+    within = np.interp(scene.axis.edges_ns[:, None] - shifts, times, integral)
+    return np.asarray(np.diff(within, axis=0) * (train.pulses / scene.axis.bin_width_ns))

@@ -1,0 +1,239 @@
+"""Rendering of images by daylight, still or animated."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.rendering.accuracy import RatioStatistics
+from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, pass_seed, run_passes
+from mitransient_lidar.rendering.session import (
+    TOLERATED_LOSS,
+    Session,
+    choose_integrator,
+    open_scene,
+    pass_attributes,
+    warn_of_edge_loss,
+)
+from mitransient_lidar.results.radiance import build_radiance
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
+
+logger = logging.getLogger(__name__)
+
+#: End of a frame without any of its options.
+DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
+
+#: Parameter of an XML scene: time of its sea [s].
+TIME_PARAMETER = "surface_time"
+
+_MOST_FRAMES = 10_000
+
+
+def render_passive(
+    scene: str | Path | Mapping[str, Any] | mi.Scene,
+    params: Mapping[str, Any] | None = None,
+    *,
+    integrator: str | Mapping[str, Any] | None = None,
+    target_error: float | None = None,
+    max_time: float | None = None,
+    passes: int | None = None,
+    seed: int = 0,
+    frames: int = 1,
+    frame_step_s: float = 0.1,
+    filter_width_nm: float | None = None,
+    variant: str | None = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Render the radiance that the receiver sees by daylight.
+
+    Parameters
+    ----------
+    scene
+        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, or a loaded scene, with a
+        ``sun``, a ``sky``, or both. A laser in it is ignored.
+    params
+        Values for the ``<default>`` parameters of an XML scene.
+    integrator
+        Name or dict of a passive integrator; by default the scene's own, or ``passive_volpath``.
+    target_error
+        Relative standard error, greater than 0: the passes of a frame end when 95 % of the pixels have reached it
+        (after at least 8 passes).
+    max_time
+        Longest time for the passes of a frame [s], greater than 0.
+    passes
+        Number of passes of a frame, at least 2. Without any of the three the target is 0.05 within 120 s.
+    seed
+        Any integer; frames and passes have independent random numbers.
+    frames
+        Number of frames, 1 to 10 000.
+    frame_step_s
+        Time between frames [s], greater than 0. The sea moves on by it: through ``surface_time`` of an XML scene, or
+        ``time`` of the ``ocean_surface`` of a dict.
+    filter_width_nm
+        Width of the receiver's filter [nm], greater than 0, for ``background_power``.
+    variant
+        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
+    progress
+        Called with a `passes.Progress` of the frame after every pass.
+
+    Returns
+    -------
+    xarray.Dataset
+        As described in `results.radiance`. ``etendue`` [m^2 sr] is open area times solid angle of each pixel times
+        the transmittance of optics and (one way) air; power is radiance times etendue times width of the filter. The
+        attribute ``background_radiance`` is the mean over the field of view. After Ctrl-C it holds the frames begun,
+        and the attribute ``interrupted`` is 1.
+
+    Raises
+    ------
+    UserError
+        When the scene, a parameter or an option is invalid.
+    """
+    frames, step = integer("frames", frames, 1, _MOST_FRAMES), positive("frame_step_s", frame_step_s)
+    width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
+    goal = Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL)
+    images: list[tuple[FloatArray, FloatArray]] = []
+    start, lost = time.perf_counter(), 0.0
+    for frame in range(frames):
+        moved = _moved(scene, params, frame * step) if frames > 1 else (scene, params)
+        session = open_scene(*moved, variant)
+        chosen = _choose_integrator(session, integrator)
+        renderer = chosen.prepare(session.scene, session.sensor)
+        if frame == 0:
+            described, first = _describe(renderer), session
+            pixels, etendue = renderer.scene.receiver.pixels, _etendue(renderer)
+        try:
+            statistics, log, share = _render_frame(renderer, goal, pass_seed(seed, frame), progress)
+        except KeyboardInterrupt:
+            if not images:
+                raise
+            interrupted = True
+            break
+        images.append((statistics.ratio, statistics.stderr))
+        if statistics.invalid:
+            logger.warning("%d of %d pixels have non-finite radiance", statistics.invalid, len(statistics.ratio))
+        last, lost, interrupted = log, max(lost, share), log.interrupted
+        if interrupted:
+            break
+    warn_of_edge_loss(lost)
+    attributes = first.attributes(
+        integrator=chosen.plugin,
+        **{**pass_attributes(last, seed), "interrupted": int(interrupted)},
+        **described,
+        elapsed_s=time.perf_counter() - start,
+        error_median=last.error_median,
+        error_p95=last.error_p95,
+        surface_edge_loss=lost,
+    )
+    return build_radiance(
+        images,
+        step * np.arange(len(images), dtype=np.float64) if frames > 1 else None,
+        etendue,
+        coords=results.pixel_coordinates(pixels.names, 1e3 * pixels.centres(), pixels.grid),
+        grid=pixels.grid,
+        filter_width_nm=width,
+        attributes=attributes,
+    )
+
+
+def _render_frame(
+    renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None
+) -> tuple[RatioStatistics, PassLog, float]:
+    """Render the passes of one frame; return their statistics, log and share of light lost at the surface's edge."""
+    statistics, received = RatioStatistics(renderer.scene.receiver.pixels.count), 0.0
+
+    def render_pass(number: int, seed: int) -> float:
+        nonlocal received
+        record = renderer.render_pass(seed)
+        found = np.array(record.found)
+        statistics.add(found, np.array(record.sampled))
+        received += float(np.sum(found))
+        return float(record.edge_loss[0])
+
+    log = run_passes(render_pass, goal, seed=seed, errors=statistics.relative_errors, progress=progress)
+    return statistics, log, log.edge_loss_share(received)
+
+
+def _choose_integrator(session: Session, wanted: str | Mapping[str, Any] | None) -> Any:
+    """Return the caller's choice, the scene's own integrator if it is passive, or the default one."""
+    own = session.scene.integrator()
+    default = own if getattr(own, "passive", False) else "passive_volpath"
+    return choose_integrator(session.scene, default if wanted is None else wanted, passive=True)
+
+
+def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[Any, Mapping[str, Any] | None]:
+    """Return scene and parameters with the sea a time `later` [s]."""
+    if isinstance(scene, Mapping):
+        moved = {name: copy.copy(part) if isinstance(part, dict) else part for name, part in scene.items()}
+        seas = [part for part in moved.values() if isinstance(part, dict) and part.get("type") == "ocean_surface"]
+        for sea in seas:
+            sea["time"] = sea.get("time", 0.0) + later
+        if not seas:
+            raise UserError("frames need an ocean_surface in the scene: nothing else changes with time")
+        return moved, params
+    if not isinstance(scene, (str, os.PathLike)):
+        raise UserError("frames need a scene by its name, path or dict: the time of a loaded one cannot be changed")
+    defaults = catalogue.scene_parameters(catalogue.scene_path(scene))
+    if TIME_PARAMETER not in defaults:
+        raise UserError(
+            f"frames need a parameter {TIME_PARAMETER} of the scene, which is the time of its ocean_surface"
+        )
+    given = {**(params or {})}
+    try:
+        begin = float(given.get(TIME_PARAMETER, defaults[TIME_PARAMETER]))
+    except ValueError:
+        raise UserError(f"{TIME_PARAMETER} = {given.get(TIME_PARAMETER)!r} must be a number") from None
+    return scene, {**given, TIME_PARAMETER: begin + later}
+
+
+def _etendue(renderer: DaylightRenderer) -> FloatArray:
+    """Return open area times solid angle times transmittance of optics and air, one way [m^2 sr], shape (pixels,)."""
+    from mitransient_lidar.transport.daylight.sampling import pixel_solid_angles
+
+    receiver = renderer.scene.receiver
+    optics = receiver.optics
+    one_way = float(np.sqrt(optics.two_way_atmospheric_transmittance))
+    area = optics.aperture_area * (1 - optics.obscuration) * optics.optical_efficiency * one_way
+    return np.asarray(area * pixel_solid_angles(receiver.pixels))
+
+
+def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
+    """Return the attributes of an image that describe receiver and daylight; warn of a view outside the surface."""
+    from mitransient_lidar.transport.daylight.sampling import share_outside_surface
+
+    scene, receiver = renderer.scene, renderer.scene.receiver
+    outside = share_outside_surface(scene, renderer.sampler)
+    if outside > TOLERATED_LOSS:
+        logger.warning("%.2g %% of the view passes outside the surface; enlarge the surface's size", 100 * outside)
+    described = {
+        "layout": receiver.pixels.layout,
+        "field_of_view_mrad": 1e3 * receiver.pixels.field_of_view,
+        "field_of_view_shape": receiver.pixels.field_of_view_shape,
+        "aperture_area": receiver.optics.aperture_area,
+        "altitude": float(receiver.pose.origin[2]),
+        "off_nadir_deg": receiver.pose.off_nadir_deg,
+        "refractive_index": scene.refractive_index,
+        "surface_slope_variance": scene.slope_variance,
+        "view_outside_surface": outside,
+    }
+    if scene.sun is not None:
+        described |= {"sun_zenith_deg": scene.sun.zenith_deg, "sun_irradiance": scene.sun.irradiance}
+    if scene.sky is not None:
+        described |= {"sky_distribution": scene.sky.distribution, "sky_irradiance": scene.sky.irradiance}
+    return described

@@ -1,0 +1,193 @@
+"""Rendering of a lidar scene to an accuracy."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import positive
+from mitransient_lidar.rendering.accumulators import choose_accumulator
+from mitransient_lidar.rendering.accuracy import ErrorWindow
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
+from mitransient_lidar.rendering.session import (
+    TOLERATED_LOSS,
+    choose_integrator,
+    open_scene,
+    pass_attributes,
+    warn_of_edge_loss,
+)
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+    import xarray
+
+    from mitransient_lidar.rendering.echo_window import EchoProbe
+    from mitransient_lidar.transport.scene import LidarScene
+
+logger = logging.getLogger(__name__)
+
+#: End of a render without any of its options, with waveforms and with gates.
+DEFAULT_GOAL = Goal(target_error=0.03, max_time=300.0)
+DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
+
+#: Memory [GB].
+DEFAULT_MAX_MEMORY = 2.0
+
+
+def render(
+    scene: str | Path | Mapping[str, Any] | mi.Scene,
+    *,
+    params: Mapping[str, Any] | None = None,
+    integrator: str | Mapping[str, Any] | mi.Integrator | None = None,
+    target_error: float | None = None,
+    max_time: float | None = None,
+    passes: int | None = None,
+    seed: int = 0,
+    max_memory: float | None = None,
+    variant: str | None = None,
+    progress: ProgressCallback | None = None,
+) -> xarray.Dataset:
+    """Render a lidar scene in independent passes until it is accurate enough.
+
+    Parameters
+    ----------
+    scene
+        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, or a loaded scene.
+    params
+        Values for the ``<default>`` parameters of an XML scene.
+    integrator
+        Name or dict of an integrator plugin, or an integrator, instead of the scene's.
+    target_error
+        Relative standard error, greater than 0: passes end when 95 % of the waveform's bins, of every lit pixel from
+        the surface echo to the end of the bottom echo, have reached it (after at least 8 passes). In a scene with
+        gates: when 95 % of the gates have, in the median over the pixels that are lit in them.
+    max_time
+        Longest time for the passes [s], greater than 0.
+    passes
+        Number of passes, at least 2. Without any of the three the target is 0.03 within 300 s, or 0.1 within 60 s in a
+        scene with gates.
+    seed
+        Any integer; the same seed gives the same result on the same machine.
+    max_memory
+        Memory for histograms, means and errors [GB], greater than 0; 2 by default. When those of a scene with gates
+        take more, gates alone are kept, with a warning.
+    variant
+        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
+    progress
+        Called with a `passes.Progress` after every pass.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``impulse_response`` [J per bin], ``waveform`` [W] (after the pulse and the receiver's response) and their
+        standard errors, with dimensions (pixel, time) or (row, column, time); see `results.dataset`. With gates in the
+        scene's film also, or instead, ``gate_energy`` [J]; see `results.gate_stack`. After Ctrl-C it holds the passes
+        so far, and the attribute ``interrupted`` is 1.
+
+    Raises
+    ------
+    UserError
+        When the scene, a parameter or an option is invalid.
+    """
+    Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL)
+    max_memory = DEFAULT_MAX_MEMORY if max_memory is None else positive("max_memory", max_memory)
+    session = open_scene(scene, params, variant)
+    chosen = choose_integrator(session.scene, integrator)
+    renderer = chosen.prepare(session.scene, session.sensor)
+    lidar: LidarScene = renderer.scene
+    from mitransient_lidar.rendering.describe import describe_lidar
+    from mitransient_lidar.rendering.echo_window import probe_echoes
+
+    probe = probe_echoes(lidar, renderer.sampler)
+    window = _error_window(lidar, probe)
+    _check_record(lidar, probe)
+    _check_solids(lidar, probe)
+    # The mean arrival over all pixels is the zero of the depth axis.
+    seen = probe.surface_ns[:, 1]
+    surface = {"surface_time_ns": float(np.nanmean(seen))} if np.isfinite(seen).any() else {}
+    accumulator = choose_accumulator(lidar, window, surface.get("surface_time_ns"), max_memory)
+    default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
+
+    def render_pass(number: int, seed: int) -> float:
+        record = renderer.render_pass(seed, gates=accumulator.gate_weights)
+        accumulator.add(record.histogram)
+        return float(record.edge_loss[0])
+
+    log = run_passes(
+        render_pass,
+        Goal.from_options(target_error, max_time, passes, default),
+        seed=seed,
+        errors=accumulator.errors,
+        progress=progress,
+    )
+    if lidar.surfaces and probe.missed_beam > TOLERATED_LOSS:
+        logger.warning(
+            "the surface is smaller than the footprint: %.2g %% of the beam in the field of view passes outside it; "
+            "enlarge the surface's size",
+            100 * probe.missed_beam,
+        )
+    lost = log.edge_loss_share(accumulator.received)
+    warn_of_edge_loss(lost)
+    attributes = session.attributes(
+        integrator=chosen.plugin,
+        **pass_attributes(log, seed),
+        elapsed_s=log.elapsed_s,
+        error_median=log.error_median,
+        error_p95=log.error_p95,
+        surface_edge_loss=lost,
+        beam_outside_surface=probe.missed_beam,
+        **describe_lidar(lidar),
+        **surface,
+        window_start_ns=float(window.start_ns.min()),
+        window_end_ns=float(window.end_ns.max()),
+    )
+    return accumulator.dataset(attributes)
+
+
+def _error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
+    """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
+    time_ns = lidar.axis.centres_ns
+    start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * lidar.transmitter.pulse.fwhm_ns
+    # Without a surface (a plate in the air) or a bottom, the window reaches from the record's start or to its end.
+    start = np.where(np.isnan(start), time_ns[0], start)
+    return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
+
+
+def _check_record(lidar: LidarScene, probe: EchoProbe) -> None:
+    """Refuse a record that ends before the surface echo."""
+    axis, arrivals = lidar.axis, probe.surface_ns[:, 0]
+    if np.isfinite(arrivals).any() and axis.end_ns <= (first := float(np.nanmin(arrivals))):
+        raise UserError(
+            f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns "
+            f"end the record at {axis.end_ns:g} ns: it must end after the surface echo, which comes at {first:.1f} ns"
+        )
+
+
+def _check_solids(lidar: LidarScene, probe: EchoProbe) -> None:
+    """Refuse a bottom that rises through the sea where the receiver looks, and a target below the bottom.
+
+    Warn of a target that rises through the sea, or lies above it.
+    """
+    bottom: Any = max(lidar.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
+    highest = max((float(surface.bbox().max.z) for surface in lidar.surfaces), default=np.inf)
+    for solid in lidar.solids:
+        low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
+        if solid is not bottom and high < float(bottom.bbox().min.z):
+            raise UserError(
+                f"shape {solid.id()!r} lies below the bottom {bottom.id()!r}, up to z = {high:.3g} m: "
+                f"it must lie above {float(bottom.bbox().min.z):.3g} m"
+            )
+        if low > highest:
+            logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
+    for solid, is_bottom in probe.pierced:
+        if is_bottom:
+            raise UserError(
+                f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
+                "receiver looks: a bottom must lie below the waves"
+            )
+        logger.warning("shape %r rises through the sea surface: part of it is seen in the air", solid.id())

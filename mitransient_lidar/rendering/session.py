@@ -1,0 +1,110 @@
+"""A loaded scene with its sensor and integrator, ready to be rendered."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import variants
+from mitransient_lidar.loading.scenes import as_user_error, load_scene
+from mitransient_lidar.rendering.passes import PassLog
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+logger = logging.getLogger(__name__)
+
+#: Share of the energy lost at the edge of the surface mesh above which a warning is given.
+TOLERATED_LOSS = 1e-3
+
+
+@dataclass(frozen=True)
+class Session:
+    """A loaded scene.
+
+    Attributes
+    ----------
+    scene, sensor
+        The Mitsuba scene and its first sensor.
+    name
+        Name of the scene.
+    parameters
+        Parameters of an XML scene with their values as text.
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    name: str
+    parameters: dict[str, str]
+
+    def attributes(self, **others: Any) -> dict[str, Any]:
+        """Return the attributes of a result: scene, versions, others, and the scene's parameters."""
+        parameters = {f"scene.{key}": value for key, value in self.parameters.items()}
+        return {"scene": self.name, **variants.versions(), **others, **parameters}
+
+
+def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str | None = None) -> Session:
+    """Load a scene and find its sensor.
+
+    Parameters
+    ----------
+    scene, params
+        As for `loading.scenes.load_scene`.
+    variant
+        Mitsuba variant; by default the active one, or the fastest that works here.
+
+    Raises
+    ------
+    UserError
+        When the scene cannot be loaded, or has no sensor.
+    """
+    variants.set_variant(variant)
+    loaded, name, parameters = load_scene(scene, params)
+    sensors = loaded.sensors()
+    if not sensors:
+        raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")
+    return Session(loaded, sensors[0], name, parameters)
+
+
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Any:
+    """Return the integrator to use: the caller's choice (name, dict or integrator) or the scene's own.
+
+    Raises
+    ------
+    UserError
+        When it is no lidar integrator, or none for daylight where `passive` is true.
+    """
+    import mitsuba as mi
+
+    if wanted is None:
+        chosen = scene.integrator()
+    elif isinstance(wanted, mi.Integrator):
+        chosen = wanted
+    else:
+        with as_user_error():
+            chosen = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
+    if not hasattr(chosen, "plugin"):
+        raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
+    if passive and not chosen.passive:
+        raise UserError(f"integrator = {chosen.plugin!r} renders no images by daylight: use 'passive_volpath'")
+    if chosen.passive and not passive:
+        raise UserError(f"integrator: {chosen.plugin} has no laser; use a lidar integrator, or render_passive")
+    return chosen
+
+
+def pass_attributes(log: PassLog, seed: int) -> dict[str, Any]:
+    """Return the attributes of a result that describe its passes."""
+    return {"seed": int(seed), "passes": log.count, "interrupted": int(log.interrupted)}
+
+
+def warn_of_edge_loss(share: float) -> None:
+    """Warn when a large share of the energy is lost at the edge of the surface mesh."""
+    if share > TOLERATED_LOSS:
+        logger.warning(
+            "the surface is smaller than the spread of the light in the water: about %.2g %% of the received energy is "
+            "lost at its edge; enlarge the surface's size",
+            100 * share,
+        )

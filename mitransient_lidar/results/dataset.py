@@ -1,0 +1,308 @@
+"""Labelled results, and their files.
+
+A result is an `xarray.Dataset` with the variables ``impulse_response`` [J per bin] and ``waveform`` [W] and their
+standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the dimensions (pixel, time), or (row, column,
+time) for an imager. The coordinates are ``time`` [ns] at the centres of the bins, ``pixel`` (names), and the centres of
+the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes.
+
+EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar._version import __version__
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results import exr, netcdf
+from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format, text
+from mitransient_lidar.results.geometry import optional_number
+
+_LOG = logging.getLogger(__name__)
+
+_VARIABLES: dict[str, dict[str, str]] = {
+    "impulse_response": {
+        "units": "J",
+        "long_name": "received energy per time bin",
+        "ancillary_variables": "impulse_response_stderr",
+    },
+    "impulse_response_stderr": {"units": "J", "long_name": "standard error of the received energy per time bin"},
+    "waveform": {"units": "W", "long_name": "received power", "ancillary_variables": "waveform_stderr"},
+    "waveform_stderr": {"units": "W", "long_name": "standard error of the received power"},
+}
+_CHANNELS = {
+    "impulse_response": ("bin", "Y"),
+    "impulse_response_stderr": ("bin", "stderr"),
+    "waveform": ("wave", "Y"),
+    "waveform_stderr": ("wave", "stderr"),
+}
+_TIME_TOLERANCE = 1e-3  # of a bin, between the time coordinate and the attributes
+_NAMED_PIXELS = 5  # largest number of pixels listed in a warning
+
+
+def build(
+    impulse_response: npt.ArrayLike,
+    impulse_response_stderr: npt.ArrayLike,
+    waveform: npt.ArrayLike,
+    waveform_stderr: npt.ArrayLike,
+    *,
+    time: TimeAxis,
+    pixel_names: Sequence[str],
+    pixel_centres_mrad: npt.ArrayLike,
+    grid: tuple[int, int] | None = None,
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Label the arrays of a render as a result, see the module's documentation.
+
+    Non-finite values are kept; a warning lists their pixels.
+
+    Parameters
+    ----------
+    impulse_response, impulse_response_stderr : array-like of shape (pixel, time)
+        Received energy and its standard error. [J per bin]
+    waveform, waveform_stderr : array-like of shape (pixel, time)
+        Received power after the pulse and the receiver's response, and its standard error. [W]
+    time : TimeAxis
+        The time bins.
+    pixel_names : sequence of str
+        Unique names of the pixels; unused with `grid`.
+    pixel_centres_mrad : array-like of shape (pixel, 2)
+        Tangent-plane angles (angle_x, angle_y) of the centres of the pixels. [mrad]
+    grid : tuple of int, optional
+        Rows and columns of an imager, with pixels in row-major order.
+    attributes : mapping of str to int, float, str or a list of those
+        Parameters and outcome of the render; they override the attributes set here (``title``, ``history``, ...).
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, names repeat, a number is out of range or an attribute has an unsupported type.
+    """
+    values = {
+        name: np.array(array, dtype=np.float64)
+        for name, array in zip(
+            _VARIABLES, (impulse_response, impulse_response_stderr, waveform, waveform_stderr), strict=True
+        )
+    }
+    shape = values["impulse_response"].shape
+    if len(shape) != 2 or 0 in shape:
+        raise ValueError(f"impulse_response has shape {shape}; it must be (pixel, time) with at least one of each.")
+    for name, array in values.items():
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}; it must be that of impulse_response, {shape}.")
+    if time.bin_count != shape[1]:
+        raise ValueError(f"time has {time.bin_count} bins; it must have those of impulse_response, {shape[1]}.")
+    centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
+    if centres.shape != (shape[0], 2) or not np.isfinite(centres).all():
+        raise ValueError(
+            f"pixel_centres_mrad must be {shape[0]} finite pairs (angle_x, angle_y), but has shape {centres.shape}."
+        )
+    if not math.isfinite(time.start_ns):
+        raise ValueError(f"time_start_ns = {time.start_ns} must be finite.")
+    if not (math.isfinite(time.bin_width_ns) and time.bin_width_ns > 0):
+        raise ValueError(f"bin_width_ns = {time.bin_width_ns} must be a finite number above 0.")
+
+    coords = pixel_coordinates(pixel_names, centres, grid)
+    dims = coords["angle_x"][0]
+    layout = coords["angle_x"][1].shape
+    time_name = "time at the centre of the bin since the pulse's peak left the transmitter"
+    coords["time"] = ("time", time.centres_ns, {"units": "ns", "long_name": time_name})
+    bins = {"time_start_ns": float(time.start_ns), "bin_width_ns": float(time.bin_width_ns)}
+
+    _warn_of_non_finite(
+        values,
+        coords["pixel"][1].tolist() if grid is None else [f"({i // grid[1]}, {i % grid[1]})" for i in range(shape[0])],
+    )
+    return xr.Dataset(
+        {name: ((*dims, "time"), values[name].reshape(*layout, -1), dict(_VARIABLES[name])) for name in _VARIABLES},
+        coords,
+        provenance({**bins, **attributes}),
+    )
+
+
+def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
+    """Return the dimensions of a variable, (pixel, time) or (row, column, time), optionally after ``shot``.
+
+    Raises
+    ------
+    UserError
+        If the variable or a coordinate is missing, or the dimensions are others.
+    """
+    if name not in dataset:
+        raise UserError(f"the dataset has no variable {name}: it must be a result with a record in time")
+    dims = tuple(str(dim) for dim in dataset[name].dims)
+    own = dims[1:] if shots and dims[:1] == ("shot",) else dims
+    if own not in (("pixel", "time"), ("row", "column", "time")):
+        after = ", or these after shot" if shots else ""
+        raise UserError(f"{name} has the dimensions {dims}; they must be (pixel, time) or (row, column, time){after}")
+    if missing := [dim for dim in dims if dim not in dataset.coords]:
+        raise UserError(f"the dataset has no coordinate {missing[0]}; {name} over {dims} needs it")
+    return dims
+
+
+def time_axis(dataset: xr.Dataset) -> TimeAxis:
+    """Return the time bins of a dataset.
+
+    They come from the attributes ``time_start_ns`` and ``bin_width_ns`` where the coordinate ``time`` agrees with
+    them, else from the coordinate, as after a selection of bins.
+
+    Raises
+    ------
+    UserError
+        If the dataset has no coordinate ``time``, or a single bin of unknown width.
+    """
+    if "time" not in dataset.coords:
+        raise UserError("the dataset has no coordinate time")
+    centres = np.asarray(dataset["time"].values, dtype=np.float64)
+    start, width = (optional_number(dataset.attrs, name) for name in ("time_start_ns", "bin_width_ns"))
+    if start is not None and width is not None and width > 0:
+        stored = TimeAxis(start, width, centres.size)
+        if np.allclose(stored.centres_ns, centres, rtol=0, atol=_TIME_TOLERANCE * width):
+            return stored
+    if centres.size > 1:
+        width = float(centres[-1] - centres[0]) / (centres.size - 1)
+    if width is None or not width > 0:
+        raise UserError("the dataset has no attribute bin_width_ns, and its coordinate time no two increasing times")
+    return TimeAxis(float(centres[0]) - 0.5 * width, width, centres.size)
+
+
+def pixel_coordinates(
+    pixel_names: Sequence[str], pixel_centres_mrad: npt.ArrayLike, grid: tuple[int, int] | None = None
+) -> dict[str, Any]:
+    """Return the coordinates of pixels: their names, or rows and columns, and their centres angle_x and angle_y.
+
+    The arguments are those of `build`.
+
+    Raises
+    ------
+    ValueError
+        If names repeat, or the number of names or grid cells differs from that of the centres.
+    """
+    centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
+    count = len(centres)
+    dims: tuple[str, ...]
+    layout: tuple[int, ...]
+    coords: dict[str, Any]
+    if grid is None:
+        names = [text(name) for name in pixel_names]
+        if len(names) != count or len(set(names)) != len(names):
+            raise ValueError(f"pixel_names = {names} must be {count} different names, one a pixel.")
+        dims, layout = ("pixel",), (count,)
+        coords = {"pixel": ("pixel", np.array(names, dtype=str), {"long_name": "pixel name"})}
+    else:
+        rows, columns = grid
+        if rows < 1 or columns < 1 or rows * columns != count:
+            raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
+        dims, layout = ("row", "column"), (rows, columns)
+        coords = {
+            "row": ("row", np.arange(rows), {"long_name": "row of the image, 0 farthest from nadir"}),
+            "column": ("column", np.arange(columns), {"long_name": "column of the image, 0 at the -angle_y edge"}),
+        }
+    where = {"angle_x": "in the plane of incidence, away from nadir", "angle_y": "across the plane of incidence"}
+    for axis, (name, direction) in enumerate(where.items()):
+        described = {"units": "mrad", "long_name": f"angle of the pixel's centre {direction}"}
+        coords[name] = (dims, centres[:, axis].reshape(layout), described)
+    return coords
+
+
+def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a result, checked, with ``title``, ``source`` and ``history`` added.
+
+    Raises
+    ------
+    ValueError
+        If an attribute is no int, float, str or list of one of those.
+    """
+    return {
+        "Conventions": "CF-1.11",
+        "title": f"Received lidar power, scene {attributes['scene']}" if "scene" in attributes else "Lidar power",
+        "source": f"mitransient-lidar {__version__}",
+        "history": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} rendered by mitransient-lidar {__version__}",
+        **{text(name): attribute(name, value) for name, value in attributes.items()},
+    }
+
+
+def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a result to an EXR or NetCDF file atomically.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A result of `build` or `open`; coordinates and, for NetCDF, variables may have been added.
+    path : path
+        File name ending in ``.exr`` or ``.nc``. An existing file is replaced.
+
+    Raises
+    ------
+    UserError
+        If the file name ends otherwise, the dataset is no result, or the file cannot be written.
+    """
+    path = Path(path)
+    file_format = output_format(path)
+    if missing := [name for name in _VARIABLES if name not in dataset]:
+        raise UserError(f"cannot write {path}: the dataset has no variable {missing[0]}.")
+    with replacing(path) as temporary:
+        if file_format == "exr":
+            _write_exr(dataset, path, temporary)
+        else:
+            netcdf.write_netcdf(dataset, temporary, _VARIABLES)
+
+
+def open(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a result from an EXR or NetCDF file of `save` into memory; values from an EXR file have 32 bits.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, damaged, truncated, or not a result of this package.
+    """
+    path = Path(path)
+    if input_format(path) == "exr":
+        return _read_exr(path)
+    dataset = netcdf.read_netcdf(path)
+    if any(name not in dataset for name in _VARIABLES):
+        raise UserError(f"{path} is a NetCDF file, but not a result of mitransient-lidar.")
+    return dataset
+
+
+def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
+    if extra := [str(name) for name in dataset.data_vars if name not in _VARIABLES]:
+        raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
+    stacks: dict[str, dict[str, npt.NDArray[Any]]] = {}
+    for name, (stack, component) in _CHANNELS.items():
+        values = dataset[name].values
+        # Pixels without a grid form an image one row high.
+        image = values if values.ndim == 3 else values[np.newaxis]
+        stacks.setdefault(stack, {})[component] = image
+    exact, readable = describe(dataset, tuple(_VARIABLES))
+    readable |= {"timeStartNs": dataset.attrs["time_start_ns"], "binWidthNs": dataset.attrs["bin_width_ns"]}
+    exr.write(temporary, stacks, exact, readable)
+
+
+def _read_exr(path: Path) -> xr.Dataset:
+    stacks, exact = exr.read(path)
+    try:
+        return labelled({name: stacks[stack][part] for name, (stack, part) in _CHANNELS.items()}, exact)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is damaged: its metadata and its image disagree.") from error
+
+
+def _warn_of_non_finite(values: Mapping[str, npt.NDArray[np.float64]], names: Sequence[str]) -> None:
+    for variable, array in values.items():
+        counts = np.count_nonzero(~np.isfinite(array), axis=1)
+        if affected := np.flatnonzero(counts).tolist():
+            pixels = ", ".join(f"{names[index]}: {counts[index]}" for index in affected[:_NAMED_PIXELS])
+            more = f" and {len(affected) - _NAMED_PIXELS} more pixels" if len(affected) > _NAMED_PIXELS else ""
+            _LOG.warning("%s has non-finite values in pixel %s%s", variable, pixels, more)

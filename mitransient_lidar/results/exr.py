@@ -1,0 +1,213 @@
+"""Images of 32-bit floating-point numbers in OpenEXR files, and stacks of time bins in one image.
+
+A file has one or more parts of scan lines, compressed with ZIP. A stack of time bins is one part whose layers are the
+bins: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the channels ``bin0000.Y``,
+``bin0000.stderr``, ``bin0001.Y`` and so on, with four digits or as many as the last bin needs.
+
+The attributes are written twice: OpenEXR supports only integers and floats of 32 bits and no empty list, so a JSON
+string (header attribute ``mitransientLidar``) stores them exactly; ``exrheader`` and other programs read the copies
+under their own names.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+
+from mitransient_lidar.core.array_files import EXR_SIGNATURE, silence_openexr
+from mitransient_lidar.core.errors import UserError
+
+SIGNATURE = EXR_SIGNATURE
+
+_EXACT = "mitransientLidar"
+_LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
+_LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer names
+_INT32 = np.iinfo(np.int32)
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+Stacks = dict[str, dict[str, npt.NDArray[np.float32]]]
+
+
+class Part(NamedTuple):
+    """One image of a file."""
+
+    name: str  #: Unique name of the part; empty in a file of one part.
+    attributes: dict[str, Any]  #: The header; for writing, the output of `header`.
+    channels: dict[str, npt.NDArray[np.float32]]  #: Channel name to values of shape (row, column).
+
+
+def write(
+    path: str | os.PathLike[str],
+    stacks: Mapping[str, Mapping[str, npt.NDArray[Any]]],
+    exact: Mapping[str, Any],
+    readable: Mapping[str, Any],
+) -> None:
+    """Write stacks of time bins.
+
+    Parameters
+    ----------
+    path : path
+        File to write; an existing one is overwritten.
+    stacks : mapping of str to mapping of str to array
+        Stack name (letters) to component name to values of shape (row, column, time); stored as 32-bit floats.
+    exact : mapping
+        Metadata that `read` returns unchanged, of JSON types.
+    readable : mapping of str to int, float, str or a list of those
+        Header attributes for other programs. Integers and floats beyond 32 bits are written as text, empty lists are
+        omitted.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    channels: dict[str, npt.NDArray[np.float32]] = {}
+    for stack, components in stacks.items():
+        for component, values in components.items():
+            # Bins first: every channel is one contiguous image.
+            images = np.ascontiguousarray(np.moveaxis(np.asarray(values, dtype=np.float32), -1, 0))
+            digits = max(4, len(str(len(images) - 1)))
+            for index, image in enumerate(images):
+                channels[f"{stack}{index:0{digits}d}.{component}"] = image
+
+    write_parts(path, [Part("", header(readable, exact), channels)])
+
+
+def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
+    """Read a file of `write`.
+
+    Returns
+    -------
+    stacks : dict of str to dict of str to float32 array
+        Stack name to component name to values of shape (row, column, time).
+    exact : dict
+        The exact metadata.
+
+    Raises
+    ------
+    UserError
+        If the file is damaged or truncated, holds no stack of time bins, or was not written by `write`.
+    """
+    parts = read_parts(path)
+    exact = exact_metadata(path, parts[0].attributes)
+    if len(parts) > 1:
+        raise UserError(f"{path} holds {len(parts)} images and no time bins.")
+
+    layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
+    for name, image in parts[0].channels.items():
+        if match := _LAYER.fullmatch(name):
+            layers.setdefault((match[1], match[3]), {})[int(match[2])] = image
+    stacks: Stacks = {}
+    for (stack, component), by_bin in layers.items():
+        if sorted(by_bin) != list(range(len(by_bin))):
+            raise UserError(_damaged(path))
+        stacks.setdefault(stack, {})[component] = np.stack([by_bin[index] for index in range(len(by_bin))], axis=-1)
+    if not stacks:
+        raise UserError(f"{path} holds no time bins.")
+    return stacks, exact
+
+
+def header(readable: Mapping[str, Any], exact: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the header attributes of a part.
+
+    They are readable attributes for other programs, as for `write`, and optionally metadata of JSON types that
+    `exact_metadata` returns unchanged.
+    """
+    attributes = {name: _plain(value) for name, value in readable.items() if _is_storable(name, value)}
+    if exact is not None:
+        attributes[_EXACT] = json.dumps(exact)
+    return attributes
+
+
+def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the exact metadata of a part.
+
+    Raises
+    ------
+    UserError
+        If they are missing or damaged.
+    """
+    foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
+    if _EXACT not in attributes:
+        raise UserError(foreign)
+    try:
+        exact = json.loads(attributes[_EXACT])
+    except ValueError as error:
+        raise UserError(_damaged(path)) from error
+    if not isinstance(exact, dict):
+        raise UserError(foreign)
+    return exact
+
+
+def write_parts(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
+    """Write one or more images into one file, which is overwritten if it exists.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with silence_openexr():
+        try:
+            with OpenEXR.File(
+                [OpenEXR.Part({**part.attributes, **kind}, part.channels, part.name) for part in parts]
+            ) as file:
+                file.write(os.fspath(path))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+
+def read_parts(path: str | os.PathLike[str]) -> list[Part]:
+    """Read all images of a file.
+
+    Raises
+    ------
+    UserError
+        If the file is damaged or truncated.
+    """
+    with silence_openexr():
+        try:
+            with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+                # Closing the file clears its dictionaries and frees the pixels.
+                parts = [
+                    Part(
+                        str(part.header.get("name", "")),
+                        dict(part.header),
+                        {name: channel.pixels.copy() for name, channel in part.channels.items()},
+                    )
+                    for part in file.parts
+                ]
+        except (RuntimeError, ValueError) as error:
+            raise UserError(_damaged(path)) from error
+    if not parts:
+        raise UserError(_damaged(path))
+    return parts
+
+
+def _damaged(path: str | os.PathLike[str]) -> str:
+    return f"{path} is damaged or truncated: its OpenEXR data cannot be read."
+
+
+def _is_storable(name: str, value: Any) -> bool:
+    """Return whether an OpenEXR header can store the attribute."""
+    return value != [] and 0 < len(name.encode()) <= _LONGEST_NAME
+
+
+def _plain(value: Any) -> Any:
+    """Replace numbers beyond 32 bits by text: OpenEXR would store 0 or infinity."""
+    if isinstance(value, list):
+        plain = [_plain(item) for item in value]
+        return [str(item) for item in value] if any(isinstance(item, str) for item in plain) else plain
+    if isinstance(value, int):
+        return value if _INT32.min <= value <= _INT32.max else str(value)
+    if isinstance(value, float) and _FLOAT32_MAX < abs(value) < float("inf"):
+        return str(value)
+    return value

@@ -1,0 +1,196 @@
+"""Gate stacks: the energy of each pixel in each gate, as a labelled dataset.
+
+A gate stack is an `xarray.Dataset` with ``gate_energy`` and ``gate_energy_stderr`` [J], the energy that a pixel
+collects while a gate is open, summed over the pulses of the gate. Dimensions are (row, column, gate) for imagers and
+(pixel, gate) otherwise. Coordinates are those of the pixels, ``gate`` (0, 1, ...), ``gate_start`` and ``gate_width``
+[ns] between half heights, and ``gate_depth`` [m], the depth of the gate's middle, NaN where the time of the surface
+echo is unknown. The attributes are those of the result and of the gate train.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar._version import __version__
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.gate_shape import GateShape
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results.geometry import LidarGeometry, optional_number
+
+_ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
+
+
+def train_from_options(
+    attributes: Mapping[str, Any],
+    *,
+    start_ns: float | None = None,
+    start_depth_m: float | None = None,
+    width_ns: float | None = None,
+    step_ns: float | None = None,
+    count: int = 1,
+    rise_ns: float = 0.0,
+    fall_ns: float = 0.0,
+    profile_file: str | PathLike[str] | None = None,
+    pulses: int = 1,
+) -> GateTrain:
+    """Build a gate train from user options.
+
+    Parameters
+    ----------
+    attributes : mapping
+        Attributes of a result, with the lidar geometry if the start is a depth.
+    start_ns, start_depth_m : float, optional
+        Half height of the first gate's rising edge, as a time [ns] or a depth [m]; exactly one of them.
+    width_ns : float, optional
+        Time between the half heights of a gate [ns], greater than 0; not with `profile_file`.
+    step_ns : float, optional
+        Time between the starts of consecutive gates [ns], greater than 0; by default the width.
+    count : int
+        Number of gates, 1 to 100 000.
+    rise_ns, fall_ns : float
+        10-90 % times of the edges [ns], at least 0; not with `profile_file`.
+    profile_file : path, optional
+        Measured gate: two columns, time [ns] and transmission 0 to 1.
+    pulses : int
+        Number of pulses summed in a gate, 1 to 10^9.
+
+    Raises
+    ------
+    UserError
+        If an option is missing, out of range, or incompatible with another.
+    """
+    if profile_file is not None and (rise_ns or fall_ns):
+        raise UserError(
+            f"rise_ns = {rise_ns:g} and fall_ns = {fall_ns:g} must be 0 with a profile, which includes its edges"
+        )
+    try:
+        if start_ns is not None and start_depth_m is None:
+            start = start_ns
+        elif start_depth_m is not None and start_ns is None:
+            start = float(LidarGeometry.from_attributes(attributes, surface="measured").time_of_depth(start_depth_m))
+        else:
+            raise UserError("a gate train needs one start: either start_ns or start_depth_m")
+        if profile_file is not None and width_ns is None:
+            profile = GateShape.from_file(profile_file)
+            return GateTrain.measured(profile, start, profile.width_ns if step_ns is None else step_ns, count, pulses)
+        if width_ns is not None and profile_file is None:
+            return GateTrain(start, width_ns, width_ns if step_ns is None else step_ns, count, rise_ns, fall_ns, pulses)
+        raise UserError("a gate train needs one shape: either width_ns or a profile file")
+    except OSError as error:
+        raise UserError(f"cannot read {profile_file}: {error.strerror}") from error
+
+
+def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
+    """Return the depths [m] of the gates' middles, NaN if an attribute of the geometry is missing."""
+    try:
+        return LidarGeometry.from_attributes(attributes, surface="measured").depth_of_time(train.middles_ns)
+    except UserError:
+        return np.full(train.count, np.nan)
+
+
+def build_gates(
+    energy: npt.ArrayLike,
+    stderr: npt.ArrayLike,
+    train: GateTrain,
+    *,
+    coords: Mapping[Any, Any],
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Label the energies in gates as a gate stack, see the module's documentation.
+
+    Parameters
+    ----------
+    energy, stderr : array-like of shape (row, column, gate) or (pixel, gate)
+        Energy in each gate, summed over its pulses, and its standard error [J]. The pixels of an imager may be in one
+        axis, in row-major order.
+    train : GateTrain
+        The gates.
+    coords : mapping
+        Coordinates of the pixels of a result: ``row``, ``column`` or ``pixel``, and ``angle_x``, ``angle_y``.
+        ``time`` is ignored.
+    attributes : mapping of str to int, float, str or a list of those
+        Attributes of the result.
+
+    Raises
+    ------
+    UserError
+        If the energies have another shape.
+    """
+    pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
+    dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
+    shape = tuple(pixels.sizes[dim] for dim in dims)
+    values = {"gate_energy": np.asarray(energy, np.float64), "gate_energy_stderr": np.asarray(stderr, np.float64)}
+    for name, array in values.items():
+        if array.shape not in ((*shape, train.count), (math.prod(shape), train.count)):
+            raise UserError(f"{name} has shape {array.shape}; it must be {(*shape, train.count)}.")
+    described = {
+        "gate_energy": {
+            "units": "J",
+            "long_name": "energy collected while the gate is open",
+            "ancillary_variables": "gate_energy_stderr",
+        },
+        "gate_energy_stderr": {"units": "J", "long_name": "standard error of the energy collected in the gate"},
+    }
+    axis = {
+        "gate": (np.arange(train.count), {"long_name": "number of the gate"}),
+        "gate_start": (train.starts_ns, {"units": "ns", "long_name": "half height of the gate's rising edge"}),
+        "gate_width": (
+            np.full(train.count, train.width_ns),
+            {"units": "ns", "long_name": "time between the half heights of the gate"},
+        ),
+        "gate_depth": (
+            gate_depths(train, attributes),
+            {"units": "m", "long_name": "depth of the middle of the gate", "positive": "down"},
+        ),
+    }
+    stack = pixels.assign(
+        {name: ((*dims, "gate"), array.reshape(*shape, train.count), described[name]) for name, array in values.items()}
+    ).assign_coords({name: ("gate", array, about) for name, (array, about) in axis.items()})
+    history = str(attributes.get("history", ""))
+    stack.attrs = {
+        **attributes,
+        "title": f"Energy in gates, scene {attributes['scene']}" if "scene" in attributes else "Energy in gates",
+        "history": "\n".join(part for part in (history, f"gates by mitransient-lidar {__version__}") if part),
+        "gate_step_ns": train.step_ns,
+        "gate_rise_ns": train.rise_ns,
+        "gate_fall_ns": train.fall_ns,
+        "pulses": train.pulses,
+    }
+    if train.profile is not None:
+        stack.attrs["gate_profile_ns"] = train.profile.times_ns.tolist()
+        stack.attrs["gate_profile"] = train.profile.values.tolist()
+    return stack
+
+
+def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis) -> None:
+    """Raise `UserError` if a gate train ends before the surface echo or is not within the record."""
+    spans = train.spans_ns
+    closes = spans[-1, 1]
+    surface, first_surface = (optional_number(attributes, name) for name in ("surface_time_ns", "window_start_ns"))
+    # Pixels near nadir receive the surface echo before the mean.
+    if surface is not None and first_surface is not None:
+        surface = min(surface, first_surface)
+    if closes <= time.start_ns or (surface is not None and closes <= surface):
+        what = "the record starts" if surface is None or surface < time.start_ns else "the surface echo arrives"
+        earliest = time.start_ns if surface is None else max(time.start_ns, surface)
+        raise UserError(
+            f"gate train before the surface: its last gate closes at {closes:.1f} ns, but {what} at {earliest:.1f} ns; "
+            "choose a later start or more gates"
+        )
+    slack = _ROUNDING * time.bin_width_ns
+    outside = np.flatnonzero((spans[:, 0] < time.start_ns - slack) | (spans[:, 1] > time.end_ns + slack))
+    if outside.size:
+        gate = int(outside[0])
+        raise UserError(
+            f"gate {gate} is open from {spans[gate, 0]:.1f} to {spans[gate, 1]:.1f} ns, but every gate must lie within "
+            f"the record, {time.start_ns:.1f} to {time.end_ns:.1f} ns"
+        )

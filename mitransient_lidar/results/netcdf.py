@@ -1,0 +1,67 @@
+"""NetCDF files of labelled datasets."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.results.formats import attribute
+
+_LISTS = "mitransient_lidar_lists"  # NetCDF attribute with the names of the attributes to read back as lists
+
+
+def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], compressed: Collection[str]) -> None:
+    """Write a dataset to a NetCDF-4 file.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Its attributes have the types that `formats.attribute` returns.
+    path : path
+        File to write; an existing one is overwritten.
+    compressed : collection of str
+        Names of the large variables.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    dataset = dataset.drop_encoding()
+    # NetCDF does not distinguish a list of one item from the item.
+    dataset.attrs[_LISTS] = json.dumps([name for name, value in dataset.attrs.items() if isinstance(value, list)])
+    # No fill value: CF forbids it for coordinates, and a NaN in the data is a value.
+    encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in dataset.variables}
+    for name in compressed:
+        encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True}
+    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+
+
+def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a file of `write_netcdf` into memory.
+
+    Raises
+    ------
+    UserError
+        If the file is damaged or truncated.
+    """
+    try:
+        dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False)
+        lists = json.loads(dataset.attrs.pop(_LISTS, "[]"))
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path} is damaged or truncated: its NetCDF data cannot be read.") from error
+    dataset = dataset.drop_encoding()
+    dataset.attrs = {
+        str(name): np.atleast_1d(value).tolist() if name in lists else attribute(str(name), value)
+        for name, value in dataset.attrs.items()
+    }
+    for name, coordinate in dataset.coords.items():
+        if coordinate.dtype.kind == "O":
+            dataset[name] = coordinate.astype(str)
+    return dataset

@@ -1,0 +1,1 @@
+"""Studies that drive many renders."""

@@ -1,0 +1,330 @@
+"""Spread of the laser's light at depth, sideways and in time."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
+from mitransient_lidar.rendering.session import TOLERATED_LOSS, open_scene, pass_attributes
+
+if TYPE_CHECKING:
+    from mitransient_lidar.transport.plane_crossings import PlaneCrossings
+    from mitransient_lidar.transport.scene import LidarScene
+
+logger = logging.getLogger(__name__)
+
+#: How far planes stay above the bottom [m]: where rays end on it is known to rounding only.
+_ABOVE_BOTTOM = 1e-3
+
+#: Number of radii and delays of the distributions, and the largest share of the light that lies beyond them.
+_STEPS, _BEYOND = 160, 2e-3
+
+#: Smallest radius over the largest, and smallest delay over the largest.
+_SMALLEST = 1e-3
+
+_MEANING = {
+    "transmitted": ("1", "share of the pulse energy that passes the depth downwards"),
+    "unscattered": ("1", "share of the pulse energy that passes the depth unscattered"),
+    "in_view": ("1", "share of the light at the depth that is in the field of view"),
+    "centroid_x": ("m", "mean x of the light"),
+    "centroid_y": ("m", "mean y of the light"),
+    "radius_rms": ("m", "root-mean-square distance from the centroid"),
+    "radius_50": ("m", "radius about the centroid that holds 50 % of the light"),
+    "radius_90": ("m", "radius about the centroid that holds 90 % of the light"),
+    "shift_rms": ("m", "root-mean-square horizontal shift by scattering"),
+    "delay_mean": ("ns", "mean delay by scattering"),
+    "delay_std": ("ns", "standard deviation of the delay by scattering"),
+    "within_radius": ("1", "share of the light within a radius of the centroid"),
+    "within_shift": ("1", "share of the light that scattering has shifted by at most a radius"),
+    "within_delay": ("1", "share of the light that scattering has delayed by at most a delay"),
+}
+#: Variables that are distributions, with what they go over.
+_CURVES = {"within_radius": "radius", "within_shift": "radius", "within_delay": "delay"}
+
+#: Columns of the table: heading, variable, and factor to its unit; and their width.
+_COLUMNS = (
+    ("passes (%)", "transmitted", 100.0),
+    ("direct (%)", "unscattered", 100.0),
+    ("in view (%)", "in_view", 100.0),
+    ("r50 (m)", "radius_50", 1.0),
+    ("r90 (m)", "radius_90", 1.0),
+    ("shift (m)", "shift_rms", 1.0),
+    ("delay (ns)", "delay_mean", 1.0),
+    ("its sd (ns)", "delay_std", 1.0),
+)
+_COLUMN = 17
+
+
+def beam_spread(
+    scene: Any,
+    depths: npt.ArrayLike,
+    params: Mapping[str, Any] | None = None,
+    *,
+    passes: int = 8,
+    photons: int = 2**16,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Trace light from the laser to horizontal planes under water, and measure where and when it gets there.
+
+    Parameters
+    ----------
+    scene, params
+        As for `rendering.render.render`.
+    depths
+        Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
+    passes
+        Number of independent passes, 2 to 10 000.
+    photons
+        Paths of light in each, 1024 to 2^24.
+    seed
+        Seed of the random numbers, at least 0.
+    progress
+        Called with a `passes.Progress` after every pass.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``depth`` [m], increasing: ``transmitted`` and ``unscattered`` (shares of the energy that leaves the
+        laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
+        ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and
+        ``radius`` [m] or ``delay`` [ns], the shares of the light ``within_radius``, ``within_shift`` and
+        ``within_delay``. Each has its standard error over the passes, ``..._stderr``. Where no light comes, all but the
+        first two are NaN.
+
+    Raises
+    ------
+    UserError
+        When the scene is wrong or has no water, or a number is out of range.
+
+    Notes
+    -----
+    Light counts before it meets any solid, each time that it passes the plane downwards under water. Light of many
+    scatterings may pass several times: this is the downward plane irradiance integrated over the plane. Light that
+    passes outside the surface mesh is left out; its share of the energy is the attribute ``beam_outside_surface``.
+
+    Shift and delay are against the way on which the light entered the water, gone on without scattering: beam, waves
+    and ripples spread the light too, but are not in them. Where the light comes in at a slant, some of it takes a short
+    cut to the level plane, with a negative delay.
+
+    Light is in the field of view where the line of sight through a still sea from the receiver to it falls into a
+    pixel. Light has no record to be late for, but is given up after 50 times the slant way to the deepest plane, or
+    where less than a millionth of it can be left.
+    """
+    passes, photons = integer("passes", passes, 2, 10_000), integer("photons", photons, 1024, 2**24)
+    seed = integer("seed", seed, 0, 2**53)
+    wanted = _depths(depths)
+    session = open_scene(scene, params)
+    from mitransient_lidar.transport.plane_crossings import CrossingTracer
+    from mitransient_lidar.transport.scene import LidarScene
+
+    system = LidarScene.from_scene(session.scene, session.sensor)
+    if system.water is None:
+        raise UserError("the scene has no water: give its surface a layered_water as interior medium")
+    planes = _planes(system, wanted)
+    tracer = CrossingTracer(system, planes, photons)
+    measured: list[list[dict[str, Any]]] = []
+    axes: dict[str, FloatArray] = {}
+    outside: list[float] = []
+
+    def render_pass(number: int, _: int) -> float:
+        crossings, missed = tracer.trace(seed, number)
+        outside.append(missed)
+        light = [crossings.select(crossings.downward & (crossings.plane == plane)) for plane in range(len(planes))]
+        if not axes:
+            axes.update(radius=_axis([_radius, _shift], light), delay=_axis([_delay_ns], light))
+        measured.append([_measure(system, *pair, axes) for pair in zip(light, planes, strict=True)])
+        return 0.0
+
+    log = run_passes(render_pass, Goal(passes=passes), seed=seed, progress=progress)
+    missed = float(np.mean(outside))
+    if missed > TOLERATED_LOSS:
+        logger.warning(
+            "the surface is smaller than the footprint: %.2g %% of the beam passes outside it and is left out; "
+            "enlarge the surface's size",
+            100 * missed,
+        )
+    attributes = session.attributes(
+        **pass_attributes(log, seed), photons_per_pass=photons, beam_outside_surface=missed, **_describe(system)
+    )
+    return _dataset(measured, wanted, axes, attributes)
+
+
+def _depths(depths: npt.ArrayLike) -> FloatArray:
+    """Return the depths [m], increasing and different."""
+    values = np.unique(finite_array("depths", depths))
+    if values.size == 0:
+        raise UserError("depths must hold at least one depth in metres")
+    if values[0] <= 0:
+        raise UserError(f"depths = {values[0]:g} m must be greater than 0")
+    return values
+
+
+def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
+    """Return the depths of the planes [m]; refuse such as lie below a bottom, which light cannot get to."""
+    transmitter = system.transmitter
+    spot = transmitter.pose.ground_point()
+    reach = 3 * transmitter.widest_angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    bottoms = []
+    for solid in system.solids:
+        box = solid.bbox()
+        low, high = np.array(box.min), np.array(box.max)
+        # Light passes beside what is smaller than the footprint.
+        if np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach) and low[2] < 0:
+            bottoms.append(-float(low[2]))
+    deepest = max(bottoms, default=np.inf)
+    if depths[-1] > deepest:
+        raise UserError(f"depths = {depths[-1]:g} m must not lie below the bottom, at {deepest:g} m")
+    return np.minimum(depths, deepest - _ABOVE_BOTTOM)
+
+
+def _radius(light: PlaneCrossings) -> FloatArray:
+    """Return distances from the centroid [m]."""
+    x, y = (np.average(values, weights=light.weight) for values in (light.x, light.y))
+    return np.hypot(light.x - x, light.y - y)
+
+
+def _shift(light: PlaneCrossings) -> FloatArray:
+    return np.hypot(light.shift_x, light.shift_y)
+
+
+def _delay_ns(light: PlaneCrossings) -> FloatArray:
+    return 1e9 * light.delay
+
+
+def _axis(kinds: list[Callable[[PlaneCrossings], FloatArray]], light: list[PlaneCrossings]) -> FloatArray:
+    """Return values, in equal ratios, up to the largest that a depth needs."""
+    largest = [
+        _quantile(kind(part), part.weight, 1 - _BEYOND) for part in light if len(part.weight) > 0 for kind in kinds
+    ]
+    top = max(largest, default=0.0)
+    return np.geomspace(_SMALLEST, 1, _STEPS) * (top if top > 0 else 1.0)
+
+
+def _quantile(values: FloatArray, weight: FloatArray, share: float) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weight[order])
+    place = np.searchsorted(cumulative, share * cumulative[-1])
+    return float(values[order[min(place, len(values) - 1)]])
+
+
+def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict[str, FloatArray]) -> dict[str, Any]:
+    """Return what one pass tells of one plane, by the names of the result."""
+    weight, energy = light.weight, system.transmitter.energy
+    shares = {
+        "transmitted": weight.sum() / energy,
+        "unscattered": weight[light.scatterings == 0].sum() / energy,
+    }
+    if len(weight) == 0:
+        unknown = {name: np.full(len(axes[_CURVES[name]]), np.nan) if name in _CURVES else np.nan for name in _MEANING}
+        return {**unknown, **shares}
+
+    def mean(values: npt.ArrayLike) -> float:
+        return float(np.average(np.asarray(values), weights=weight))
+
+    def within(values: FloatArray, limits: FloatArray) -> FloatArray:
+        order = np.argsort(values)
+        held = np.concatenate(([0.0], np.cumsum(weight[order])))
+        return np.asarray(held[np.searchsorted(values[order], limits, side="right")] / held[-1])
+
+    radius, shift, delay = _radius(light), _shift(light), _delay_ns(light)
+    return {
+        **shares,
+        "in_view": mean(_in_view(system, light, depth)),
+        "centroid_x": mean(light.x),
+        "centroid_y": mean(light.y),
+        "radius_rms": np.sqrt(mean(radius**2)),
+        "radius_50": _quantile(radius, weight, 0.5),
+        "radius_90": _quantile(radius, weight, 0.9),
+        "shift_rms": np.sqrt(mean(shift**2)),
+        "delay_mean": mean(delay),
+        "delay_std": np.sqrt(mean((delay - mean(delay)) ** 2)),
+        "within_radius": within(radius, axes["radius"]),
+        "within_shift": within(shift, axes["radius"]),
+        "within_delay": within(delay, axes["delay"]),
+    }
+
+
+def _in_view(system: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDArray[np.bool_]:
+    """Return whether the line of sight through a still sea from the receiver to the light falls into a pixel."""
+    import mitsuba as mi
+
+    pose, pixels = system.receiver.pose, system.receiver.pixels
+    x, y = light.x - pose.origin[0], light.y - pose.origin[1]
+    distance = np.hypot(x, y)
+    theta, _ = refracted_path(distance, pose.origin[2], depth, system.refractive_index)
+    across = np.sin(theta) / np.maximum(distance, 1e-9)
+    direction = np.stack([across * x, across * y, -np.cos(theta)], axis=1)
+    along = direction @ pose.axis
+    angle_x, angle_y = (direction @ side / along for side in (pose.far, pose.left))
+    _, count = pixels.pixel_at(mi.Float(angle_x), mi.Float(angle_y), mi.Float(0.5))
+    return (along > 0) & (np.array(count) > 0)
+
+
+def _describe(system: LidarScene) -> dict[str, Any]:
+    """Return the attributes that readers and plots need."""
+    from mitransient_lidar.transport.medium.water_phases import table_of
+
+    water: Any = system.water
+    column, boundaries = water.column, water.index_layers.boundaries
+    first = 0.0 if water.plume is not None else np.inf
+    for layer in range(1, column.count):
+        same = all(values[layer] == values[0] for values in (column.attenuation, column.scattering))
+        if not (same and water.phases.phases[layer] is water.phases.phases[0]):
+            first = min(first, float(column.layer_tops[layer]))
+    if len(boundaries):
+        first = min(first, float(boundaries[0]))
+    return {
+        "pulse_energy_mj": 1e3 * system.transmitter.pulse_energy,
+        "field_of_view_mrad": 1e3 * system.receiver.pixels.field_of_view,
+        "off_nadir_deg": system.transmitter.pose.off_nadir_deg,
+        "refractive_index": system.refractive_index,
+        "group_index": system.group_index,
+        "absorption": float(column.absorption[0]),
+        "scattering": float(column.scattering[0]),
+        "mean_cosine": table_of(water.phases.phases[0]).mean_cosine,
+        "uniform_down_to": first,
+    }
+
+
+def _dataset(
+    measured: list[list[dict[str, Any]]], depths: FloatArray, axes: dict[str, FloatArray], attributes: dict[str, Any]
+) -> xr.Dataset:
+    """Return means and standard errors over the passes."""
+    data: dict[str, Any] = {}
+    for name, (units, meaning) in _MEANING.items():
+        values = np.array([[row[name] for row in rows] for rows in measured])
+        error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
+        dims = ("depth", _CURVES[name]) if name in _CURVES else ("depth",)
+        told = {"units": units, "long_name": meaning, "ancillary_variables": f"{name}_stderr"}
+        data[name] = dims, values.mean(axis=0), told
+        data[f"{name}_stderr"] = dims, error, {"units": units, "long_name": f"standard error of the {meaning}"}
+    coordinates = {
+        "depth": ("depth", depths, {"units": "m", "long_name": "depth below the mean sea level", "positive": "down"}),
+        "radius": ("radius", axes["radius"], {"units": "m", "long_name": "horizontal distance"}),
+        "delay": ("delay", axes["delay"], {"units": "ns", "long_name": "delay by scattering"}),
+    }
+    return xr.Dataset(data, coords=coordinates, attrs=attributes)
+
+
+def describe_spread(spread: xr.Dataset) -> list[str]:
+    """Return the lines of a table of a result of `beam_spread`, with standard errors."""
+    lines = ["".join(f"{heading:>{_COLUMN}}" for heading in ("depth (m)", *(column[0] for column in _COLUMNS)))]
+    for depth in range(spread.sizes["depth"]):
+        row = spread.isel(depth=depth)
+        cells = [f"{float(row['depth']):.4g}"]
+        for _, name, factor in _COLUMNS:
+            value, error = (factor * float(row[key]) for key in (name, f"{name}_stderr"))
+            digits = min(max(-int(np.floor(np.log10(error))), 0), 4) if error > 0 else 4
+            cells.append(f"{value:.{digits}f} ± {error:.{digits}f}" if np.isfinite(value) else "-")
+        lines.append("".join(f"{cell:>{_COLUMN}}" for cell in cells))
+    return lines

@@ -1,0 +1,267 @@
+"""Attenuation of the column signal against the field of view, from c down to a (Gordon 1982)."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
+from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes
+from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
+from mitransient_lidar.results.geometry import LidarGeometry
+
+if TYPE_CHECKING:
+    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.sensor.receiver import Receiver
+
+logger = logging.getLogger(__name__)
+
+
+def fov_sweep(
+    scene: Any,
+    fov_mrad: npt.ArrayLike,
+    params: Mapping[str, Any] | None = None,
+    *,
+    min_depth: float = 1.0,
+    max_depth: float = 5.0,
+    passes: int = 48,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Measure how the slope of the column signal goes with the field of view.
+
+    Parameters
+    ----------
+    scene, params
+        As for `rendering.render.render`. The receiver's pixels are replaced by one circle about the axis, and an XML
+        scene's ``field_of_view_mrad``, for which waves are laid out, by the largest of the fields.
+    fov_mrad
+        Full angles of the circles [mrad], above 0, in any order.
+    min_depth, max_depth
+        Between which depths the slope is measured, as in `effective_attenuation` [m]. The water must be the same
+        between them, and no bottom or target near.
+    passes
+        Independent passes for each field of view, 4 to 10 000.
+    seed
+        Seed of the random numbers, at least 0.
+    progress
+        Called with a `passes.Progress` after every pass.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``field_of_view`` [mrad], increasing: ``effective_attenuation`` K and its standard error
+        ``effective_attenuation_stderr`` [1/m], ``spot_radius`` R_s [m] of the circle that the receiver sees across the
+        axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] of the fit in
+        `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its
+        standard error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water,
+        ``beam_radius`` R_b [m].
+
+    Raises
+    ------
+    UserError
+        When the scene is wrong, has no water, bubbles, or other water between the depths, an echo of a solid can come
+        from between them, a number is out of range, or for the reasons of `effective_attenuation`.
+
+    Notes
+    -----
+    Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996: K is c where c R_s is far below 1 and comes down to
+    the diffuse attenuation where it is above 5 to 6. His beam is narrow. A beam's own width counts as much as the
+    view's: light that enters at x and leaves at x' counts by how often the beam's and the view's profile have the
+    distance x' - x, and so K goes with their correlation, whichever of them is the wide one. Of beam and view,
+    R = sqrt(R_s^2 + R_b^2) is the radius of a disc with the mean-square radius of their correlation; R_b, twice the
+    root-mean-square angle of the beam per axis times the slant range, is that of the beam alone. The fit takes 2 R for
+    its diameter. K can come near c only where c R_b, too, is far below 1.
+
+    ``kd`` is Lee's (`water_types`): daylight's, averaged over depth. bb is that of the phase function in use.
+    Between the depths K may itself depend on depth; what is given is the mean of the fit.
+
+    What comes out for the default water and a narrow beam on a level sea: the fall is Gordon's and ends by c R_s = 3,
+    but at absorption, 0.149 for a = 0.150 1/m, as Phillips and Koerber (1984), Aust. J. Phys. 37, 75, have it, and 14 %
+    below Lee's Kd. The forward peak keeps K below c in any practical view: at c R_s = 0.015 it is 0.91 c. The fit,
+    which knows no phase function, is up to 0.06 1/m too high between the limits.
+
+    Each field is rendered for itself but for what lies inside the next smaller one, which is added from there: in a
+    narrow beam the rare paths near the middle would make most of the noise. So errors of neighbours go together. They
+    are jackknife estimates over the passes, with the correlation of the bins in them.
+    """
+    passes, seed = integer("passes", passes, 4, 10_000), integer("seed", seed, 0, 2**53)
+    fields = np.unique(finite_array("fov_mrad", fov_mrad))
+    if fields.size == 0 or fields[0] <= 0:
+        raise UserError(f"fov_mrad = {fields.tolist()} must hold at least one angle, each greater than 0")
+    session = open_scene(scene, _with_widest(scene, params, float(fields[-1])))
+    from mitransient_lidar.transport.scene import LidarScene
+
+    system = LidarScene.from_scene(session.scene, session.sensor)
+    geometry, edge = _geometry(system, 0.5e-3 * float(fields[-1]))
+    column = ColumnBins.between(geometry, edge, system.axis, min_depth, max_depth)
+    water = _water(system, float(min_depth), float(max_depth))
+    _check_solids(system, geometry, edge, float(max_depth))
+    energy, log = _render(session, fields, passes, seed, progress)
+    fields = fields[: len(energy)]
+
+    mean, stderr = energy.mean(axis=1), energy.std(axis=1, ddof=1) / math.sqrt(passes)
+    slopes = [slope_and_error(column, energy[field][:, column.inside]) for field in range(fields.size)]
+    radius = 0.5e-3 * fields * geometry.slant_range
+    beam = 2 * system.transmitter.widest_angular_spread * geometry.slant_range
+    per_field = {
+        "effective_attenuation": ([slope for slope, _ in slopes], "1/m", "attenuation coefficient of the column"),
+        "effective_attenuation_stderr": ([error for _, error in slopes], "1/m", "standard error of the attenuation"),
+        "spot_radius": (radius, "m", "radius of the circle that the receiver sees on the surface"),
+        "scaled_radius": (water.attenuation * radius, "1", "beam attenuation times spot radius"),
+        "system_attenuation": (_fit(water, radius, beam), "1/m", "fit to Gordon's results"),
+    }
+    data: dict[str, Any] = {
+        key: ("field_of_view", np.asarray(values), {"units": units, "long_name": meaning})
+        for key, (values, units, meaning) in per_field.items()
+    }
+    over_time = ("field_of_view", "time")
+    data["impulse_response"] = (over_time, mean, {"units": "J", "long_name": "received energy per bin"})
+    data["impulse_response_stderr"] = (over_time, stderr, {"units": "J", "long_name": "its standard error"})
+    coords = {
+        "field_of_view": ("field_of_view", fields, {"units": "mrad", "long_name": "full angle of the field of view"}),
+        "time": ("time", system.axis.centres_ns, {"units": "ns"}),
+    }
+    attributes = session.attributes(
+        seed=seed,
+        passes=passes,
+        interrupted=int(log.interrupted),
+        min_depth=float(min_depth),
+        max_depth=float(max_depth),
+        attenuation=water.attenuation,
+        absorption=water.absorption,
+        a_plus_bb=water.absorption + water.backscattering,
+        kd=water.kd,
+        beam_radius=beam,
+    )
+    return xr.Dataset(data, coords, attributes)
+
+
+def describe_fov_sweep(found: xr.Dataset) -> list[str]:
+    """Return the lines of a table of what `fov_sweep` returned."""
+    columns = ("effective_attenuation", "effective_attenuation_stderr", "system_attenuation")
+    lines = [f"{'field of view':>13}{'R_s':>9}{'c R_s':>8}{'K':>9}{'+-':>9}{'fit':>9}"]
+    lines.append(f"{'(mrad)':>13}{'(m)':>9}{'':>8}{'(1/m)':>9}{'(1/m)':>9}{'(1/m)':>9}")
+    for row in (found.isel(field_of_view=number) for number in range(found.sizes["field_of_view"])):
+        view, radius, scaled = (float(row[name]) for name in ("field_of_view", "spot_radius", "scaled_radius"))
+        values = "".join(f"{float(row[name]):>9.4f}" for name in columns)
+        lines.append(f"{view:>13g}{radius:>9.3g}{scaled:>8.3f}{values}")
+    names = {"c": "attenuation", "Kd": "kd", "a + bb": "a_plus_bb", "a": "absorption"}
+    limits = ", ".join(f"{symbol} = {found.attrs[name]:.4f}" for symbol, name in names.items())
+    lines.append(f"{limits} 1/m; radius of the beam {found.attrs['beam_radius']:.3g} m")
+    return lines
+
+
+def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) -> Mapping[str, Any] | None:
+    """Return the parameters of an XML scene with its field of view as wide as the widest, where it has one."""
+    if isinstance(scene, (str, os.PathLike)):
+        known = catalogue.scene_parameters(catalogue.scene_path(scene))
+        if "field_of_view_mrad" in known:
+            return {**(params or {}), "field_of_view_mrad": widest}
+    return params
+
+
+def _geometry(system: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:
+    """Return geometry and edge of the beam in a half angle [rad]; raise `UserError` if it reaches the horizon."""
+    pose = system.receiver.pose
+    off_nadir = math.acos(min(1.0, -float(pose.axis[2])))
+    widest = 2e3 * math.tan(0.5 * math.pi - off_nadir)
+    if 2e3 * half_view >= widest:
+        raise UserError(f"fov_mrad = {2e3 * half_view:g} must be less than {widest:.4g}: it would reach the horizon")
+    edge = min(BEAM_EDGE * system.transmitter.widest_angular_spread, half_view)
+    return LidarGeometry.level(float(pose.origin[2]), off_nadir, system.refractive_index, system.group_index), edge
+
+
+def _water(system: LidarScene, min_depth: float, max_depth: float) -> InherentProperties:
+    """Return the water between two depths [m]; refuse several."""
+    from mitransient_lidar.transport.medium.water_phases import table_of
+
+    water = system.water
+    if water is None:
+        raise UserError("the scene has no water: give its surface a layered_water as interior medium")
+    if water.plume is not None:
+        raise UserError("the scene has bubbles: the slope needs the same water everywhere, plume_scattering = 0")
+    layer, last = (int(number) for number in water.column.layer_at([min_depth, max_depth]))
+    if layer != last:
+        raise UserError(
+            f"the water has {last - layer + 1} layers from min_depth = {min_depth:g} m to max_depth = {max_depth:g} m: "
+            "it must be the same between them"
+        )
+    scattering = float(water.column.scattering[layer])
+    ratio = table_of(water.phases.phases[layer]).backscatter_ratio
+    return InherentProperties(float(water.column.absorption[layer]), scattering, ratio * scattering)
+
+
+def _check_solids(system: LidarScene, geometry: LidarGeometry, edge: float, max_depth: float) -> None:
+    """Refuse a bottom or target whose echo can come from above a depth [m]."""
+    # Scattered light takes the shortest way to a level bottom, which is shorter by cos^2 than that along the axis.
+    for solid in system.solids:
+        begin = -float(solid.bbox().max.z) * geometry.cos_water**2 - geometry.surface_depth(edge)
+        if max_depth > begin:
+            raise UserError(
+                f"max_depth = {max_depth:g} m must be at most {begin:.3g} m, where the echo of {solid.id()!r} can begin"
+            )
+
+
+def _render(
+    session: Session, fields: FloatArray, passes: int, seed: int, progress: ProgressCallback | None
+) -> tuple[FloatArray, PassLog]:
+    """Return the energy [J] in circles of full angles [mrad], shape (fields, passes, bins), and the log."""
+    from mitransient_lidar.transport.sensor.fov_shapes import Sector
+    from mitransient_lidar.transport.sensor.pixels import ShapedPixels
+
+    chosen = choose_integrator(session.scene, None)
+    receiver: Receiver = session.sensor.receiver
+    edges = np.append(0.0, 0.5e-3 * fields)
+    rings: list[FloatArray] = []
+    renderer: Any = None
+
+    def render_pass(number: int, seed: int) -> float:
+        nonlocal renderer
+        if number % passes == 0:
+            inner, outer = edges[number // passes : number // passes + 2]
+            ring = replace(receiver, pixels=ShapedPixels([Sector(outer, inner)], ["ring"]))
+            renderer = chosen.prepare(session.scene, session.sensor, receiver=ring)
+        record = renderer.render_pass(seed)
+        rings.append(record.histogram.energy()[0])
+        return float(record.edge_loss[0])
+
+    goal = Goal(passes=fields.size * passes)
+    log = run_passes(render_pass, goal, seed=seed, smallest=passes, progress=progress)
+    complete = log.count // passes
+    energy = np.array(rings[: complete * passes]).reshape(complete, passes, -1)
+    warn_of_edge_loss(log.edge_loss_share(float(energy.sum())))
+    return np.cumsum(energy, axis=0), log
+
+
+def slope_and_error(column: ColumnBins, energy: FloatArray) -> tuple[float, float]:
+    """Return K and its standard error over the passes [1/m], from energies of shape (passes, bins)."""
+    passes = len(energy)
+    total = energy.sum(axis=0)
+    weights, _ = column.weights(total / passes, energy.std(axis=0, ddof=1) / math.sqrt(passes))
+    without = total - energy
+    if np.any(without <= 0):
+        raise UserError(f"the signal of a bin is that of a single one of {passes} passes: render more passes")
+    slopes = np.log(without / column.gain) @ weights
+    spread = (passes - 1) / passes * np.sum((slopes - slopes.mean()) ** 2)
+    return float(weights @ np.log(total / column.gain)), float(np.sqrt(spread))
+
+
+def _fit(water: InherentProperties, radius: FloatArray, beam_radius: float) -> FloatArray:
+    """Return the fit to Gordon's results [1/m] for radii of view and beam [m]."""
+    # Nearly isotropic scattering makes a Kd above c, where the fit has no meaning.
+    kd = min(water.kd, water.attenuation)
+    return system_attenuation(water.attenuation, kd, 2 * np.hypot(radius, beam_radius))

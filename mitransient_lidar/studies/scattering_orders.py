@@ -1,0 +1,142 @@
+"""Received light by order of scattering, and by one or several vertical reversals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.core.validation import integer
+from mitransient_lidar.physics.lidar.pulse import waveform
+from mitransient_lidar.rendering.accuracy import PassStatistics
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
+from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
+from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
+
+_REVERSALS = ("one", "several")
+
+
+def scattering_orders(
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    *,
+    orders: int = 8,
+    passes: int = 32,
+    seed: int = 0,
+    integrator: Any = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Render a scene and separate its light by the number of scattering events in the water.
+
+    Light that only the sea, the bottom or a target has returned is of order 0. Every echo is reversed, from going down
+    to going up, at least once; light with three reversals or more was scattered down and up again, met the bottom
+    twice, or was reflected inside the surface.
+
+    Parameters
+    ----------
+    scene, params, seed, integrator
+        As for `rendering.render.render`.
+    orders
+        Number of separate orders, 1 to 62: 0 to `orders` - 1, and all higher ones together.
+    passes
+        Number of passes, 2 to 100 000.
+    progress
+        Called with a `passes.Progress` after every pass.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``impulse_response`` [J per bin] and ``waveform`` [W] with their standard errors, over ``pixel``, ``reversals``
+        (``one``, ``several``), ``order`` (the last includes all higher ones) and ``time`` [ns]. Summed over
+        ``reversals`` and ``order`` they are what `rendering.render.render` estimates. ``energy`` [J] of all pixels and
+        times and its standard error, over ``reversals`` and ``order``. After Ctrl-C it holds the passes done so far,
+        and the attribute ``interrupted`` is 1.
+
+    Raises
+    ------
+    UserError
+        When the scene, a parameter or an option is wrong.
+    UserError
+        When `orders` or `passes` is out of range.
+    """
+    orders = integer("orders", orders, 1, MOST_ORDERS)
+    passes = integer("passes", passes, 2, 100_000)
+    session = open_scene(scene, params)
+    chosen = choose_integrator(session.scene, integrator)
+    renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
+    lidar = renderer.scene
+    axis, pixels = lidar.axis, lidar.receiver.pixels
+    kernel = lidar.transmitter.pulse.kernel(axis.bin_width_ns, lidar.receiver.optics.response_time_ns)
+    shape = (pixels.count, len(_REVERSALS), orders + 1, axis.bin_count)
+    energy, power, totals = PassStatistics(), PassStatistics(), PassStatistics()
+
+    def render_pass(number: int, seed: int) -> float:
+        record = renderer.render_pass(seed)
+        histogram = record.histogram.energy()
+        energy.add(histogram)
+        totals.add(histogram.reshape(shape).sum(axis=(0, 3)))
+        power.add(waveform(histogram, axis.bin_width_ns, kernel))
+        return float(record.edge_loss[0])
+
+    log = run_passes(render_pass, Goal(passes=passes), seed=seed, progress=progress)
+    warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
+    dims = ("pixel", "reversals", "order", "time")
+    data = {
+        "impulse_response": (dims, energy.mean.reshape(shape), {"units": "J", "long_name": "received energy per bin"}),
+        "impulse_response_stderr": (dims, energy.stderr.reshape(shape), {"units": "J"}),
+        "waveform": (dims, power.mean.reshape(shape), {"units": "W", "long_name": "received power"}),
+        "waveform_stderr": (dims, power.stderr.reshape(shape), {"units": "W"}),
+        # Bins of a pass share paths: the errors of sums over them come from the passes, not from the bins' errors.
+        "energy": (dims[1:3], totals.mean, {"units": "J", "long_name": "received energy"}),
+        "energy_stderr": (dims[1:3], totals.stderr, {"units": "J"}),
+    }
+    coords = {
+        "pixel": list(pixels.names),
+        "reversals": list(_REVERSALS),
+        "order": ("order", np.arange(orders + 1), {"long_name": "scattering events; the last, and more"}),
+        "time": ("time", axis.centres_ns, {"units": "ns"}),
+    }
+    attributes = session.attributes(integrator=chosen.plugin, **pass_attributes(log, seed))
+    return xr.Dataset(data, coords=coords, attrs=attributes)
+
+
+def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
+    """Return order, energy and its standard error [J], share of the whole, and of that order by several turns.
+
+    Parameters
+    ----------
+    result
+        What `scattering_orders` returned.
+
+    Returns
+    -------
+    list
+        One row an order and a last one for all; NaN where there is no light. Errors of sums are taken as if those of
+        the parts were of one sign, the largest that they can be.
+    """
+    energy, stderr = result["energy"].values, result["energy_stderr"].values
+    total = energy.sum()
+    last = int(result["order"][-1])
+    names = [*(str(order) for order in range(last)), f">={last}", "all"]
+    columns = np.column_stack([energy, energy.sum(axis=1)])
+    errors = np.append(stderr.sum(axis=0), stderr.sum())
+    rows = []
+    for name, (one, several), error in zip(names, columns.T, errors, strict=True):
+        both = one + several
+        rows.append((name, float(both), float(error), _share(both, total), _share(several, both)))
+    return rows
+
+
+def describe_orders(result: xr.Dataset) -> list[str]:
+    """Return lines of a table of what `scattering_orders` returned: one an order, and one for all."""
+    lines = [f"{'order':<8}{'energy (J)':>22}{'share (%)':>12}{'several reversals (%)':>24}"]
+    for name, energy, error, share, several in shares(result):
+        known = f"{energy:.3e} +- {error:.0e}"
+        lines.append(f"{name:<8}{known:>22}{100 * share:>12.3f}{100 * several:>24.3f}")
+    return lines
+
+
+def _share(part: float, total: float) -> float:
+    return float(part / total) if total > 0 else float("nan")

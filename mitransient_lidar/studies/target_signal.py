@@ -1,0 +1,356 @@
+"""Signal of a target: a scene rendered with and without it, on the same random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.physics.lidar.pulse import waveform
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.accuracy import PassStatistics
+from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes
+from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
+
+#: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
+_HALF_GATE = 1.0
+
+#: Groups of passes whose spread gives the errors of ratios.
+_GROUPS = 16
+
+
+def target_signal(
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    *,
+    target_id: str = "target",
+    passes: int = 64,
+    seed: int = 0,
+    integrator: Any = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Render a scene with and without a target, and measure the target's own signal.
+
+    Both renders take the same random numbers, and paths that do not meet the target are the same: the difference is
+    known far better than either record. It is the target's echo, and behind it the shadow in the water and on the
+    bottom, which is negative.
+
+    Parameters
+    ----------
+    scene, params, seed, integrator
+        As for `rendering.render.render`.
+    target_id
+        Id of the shape that is the target.
+    passes
+        Number of passes of each render, 16 to 100 000.
+    progress
+        Called with a `passes.Progress` after every pass.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and ``difference``
+        [W] with their standard errors. Over ``pixel``, within two pulse widths about the peak of the summed
+        difference: ``echo`` and ``backscatter`` [J], of the difference and of the background, the ``contrast`` echo
+        over backscatter, ``shadow`` [J], the negative part of the difference after the gate, and ``weight``, the best
+        weight of each pixel. Over ``combination`` (``sum``: the sum of all pixels, ``best``: their sum with these
+        weights): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``. All with standard errors
+        (jackknife over 16 groups of passes).
+
+    Raises
+    ------
+    UserError
+        When the scene, a parameter or an option is wrong, there is no such shape, it is above the sea or below the
+        bottom, or it returns no light.
+    UserError
+        When `passes` is out of range.
+
+    Notes
+    -----
+    Where backscatter limits detection, the noise of a pixel is that of the light around the target, of a variance in
+    proportion to its energy B. With an echo E in each pixel and weights w, the signal-to-noise ratio goes with
+    sum(w E) / sqrt(sum(w^2 B)); it is largest for w = E/B (matched filter), where it is sqrt(sum(E^2/B)). That is the
+    ``detectability`` [sqrt(J)], of the plain sum sum(E) / sqrt(sum(B)): ratios of detectabilities are ratios of
+    signal-to-noise ratios, whatever the detector.
+    """
+    passes = integer("passes", passes, _GROUPS, 100_000)
+    session = open_scene(scene, params)
+    bare = _without(session.scene, target_id)
+    chosen = choose_integrator(session.scene, integrator)
+    with_target = chosen.prepare(session.scene, session.sensor)
+    without = chosen.prepare(bare, session.sensor, layout_of=with_target)
+    lidar = with_target.scene
+    axis, pixels, pulse = lidar.axis, lidar.receiver.pixels, lidar.transmitter.pulse
+    if pixels.grid is not None:
+        raise UserError(f"layout = {pixels.layout!r} is an imager: the target's signal needs at most 16 pixels")
+    kernel = pulse.kernel(axis.bin_width_ns, lidar.receiver.optics.response_time_ns)
+    pairs: list[tuple[FloatArray, FloatArray]] = []
+
+    def render_pass(number: int, seed: int) -> float:
+        records = [renderer.render_pass(seed) for renderer in (with_target, without)]
+        pairs.append((records[0].histogram.energy(), records[1].histogram.energy()))
+        return float(records[0].edge_loss[0])
+
+    log = run_passes(render_pass, Goal(passes=passes), seed=seed, smallest=_GROUPS, progress=progress)
+    result = _measure(np.array(pairs), axis, kernel, pulse.fwhm_ns)
+    warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
+    attributes = session.attributes(
+        target=target_id, integrator=chosen.plugin, **pass_attributes(log, seed), **result.attrs
+    )
+    return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
+
+
+def target_map(
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    *,
+    x: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
+    y: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
+    progress: ProgressCallback | None = None,
+    **options: Any,
+) -> xr.Dataset:
+    """Measure a target's own signal at many places.
+
+    Parameters
+    ----------
+    scene, params
+        An XML scene with the parameters ``target_x`` and ``target_y``.
+    x, y
+        Offsets from the target's place in the scene [m], each at least one.
+    progress
+        Called with a `passes.Progress` after every place.
+    **options
+        As for `target_signal`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Results of `target_signal` for pixels and combinations, over ``target_x`` and ``target_y`` [m], too.
+
+    Raises
+    ------
+    UserError
+        As `target_signal`, and for a scene without these parameters.
+    """
+    known = open_scene(scene, params).parameters
+    for name in ("target_x", "target_y"):
+        if name not in known:
+            raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
+    places = [float(known["target_x"]) + np.asarray(x, float), float(known["target_y"]) + np.asarray(y, float)]
+    rows: list[xr.Dataset] = []
+    for place_x in places[0]:
+        row = []
+        for place_y in places[1]:
+            moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
+            found = target_signal(scene, moved, **options)
+            row.append(found.drop_dims("time"))
+            if progress is not None:
+                done = len(rows) * len(places[1]) + len(row)
+                progress(Progress(done, len(places[0]) * len(places[1]), "place"))
+        rows.append(xr.concat(row, "target_y", combine_attrs="drop_conflicts"))
+    maps = xr.concat(rows, "target_x", combine_attrs="drop_conflicts")
+    return maps.assign_coords(target_x=places[0], target_y=places[1])
+
+
+def grid_offsets(count: int, max_offset: float) -> list[float]:
+    """Return evenly spaced offsets [m] for `target_map`, `count` (1 to 15) from -`max_offset` to `max_offset`."""
+    count, reach = integer("grid", count, 1, 15), positive("max_offset", max_offset)
+    return np.linspace(-reach, reach, count).tolist() if count > 1 else [0.0]
+
+
+def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
+    """Return the shape of a scene that is its target.
+
+    Raises
+    ------
+    UserError
+        When there is no such shape, or it is the sea, or wholly above the sea or below the bottom.
+    """
+    shapes = list(scene.shapes())
+    names = [shape.id() for shape in shapes]
+    if target_id not in names:
+        raise UserError(f"target_id = {target_id!r} must be the id of a shape of the scene: {', '.join(names)}")
+    found = shapes[names.index(target_id)]
+    if found.is_medium_transition():
+        raise UserError(f"target_id = {target_id!r} must not be the sea surface")
+    _check_place(found, [shape for shape in shapes if shape is not found])
+    return found
+
+
+def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
+    """Return a scene without one of its shapes; all else is shared."""
+    shapes, gone = list(scene.shapes()), find_target(scene, target_id)
+    parts: dict[str, Any] = {"type": "scene", "integrator": scene.integrator()}
+    parts |= {f"sensor_{i}": sensor for i, sensor in enumerate(scene.sensors())}
+    parts |= {f"emitter_{i}": emitter for i, emitter in enumerate(scene.emitters())}
+    parts |= {f"shape_{i}": shape for i, shape in enumerate(shapes) if shape is not gone}
+    found: mi.Scene = mi.load_dict(parts)
+    return found
+
+
+def _check_place(target: mi.Shape, others: list[mi.Shape]) -> None:
+    """Refuse a target that is wholly above the sea or below the bottom."""
+    low, high = float(target.bbox().min.z), float(target.bbox().max.z)
+    seas = [float(shape.bbox().max.z) for shape in others if shape.is_medium_transition()]
+    bottoms = [float(shape.bbox().min.z) for shape in others if not shape.is_medium_transition()]
+    if seas and low >= max(seas):
+        raise UserError(f"target {target.id()!r} lies above the sea, from z = {low:.3g} m: it must lie in the water")
+    if bottoms and high <= min(bottoms):
+        raise UserError(
+            f"target {target.id()!r} lies below the bottom, up to z = {high:.3g} m: "
+            f"it must lie above {min(bottoms):.3g} m"
+        )
+
+
+@dataclass(frozen=True)
+class _Gated:
+    """Energies [J] of the pixels, shape (..., pixels): echo of the target, backscatter around it, shadow behind."""
+
+    echo: FloatArray
+    backscatter: FloatArray
+    shadow: FloatArray
+
+    def numbers(self) -> dict[str, FloatArray]:
+        """Return the quantities of each pixel, and of combinations of pixels."""
+        echo, backscatter = np.maximum(self.echo, 0), self.backscatter
+        quality = np.divide(echo, backscatter, out=np.zeros_like(echo), where=backscatter > 0)
+        weight = quality / max(float(np.max(quality)), 1e-300)
+        combined = [(np.sum(w * self.echo), np.sum(w * backscatter), np.sum(w**2 * backscatter)) for w in (1, weight)]
+        return {
+            "echo": self.echo,
+            "backscatter": backscatter,
+            "shadow": self.shadow,
+            "contrast": _ratio(self.echo, backscatter),
+            "weight": weight,
+            "detectability": _ratio(self.echo, np.sqrt(backscatter)),
+            "combined_echo": np.array([e for e, _, _ in combined]),
+            "combined_contrast": np.array([_ratio(e, b) for e, b, _ in combined]),
+            "combined_detectability": np.array([_ratio(e, np.sqrt(v)) for e, _, v in combined]),
+        }
+
+
+def _ratio(part: Any, total: Any) -> FloatArray:
+    return np.asarray(np.divide(part, total, out=np.full(np.shape(part), np.nan), where=np.asarray(total) > 0))
+
+
+def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray], pulse_width: float) -> xr.Dataset:
+    """Return the result for energies [J] of shape (passes, 2, pixels, time), with and without the target."""
+    time, bin_width = axis.centres_ns, axis.bin_width_ns
+    power = waveform(records, bin_width, kernel)
+    curves = {}
+    for name, values in _curves(power):
+        statistics = PassStatistics()
+        for one in values:
+            statistics.add(one)
+        curves[name] = (("pixel", "time"), statistics.mean, {"units": "W"})
+        curves[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr, {"units": "W"})
+    summed = curves["difference"][1].sum(axis=0)
+    if not np.any(summed > 0):
+        raise UserError("target: it returns no light within the record; see its place, and that of the record")
+    peak = float(time[np.argmax(summed)])
+    start, end = peak - _HALF_GATE * pulse_width, peak + _HALF_GATE * pulse_width
+    gate = (time >= start) & (time <= end)
+
+    def gated(energy: FloatArray) -> dict[str, FloatArray]:
+        """Return the numbers for mean powers, shape (2, pixels, time)."""
+        difference, background = energy[0] - energy[1], energy[1]
+        seconds = bin_width * 1e-9
+        after = np.where(time > end, np.minimum(difference, 0), 0)
+        return _Gated(
+            difference[:, gate].sum(axis=-1) * seconds,
+            background[:, gate].sum(axis=-1) * seconds,
+            after.sum(axis=-1) * seconds,
+        ).numbers()
+
+    groups = np.array_split(np.arange(len(power)), _GROUPS)
+    total = power.sum(axis=0)
+    means = gated(total / len(power))
+    left_out = [gated((total - power[group].sum(axis=0)) / (len(power) - len(group))) for group in groups]
+    data: dict[str, Any] = dict(curves)
+    units = {"echo": "J", "backscatter": "J", "shadow": "J", "detectability": "J^(1/2)"}
+    for name, value in means.items():
+        error = np.sqrt((_GROUPS - 1) * np.mean([(other[name] - value) ** 2 for other in left_out], axis=0))
+        dims = "combination" if name.startswith("combined") else "pixel"
+        unit = units.get(name.removeprefix("combined_"), "1")
+        data[name] = (dims, value, {"units": unit})
+        data[f"{name}_stderr"] = (dims, error, {"units": unit})
+    coords = {"time": ("time", time, {"units": "ns"}), "combination": ["sum", "best"]}
+    return xr.Dataset(data, coords=coords, attrs={"gate_start_ns": start, "gate_end_ns": end, "peak_ns": peak})
+
+
+def _curves(power: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Yield name and values, shape (passes, pixels, time)."""
+    yield "waveform", power[:, 0]
+    yield "background", power[:, 1]
+    yield "difference", power[:, 0] - power[:, 1]
+
+
+def describe_target(result: xr.Dataset) -> list[str]:
+    """Return lines of a table of what `target_signal` has found.
+
+    Parameters
+    ----------
+    result
+        What `target_signal` returned.
+
+    Returns
+    -------
+    list
+        Where the echo is, a heading, one line a pixel, then the sum and the best combination. The relative SNR is
+        the detectability over that of the sum.
+    """
+    attributes = result.attrs
+    sum_echo, sum_snr = (float(result[f"combined_{name}"][0]) for name in ("echo", "detectability"))
+    lines = [
+        f"target's echo at {attributes['peak_ns']:.1f} ns, gate {attributes['gate_start_ns']:.1f} to "
+        f"{attributes['gate_end_ns']:.1f} ns",
+        f"{'pixel':<12}{'echo (J)':>22}{'of all (%)':>12}{'contrast':>18}{'weight':>8}{'relative SNR':>18}",
+    ]
+    rows = [(str(name), result.isel(pixel=i), "", "weight") for i, name in enumerate(result["pixel"].values)]
+    rows += [(name, result.isel(combination=i), "combined_", "") for i, name in enumerate(("sum", "best"))]
+    for name, one, kind, weight in rows:
+        echo, contrast, snr = (one[kind + quantity] for quantity in ("echo", "contrast", "detectability"))
+        errors = [float(one[f"{kind}{quantity}_stderr"]) for quantity in ("echo", "contrast", "detectability")]
+        share = "" if name == "best" else f"{100 * float(echo) / sum_echo:.1f}"
+        cells = (
+            f"{float(echo):.3e} +- {errors[0]:.0e}",
+            f"{float(contrast):.3f} +- {errors[1]:.3f}",
+            f"{float(one[weight]):.2f}" if weight else "",
+            f"{float(snr) / sum_snr:.3f} +- {errors[2] / sum_snr:.3f}",
+        )
+        lines.append(f"{name:<12}{cells[0]:>22}{share:>12}{cells[1]:>18}{cells[2]:>8}{cells[3]:>18}")
+    return lines
+
+
+def describe_map(maps: xr.Dataset) -> list[str]:
+    """Return lines of a table of what `target_map` has found.
+
+    Parameters
+    ----------
+    maps
+        What `target_map` returned.
+
+    Returns
+    -------
+    list
+        A heading, and for each place the pixels' shares of the echo [%], contrasts, and the gain of the best weights.
+    """
+    names = [str(name) for name in maps["pixel"].values]
+    share = 100 * maps["echo"] / maps["combined_echo"].sel(combination="sum")
+    snr = maps["combined_detectability"]
+    gain = snr.sel(combination="best") / snr.sel(combination="sum")
+    columns = "".join(f"{name + ' (%)':>12}" for name in names) + "".join(f"{name + ' contrast':>16}" for name in names)
+    lines = [f"{'target_x':>9}{'target_y':>10}{columns}{'best SNR/sum':>16}"]
+    for x in maps["target_x"].values:
+        for y in maps["target_y"].values:
+            place = {"target_x": x, "target_y": y}
+            shares = "".join(f"{float(value):>12.1f}" for value in share.sel(place).values)
+            contrasts = "".join(f"{float(value):>16.3f}" for value in maps["contrast"].sel(place).values)
+            lines.append(f"{x:>9.2f}{y:>10.2f}{shares}{contrasts}{float(gain.sel(place)):>16.3f}")
+    return lines

@@ -1,0 +1,253 @@
+"""Optical properties and scene parameters of a water, from its type or a quantity measured of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.water import seawater, water_types
+from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.physics.water.profiles import Profile, read_profile
+
+PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
+"""Maps angles [rad] to p [1/sr]."""
+
+KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
+
+DEFAULT_TOLERANCE = 0.01
+"""What the medium ``layered_water`` lets the layers of a profile deviate from it, relative."""
+
+#: How well each kind is known to stand for the water's own properties.
+_CAUTION = {
+    "jerlov": "bb follows from Kd and is uncertain by half",
+    "chlorophyll": "single waters scatter twice or half as much",
+    "kd": "a Kd leaves the scattering open by a factor of 2",
+    "secchi": "a Secchi depth is a rough way in: a factor of 2",
+    "petzold": "measured at 514 to 530 nm; what is rendered is a Fournier-Forand function of the same bb/b",
+    "pure": "natural waters hold particles, which scatter more",
+}
+
+#: Titles of figures, by kind.
+_TITLES = {
+    "jerlov": "Jerlov's water type {}",
+    "chlorophyll": "chlorophyll {} mg/m³",
+    "kd": "Kd {} 1/m",
+    "secchi": "Secchi depth {} m",
+    "petzold": "Petzold's {} water",
+    "pure": "pure sea water",
+}
+
+#: Wavelengths [nm] at which Petzold's waters stand for themselves: from his filter's middle to the usual laser.
+_PETZOLD_RANGE = (514.0, water_types.GREEN_RANGE[1])
+
+#: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
+_NODES = 32768
+
+
+def water_of(
+    kind: str, value: str | None, wavelength_nm: float, temperature: float, salinity: float
+) -> water_types.InherentProperties:
+    """Return the inherent optical properties of a water.
+
+    Parameters
+    ----------
+    kind
+        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``.
+    value
+        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
+        ``coastal`` or ``turbid``; None for pure sea water.
+    wavelength_nm, temperature, salinity
+        Wavelength [nm], temperature [deg C] and salinity [per mille].
+
+    Raises
+    ------
+    UserError
+        When the kind is unknown, the value missing or not a number.
+    UserError
+        When a value is out of range.
+    """
+    if kind not in _CAUTION:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(_CAUTION)}")
+    if kind == "pure":
+        if value is not None:
+            raise UserError(f"value = {value!r} must be left out for pure sea water")
+        return water_types.pure_seawater(wavelength_nm, temperature, salinity)
+    text = _given(kind, value)
+    if kind == "jerlov":
+        return water_types.jerlov(text, wavelength_nm)
+    if kind == "petzold":
+        return _petzold(text, wavelength_nm)
+    try:
+        number = float(text)
+    except ValueError:
+        raise UserError(f"value = {text!r} must be a number for {kind}") from None
+    if kind == "chlorophyll":
+        return water_types.chlorophyll(number, wavelength_nm)
+    if wavelength_nm != 532.0:
+        raise UserError(f"wavelength = {wavelength_nm:g} must be 532 nm for {kind}")
+    return water_types.from_kd(number) if kind == "kd" else water_types.from_secchi(number)
+
+
+def describe_water(
+    kind: str,
+    value: str | None,
+    wavelength_nm: float,
+    temperature: float,
+    salinity: float,
+    tolerance: float = DEFAULT_TOLERANCE,
+) -> list[str]:
+    """Return lines that tell the properties of a water and what to render it with.
+
+    Parameters
+    ----------
+    kind, value, wavelength_nm, temperature, salinity
+        As for `water_of`; or the kind ``profile`` and the path of a file for `profiles.read_profile`.
+    tolerance
+        Largest relative deviation of a profile's layers, 1e-5 to 0.5.
+
+    Raises
+    ------
+    UserError
+        As `water_of`, for a value out of range, too; or when the file cannot be read.
+    """
+    _require_kind(kind)
+    index = float(seawater.refractive_index(wavelength_nm, temperature, salinity))
+    group = float(seawater.group_index(wavelength_nm, temperature, salinity))
+    if kind == "profile":
+        return _describe_profile(_given(kind, value), tolerance, index, group)
+    found = water_of(kind, value, wavelength_nm, temperature, salinity)
+    rows = {
+        "absorption a (1/m)": found.absorption,
+        "scattering b (1/m)": found.scattering,
+        "backscattering bb (1/m)": found.backscattering,
+        "attenuation c (1/m)": found.attenuation,
+        "albedo b/c": found.albedo,
+        "bb/b": found.backscatter_ratio,
+        "diffuse attenuation Kd (1/m)": found.kd,
+        "refractive index": index,
+        "group index": group,
+    }
+    parameters = {
+        "attenuation": found.attenuation,
+        "scattering": found.scattering,
+        "backscattering": found.backscattering,
+        "refractive_index": index,
+        "group_index": group,
+    }
+    if kind == "pure":
+        parameters["water_scattering"] = found.scattering
+    options = " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items())
+    return [
+        *(f"{name:<30}{number:.5g}" for name, number in rows.items()),
+        f"Note: {_CAUTION[kind]}.",
+        f"mitransient-lidar render table1 {options}",
+    ]
+
+
+def phase_function_of(
+    kind: str, value: str | None, found: water_types.InherentProperties
+) -> tuple[PhaseFunction, str, str]:
+    """Return the phase function of a water, its label, and a title with the properties of the water.
+
+    Parameters
+    ----------
+    kind, value
+        As for `water_of`.
+    found
+        The properties that `water_of` returned.
+    """
+    ratio = f"bb/b = {found.backscatter_ratio:.3g}"
+    phase: PhaseFunction
+    if kind == "pure":
+        phase, label = seawater.water_phase_function, f"pure sea water, {ratio}"
+    elif kind == "petzold":
+        phase, label = petzold_water(_given(kind, value)), f"measured, {ratio}"
+    else:
+        phase, label = fournier_forand_of(found.backscatter_ratio), f"Fournier-Forand, {ratio}"
+    properties = f"a = {found.absorption:.3g}, b = {found.scattering:.3g}, bb = {found.backscattering:.3g} 1/m"
+    return phase, label, f"{_TITLES[kind].format(value)}  ·  {properties}"
+
+
+def fournier_forand_of(backscatter_ratio: float) -> PhaseFunction:
+    """Return the Fournier-Forand function with a bb/b, which maps angles [rad] to p [1/sr].
+
+    Raises
+    ------
+    UserError
+        If no such function has this bb/b.
+    """
+    n, mu = fournier_forand_parameters(backscatter_ratio)
+    return lambda theta: fournier_forand(theta, n, mu)
+
+
+def profile_of(file: str | None) -> Profile:
+    """Read the file of a profile; raise a `UserError` if there is none, or as `profiles.read_profile`."""
+    return read_profile(_given("profile", file))
+
+
+def _describe_profile(file: str, tolerance: float, index: float, group: float) -> list[str]:
+    profile = read_profile(file)
+    layers = profile.layers(tolerance)
+    bottom = float(profile.depth[-1])
+    rows = {
+        "depth (m)": _span(profile.depth),
+        "absorption a (1/m)": _span(profile.absorption),
+        "scattering b (1/m)": _span(profile.scattering),
+        "attenuation c (1/m)": _span(profile.attenuation),
+        "bb/b": _ratio_span(profile),
+        f"optical depth to {bottom:.5g} m": f"{float(layers.cumulative(bottom)):.5g}",
+        f"layers within {100 * tolerance:.3g} %": str(layers.count),
+        "refractive index": f"{index:.5g}",
+        "group index": f"{group:.5g}",
+    }
+    # A scene may be rendered from another folder.
+    element = f'<string name="profile" value={quoteattr(str(Path(file).absolute()))}/>'
+    if tolerance != DEFAULT_TOLERANCE:
+        element += f' <float name="profile_tolerance" value="{tolerance:g}"/>'
+    return [
+        *(f"{name:<30}{text}" for name, text in rows.items()),
+        "Put into the medium of a scene instead of layer_tops, attenuation, scattering and backscattering:",
+        element,
+    ]
+
+
+def _span(values: FloatArray) -> str:
+    low, high = f"{values.min():.5g}", f"{values.max():.5g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _ratio_span(profile: Profile) -> str:
+    """Return the range of bb/b, whose extremes lie at nodes, where there is scattering."""
+    scatters = profile.scattering > 0
+    if not scatters.any():
+        return "none, nothing scatters"
+    return _span(profile.backscattering[scatters] / profile.scattering[scatters])
+
+
+def _petzold(name: str, wavelength_nm: float) -> water_types.InherentProperties:
+    if name not in PETZOLD_WATERS:
+        raise UserError(f"value = {name!r} must be one of {', '.join(PETZOLD_WATERS)} for petzold")
+    low, high = _PETZOLD_RANGE
+    if not low <= wavelength_nm <= high:
+        raise UserError(f"wavelength = {wavelength_nm:g} must lie between {low:g} and {high:g} nm for petzold")
+    a, b = PETZOLD_WATERS[name]
+    share = PowerLawTable.from_function(petzold_water(name), _NODES).backscatter_ratio
+    return water_types.InherentProperties(a, b, b * share)
+
+
+def _require_kind(kind: str) -> None:
+    if kind not in KINDS:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+
+
+def _given(kind: str, value: str | None) -> str:
+    if value is None:
+        raise UserError(f"value is missing: {kind} needs one")
+    return value

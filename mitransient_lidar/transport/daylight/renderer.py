@@ -1,0 +1,171 @@
+"""Passes of daylight: the radiance that each pixel sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.daylight.sampling import FovSampler
+from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.refracted_connection import (
+    ConnectedPath,
+    EmitterDirection,
+    RefractedSunSampler,
+    connect_sun,
+)
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.volpath import PathLight, PathTracer, VolpathOptions, level_transmittance
+
+#: Number of the random streams within a pass.
+_STREAM = 4
+
+#: Scattering events beyond which a tenth of the paths ends at each: without absorption light would be scattered for
+#: ever.
+_LONG = 100
+_LONG_SURVIVAL = 0.9
+
+
+@dataclass
+class DaylightRecord:
+    """Daylight of one pass.
+
+    Attributes
+    ----------
+    found
+        Radiance times solid angle of each pixel [W m^-2 nm^-1], shape (pixels,); NaN where a value was not finite.
+    sampled
+        Solid angle of the samples of each pixel [sr], shape (pixels,).
+    edge_loss
+        Radiance times solid angle that would have been found if the surface mesh did not end, shape (1,).
+    rays
+        Number of rays traced.
+    """
+
+    found: mi.Float64
+    sampled: mi.Float64
+    edge_loss: mi.Float64
+    rays: mi.Float64
+
+
+class DaylightLight(PathLight):
+    """Sun and sky, and the record of a pass.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    record
+        Record of the pass.
+    u
+        Uniform random numbers that choose a point of the sun's disc, one for each path.
+    """
+
+    def __init__(self, scene: DaylightScene, record: DaylightRecord, u: mi.Point2f) -> None:
+        self.scene, self.record = scene, record
+        self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
+        self.invalid = dr.zeros(mi.Bool, dr.width(record.found))
+
+    def _add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
+        # Sums leave out values that are not finite; the pixel is marked instead.
+        dr.scatter(self.invalid, mi.Bool(True), pixel, active & ~dr.isfinite(found))
+        dr.scatter_add(self.record.found, mi.Float64(found), pixel, active & (found > 0))
+
+    def connect(
+        self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Connect surface points to the sun."""
+        sun = self.scene.sun
+        if sun is None:
+            return mi.Float(0), mi.Float(0)
+        return connect_sun(self.scene, si, emitter.in_air, sun.sampled_irradiance, active), mi.Float(0)
+
+    def receive(
+        self, path: ConnectedPath, pixel: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool
+    ) -> None:
+        """Add light of the sun."""
+        self._add(pixel, energy, active)
+
+    def escape(self, path: ConnectedPath, pixel: mi.UInt32, weight: mi.Float, active: mi.Bool) -> None:
+        """Add the sky where paths leave the scene, and the sun where they could not be connected to it."""
+        scene = self.scene
+        radiance = dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))
+        if scene.sun is not None:
+            radiance += dr.select(path.specular, scene.sun.radiance(path.direction), 0)
+        self._add(pixel, weight * path.throughput * radiance, active & ~path.in_water)
+
+    def reflect(
+        self,
+        path: ConnectedPath,
+        si: mi.SurfaceInteraction3f,
+        pixel: mi.UInt32,
+        weight: mi.Float,
+        rng: mi.PCG32,
+        active: mi.Bool,
+    ) -> None:
+        """Add the sky that the dry side of the sea surface reflects, where nothing is in the way."""
+        if self.scene.sky is None:
+            return
+        context = mi.BSDFContext()
+        context.type_mask = mi.BSDFFlags.Reflection.value
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        sample, value = si.bsdf().sample(context, si, mi.Float(0), u, active)
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        radiance = value[0] * self.scene.sky_radiance(ray.d)
+        bright = active & (radiance > 0)
+        bright &= ~self.scene.ray_test(ray, bright)
+        path.rays += dr.select(active, mi.UInt32(1), 0)
+        self._add(pixel, weight * path.throughput * radiance, bright)
+
+    def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
+        """Add to the light lost because the surface mesh ends, for a flat surface at normal incidence."""
+        sun = self.scene.sun
+        if sun is not None:
+            missing = share * level_transmittance(self.scene, emitter) * sun.sampled_irradiance
+            dr.scatter_add(self.record.edge_loss, mi.Float64(missing), mi.UInt32(0), missing > 0)
+
+    def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
+        """End very long paths at random."""
+        path.active &= (path.scatterings <= _LONG) | (rng.next_float32() < _LONG_SURVIVAL)
+        path.throughput = dr.select(path.scatterings > _LONG, path.throughput / _LONG_SURVIVAL, path.throughput)
+
+
+class DaylightRenderer:
+    """Renders independent passes of daylight over one prepared scene.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    options
+        Options of the path tracer.
+    paths
+        Paths of one pass.
+    """
+
+    def __init__(self, scene: DaylightScene, options: VolpathOptions, paths: int) -> None:
+        self.scene, self.options, self.paths = scene, options, paths
+        self.sampler = FovSampler(scene.receiver)
+
+    def render_pass(self, seed: int, *, paths: int | None = None) -> DaylightRecord:
+        """Render one pass: seed and, optionally, number of paths."""
+        count = self.paths if paths is None else paths
+        with dr.suspend_grad():
+            rng = pass_streams(seed, _STREAM, count)
+            start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
+            path = ConnectedPath.start(self.scene.receiver.pose, start.direction, start.weight > 0)
+            return self.follow(path, rng, start.pixel, start.weight)
+
+    def follow(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> DaylightRecord:
+        """Trace paths from their last vertices to their ends; each counts for a pixel with a weight [sr]."""
+        pixels = self.scene.receiver.pixels.count
+        found, sampled, lost = (dr.zeros(mi.Float64, count) for count in (pixels, pixels, 1))
+        record = DaylightRecord(found, sampled, lost, mi.Float64(0))
+        dr.scatter_add(record.sampled, mi.Float64(weight), pixel, weight > 0)
+        light = DaylightLight(self.scene, record, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        options = self.options if self.scene.sun is not None else replace(self.options, connection="phase")
+        record.rays = PathTracer(self.scene, options, light).trace(path, rng, pixel, weight)
+        record.found = dr.select(light.invalid, dr.nan, record.found)
+        dr.eval(record.found, record.sampled, record.edge_loss, record.rays)
+        return record

@@ -1,0 +1,84 @@
+"""A scene lit by sun and sky."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.scene import (
+    WaterScene,
+    check_layers,
+    find_receiver,
+    find_water,
+    largest_slope_variance,
+)
+
+#: Largest angle between the sun and the sun of a clear sky [deg].
+_SAME_DIRECTION_DEG = 0.05
+
+
+@dataclass(frozen=True)
+class DaylightScene(WaterScene):
+    """A scene lit by sun and sky.
+
+    Attributes
+    ----------
+    sun, sky
+        The ``sun`` and the ``sky`` plugins, None where there is none; at least one is present.
+    """
+
+    sun: Any
+    sky: Any
+
+    @classmethod
+    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor) -> DaylightScene:
+        """Find the parts in a loaded scene. A ``lidar_transmitter`` may be present and is ignored.
+
+        Raises
+        ------
+        UserError
+            When a part is missing, of a foreign kind, or there are several where one is allowed.
+        """
+        receiver = find_receiver(sensor)
+        found: dict[str, mi.Emitter] = {}
+        for emitter in scene.emitters():
+            kind = getattr(emitter, "daylight", None)
+            if kind is None and not hasattr(emitter, "pulse_energy"):
+                raise UserError("emitters: passive imaging allows sun, sky and lidar_transmitter; there is another one")
+            if kind in found:
+                raise UserError(f"emitters: the scene has more than one {kind}; allowed is one")
+            if kind is not None:
+                found[kind] = emitter
+        if not found:
+            raise UserError("emitters: passive imaging needs a sun or a sky, and the scene has neither")
+        sun, sky = found.get("sun"), found.get("sky")
+        if sun is not None and sky is not None and sky.distribution == "clear":
+            _check_sun(sun, sky)
+        water, surfaces = find_water(scene)
+        if receiver.pose.origin[2] <= 0:
+            raise UserError("altitude: the receiver must be above the mean sea level z = 0")
+        if water is not None:
+            check_layers(scene, surfaces, water)
+        return cls(scene, receiver, water, surfaces, largest_slope_variance(surfaces), sun, sky)
+
+    def sky_radiance(self, direction: mi.Vector3f) -> mi.Float:
+        """Return the radiance of the sky in a direction [W m^-2 sr^-1 nm^-1]; 0 below the horizon."""
+        return mi.Float(0) if self.sky is None else self.sky.radiance(direction)
+
+    def sun_directions(self, u: mi.Point2f) -> mi.Vector3f:
+        """Map uniform numbers to directions of the sun's disc; without a sun to the zenith."""
+        return mi.Vector3f(0, 0, 1) if self.sun is None else self.sun.sample(u)
+
+
+def _check_sun(sun: Any, sky: Any) -> None:
+    """Refuse a clear sky whose sun is elsewhere than the sun."""
+    apart = float(np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(sun.direction - sky.sun))))
+    if apart > _SAME_DIRECTION_DEG:
+        raise UserError(
+            f"sun_zenith_deg and sun_azimuth_deg of the clear sky put the sun {apart:.3g} degrees from where it is: "
+            "they must be the sun's own zenith_deg and azimuth_deg"
+        )

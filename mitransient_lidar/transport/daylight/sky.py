@@ -1,0 +1,77 @@
+"""Radiance distributions of the sky, and directions of the sun."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.validation import finite, in_range
+from mitransient_lidar.physics.lidar.clear_sky import LARGEST_SUN_ZENITH_DEG
+
+#: Points along each axis of the quadrature that normalises a sky.
+_QUADRATURE_POINTS = 1024
+
+
+def read_direction(props: mi.Properties, prefix: str = "") -> tuple[float, NDArray[np.float64]]:
+    """Read ``zenith_deg`` and ``azimuth_deg`` of the sun; return the zenith angle [deg] and its unit direction.
+
+    Raises
+    ------
+    UserError
+        When an angle is out of range.
+    """
+    name = f"{prefix}zenith_deg"
+    zenith = in_range(name, props.get(name, 40.0), 0.0, LARGEST_SUN_ZENITH_DEG)
+    azimuth = np.radians(finite(f"{prefix}azimuth_deg", props.get(f"{prefix}azimuth_deg", 0.0)))
+    sin, cos = np.sin(np.radians(zenith)), np.cos(np.radians(zenith))
+    return zenith, np.array([sin * np.cos(azimuth), sin * np.sin(azimuth), cos])
+
+
+def uniform_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
+    """Return the relative radiance of a uniform sky."""
+    return mi.Float(1)
+
+
+def overcast_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
+    """Return the relative radiance of a thickly overcast sky: three times as bright at the zenith as at the horizon.
+
+    Moon and Spencer 1942, Illuminating Engineering 37, 707; the cardioidal sky.
+    """
+    return 1 + 2 * direction.z
+
+
+def clear_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
+    """Return the relative radiance of a clear sky, bright around the sun and at the horizon.
+
+    Harrison and Coombes 1988, equations 3 to 5 (doi:10.1016/0038-092X(88)90072-2), without the factor that depends on
+    the sun's zenith angle alone.
+    """
+    cosine = dr.dot(direction, sun)
+    # The arc cosine is inaccurate next to the sun.
+    angle = 2 * dr.safe_asin(0.5 * dr.norm(direction - sun))
+    around = 1.63 + 53.7 * dr.exp(-5.49 * angle) + 2.04 * dr.square(cosine) * sun.z
+    return around * (1 - dr.exp(-0.19 / dr.maximum(direction.z, 1e-6)))
+
+
+#: Relative radiance by the name of the distribution.
+SKIES: dict[str, Callable[[mi.Vector3f, mi.Vector3f], mi.Float]] = {
+    "clear": clear_distribution,
+    "overcast": overcast_distribution,
+    "uniform": uniform_distribution,
+}
+
+
+def relative_irradiance(name: str, sun: NDArray[np.float64]) -> float:
+    """Return the irradiance on a level plane of a distribution of relative radiance, by the midpoint rule."""
+    n = _QUADRATURE_POINTS
+    index = dr.arange(mi.UInt32, n**2)
+    cosine2 = (mi.Float(index % n) + 0.5) / n
+    sin, cos = dr.sincos(dr.two_pi * (mi.Float(index // n) + 0.5) / n)
+    level = dr.sqrt(1 - cosine2)
+    direction = mi.Vector3f(level * cos, level * sin, dr.sqrt(cosine2))
+    radiance = SKIES[name](direction, mi.Vector3f(sun.tolist()))
+    return float(np.pi * np.mean(np.array(radiance, dtype=np.float64)))

@@ -1,0 +1,165 @@
+"""Sums of received energy over one pass, by pixel and time bin or by pixel and gate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GateTrain, ResponseTable
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.transport.opaque import opaque
+
+#: Largest number of sums: more do not fit the memory of a laptop.
+_LARGEST = 2**28
+
+#: Weights of a gate below this are neglected: beyond 5 standard deviations of a Gaussian pulse.
+_SMALLEST_WEIGHT = 1e-7
+
+#: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below
+#: which energies are summed finely. Coarse sums hold 64 times the emitted energy; fine ones 2^23 of the largest they
+#: take.
+_COARSE_BITS, _FINE_BITS, _COARSEST_FINE = 57, 32, 2.0**8
+
+
+class GateWeights:
+    """Weights with which an arrival counts in the gates that are open to a part of its pulse.
+
+    Parameters
+    ----------
+    train
+        Gates.
+    table
+        Weight of an arrival in the first gate, from `GateTrain.response_weights`.
+    """
+
+    def __init__(self, train: GateTrain, table: ResponseTable) -> None:
+        self.count = train.count
+        kept = np.flatnonzero(table.values > _SMALLEST_WEIGHT)
+        first, last = max(int(kept[0]) - 1, 0), min(int(kept[-1]) + 2, table.values.size)
+        # Zero at both ends, so that linear interpolation never leaves the table.
+        values = np.append(table.values[first:last], 0.0)
+        values[0] = 0.0
+        self._values = mi.Float(values)
+        self._last = values.size - 2
+        self._start = opaque((table.start_ns + first * table.step_ns) * 1e-9 * C0)
+        self._per_metre = opaque(1 / (table.step_ns * 1e-9 * C0))
+        self._per_gate = opaque(train.step_ns / table.step_ns)
+        self._pulses = float(train.pulses)
+
+    def add(
+        self,
+        path_length: mi.Float,
+        energy: mi.Float,
+        active: mi.Bool,
+        add: Callable[[mi.UInt32, mi.Float, mi.Bool], None],
+    ) -> None:
+        """Call `add` with every gate in which an arrival counts, and its share of the energy."""
+        position = (path_length - self._start) * self._per_metre
+        latest = dr.floor(position / self._per_gate)
+        earliest = dr.ceil((position - self._last) / self._per_gate)
+        active = active & (latest >= 0) & (earliest < self.count)
+        gate = mi.UInt32(dr.maximum(earliest, 0))
+        end = dr.select(active, mi.UInt32(dr.clip(latest, 0, self.count - 1)) + 1, 0)
+
+        def share(gate: mi.UInt32) -> tuple[mi.UInt32]:
+            here = dr.clip(position - mi.Float(gate) * self._per_gate, 0, self._last)
+            below = mi.UInt32(here)
+            low, high = (dr.gather(mi.Float, self._values, below + step) for step in (0, 1))
+            add(gate, energy * self._pulses * dr.lerp(low, high, here - mi.Float(below)), gate < end)
+            return (gate + 1,)
+
+        dr.while_loop((gate,), lambda gate: gate < end, share, label="gates")
+
+
+class TransientHistogram:
+    """Energy of each pixel in each time bin, or in each gate.
+
+    Energies are summed as integers of two units, so that the sums do not depend on their order: the same seed gives the
+    same bits, and pixels sum exactly to the whole.
+
+    Parameters
+    ----------
+    axis
+        Time bins of the record.
+    shape
+        Numbers of pixels, (pixels,) or (rows, columns).
+    emitted
+        Energy that the laser emits [J]: no bin receives more.
+    gates
+        Gates that are summed instead of the time bins, or None.
+
+    Raises
+    ------
+    UserError
+        When pixels times bins, or pixels times gates, exceed 2^28.
+    """
+
+    #: Memory of a bin, or of a gate [bytes]: two sums and a mark.
+    BYTES_PER_BIN = 20
+
+    def __init__(
+        self, axis: TimeAxis, shape: tuple[int, ...], emitted: float, gates: GateWeights | None = None
+    ) -> None:
+        self.axis, self.gates = axis, gates
+        #: Number of sums of a pixel: time bins, or gates.
+        self.record_length = axis.bin_count if gates is None else gates.count
+        pixels = int(np.prod(shape))
+        if pixels * self.record_length > _LARGEST:
+            name = "bin_count" if gates is None else "gate_count"
+            raise UserError(f"{name} = {self.record_length} times {pixels} pixels must not exceed {_LARGEST} in all")
+        #: Shape of `energy`: pixels, then time bins or gates.
+        self.shape = (*shape, self.record_length)
+        self._count = pixels * self.record_length
+        self._start = axis.start_ns * 1e-9 * C0
+        self._per_metre = 1 / (axis.bin_width_ns * 1e-9 * C0)
+        self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
+        self.clear()
+
+    def clear(self) -> None:
+        """Set all sums to zero."""
+        self._sums = dr.zeros(mi.Int64, 2 * self._count)
+        self._invalid = dr.zeros(mi.UInt32, self._count)
+
+    def evaluate(self) -> None:
+        """Compute the sums."""
+        dr.eval(self._sums, self._invalid)
+
+    def add(self, pixel: mi.UInt32, path_length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
+        """Add energy [J] that arrives after an optical path of `path_length` metres (group index included)."""
+        if self.gates is not None:
+            self.gates.add(path_length, energy, active, lambda k, e, on: self._add(pixel, k, e, on))
+            return
+        position = (path_length - self._start) * self._per_metre
+        active = active & (position >= 0) & (position < self.axis.bin_count)
+        self._add(pixel, dr.minimum(mi.UInt32(position), self.axis.bin_count - 1), energy, active)
+
+    def _add(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
+        """Add energy to time bin or gate `number` of a pixel."""
+        index = pixel * self.record_length + number
+        valid = dr.isfinite(energy)
+        dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
+        coarse, fine = self._units
+        small = energy < _COARSEST_FINE * coarse
+        units = mi.Int64(dr.round(energy * dr.select(small, mi.Float(1 / fine), mi.Float(1 / coarse))))
+        dr.scatter_add(self._sums, units, index + dr.select(small, mi.UInt32(self._count), 0), active & valid)
+
+    def energy(self) -> np.ndarray:
+        """Return the energy [J] as float64, shape `shape`; NaN where a value was added that is not finite."""
+        coarse, fine = np.array(self._sums).reshape(2, self._count)
+        energy = coarse * self._units[0] + fine * self._units[1]
+        energy[np.array(self._invalid) > 0] = np.nan
+        return np.asarray(energy.reshape(self.shape))
+
+    def rounded_energy(self) -> np.ndarray:
+        """Return `energy` as float32, at a quarter of the cost."""
+        coarse, fine = (mi.Float64(unit) for unit in self._units)
+        index = dr.arange(mi.UInt32, self._count)
+        sums = (mi.Float64(dr.gather(mi.Int64, self._sums, index + first)) for first in (0, self._count))
+        energy = mi.Float(next(sums) * coarse + next(sums) * fine)
+        energy = dr.select(self._invalid > 0, dr.nan, energy)
+        return np.array(energy).reshape(self.shape)

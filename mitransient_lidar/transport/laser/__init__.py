@@ -1,0 +1,1 @@
+"""The laser's beam: profiles and sampling."""

@@ -1,0 +1,239 @@
+"""Profiles of a laser beam in tangent-plane angles: density of its energy, sampling, widths and contours.
+
+Coordinates (angle_x, angle_y) are radians about the optical axis, +angle_x away from nadir.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import contourpy
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import positive
+from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
+from mitransient_lidar.transport.sensor.outlines import Outline, enclosed_area
+
+#: Shares of the peak irradiance at which a beam's outlines are drawn.
+OUTLINE_LEVELS = (float(np.exp(-0.5)), float(np.exp(-2)))
+
+#: Longest side of an image: finer ones would lose their cells in the digits of 32-bit random numbers.
+_LONGEST_SIDE = 2048
+
+#: Outlines of an image that enclose less than this share of the largest are noise.
+_SMALLEST_ISLAND = 0.02
+
+
+class BeamProfile(ABC):
+    """Energy of a beam over the tangent plane, normalised to 1.
+
+    Attributes
+    ----------
+    spreads
+        Root-mean-square angles along the beam's two principal axes, about its centre of gravity [rad].
+    rotation
+        Azimuth of the first of these axes, from +angle_x towards +angle_y [rad].
+    divergence
+        Full angles along these axes as the transmitter's manual defines them [rad].
+    """
+
+    spreads: tuple[float, float]
+    rotation: float
+    divergence: tuple[float, float]
+
+    @abstractmethod
+    def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the share of the energy per tangent-plane area [1/rad^2]."""
+
+    @abstractmethod
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers in the unit square to points distributed as the density."""
+
+    @abstractmethod
+    def outlines(self) -> list[tuple[float, list[Outline]]]:
+        """Return contours: share of the peak irradiance, and closed lines (angle_x, angle_y) [rad], shape (n, 2)."""
+
+
+@dataclass(frozen=True)
+class _Ellipse(BeamProfile):
+    """Beam that is circular once its second axis is stretched.
+
+    Parameters
+    ----------
+    along, across
+        Half angles [rad] along the first and the second axis, positive.
+    rotation
+        Azimuth of the first axis, from +angle_x towards +angle_y [rad].
+    """
+
+    along: float
+    across: float
+    rotation: float = 0.0
+
+    @property
+    def divergence(self) -> tuple[float, float]:  # type: ignore[override]
+        """Full angles along and across [rad]."""
+        return 2 * self.along, 2 * self.across
+
+    @property
+    def _ratio(self) -> float:
+        return self.across / self.along
+
+    def _to_circle(self, angle_x: mi.Float, angle_y: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Return the point of the circular beam of half angle `along` that stands for (angle_x, angle_y)."""
+        if self.rotation != 0:
+            sin, cos = float(np.sin(self.rotation)), float(np.cos(self.rotation))
+            angle_x, angle_y = cos * angle_x + sin * angle_y, cos * angle_y - sin * angle_x
+        return angle_x, angle_y / self._ratio
+
+    def _from_circle(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Invert `_to_circle`."""
+        y = y * self._ratio
+        if self.rotation == 0:
+            return x, y
+        sin, cos = float(np.sin(self.rotation)), float(np.cos(self.rotation))
+        return cos * x - sin * y, sin * x + cos * y
+
+    def _rim(self, scale: float) -> Outline:
+        azimuth = np.linspace(0, 2 * np.pi, 97)
+        angle_x, angle_y = self._from_circle(scale * self.along * np.cos(azimuth), scale * self.along * np.sin(azimuth))
+        return np.stack([angle_x, angle_y], axis=-1)
+
+
+class GaussianBeam(_Ellipse):
+    """Gaussian beam: the half angles are standard deviations."""
+
+    @property
+    def spreads(self) -> tuple[float, float]:  # type: ignore[override]
+        """Root-mean-square angles [rad]: the standard deviations."""
+        return self.along, self.across
+
+    def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the share of the energy per tangent-plane area [1/rad^2]."""
+        x, y = self._to_circle(angle_x, angle_y)
+        return dr.exp(-(x * x + y * y) / (2 * self.along**2)) / (2 * np.pi * self.along**2 * self._ratio)
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to points by Box and Muller's transform."""
+        # 1 - u lies in (0, 1], so that the logarithm is finite.
+        radius = self.along * dr.sqrt(-2 * dr.log(1 - u.x))
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        return self._from_circle(radius * cos, radius * sin)
+
+    def outlines(self) -> list[tuple[float, list[Outline]]]:
+        """Return the ellipses at one and two standard deviations."""
+        return [(level, [self._rim(float(np.sqrt(-2 * np.log(level))))]) for level in OUTLINE_LEVELS]
+
+
+class TopHatBeam(_Ellipse):
+    """Beam of even irradiance within an ellipse: the half angles are its semi-axes."""
+
+    @property
+    def spreads(self) -> tuple[float, float]:  # type: ignore[override]
+        """Root-mean-square angles [rad]: half the semi-axes."""
+        return self.along / 2, self.across / 2
+
+    def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the share of the energy per tangent-plane area [1/rad^2]."""
+        x, y = self._to_circle(angle_x, angle_y)
+        inside = x * x + y * y <= self.along**2
+        return dr.select(inside, mi.Float(1 / (np.pi * self.along**2 * self._ratio)), 0)
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points of the ellipse."""
+        radius = dr.sqrt(self.along**2 * u.x)
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        return self._from_circle(radius * cos, radius * sin)
+
+    def outlines(self) -> list[tuple[float, list[Outline]]]:
+        """Return the rim."""
+        return [(1.0, [self._rim(1.0)])]
+
+
+class ImageBeam(BeamProfile):
+    """Measured beam: even irradiance within each cell of an image that is centred on the optical axis.
+
+    A point is sampled row first, then column, each by its cumulative distribution: exactly by the density.
+
+    Parameters
+    ----------
+    irradiance
+        Image in any unit, shape (rows, columns): row 0 is the far edge (+angle_x), column 0 the -angle_y edge. Sides of
+        1 to 2048 cells; not negative, not all 0.
+    side
+        Full angle [rad] from the first column's outer edge to the last one's, positive. Cells are squares.
+
+    Raises
+    ------
+    UserError
+        When the image is of another kind, or the side out of range.
+    """
+
+    def __init__(self, irradiance: NDArray[np.float64], side: float) -> None:
+        image = np.asarray(irradiance, dtype=np.float64)
+        if image.ndim != 2 or 0 in image.shape or max(image.shape) > _LONGEST_SIDE:
+            raise UserError(
+                f"beam image of shape {image.shape} must have two dimensions of 1 to {_LONGEST_SIDE} cells each"
+            )
+        if not np.isfinite(image).all():
+            raise UserError(f"beam image holds {image[~np.isfinite(image)][0]} but every irradiance must be finite")
+        if image.min() < 0:
+            raise UserError(f"beam image holds {image.min():g} but no irradiance may be negative")
+        if image.max() == 0:
+            raise UserError("beam image holds zeros only but must have light in at least one cell")
+        # Scaled first: the sum of irradiances in units of their own may overflow.
+        self._share = image / image.max()
+        self._share /= self._share.sum()
+        self._rows, self._columns = image.shape
+        self._cell = positive("side of the beam image", side) / self._columns
+        self._sampler = ImageSampler(self._share)
+        self._density = mi.Float((self._share / self._cell**2).ravel())
+        self._measure()
+
+    def _measure(self) -> None:
+        """Set widths and azimuth from the second moments about the centre of gravity."""
+        far = self._cell * (0.5 * self._rows - np.arange(self._rows) - 0.5)
+        left = self._cell * (np.arange(self._columns) + 0.5 - 0.5 * self._columns)
+        rows, columns = self._share.sum(axis=1), self._share.sum(axis=0)
+        dx, dy = far - rows @ far, left - columns @ left
+        # Light is spread evenly within a cell.
+        within = self._cell**2 / 12
+        mixed = float(dx @ self._share @ dy)
+        moments = np.array([[rows @ dx**2 + within, mixed], [mixed, columns @ dy**2 + within]])
+        variances, axes = np.linalg.eigh(moments)
+        self.spreads = float(np.sqrt(variances[1])), float(np.sqrt(variances[0]))
+        self.rotation = float(np.arctan2(axes[1, 1], axes[0, 1]))
+        self.divergence = 2 * self.spreads[0], 2 * self.spreads[1]
+
+    def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the share of the energy per tangent-plane area [1/rad^2]."""
+        row = 0.5 * self._rows - angle_x / self._cell
+        column = angle_y / self._cell + 0.5 * self._columns
+        inside = (row >= 0) & (row < self._rows) & (column >= 0) & (column < self._columns)
+        index = mi.UInt32(dr.select(inside, row, 0)) * self._columns + mi.UInt32(dr.select(inside, column, 0))
+        return dr.gather(mi.Float, self._density, index, inside)
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to points distributed as the density."""
+        row, column = self._sampler.sample(u)
+        return self._cell * (0.5 * self._rows - row), self._cell * (column - 0.5 * self._columns)
+
+    def outlines(self) -> list[tuple[float, list[Outline]]]:
+        """Return the lines of equal irradiance, without islands of noise."""
+        # A dark frame closes every line.
+        padded = np.pad(self._share / self._share.max(), 1)
+        far = self._cell * (0.5 * self._rows + 0.5 - np.arange(self._rows + 2))
+        left = self._cell * (np.arange(self._columns + 2) - 0.5 - 0.5 * self._columns)
+        lines = contourpy.contour_generator(left, far, padded)
+        found = []
+        for level in OUTLINE_LEVELS:
+            loops = [np.asarray(line)[:, ::-1] for line in lines.lines(level)]
+            areas = [abs(enclosed_area(loop)) for loop in loops]
+            large = _SMALLEST_ISLAND * max(areas)
+            found.append((level, [loop for loop, area in zip(loops, areas, strict=True) if area >= large]))
+        return found

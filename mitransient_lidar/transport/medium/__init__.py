@@ -1,0 +1,1 @@
+"""Free flight, phase functions and index layers of the water."""

@@ -1,0 +1,92 @@
+"""A region of bubbles in the water: a box behind a ship, crossed in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.validation import finite, in_range, non_negative, positive
+
+
+@dataclass(frozen=True)
+class BubblePlume:
+    """Bubbles of even density behind a ship, from the surface down.
+
+    They scatter and do not absorb. The plume adds to the layers of water that it lies in: a flight ends in whichever
+    comes first, and that is exact for the sum of both.
+
+    Parameters
+    ----------
+    scattering
+        What the bubbles add to the scattering coefficient [1/m].
+    x, y
+        Where it begins, at the stern [m].
+    bearing
+        Where the ship goes [rad], counter-clockwise from +x; the plume lies behind.
+    length, width, depth
+        How long, wide and deep it is [m].
+    """
+
+    scattering: float
+    x: float
+    y: float
+    bearing: float
+    length: float
+    width: float
+    depth: float
+
+    @classmethod
+    def from_properties(cls, props: mi.Properties) -> BubblePlume | None:
+        """Read the parameters ``plume_...`` of the plugin ``layered_water``; None without bubbles."""
+        plume = cls(
+            non_negative("plume_scattering", props.get("plume_scattering", 0.0)),
+            finite("plume_x", props.get("plume_x", 0.0)),
+            finite("plume_y", props.get("plume_y", 0.0)),
+            np.deg2rad(finite("plume_bearing_deg", props.get("plume_bearing_deg", 0.0))),
+            positive("plume_length", props.get("plume_length", 200.0)),
+            positive("plume_width", props.get("plume_width", 8.0)),
+            in_range("plume_depth", props.get("plume_depth", 2.0), 0.01, 100.0),
+        )
+        return plume if plume.scattering > 0 else None
+
+    def _frame(self, vector: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Return the components of a vector astern and across."""
+        cos, sin = float(np.cos(self.bearing)), float(np.sin(self.bearing))
+        return -(cos * vector.x + sin * vector.y), cos * vector.y - sin * vector.x
+
+    def holds(self, point: mi.Point3f) -> mi.Bool:
+        """Return whether a point lies in the plume."""
+        astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
+        return (astern >= 0) & (astern <= self.length) & (dr.abs(across) <= self.width / 2) & (point.z >= -self.depth)
+
+    def crossing(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """Return where a ray enters and leaves the plume [m]; where it misses, it leaves before it enters."""
+        near, far = mi.Float(0), mi.Float(dr.inf)
+        astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
+        along_astern, along_across = self._frame(direction)
+        slabs = (
+            (astern, along_astern, 0.0, self.length),
+            (across, along_across, -self.width / 2, self.width / 2),
+            # The plume reaches up into the wave crests.
+            (point.z, direction.z, -self.depth, 1e4),
+        )
+        for place, speed, low, high in slabs:
+            # A ray that runs along a slab's faces is inside for ever or never.
+            safe = dr.select(dr.abs(speed) > 1e-9, speed, 1e-9)
+            first, second = (low - place) / safe, (high - place) / safe
+            near, far = dr.maximum(near, dr.minimum(first, second)), dr.minimum(far, dr.maximum(first, second))
+        return near, far
+
+    def optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float) -> mi.Float:
+        """Return the optical depth that the bubbles add to a segment."""
+        near, far = self.crossing(point, direction)
+        return self.scattering * dr.maximum(dr.minimum(far, length) - near, 0)
+
+    def distance(self, point: mi.Point3f, direction: mi.Vector3f, optical_depth: mi.Float) -> mi.Float:
+        """Return how far a ray goes until it has crossed an optical depth of bubbles [m], infinite if it never does."""
+        near, far = self.crossing(point, direction)
+        end = near + optical_depth / self.scattering
+        return dr.select(end < far, end, dr.inf)

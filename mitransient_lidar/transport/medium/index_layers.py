@@ -1,0 +1,100 @@
+"""Index layers: runs of water layers with one refractive and one group index, between which light is refracted."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.snell import refract_level
+
+#: Largest number of index layers: connections are traced through each of them.
+MOST_INDEX_LAYERS = 16
+
+
+class IndexLayers:
+    """Index layers of a water column, numbered from the top.
+
+    Light that crosses the boundary of two index layers is refracted by Snell's law, or reflected totally. The partial
+    reflection (5e-6 at vertical incidence between fresh and sea water) is neglected.
+
+    Parameters
+    ----------
+    layer_tops
+        Depths of the upper edges of the water layers [m], shape (layers,).
+    refractive_index, group_index
+        Indices of the water layers, shape (layers,).
+
+    Raises
+    ------
+    UserError
+        If there are more than 16 index layers.
+    """
+
+    def __init__(self, layer_tops: np.ndarray, refractive_index: np.ndarray, group_index: np.ndarray) -> None:
+        begins = np.append(True, (np.diff(refractive_index) != 0) | (np.diff(group_index) != 0))
+        #: Depths of the boundaries [m].
+        self.boundaries = layer_tops[begins][1:]
+        self.refractive_index, self.group_index = refractive_index[begins], group_index[begins]
+        self.count = len(self.refractive_index)
+        if self.count > MOST_INDEX_LAYERS:
+            raise UserError(
+                f"refractive_index has {self.count} different index layers but must have at most {MOST_INDEX_LAYERS}"
+            )
+        self._top = mi.Float(np.append(-np.inf, self.boundaries))
+        self._bottom = mi.Float(np.append(self.boundaries, np.inf))
+        self._index = mi.Float(self.refractive_index)
+        self._group = mi.Float(self.group_index)
+
+    def at(self, depth: mi.Float) -> mi.UInt32:
+        """Return the number of the index layer at a depth [m]."""
+        layer = mi.UInt32(0)
+        for boundary in self.boundaries:
+            layer += dr.select(depth >= float(boundary), mi.UInt32(1), 0)
+        return layer
+
+    def group(self, layer: mi.UInt32) -> mi.Float:
+        """Return the group index of an index layer."""
+        return mi.Float(float(self.group_index[0])) if self.count == 1 else dr.gather(mi.Float, self._group, layer)
+
+    def to_boundary(self, depth: mi.Float, downward: mi.Float, layer: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """Return the distance to the boundary at which rays leave their index layer [m], infinite where they never do.
+
+        Parameters
+        ----------
+        depth
+            Depths of the rays' origins [m].
+        downward
+            Vertical component of their unit directions, positive downwards.
+        layer
+            Their index layers.
+        active
+            Active lanes.
+        """
+        down = downward > 0
+        boundary = dr.select(down, dr.gather(mi.Float, self._bottom, layer), dr.gather(mi.Float, self._top, layer))
+        leaves = active & dr.isfinite(boundary) & (downward != 0)
+        return dr.select(leaves, dr.maximum((boundary - depth) / downward, 0), dr.inf)
+
+    def refract(
+        self, direction: mi.Vector3f, here: mi.UInt32, there: mi.UInt32, active: mi.Bool | bool = True
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+        """Return a direction in another index layer, the ratio of the refractive indices, and whether light passes."""
+        ratio = dr.gather(mi.Float, self._index, here, active) / dr.gather(mi.Float, self._index, there, active)
+        refracted, passes = refract_level(direction, ratio)
+        return refracted, ratio, active & passes
+
+    def from_top(self, direction: mi.Vector3f, density: mi.Float, layer: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """Transform a direction of the top index layer and its density [1/sr] to another index layer."""
+        if self.count == 1:
+            return direction, density
+        there, ratio, passes = self.refract(direction, mi.UInt32(0), layer)
+        return there, dr.select(passes, density * dr.abs(there.z / direction.z) / dr.square(ratio), 0)
+
+    def to_top(self, direction: mi.Vector3f, layer: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """Transform a direction to the top index layer; return it and the factor for densities there, 0 for none."""
+        if self.count == 1:
+            return direction, mi.Float(1)
+        there, ratio, passes = self.refract(direction, layer, mi.UInt32(0))
+        return there, dr.select(passes, dr.square(ratio) * dr.abs(direction.z / there.z), 0)

@@ -1,0 +1,179 @@
+"""Phase functions of the layers of water: chosen, mixed with that of the water itself, and looked up by layer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
+from mitransient_lidar.physics.water.seawater import water_phase_function
+from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase, deflect
+
+#: Phase functions that ``layered_water`` makes itself.
+KINDS = ("fournier_forand", "petzold", "hg")
+
+#: Layers with more different mixtures than this share functions whose bb/b and share of water are this close.
+_MOST_FUNCTIONS, _STEP = 16, 0.02
+
+#: bb/b where there are no particles: any will do.
+_ANY_RATIO = 0.0183
+
+#: Share of the scattering below which that of the water itself is left out.
+_SMALLEST_SHARE = 1e-4
+
+
+class ScattererPhases:
+    """Phase functions by the number of the scatterer: layers from the top, then bubbles.
+
+    Different functions that are tables with the same nodes are looked up in one large table; others are called through
+    pointers, which costs a call for each.
+
+    Parameters
+    ----------
+    phases
+        One function a scatterer, the same object where scatterers share it.
+    """
+
+    def __init__(self, phases: Sequence[mi.PhaseFunction]) -> None:
+        self.phases = list(phases)
+        different = {id(phase): phase for phase in self.phases}
+        self._single = self.phases[0] if len(different) == 1 else None
+        numbers = {key: number for number, key in enumerate(different)}
+        self._of_scatterer = [numbers[id(phase)] for phase in self.phases]
+        self._different = list(different.values())
+        tables = [phase.tabulated.table for phase in self._different if hasattr(phase, "tabulated")]
+        alike = len(tables) == len(self._different) and len({(table.count, table.log_s0) for table in tables}) == 1
+        self._stack = TabulatedPhase(*tables) if alike and self._single is None else None
+        self._numbers: mi.UInt32 | None = None
+
+    def at(self, scatterer: mi.UInt32) -> Any:
+        """Return the phase function of a scatterer; what it is has Mitsuba's ``eval_pdf`` and ``sample``."""
+        if self._single is not None:
+            return self._single
+        if self._numbers is None:
+            found = self._of_scatterer
+            if self._stack is None:
+                pointers = [dr.reinterpret_array(mi.UInt32, mi.PhaseFunctionPtr(phase))[0] for phase in self._different]
+                found = [pointers[number] for number in found]
+            self._numbers = mi.UInt32(found)
+        number = dr.gather(mi.UInt32, self._numbers, scatterer)
+        if self._stack is None:
+            return dr.reinterpret_array(mi.PhaseFunctionPtr, number)
+        return NumberedPhase(self._stack, number)
+
+
+def phases_of_layers(
+    column: WaterColumn,
+    nested: dict[str, mi.PhaseFunction],
+    kind: str,
+    phase_g: float,
+    water_scattering: np.ndarray,
+    tabulated: Callable[[PowerLawTable], mi.PhaseFunction],
+) -> list[mi.PhaseFunction]:
+    """Return one phase function a layer, the same object where layers share it.
+
+    Parameters
+    ----------
+    column
+        The layers.
+    nested
+        Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
+    kind
+        What to make where none is nested: one of `KINDS`.
+    phase_g
+        Mean cosine for ``hg``.
+    water_scattering
+        What the water itself scatters [1/m], shape (layers,), part of the column's scattering. It is mixed with the
+        particles by its share.
+    tabulated
+        Makes a phase function of a table.
+
+    Raises
+    ------
+    UserError
+        When nested functions are neither one nor one a layer.
+    """
+    count = column.count
+    share = np.divide(water_scattering, column.scattering, out=np.zeros(count), where=column.scattering > 0)
+    if len(nested) == 1:
+        particles = list(nested.values()) * count
+    elif nested:
+        wanted = [f"phase_{layer}" for layer in range(count)]
+        if sorted(nested) != sorted(wanted):
+            raise UserError(
+                f"layered_water: nested phase functions are named {', '.join(sorted(nested))}; "
+                f"allowed is one of any name, or one a layer: {', '.join(wanted)}"
+            )
+        particles = [nested[name] for name in wanted]
+    elif kind == "petzold":
+        particles = [mi.load_dict({"type": "petzold"})] * count
+    elif kind == "hg":
+        particles = [mi.load_dict({"type": "hg", "g": phase_g})] * count
+    else:
+        return _mixed(*_fournier_forand(column, water_scattering, share), tabulated)
+    return _mixed(particles, share, tabulated)
+
+
+def _fournier_forand(
+    column: WaterColumn, water_scattering: np.ndarray, share: np.ndarray
+) -> tuple[list[mi.PhaseFunction], np.ndarray]:
+    """Return functions of particles by their bb/b, and the water's share of the scattering; both one a layer."""
+    particles = column.scattering - water_scattering
+    back = column.backscattering - water_scattering / 2
+    for layer in np.flatnonzero((back < 0) & (particles > 0))[:1]:
+        raise UserError(
+            f"backscattering = {column.backscattering[layer]:g} must be at least half of water_scattering = "
+            f"{water_scattering[layer]:g}, in layer {layer}"
+        )
+    ratios = np.divide(back, particles, out=np.full(column.count, _ANY_RATIO), where=particles > 0)
+    # Rounded so that layers whose bb/b differ by rounding share a function.
+    kinds = [(round(float(ratio), 12), float(part)) for ratio, part in zip(ratios, share, strict=True)]
+    if len(set(kinds)) > _MOST_FUNCTIONS:
+        kinds = [(_rounded(ratio), _rounded(part) if _SMALLEST_SHARE < part < 1 else part) for ratio, part in kinds]
+    made = {
+        ratio: mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
+        for ratio, _ in dict.fromkeys(kinds)
+    }
+    return [made[ratio] for ratio, _ in kinds], np.array([part for _, part in kinds])
+
+
+def _rounded(value: float) -> float:
+    """Return the value on a grid of equal ratios; what is too small for it is left to be refused."""
+    return math.exp(_STEP * round(math.log(value) / _STEP)) if value > 0 else value
+
+
+def _mixed(
+    particles: list[mi.PhaseFunction], share: np.ndarray, tabulated: Callable[[PowerLawTable], mi.PhaseFunction]
+) -> list[mi.PhaseFunction]:
+    """Return the functions of particles mixed with the water's, which has a share of the scattering."""
+    made: dict[tuple[int, float], mi.PhaseFunction] = {}
+    for phase, part in zip(particles, share.tolist(), strict=True):
+        key = id(phase), part
+        if key in made:
+            continue
+        if part <= _SMALLEST_SHARE:
+            made[key] = phase
+        else:
+            water = PowerLawTable.from_function(water_phase_function)
+            table = PowerLawTable.mixture([table_of(phase), water], [1 - part, part])
+            made[key] = tabulated(table)
+    return [made[id(phase), part] for phase, part in zip(particles, share.tolist(), strict=True)]
+
+
+def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
+    """Return a phase function as a table: its own, or one of its values."""
+    if hasattr(phase, "tabulated"):
+        table: PowerLawTable = phase.tabulated.table
+        return table
+    s = np.exp(DEFAULT_LOG_S0 * np.linspace(1, 0, DEFAULT_COUNT))
+    mei = dr.zeros(mi.MediumInteraction3f, len(s))
+    mei.wi = mi.Vector3f(0, 0, -1)
+    value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, deflect(mi.Frame3f(-mei.wi), mi.Float(s), mi.Float(0)))
+    return PowerLawTable.from_values(np.array(value[0], dtype=np.float64))

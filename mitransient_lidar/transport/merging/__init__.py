@@ -1,0 +1,1 @@
+"""Merging of light from the laser with paths from the receiver."""

@@ -1,0 +1,208 @@
+"""Cells of water in which light from the laser meets paths from the receiver."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+#: Texels a side of the table of surface heights.
+_HEIGHT_TEXELS = 512
+
+#: Number of rays that find the region, and what lies below it.
+PROBE_RAYS = 4096
+
+#: Share of rays that may fall outside the region on either side, and by how much it is widened.
+_REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
+
+#: Logarithm to base 2 of the number of buckets.
+_BUCKET_BITS = 20
+
+#: Added to cell numbers so that they are positive.
+ORIGIN = 1 << 20
+
+
+@dataclass(frozen=True)
+class Region:
+    """Rectangle of the mean sea level that is lit or seen: corners (x, y) [m]."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    @classmethod
+    def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
+        """Find the region with rays of the beam and of the field of view."""
+        seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+        tangent = scene.transmitter.sample_tangent(unit_points(PROBE_RAYS))
+        beam = scene.transmitter.pose.direction(*tangent)
+        places = [
+            _at_sea_level(scene.receiver.pose, np.array(seen.direction).T[np.array(seen.weight) > 0]),
+            _at_sea_level(scene.transmitter.pose, np.array(beam).T),
+        ]
+        ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
+        low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+        margin = _REGION_MARGIN * (high - low)
+        x, y = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)
+        return cls((x[0], y[0]), (x[1], y[1]))
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Sides along x and y [m]."""
+        return self.high[0] - self.low[0], self.high[1] - self.low[1]
+
+    def track_length(self, scene: LidarScene) -> float:
+        """Return the mean way in the water to a solid, or to the depth of the record's end, along the axis [m]."""
+        transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
+        spot = transmitter.ground_point()
+        sine = transmitter.axis[:2] / scene.refractive_index
+        down = np.append(sine, -np.sqrt(1 - sine @ sine))
+        air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
+        longest = (scene.axis.path_end - air) / (2 * scene.group_index)
+        u = unit_points(PROBE_RAYS)
+        x, y = (
+            dr.lerp(opaque(low), opaque(high), part) for low, high, part in zip(self.low, self.high, u, strict=True)
+        )
+        lowest = min(float(surface.bbox().min.z) for surface in scene.surfaces)
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, opaque(lowest - 1e-3)), mi.Vector3f(down.tolist())))
+        length = dr.mean(dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), max(longest, 0.1)))
+        return float(length[0])
+
+    def within(self, box: mi.ScalarBoundingBox3f) -> bool:
+        """Return whether a bounding box covers the region with a margin of its width on every side."""
+        return all(
+            float(box.min[axis]) < self.low[axis] - self.size[axis]
+            and float(box.max[axis]) > self.high[axis] + self.size[axis]
+            for axis in (0, 1)
+        )
+
+
+def _at_sea_level(pose: Pose, directions: np.ndarray) -> np.ndarray:
+    """Return where rays from a pose meet z = 0, (x, y) [m], without those that do not."""
+    down = directions[directions[:, 2] < 0]
+    return np.asarray(pose.origin[:2] - down[:, :2] * (pose.origin[2] / down[:, 2:]))
+
+
+class SurfaceHeights:
+    """Height of the sea surface over a region, as a table."""
+
+    def __init__(self, scene: LidarScene, region: Region) -> None:
+        n = _HEIGHT_TEXELS
+        self._low = [opaque(low) for low in region.low]
+        self._per_metre = [opaque(n / size) for size in region.size]
+        index = dr.arange(mi.UInt32, n * n)
+        x = (mi.Float(index % n) + 0.5) / self._per_metre[0] + self._low[0]
+        y = (mi.Float(index // n) + 0.5) / self._per_metre[1] + self._low[1]
+        top = opaque(max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0)
+
+        def look_down(ray: mi.Ray3f, height: mi.Float, active: mi.Bool) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
+            si = scene.ray_intersect(ray, active)
+            at_sea = si.is_valid() & scene.is_surface(si.shape)
+            height = dr.select(active & at_sea, si.p.z, height)
+            # Look on beneath what stands above the sea.
+            active &= si.is_valid() & ~at_sea
+            return dr.select(active, si.spawn_ray(ray.d), ray), height, active
+
+        state = (
+            mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1)),
+            dr.zeros(mi.Float, n * n),
+            dr.full(mi.Bool, True, n * n),
+        )
+        _, self._height, _ = dr.while_loop(state, lambda ray, height, active: active, look_down, label="heights")
+        dr.eval(self._height)
+
+    def at(self, x: mi.Float, y: mi.Float) -> mi.Float:
+        """Return the height at (x, y) [m]; outside the region, that of its nearest point."""
+        i = dr.clip(mi.Int32((x - self._low[0]) * self._per_metre[0]), 0, _HEIGHT_TEXELS - 1)
+        j = dr.clip(mi.Int32((y - self._low[1]) * self._per_metre[1]), 0, _HEIGHT_TEXELS - 1)
+        return dr.gather(mi.Float, self._height, mi.UInt32(j * _HEIGHT_TEXELS + i))
+
+
+class WaterGrid:
+    """Layout of cells that follow the sea surface and are sheared along the refracted beam.
+
+    Cells are horizontal squares, and layers of the depth below the surface above them. They are sheared as the beam is
+    inclined in still water, so that light along the beam stays in one column of cells. They begin at the surface, so
+    that none is cut by it.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene.
+    heights
+        Heights of its surface.
+    width, thickness
+        Horizontal side of a cell at the surface, and its depth [m].
+    growth
+        Growth of the width with depth [m/m]: light patterns of the waves blur with depth.
+    depth
+        Depth within which different layers have different buckets [m].
+    """
+
+    def __init__(
+        self,
+        scene: LidarScene,
+        heights: SurfaceHeights,
+        width: float,
+        growth: float,
+        thickness: float,
+        depth: float,
+    ) -> None:
+        self.heights = heights
+        self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)
+        sine = scene.transmitter.pose.axis[:2] / scene.refractive_index
+        self.shear = (sine / np.sqrt(1 - sine @ sine)).tolist()
+        self.bits_z = int(np.clip(math.ceil(math.log2(depth / thickness + 1)), 2, 8))
+        self.bits_xy = (_BUCKET_BITS - self.bits_z) // 2
+
+    @property
+    def buckets(self) -> int:
+        """Number of buckets."""
+        return 1 << (2 * self.bits_xy + self.bits_z)
+
+
+class WaterCells:
+    """The cells of one pass: a `WaterGrid` shifted at random.
+
+    Parameters
+    ----------
+    grid
+        The layout.
+    shift
+        Three uniform random numbers. The uppermost layer is between half and one and a half layers thick.
+    """
+
+    def __init__(self, grid: WaterGrid, shift: mi.Point3f) -> None:
+        self.grid = grid
+        self._shift = mi.Point2f(shift.x, shift.y)
+        self._top = grid.thickness * (0.5 + shift.z)
+
+    def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
+        grid = self.grid
+        depth = grid.heights.at(point.x, point.y) - point.z
+        # The table of heights is approximate: what it places above the surface lies just below.
+        layer = dr.maximum(dr.floor((depth - self._top) * (1 / grid.thickness)) + 1, 0)
+        width = dr.fma(layer, grid.growth * grid.thickness, grid.width)
+        u = (point.x - grid.shear[0] * depth) / width + self._shift.x
+        v = (point.y - grid.shear[1] * depth) / width + self._shift.y
+        i, j = mi.UInt32(mi.Int32(dr.floor(u)) + ORIGIN), mi.UInt32(mi.Int32(dr.floor(v)) + ORIGIN)
+        k = mi.UInt32(layer)
+        xy, z = grid.bits_xy, grid.bits_z
+        bucket = low_bits(i, xy) | (low_bits(j, xy) << xy) | (low_bits(k, z) << (2 * xy))
+        tag = low_bits(i >> xy, 12) | (low_bits(j >> xy, 12) << 12) | (low_bits(k >> z, 8) << 24)
+        thickness = dr.select(k == 0, self._top, grid.thickness)
+        return bucket, tag, thickness * width * width
+
+
+def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:
+    """Return the lowest bits of a number."""
+    return number & ((1 << bits) - 1)

@@ -1,0 +1,179 @@
+"""Patches of solids on which light from the laser meets paths from the receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.merging.cells import ORIGIN, PROBE_RAYS, Region, low_bits
+from mitransient_lidar.transport.opaque import is_one_of, opaque
+from mitransient_lidar.transport.rng import unit_points
+from mitransient_lidar.transport.scene import LidarScene
+
+#: Logarithm to base 2 of the number of buckets along one side.
+_BUCKET_BITS = 9
+
+#: Height of the floors into which patches of bounded solids are cut, in widths of a patch.
+_FLOOR_WIDTHS = 8
+
+#: Surfaces that a vertical ray may meet where levels of one solid are looked for.
+_MOST_LEVELS = 8
+
+#: Largest number of coverage samples: rounding may hide a sliver of a patch from all of them.
+_MOST_COVERAGE_SAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Piece of a solid's surface.
+
+    Attributes
+    ----------
+    bucket, tag
+        Place of its photons; patches of one bucket differ in tag.
+    area
+        Area of the surface over the patch's square in projection, if the surface covers it [m^2].
+    corner
+        Corner of that square, and height over it, in the coordinates (u, v, w) of the projection [m].
+    axis
+        Axis of the projection: 0, 1 or 2 for x, y or z.
+    faces
+        Sign of the normal's component along that axis.
+    """
+
+    bucket: mi.UInt32
+    tag: mi.UInt32
+    area: mi.Float
+    corner: mi.Point3f
+    axis: mi.UInt32
+    faces: mi.Float
+
+
+def solids_of_several_levels(scene: LidarScene, region: Region) -> list[mi.Shape]:
+    """Return solids with parts above each other somewhere in the region, found with vertical rays."""
+    u = unit_points(PROBE_RAYS)
+    x, y = (
+        dr.lerp(opaque(low), opaque(high), part) for low, high, part in zip(region.low, region.high, u, strict=True)
+    )
+    top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
+    ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
+    looking = dr.full(mi.Bool, True, PROBE_RAYS)
+    met = [mi.UInt32(0) for _ in scene.solids]
+    for _ in range(_MOST_LEVELS):
+        si = scene.ray_intersect(ray, looking)
+        looking &= si.is_valid()
+        for i, solid in enumerate(scene.solids):
+            met[i] += dr.select(looking & (si.shape == mi.ShapePtr(solid)), mi.UInt32(1), 0)
+        ray = si.spawn_ray(ray.d)
+    return [solid for solid, count in zip(scene.solids, met, strict=True) if bool(dr.any(count > 1)[0])]
+
+
+class SolidPatches:
+    """Patches of one pass: squares in projection along the axis nearest to the normal, shifted at random.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene.
+    region
+        Region that is lit or seen.
+    width
+        Side of a square [m].
+    shift
+        Two uniform random numbers.
+    uneven
+        Solids that `solids_of_several_levels` found.
+    """
+
+    #: Number of buckets.
+    buckets = 1 << (2 * _BUCKET_BITS)
+
+    def __init__(
+        self,
+        scene: LidarScene,
+        region: Region,
+        width: float,
+        shift: mi.Point2f,
+        uneven: Sequence[mi.Shape] = (),
+    ) -> None:
+        self.scene = scene
+        self.width = opaque(width)
+        self._shift = shift
+        self._bounded = [
+            solid
+            for solid in scene.solids
+            if not region.within(solid.bbox()) or any(solid is other for other in uneven)
+        ]
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> Patch:
+        """Return the patches of points on solids."""
+        size = dr.abs(si.n)
+        along_x = (size.x > size.y) & (size.x > size.z)
+        along_y = ~along_x & (size.y > size.z)
+        axis = dr.select(along_x, mi.UInt32(0), dr.select(along_y, mi.UInt32(1), mi.UInt32(2)))
+        normal = dr.select(along_x, si.n.x, dr.select(along_y, si.n.y, si.n.z))
+        u = dr.select(along_x, si.p.y, si.p.x)
+        v = dr.select(along_x | along_y, si.p.z, si.p.y)
+        w = dr.select(along_x, si.p.x, dr.select(along_y, si.p.y, si.p.z))
+        cu, cv = dr.floor(u / self.width + self._shift.x), dr.floor(v / self.width + self._shift.y)
+        i, j = mi.UInt32(mi.Int32(cu) + ORIGIN), mi.UInt32(mi.Int32(cv) + ORIGIN)
+        bits = _BUCKET_BITS
+        side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        # Solids with overhangs have several floors over one square.
+        floor = mi.UInt32(mi.Int32(dr.floor(w / (_FLOOR_WIDTHS * self.width))) + ORIGIN)
+        floor = dr.select(self._is_bounded(si.shape), floor, 0)
+        return Patch(
+            bucket=low_bits(i, bits) | (low_bits(j, bits) << bits),
+            tag=low_bits(i >> bits, 6)
+            | (low_bits(j >> bits, 6) << 6)
+            | (low_bits(floor, 8) << 12)
+            | (side << 20)
+            | (low_bits(shape, 9) << 23),
+            area=self.width * self.width / dr.abs(normal),
+            corner=mi.Point3f((cu - self._shift.x) * self.width, (cv - self._shift.y) * self.width, w),
+            axis=axis,
+            faces=dr.sign(normal),
+        )
+
+    def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:
+        """Return whether a solid may end inside the region."""
+        return is_one_of(shape, self._bounded)
+
+    def inverse_share(self, patch: Patch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
+        """Return an estimate of 1 / (covered share of the patch's square): edges cut some patches.
+
+        The number of random points in the square until the first one on the patch has that mean (Booth 2007,
+        doi:10.1080/2151237X.2007.10129248).
+        """
+        if not self._bounded:
+            return mi.Float(1)
+        reach = 2 * self.width
+
+        def look(samples: mi.Float, rng: mi.PCG32, looking: mi.Bool) -> tuple[mi.Float, mi.PCG32, mi.Bool]:
+            u = patch.corner.x + self.width * rng.next_float32()
+            v = patch.corner.y + self.width * rng.next_float32()
+            w = patch.corner.z + reach * patch.faces
+            is_x, is_y = patch.axis == 0, patch.axis == 1
+            origin = mi.Point3f(
+                dr.select(is_x, w, u), dr.select(is_x, u, dr.select(is_y, w, v)), dr.select(is_x | is_y, v, w)
+            )
+            down = mi.Vector3f(
+                dr.select(is_x, -patch.faces, 0),
+                dr.select(is_y, -patch.faces, 0),
+                dr.select(is_x | is_y, 0, -patch.faces),
+            )
+            ray = mi.Ray3f(origin, down)
+            ray.maxt = 2 * reach
+            si = self.scene.ray_intersect(ray, looking)
+            found = si.is_valid() & (self.locate(si).tag == patch.tag)
+            looking &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
+            return samples + dr.select(looking, mi.Float(1), 0), rng, looking
+
+        state = mi.Float(1), mi.PCG32(rng), active & self._is_bounded(shape)
+        samples, advanced, _ = dr.while_loop(state, lambda samples, rng, looking: looking, look, label="coverage")
+        rng.state = advanced.state
+        return samples

@@ -1,0 +1,131 @@
+"""Segments of paths in the water, and points at equal distances along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.random_walk import RandomWalkPath
+
+
+@dataclass(frozen=True)
+class SegmentPoints:
+    """Points along segments, one a lane.
+
+    Attributes
+    ----------
+    point
+        Position [m].
+    direction
+        Unit direction of the segment.
+    length
+        Optical length of the path up to the point [m].
+    weight
+        Throughput of the path up to the point times the track length of the point [m]; negative for paths outside the
+        surface mesh.
+    mis_partial_sum
+        That of the path, see `RandomWalkPath`.
+    label
+        Label of the path, with its events and reversals so far (`PathClasses.pack`).
+    """
+
+    point: mi.Point3f
+    direction: mi.Vector3f
+    length: mi.Float
+    weight: mi.Float
+    mis_partial_sum: mi.Float
+    label: mi.UInt32
+
+
+class SegmentBuffer:
+    """Segments in the water of many paths, in any order, with points at equal distances along each path.
+
+    Parameters
+    ----------
+    water
+        The ``layered_water``.
+    classes
+        Classes of the received light, which labels carry.
+    spacing
+        Distance between points along a path [m].
+    capacity
+        Largest number of segments; more are counted, but not stored.
+    """
+
+    def __init__(self, water: Any, classes: PathClasses, spacing: float, capacity: int) -> None:
+        self._water, self._classes = water, classes
+        self.spacing = opaque(spacing)
+        self.capacity = capacity
+        self._stored = dr.zeros(mi.UInt32, 1)
+        self._number = dr.zeros(mi.UInt32, capacity)
+        self._label = dr.empty(mi.UInt32, capacity)
+        self._start = dr.empty(mi.Float, 4 * capacity)
+        self._direction = dr.empty(mi.Float, 4 * capacity)
+        self._weight = dr.empty(mi.Float, 2 * capacity)
+        self._end = mi.UInt32()
+        self._segment = mi.UInt32()
+
+    def add(self, path: RandomWalkPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """Store the next segment of each path and return the offset of the first point beyond its end [m].
+
+        Parameters
+        ----------
+        path
+            Paths at the start of the segment.
+        length
+            Length of the segment [m].
+        label
+            Label of the path.
+        active
+            Lanes with a segment to store.
+        """
+        number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
+        number = dr.select(active, number, 0)
+        slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
+        keep = (number > 0) & (slot < self.capacity)
+        dr.scatter(self._number, number, slot, keep)
+        dr.scatter(self._label, self._classes.pack(label, path.scatterings, path.reversals), slot, keep)
+        dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.offset), slot, keep)
+        direction = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
+        dr.scatter(self._direction, direction, slot, keep)
+        dr.scatter(self._weight, mi.Vector2f(path.weight, path.mis_partial_sum), slot, keep)
+        return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
+
+    def finalize(self) -> tuple[int, int]:
+        """Finalize; return the number of points and the number of segments, stored or not."""
+        dr.eval(self._stored, self._number, self._label, self._start, self._direction, self._weight)
+        self._end = dr.cumsum(self._number)
+        count = int(self._end[self.capacity - 1])
+        segment = dr.zeros(mi.UInt32, max(count, 1))
+        dr.scatter(segment, dr.arange(mi.UInt32, self.capacity), self._end - self._number, self._number > 0)
+        # Every point belongs to the last segment that begins at or before it.
+        self._segment = dr.prefix_reduce(dr.ReduceOp.Max, segment, exclusive=False)
+        dr.eval(self._segment)
+        return count, int(self._stored[0])
+
+    def points(self, index: mi.UInt32) -> SegmentPoints:
+        """Return points by number."""
+        segment = dr.gather(mi.UInt32, self._segment, index)
+        x, y, z, offset = dr.gather(mi.Vector4f, self._start, segment)
+        dx, dy, dz, length = dr.gather(mi.Vector4f, self._direction, segment)
+        throughput, mis_partial_sum = dr.gather(mi.Vector2f, self._weight, segment)
+        first = dr.gather(mi.UInt32, self._end, segment) - dr.gather(mi.UInt32, self._number, segment)
+        along = dr.fma(mi.Float(index - first), self.spacing, offset)
+        direction = mi.Vector3f(dx, dy, dz)
+        absorption = self._water.absorption_flight.optical_depth(-z, -dz, along)
+        # A segment lies in one index layer, and may begin on its boundary.
+        layers = self._water.index_layers
+        group = layers.group(layers.at(-z - 0.5 * dz * along))
+        return SegmentPoints(
+            mi.Point3f(x, y, z) + direction * along,
+            direction,
+            length + along * group,
+            throughput * dr.exp(-absorption) * self.spacing,
+            mis_partial_sum,
+            dr.gather(mi.UInt32, self._label, segment),
+        )

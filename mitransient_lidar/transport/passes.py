@@ -1,0 +1,111 @@
+"""Independent passes over one scene: what prepares them, and what each of them records."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
+from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+
+class PassRecord:
+    """Received light of one pass.
+
+    Parameters
+    ----------
+    histogram
+        Energy by pixel (or by class of a pixel) and time.
+    classes
+        Classes into which the light of a pixel is separated.
+
+    Attributes
+    ----------
+    edge_loss
+        Energy that would have been received if the surface mesh did not end [J], shape (1,).
+    rays
+        Number of rays traced.
+    """
+
+    def __init__(self, histogram: TransientHistogram, classes: PathClasses) -> None:
+        self.histogram, self.classes = histogram, classes
+        self.clear()
+
+    def clear(self) -> None:
+        """Empty the record."""
+        self.histogram.clear()
+        self.edge_loss = dr.zeros(mi.Float64, 1)
+        self.rays = mi.Float64(0)
+
+    def receive(
+        self,
+        pixel: mi.UInt32,
+        order: mi.UInt32,
+        reversals: mi.UInt32,
+        length: mi.Float,
+        energy: mi.Float,
+        active: mi.Bool,
+    ) -> None:
+        """Add the energy [J] of a path of an optical length [m], with its scattering events and vertical reversals."""
+        self.histogram.add(self.classes.index(pixel, order, reversals), length, energy, active)
+
+    def lose(self, energy: mi.Float, active: mi.Bool) -> None:
+        """Add energy [J] that is lost because the surface mesh ends."""
+        dr.scatter_add(self.edge_loss, mi.Float64(energy), mi.UInt32(0), active)
+
+    def evaluate(self) -> None:
+        """Compute the record."""
+        self.histogram.evaluate()
+        dr.eval(self.edge_loss, self.rays)
+
+
+class PassRenderer(ABC):
+    """Renders independent passes of one prepared scene.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene.
+    classes
+        Classes into which the received light is separated.
+    paths
+        Paths from the receiver in one pass.
+    """
+
+    def __init__(self, scene: LidarScene, classes: PathClasses, paths: int) -> None:
+        self.scene, self.classes, self.paths = scene, classes, paths
+        self.sampler = SensorSampler(scene.receiver, scene.transmitter)
+
+    def render_pass(self, seed: int, *, paths: int | None = None, gates: GateWeights | None = None) -> PassRecord:
+        """Render one pass.
+
+        Parameters
+        ----------
+        seed
+            Seed of the pass; passes of different seeds are independent.
+        paths
+            Number of paths, instead of the renderer's own.
+        gates
+            Gates that are summed instead of time bins, or None.
+
+        Raises
+        ------
+        UserError
+            When the histogram would be too large.
+        """
+        pixels = self.scene.receiver.pixels
+        shape = (pixels.count * self.classes.count,) if self.classes.separate else pixels.grid or (pixels.count,)
+        histogram = TransientHistogram(self.scene.axis, shape, self.scene.transmitter.energy, gates)
+        record = PassRecord(histogram, self.classes)
+        with dr.suspend_grad():
+            self.trace(record, seed, self.paths if paths is None else paths)
+        record.evaluate()
+        return record
+
+    @abstractmethod
+    def trace(self, record: PassRecord, seed: int, paths: int) -> None:
+        """Trace the paths of one pass into a record."""

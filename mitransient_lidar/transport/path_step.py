@@ -1,0 +1,179 @@
+"""One step of a path: flight to the next vertex, and what happens there to its position, medium and direction.
+
+The reference integrator, merging and daylight share these steps. They differ in how they draw a new direction and in
+what they record at a vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.medium.free_flight import LayeredFlight
+from mitransient_lidar.transport.path import Path, advance
+from mitransient_lidar.transport.scene import WaterScene
+
+
+@dataclass
+class Vertex:
+    """End of a segment.
+
+    Attributes
+    ----------
+    si
+        What the ray meets, valid or not.
+    reach
+        Distance to the surface or to the boundary of index layers, whichever is nearer [m].
+    length
+        Length of the segment [m]: `reach`, or less up to a scattering event.
+    scattered
+        Whether the segment ends with a scattering event.
+    at_boundary
+        Whether it ends at a boundary of index layers.
+    outside
+        Whether it enters the water outside the surface mesh.
+    in_water
+        Whether the segment lies in water.
+    at_sea, on_solid
+        Whether it ends on the sea surface, or on a solid; set by `PathStep.arrive`.
+    """
+
+    si: mi.SurfaceInteraction3f
+    reach: mi.Float
+    length: mi.Float
+    scattered: mi.Bool
+    at_boundary: mi.Bool
+    outside: mi.Bool
+    in_water: mi.Bool
+    at_sea: mi.Bool
+    on_solid: mi.Bool
+
+    @property
+    def exists(self) -> mi.Bool:
+        """Whether the segment ends anywhere."""
+        return self.scattered | self.at_boundary | self.outside | self.si.is_valid()
+
+    @property
+    def on_surface(self) -> mi.Bool:
+        """Whether the segment ends on the sea surface or on a solid."""
+        return self.at_sea | self.on_solid
+
+
+@dataclass
+class ScatteringEvent:
+    """A scattering event: interaction, phase function (None without water), and number of the scatterer."""
+
+    interaction: mi.MediumInteraction3f
+    phase: Any
+    scatterer: mi.UInt32
+
+
+class PathStep:
+    """Steps of paths through sea surface, water and solids.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    flight
+        Free flight from which the distances to scattering events are drawn; None without water.
+    mode
+        ``Radiance`` for paths from the receiver, ``Importance`` for light.
+    """
+
+    def __init__(self, scene: WaterScene, flight: LayeredFlight | None, mode: mi.TransportMode) -> None:
+        self.scene, self.flight = scene, flight
+        self.context = mi.BSDFContext(mode)
+        self.adjoint = mode == mi.TransportMode.Importance
+
+    def next_vertex(self, path: Path, rng: mi.PCG32) -> Vertex:
+        """Return where the next segment ends: at a scattering event, a boundary of index layers, or a surface."""
+        scene, no = self.scene, mi.Bool(False)
+        si = scene.ray_intersect(path.ray(), path.active)
+        in_water = mi.Bool(path.in_water)
+        if scene.water is None:
+            return Vertex(si, si.t, si.t, no, no, no, in_water, no, no)
+        wet = path.active & path.in_water
+        distance = scene.water.free_flight(self.flight, path, rng)
+        reach, at_boundary = mi.Float(si.t), no
+        layers = scene.water.index_layers
+        if layers.count > 1:
+            to_boundary = layers.to_boundary(path.depth, path.downward, path.index_layer, wet)
+            at_boundary = to_boundary < reach
+            reach = dr.minimum(reach, to_boundary)
+        scattered = wet & (distance < reach)
+        length = dr.select(scattered, distance, reach)
+        return Vertex(si, reach, length, scattered, at_boundary & ~scattered, no, in_water, no, no)
+
+    def arrive(self, path: Path, vertex: Vertex) -> None:
+        """Move paths to their next vertex and sort the vertices; paths that pass outside the surface mesh end."""
+        free = vertex.scattered | vertex.at_boundary | vertex.outside
+        point = dr.select(free, path.point + path.direction * vertex.length, vertex.si.p)
+        advance(path, self.scene.index_layers, vertex.length, point)
+        path.active &= ~self.scene.outside_surface(path.point.z, vertex.in_water)
+        vertex.scattered &= path.active
+        vertex.at_boundary &= path.active
+        met = path.active & ~(vertex.scattered | vertex.at_boundary | vertex.outside)
+        vertex.at_sea = met & self.scene.is_surface(vertex.si.shape)
+        vertex.on_solid = met & ~vertex.at_sea
+
+    def scattering_event(self, path: Path, scattered: mi.Bool, rng: mi.PCG32) -> ScatteringEvent:
+        """Return the scattering event at the last vertex of paths."""
+        mei = dr.zeros(mi.MediumInteraction3f)
+        mei.p = path.point
+        mei.wi = -path.direction
+        mei.sh_frame = mi.Frame3f(mei.wi)
+        mei.t = dr.select(scattered, mi.Float(1), dr.inf)
+        water = self.scene.water
+        if water is None:
+            return ScatteringEvent(mei, None, mi.UInt32(0))
+        scatterer = water.scatterer_at(self.flight, path.point, rng)
+        return ScatteringEvent(mei, water.phases.at(scatterer), scatterer)
+
+    def redirect(
+        self, path: Path, vertex: Vertex, direction: mi.Vector3f, factor: mi.Float, bs: mi.BSDFSample3f, passes: mi.Bool
+    ) -> None:
+        """Continue paths from a scattering event or a surface in a new direction.
+
+        Parameters
+        ----------
+        path, vertex
+            Paths at their vertices.
+        direction
+            New unit directions.
+        factor
+            Factor of the throughput; paths end where it is 0.
+        bs
+            Sample of the surface's BSDF, which decides on which side of the sea surface a path continues.
+        passes
+            Whether a path passes a solid as if it were not there (null interface).
+        """
+        path.throughput *= dr.select(path.active, factor, 1)
+        path.active &= path.throughput > 0
+        path.before_first_solid &= ~(vertex.on_solid & ~passes)
+        path.in_water = dr.select(vertex.at_sea, bs.wo.z < 0, path.in_water)
+        path.point = dr.select(vertex.on_surface, vertex.si.spawn_ray(direction).o, path.point)
+        before = mi.Float(path.direction.z)
+        turned = path.active & (vertex.on_surface | vertex.scattered)
+        path.direction = dr.select(turned, direction, path.direction)
+        path.reversals += dr.select(path.active & (before * path.direction.z < 0), mi.UInt32(1), 0)
+
+    def cross_boundary(self, path: Path, at_boundary: mi.Bool) -> None:
+        """Refract paths at a boundary of index layers, or reflect them totally.
+
+        Radiance is multiplied by the square of the ratio of the refractive indices; energy is not.
+        """
+        layers = self.scene.index_layers
+        if layers is None or layers.count == 1:
+            return
+        beyond = dr.select(path.downward > 0, path.index_layer + 1, path.index_layer - 1)
+        direction, ratio, passes = layers.refract(path.direction, path.index_layer, beyond, at_boundary)
+        mirrored = mi.Vector3f(path.direction.x, path.direction.y, -path.direction.z)
+        path.direction = dr.select(at_boundary, dr.select(passes, direction, mirrored), path.direction)
+        path.reversals += dr.select(at_boundary & ~passes, mi.UInt32(1), 0)
+        path.index_layer = dr.select(at_boundary & passes, beyond, path.index_layer)
+        if not self.adjoint:
+            path.throughput *= dr.select(at_boundary & passes, ratio * ratio, 1)

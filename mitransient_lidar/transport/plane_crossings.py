@@ -1,0 +1,275 @@
+"""Crossings of horizontal planes by light in the water: place, time and energy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.scene import LidarScene
+
+FloatArray = NDArray[np.float64]
+
+#: Paths end after this multiple of the way to the deepest plane, or where absorption has left this share of the light.
+_LONGEST_WAY, _SMALLEST_REST = 50.0, 1e-6
+
+#: Capacity for segments of each photon at first, and capacity over what the last pass needed.
+_SEGMENTS, _CAPACITY_MARGIN = 2.5, 1.25
+
+
+@dataclass(kw_only=True)
+class CrossingPath(RandomWalkPath):
+    """A path with its entry into the water, and its side of each plane.
+
+    Attributes
+    ----------
+    entry, entry_direction, entry_length
+        Start of its first segment in the water [m], unit direction, and optical length up to there [m].
+    entered
+        Whether it has entered the water.
+    submerged
+        Whether its last segment lies in water.
+    passed
+        Number of planes at or above it. It is part of the state: computed anew at each vertex, rounding could lose a
+        crossing or count it twice.
+    """
+
+    entry: mi.Point3f
+    entry_direction: mi.Vector3f
+    entry_length: mi.Float
+    entered: mi.Bool
+    submerged: mi.Bool
+    passed: mi.UInt32
+
+    @classmethod
+    def of(cls, path: RandomWalkPath) -> CrossingPath:
+        """Return paths at their start."""
+        return cls(
+            **vars(path),
+            entry=mi.Point3f(0),
+            entry_direction=mi.Vector3f(0),
+            entry_length=mi.Float(0),
+            entered=mi.Bool(False),
+            submerged=mi.Bool(False),
+            passed=mi.UInt32(0),
+        )
+
+
+@dataclass(frozen=True)
+class PlaneCrossings:
+    """Crossings of planes, one for each element.
+
+    Attributes
+    ----------
+    plane
+        Number of the plane.
+    downward
+        Whether it is crossed downwards.
+    x, y
+        Position [m].
+    weight
+        Energy of the light [J].
+    length
+        Optical length of its path up to the crossing [m].
+    scatterings
+        Number of scattering events before.
+    shift_x, shift_y
+        Horizontal distance from where it would cross the plane without scattering since it entered the water [m].
+    delay
+        Delay against that crossing [s].
+    """
+
+    plane: NDArray[np.int64]
+    downward: NDArray[np.bool_]
+    x: FloatArray
+    y: FloatArray
+    weight: FloatArray
+    length: FloatArray
+    scatterings: NDArray[np.int64]
+    shift_x: FloatArray
+    shift_y: FloatArray
+    delay: FloatArray
+
+    def select(self, which: NDArray[np.bool_]) -> PlaneCrossings:
+        """Return some of the crossings."""
+        return PlaneCrossings(**{name: values[which] for name, values in vars(self).items()})
+
+
+class Crossings:
+    """Segments that cross horizontal planes, instead of a `SegmentBuffer`, in a random walk of `CrossingPath`.
+
+    Light counts before its first solid, and inside the surface mesh.
+
+    Parameters
+    ----------
+    water
+        The ``layered_water``.
+    depths
+        Depths of the planes below the mean sea level [m], increasing, shape (planes,).
+    capacity
+        Largest number of segments; more are counted, but not stored.
+    longest
+        Optical length in the water after which paths end [m].
+    """
+
+    def __init__(self, water: Any, depths: FloatArray, capacity: int, longest: float = np.inf) -> None:
+        self.capacity = capacity
+        self._water = water
+        self._longest = opaque(longest)
+        self._depths = mi.Float(np.append(depths, np.inf))
+        self._planes = len(depths)
+        self._stored = dr.zeros(mi.UInt32, 1)
+        self._first = dr.empty(mi.UInt32, 4 * capacity)
+        self._start = dr.empty(mi.Float, 4 * capacity)
+        self._direction = dr.empty(mi.Float, 4 * capacity)
+        self._entry = dr.empty(mi.Float, 4 * capacity)
+        self._entry_direction = dr.empty(mi.Float, 4 * capacity)
+
+    def _planes_above(self, depth: mi.Float) -> mi.UInt32:
+        return mi.UInt32(dr.binary_search(0, self._planes, lambda i: dr.gather(mi.Float, self._depths, i) <= depth))
+
+    def add(self, path: CrossingPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """Store the next segment of each path that crosses a plane, and return the paths' offset unchanged.
+
+        Parameters
+        ----------
+        path
+            Paths at the start of the segment.
+        length
+            Length of the segment [m], infinite where it never ends.
+        label, active
+            As for `SegmentBuffer`, not used: light that leaves through clear water for ever is not active any more but
+            crosses planes, too. Every lane of the walk's loop has a segment.
+        """
+        wet = path.in_water & path.before_first_solid & ~path.outside_surface
+        enters = wet & ~path.entered
+        path.entry = dr.select(enters, path.point, path.entry)
+        path.entry_direction = dr.select(enters, path.direction, path.entry_direction)
+        path.entry_length = dr.select(enters, path.length, path.entry_length)
+        path.entered |= enters
+        before = dr.select(path.submerged, path.passed, self._planes_above(path.depth))
+        fall = dr.select(path.downward == 0, 0, path.downward * length)
+        path.passed = self._planes_above(path.depth + fall)
+        path.submerged = mi.Bool(path.in_water)
+        crosses = wet & (path.passed != before)
+        slot = dr.scatter_inc(self._stored, mi.UInt32(0), crosses)
+        keep = crosses & (slot < self.capacity)
+        dr.scatter(self._first, mi.Vector4u(before, path.passed, path.scatterings, path.index_layer), slot, keep)
+        dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.length), slot, keep)
+        along, into = path.direction, path.entry_direction
+        dr.scatter(self._direction, mi.Vector4f(along.x, along.y, along.z, length), slot, keep)
+        entry = mi.Vector4f(path.entry.x, path.entry.y, path.entry.z, path.entry_length)
+        dr.scatter(self._entry, entry, slot, keep)
+        dr.scatter(self._entry_direction, mi.Vector4f(into.x, into.y, into.z, path.weight), slot, keep)
+        path.active &= ~path.entered | (path.length - path.entry_length < self._longest)
+        return path.offset
+
+    def finalize(self) -> tuple[PlaneCrossings, int]:
+        """Return the crossings, and the number of segments, stored or not."""
+        arrays = (self._first, self._start, self._direction, self._entry, self._entry_direction)
+        dr.eval(self._stored, *arrays)
+        wanted = int(self._stored[0])
+        count = min(wanted, self.capacity)
+        counts, start, direction, entry, entry_direction = (np.array(array).reshape(-1, 4)[:count] for array in arrays)
+        before, after, scatterings, layer = counts.astype(np.int64).T
+        number = np.abs(after - before)
+        segment = np.repeat(np.arange(count), number)
+        rank = np.arange(len(segment)) - np.repeat(np.cumsum(number) - number, number)
+        plane = np.minimum(before, after)[segment] + rank
+        depth = np.array(self._depths, dtype=np.float64)[plane]
+        x, y, z, length = start[segment].astype(np.float64).T
+        dx, dy, dz, longest = direction[segment].astype(np.float64).T
+        # To rounding, a crossing may lie just outside the segment.
+        along = np.clip((-z - depth) / dz, 0, longest)
+        absorption = self._water.absorption_flight.column
+        straight = entry[segment].astype(np.float64), entry_direction[segment].astype(np.float64)
+        x0, y0, length0 = self._unscattered(*straight, depth)
+        unscattered = scatterings[segment] == 0
+        x, y = x + along * dx, y + along * dy
+        length = length + along * self._water.index_layers.group_index[layer[segment]]
+        return PlaneCrossings(
+            plane,
+            (after > before)[segment],
+            x,
+            y,
+            straight[1][:, 3] * np.exp(-absorption.optical_depth(-z, -z - along * dz, along)),
+            length,
+            scatterings[segment],
+            np.where(unscattered, 0, x - x0),
+            np.where(unscattered, 0, y - y0),
+            np.where(unscattered, 0, (length - length0) / C0),
+        ), wanted
+
+    def _unscattered(
+        self, entry: FloatArray, direction: FloatArray, depth: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where rays that enter the water meet planes without scattering, and their optical lengths [m].
+
+        The horizontal part of index times direction is the same in all index layers.
+        """
+        layers = self._water.index_layers
+        x, y, length = entry[:, 0], entry[:, 1], entry[:, 3]
+        top = -entry[:, 2]
+        edges = [*layers.boundaries, np.inf]
+        for index, group, bottom in zip(layers.refractive_index, layers.group_index, edges, strict=True):
+            ratio = layers.refractive_index[0] / index
+            ux, uy = ratio * direction[:, 0], ratio * direction[:, 1]
+            # The ray of the top index layer also reaches planes above the trough of a wave.
+            drop = np.minimum(depth, bottom) - top
+            way = np.where(bottom == edges[0], drop, np.maximum(drop, 0)) / np.sqrt(1 - ux**2 - uy**2)
+            x, y, length = x + way * ux, y + way * uy, length + way * group
+            top = np.full_like(top, bottom)
+        return x, y, length
+
+
+class CrossingTracer:
+    """Traces light from the laser to its first solid, and finds where it crosses planes.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene; it has water.
+    depths
+        Depths of the planes [m], increasing, shape (planes,).
+    photons
+        Number of light paths in a pass.
+    """
+
+    def __init__(self, scene: LidarScene, depths: FloatArray, photons: int) -> None:
+        self._scene = scene
+        self._depths, self._photons = depths, photons
+        self._beam = BeamSampler(scene.transmitter, scene.receiver)
+        self._segments = _SEGMENTS
+        sine = np.sqrt(1 - scene.transmitter.pose.axis[2] ** 2) / scene.refractive_index
+        longest = _LONGEST_WAY * depths[-1] / np.sqrt(1 - sine**2)
+        absorption = scene.water.column.absorption.min()
+        if absorption > 0:
+            longest = min(longest, -np.log(_SMALLEST_REST) / absorption)
+        self._longest = float(longest * scene.water.index_layers.group_index.max())
+
+    def trace(self, seed: int, number: int) -> tuple[PlaneCrossings, float]:
+        """Return the crossings of a pass, and the share of the energy that passes outside the surface mesh."""
+        scene, count = self._scene, self._photons
+        while True:
+            rng = pass_streams(seed, number, count)
+            segments = Crossings(scene.water, self._depths, int(self._segments * count), self._longest)
+            direction, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
+            sent = np.broadcast_to(np.array(energy, dtype=np.float64), count)
+            path = CrossingPath.of(RandomWalkPath.start(scene.transmitter.pose, direction, energy, mi.Float(0)))
+            # No light is too late: there is no record.
+            walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, np.inf)
+            end = walk.run(path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False)
+            outside = sent[np.array(end.outside_surface)].sum()
+            crossings, wanted = segments.finalize()
+            if wanted <= segments.capacity:
+                return crossings, float(outside / scene.transmitter.energy)
+            self._segments = _CAPACITY_MARGIN * wanted / count

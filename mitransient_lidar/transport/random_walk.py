@@ -1,0 +1,199 @@
+"""Random walk of light through sea surface and water, from the laser or from the receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.path import Path
+from mitransient_lidar.transport.path_step import PathStep, Vertex
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.scene import WaterScene
+from mitransient_lidar.transport.snell import refract_level
+
+
+@dataclass
+class RandomWalkPath(Path):
+    """A path of a random walk.
+
+    Attributes
+    ----------
+    mis_partial_sum
+        Sum over the path's scattering events of 1 / (b p), the inverse of the scattering coefficient [1/m] times the
+        phase function [1/sr]: the density, up to a common factor, with which a merge at that event makes the same path.
+    outside_surface
+        Whether the path has entered the water outside the surface mesh and continues as if the sea did not end there:
+        such paths measure what is lost.
+    offset
+        Distance from the last vertex to the next point along the path [m].
+    """
+
+    mis_partial_sum: mi.Float
+    outside_surface: mi.Bool
+    offset: mi.Float
+
+    @property
+    def weight(self) -> mi.Float:
+        """Throughput, negative for paths outside the surface mesh."""
+        return dr.select(self.outside_surface, -self.throughput, self.throughput)
+
+    @classmethod
+    def start(cls, pose: Pose, direction: mi.Vector3f, throughput: mi.Float, offset: mi.Float) -> RandomWalkPath:
+        """Return paths that start at the laser or at the receiver; a throughput of 0 makes no path."""
+        active = (throughput > 0) & dr.full(mi.Bool, True, dr.width(direction))
+        state = Path.initial(opaque_point(pose.origin), direction, throughput, active)
+        return cls(**state, mis_partial_sum=mi.Float(0), outside_surface=mi.Bool(False), offset=offset)
+
+
+class Segments(Protocol):
+    """Store of the segments in the water, up to the first solid."""
+
+    def add(self, path: Any, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """Store the next segment of each path and return the offset of the first point beyond its end [m]."""
+
+
+#: Called where paths have met something: paths, interaction, active lanes.
+Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
+
+
+class RandomWalk:
+    """Random walk that draws directions from phase functions and BSDFs alone, and stores its segments in the water.
+
+    Free flights are drawn from the scattering coefficient; absorption is a weight. So as many paths reach the bottom of
+    absorbing water as its top, with weights that fall smoothly.
+
+    Parameters
+    ----------
+    scene
+        The scene; it has water.
+    mode
+        ``Importance`` for light from the laser, ``Radiance`` for paths from the receiver.
+    destination
+        Pose of the receiver for light, of the laser for paths from the receiver.
+    path_end
+        Optical path length at which the record ends [m]: paths that cannot arrive before end.
+    """
+
+    def __init__(self, scene: WaterScene, mode: mi.TransportMode, destination: Pose, path_end: float) -> None:
+        self.scene = scene
+        self._water, self._path_end = scene.water, path_end
+        self._step = PathStep(scene, scene.water.scattering_flight, mode)
+        self._destination = opaque_point(destination.origin)
+
+    def run(
+        self,
+        path: RandomWalkPath,
+        rng: mi.PCG32,
+        label: mi.UInt32,
+        segments: Segments,
+        *,
+        on_solid: Action,
+        on_first_hit: Action | None = None,
+        past_solids: bool,
+    ) -> RandomWalkPath:
+        """Walk until all paths have ended.
+
+        Parameters
+        ----------
+        path, rng
+            Paths at their start, and their random numbers.
+        label
+            Label that is stored with each path's segments.
+        segments
+            Store of the segments in the water, up to the first solid.
+        on_solid
+            Called where a path meets a solid under water.
+        on_first_hit
+            Called where a path ends its first segment.
+        past_solids
+            Whether paths continue beyond the first solid.
+        """
+        step = self._step
+
+        def body(path: RandomWalkPath, rng: mi.PCG32) -> tuple[RandomWalkPath, mi.PCG32]:
+            first, wet = path.length == 0, path.active & path.in_water
+            vertex = step.next_vertex(path, rng)
+            path.rays += dr.select(path.active, mi.UInt32(1), 0)
+            self._look_outside(path, vertex, first)
+            path.active &= vertex.exists
+            useful = dr.minimum(vertex.length, self._longest(path))
+            path.offset = segments.add(path, useful, label, wet & path.active & path.before_first_solid)
+            absorption = self._water.absorption_flight.optical_depth(path.depth, path.downward, vertex.length)
+            path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
+            step.arrive(path, vertex)
+            if on_first_hit is not None:
+                on_first_hit(path, vertex.si, first & path.active & ~vertex.outside)
+            on_solid(path, vertex.si, vertex.on_solid & wet)
+            self._redirect(path, rng, vertex)
+            self._enter_outside(path, vertex.outside)
+            step.cross_boundary(path, vertex.at_boundary & path.active)
+            if not past_solids:
+                path.active &= path.before_first_solid
+            path.active &= path.length + dr.norm(self._destination - path.point) < self._path_end
+            return path, rng
+
+        path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="random walk")
+        return path
+
+    def _look_outside(self, path: RandomWalkPath, vertex: Vertex, first: mi.Bool) -> None:
+        """Let paths that miss the surface mesh end their first segment at the mean sea level."""
+        outside = path.active & first & (path.downward > 0)
+        outside &= ~vertex.si.is_valid() | self.scene.outside_surface(vertex.si.p.z, mi.Bool(False))
+        vertex.outside = outside
+        vertex.length = dr.select(outside, -path.depth / path.downward, vertex.length)
+
+    def _longest(self, path: RandomWalkPath) -> mi.Float:
+        """Return the length of the next segment in water beyond which its light arrives after the record [m].
+
+        The remaining distance to the destination falls at most by the segment's component towards it.
+        """
+        away = self._destination - path.point
+        distance = dr.norm(away)
+        spare = self._path_end - path.length - distance
+        return spare / (self._water.index_layers.group(path.index_layer) - dr.dot(away, path.direction) / distance)
+
+    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex) -> None:
+        """Draw the next direction."""
+        step, si = self._step, vertex.si
+        pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        bs, bsdf_weight = si.bsdf().sample(step.context, si, pick, u, vertex.on_surface)
+        event = step.scattering_event(path, vertex.scattered, rng)
+        context = mi.PhaseFunctionContext()
+        natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)
+        # The sum is over scattering coefficient times value of the phase function.
+        likely = self._water.coefficient(step.flight, event.scatterer) * weight[0] * pdf
+        path.mis_partial_sum += dr.select(vertex.scattered, dr.rcp(likely), 0)
+        path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
+        direction = dr.select(vertex.scattered, dr.normalize(natural), si.to_world(bs.wo))
+        factor = dr.select(vertex.scattered, weight[0], dr.select(vertex.on_surface, bsdf_weight[0], 1))
+        if step.adjoint:
+            factor *= dr.select(vertex.on_surface, _shading_correction(si, path.direction, direction), 1)
+        # Solids reflect little light: a few paths carry it on.
+        survival = dr.select(vertex.on_solid, dr.minimum(factor, 1), 1)
+        path.active &= (factor > 0) & (rng.next_float32() < survival)
+        passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        step.redirect(path, vertex, direction, factor / survival, bs, passes)
+
+    def _enter_outside(self, path: RandomWalkPath, outside: mi.Bool) -> None:
+        """Refract paths outside the surface mesh into level water, to measure what is lost there."""
+        index = self.scene.refractive_index
+        entered, _ = refract_level(path.direction, 1 / index)
+        path.direction = dr.select(outside, entered, path.direction)
+        path.throughput *= dr.select(outside, 4 * index / (1 + index) ** 2, 1)
+        path.in_water |= outside
+        path.outside_surface |= outside
+
+
+def _shading_correction(si: mi.SurfaceInteraction3f, incoming: mi.Vector3f, outgoing: mi.Vector3f) -> mi.Float:
+    """Return the factor by which light differs from importance at interpolated normals.
+
+    Veach 1997, section 5.3 (thesis, Stanford University): the cosines of light are those of the true surface.
+    """
+    shading = dr.abs(dr.dot(incoming, si.sh_frame.n) * dr.dot(outgoing, si.n))
+    true = dr.abs(dr.dot(incoming, si.n) * dr.dot(outgoing, si.sh_frame.n))
+    return dr.select(true > 0, shading / true, 0)

@@ -1,0 +1,237 @@
+"""The parts of a loaded scene that the integrators need, found and checked once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GatePlan
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.opaque import is_one_of, opaque
+from mitransient_lidar.transport.sensor.receiver import Receiver
+
+#: Total slope variance assumed for a surface without a stated one: a broad distribution suits any sea.
+_UNKNOWN_SLOPE_VARIANCE = 0.04
+
+
+@dataclass(frozen=True)
+class WaterScene:
+    """Receiver, water and sea surface of a scene.
+
+    Attributes
+    ----------
+    mitsuba_scene
+        The Mitsuba scene.
+    receiver
+        Pose, aperture and pixels of the sensor.
+    water
+        The ``layered_water``, or None in a scene without water.
+    surfaces
+        Shapes that have the water as interior medium.
+    slope_variance
+        Total slope variance of the sea, which shapes the proposals of the surface connection.
+    """
+
+    mitsuba_scene: mi.Scene
+    receiver: Receiver
+    water: Any
+    surfaces: list[mi.Shape]
+    slope_variance: float
+
+    @property
+    def solids(self) -> list[mi.Shape]:
+        """All shapes that do not bound the water: bottom and targets."""
+        return [
+            shape for shape in self.mitsuba_scene.shapes() if not any(shape is surface for surface in self.surfaces)
+        ]
+
+    @property
+    def has_specular_or_dry_solids(self) -> bool:
+        """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
+        lowest = min((float(surface.bbox().min.z) for surface in self.surfaces), default=0.0)
+        mirror = mi.BSDFFlags.DeltaReflection.value | mi.BSDFFlags.DeltaTransmission.value
+        return any(int(solid.bsdf().flags()) & mirror or float(solid.bbox().max.z) > lowest for solid in self.solids)
+
+    @property
+    def facet_size(self) -> float:
+        """Side of the squares of which the sea surface's triangles are halves where the lidar looks [m].
+
+        Their mean for a mesh without a stated cell size.
+        """
+        sizes = [
+            getattr(surface, "cell_size", None) or float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
+            for surface in self.surfaces
+            if surface.is_mesh()
+        ]
+        return min(sizes, default=np.inf)
+
+    @property
+    def refractive_index(self) -> float:
+        """Refractive index of the top index layer, 1 without water."""
+        return float(self.water.refractive_index) if self.water is not None else 1.0
+
+    @property
+    def group_index(self) -> float:
+        """Group index of the top index layer, 1 without water."""
+        return float(self.water.group_index) if self.water is not None else 1.0
+
+    @property
+    def index_layers(self) -> IndexLayers | None:
+        """Index layers of the water, None without water."""
+        return self.water.index_layers if self.water is not None else None
+
+    def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
+        """Return what rays meet first."""
+        return self.mitsuba_scene.ray_intersect(ray, active)
+
+    def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
+        """Return whether rays meet anything."""
+        return self.mitsuba_scene.ray_test(ray, active)
+
+    def outside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
+        """Return whether a height [m] can be reached outside the surface mesh only: wet above it, or dry below it."""
+        if not self.surfaces:
+            return mi.Bool(False)
+        boxes = [surface.bbox() for surface in self.surfaces]
+        lowest, highest = min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)
+        # A margin of a millimetre for points that lie on the surface to rounding.
+        return dr.select(in_water, z > opaque(highest + 1e-3), z < opaque(lowest - 1e-3))
+
+    def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:
+        """Return whether a shape bounds the water."""
+        return is_one_of(shape, self.surfaces)
+
+
+@dataclass(frozen=True)
+class LidarScene(WaterScene):
+    """A scene with a transmitter, and a receiver that records the time of arrival.
+
+    Attributes
+    ----------
+    transmitter
+        The ``lidar_transmitter``.
+    axis
+        Time bins of the record.
+    gates
+        Gates of the ``time_gated_film``, or None.
+    """
+
+    transmitter: Any
+    axis: TimeAxis
+    gates: GatePlan | None
+
+    @classmethod
+    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor, receiver: Receiver | None = None) -> LidarScene:
+        """Find the parts in a loaded scene. Sun and sky may be present and are ignored.
+
+        Parameters
+        ----------
+        scene
+            The loaded scene.
+        sensor
+            A ``multipixel_receiver`` or ``pixel_fov`` with a ``time_gated_film``.
+        receiver
+            Receiver that replaces the sensor's own.
+
+        Raises
+        ------
+        UserError
+            When a part is missing, of a foreign kind, or there are several where one is allowed.
+        """
+        receiver = receiver or find_receiver(sensor)
+        film = sensor.film()
+        if not isinstance(getattr(film, "axis", None), TimeAxis):
+            raise UserError("film: the lidar integrators need a time_gated_film inside the sensor")
+        emitters = [emitter for emitter in scene.emitters() if not hasattr(emitter, "daylight")]
+        transmitters = [emitter for emitter in emitters if hasattr(emitter, "pulse_energy")]
+        if len(transmitters) != 1 or len(emitters) != 1:
+            raise UserError(
+                f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
+                "allowed is exactly one lidar_transmitter, beside sun and sky"
+            )
+        water, surfaces = find_water(scene)
+        if receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
+            raise UserError("altitude: transmitter and receiver must be above the mean sea level z = 0")
+        _check_cells(surfaces, transmitters[0])
+        if water is not None:
+            check_layers(scene, surfaces, water)
+        variance = largest_slope_variance(surfaces)
+        return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
+
+
+def find_receiver(sensor: mi.Sensor) -> Receiver:
+    """Return the receiver of a sensor plugin; raise UserError when the sensor is of a foreign kind."""
+    receiver = getattr(sensor, "receiver", None)
+    if not isinstance(receiver, Receiver):
+        raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
+    return receiver
+
+
+def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape]]:
+    """Return the water of a scene, None without any, and the shapes that have it as interior medium.
+
+    Raises
+    ------
+    UserError
+        When a medium is of a foreign kind or in the wrong place, or there are several.
+    """
+    surfaces: list[mi.Shape] = []
+    waters: list[mi.Medium] = []
+    for shape in scene.shapes():
+        if not shape.is_medium_transition():
+            continue
+        if shape.exterior_medium() is not None:
+            raise UserError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
+        water = shape.interior_medium()
+        if not hasattr(water, "flight"):
+            raise UserError(f"shape {shape.id()!r}: its interior medium must be layered_water")
+        surfaces.append(shape)
+        if not any(water is other for other in waters):
+            waters.append(water)
+    for shape in scene.shapes():
+        if hasattr(shape, "ripple_variance") and shape not in surfaces:
+            raise UserError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
+    if len(waters) > 1:
+        raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
+    return (waters[0] if waters else None), surfaces
+
+
+def largest_slope_variance(surfaces: list[mi.Shape]) -> float:
+    """Return the total slope variance of the roughest surface, or a usual one where none is stated."""
+    variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
+    return float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
+
+
+def _check_cells(surfaces: list[mi.Shape], transmitter: Any) -> None:
+    """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
+    spot = transmitter.pose.ground_point()
+    footprint = 2 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    for surface in surfaces:
+        cell = getattr(surface, "cell_size", np.inf)
+        if np.isfinite(cell) and cell > footprint:
+            raise UserError(
+                f"cell_size = {cell:.3g} m is coarser than the beam's footprint on the sea, {footprint:.3g} m: "
+                "it must be finer, or 'auto'"
+            )
+
+
+def check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Any) -> None:
+    """Refuse water layers below all solids, and index layers that begin within the waves."""
+    solids = [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
+    lowest = min((float(solid.bbox().min.z) for solid in solids), default=-np.inf)
+    deepest = float(water.column.layer_tops[-1])
+    if not water.from_profile and -deepest <= lowest:
+        raise UserError(f"layer_tops = {deepest:g} m is a layer below the bottom: it must be less than {-lowest:g} m")
+    trough = min(float(surface.bbox().min.z) for surface in surfaces)
+    for boundary in water.index_layers.boundaries[:1]:
+        if -boundary >= trough:
+            raise UserError(
+                f"refractive_index changes at {boundary:g} m, within the waves: "
+                f"it must do so below their troughs, {-trough:.3g} m"
+            )

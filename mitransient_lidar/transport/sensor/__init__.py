@@ -1,0 +1,1 @@
+"""The receiver: pixels, fields of view, blur and sampling."""

@@ -1,0 +1,90 @@
+"""Images as parameters of a receiver: read from files, and sampled in proportion to their values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.errors import UserError
+
+_SUFFIXES = (".png", ".npy", ".exr")
+
+
+def read_image(name: str, path: str) -> NDArray[np.float64]:
+    """Read an image of one channel; PNG files hold whole numbers from 0 to 255 or 65535.
+
+    Parameters
+    ----------
+    name
+        Parameter that names the file, for messages.
+    path
+        A .png, .npy or .exr file.
+
+    Returns
+    -------
+    Values, shape (rows, columns), row 0 on top.
+
+    Raises
+    ------
+    UserError
+        When the file cannot be read, is of another kind, or holds anything but finite real numbers in two dimensions.
+    """
+    where = f"{name} = {path!r}"
+    if Path(path).suffix.lower() not in _SUFFIXES:
+        raise UserError(f"{where} must be a {', '.join(_SUFFIXES[:-1])} or {_SUFFIXES[-1]} file")
+    try:
+        with Path(path).open("rb"):
+            pass
+    except OSError as error:
+        raise UserError(f"{where} cannot be read: {error.strerror}") from error
+    try:
+        is_array = Path(path).suffix.lower() == ".npy"
+        values = np.load(path, allow_pickle=False) if is_array else np.array(mi.Bitmap(path))
+    except (RuntimeError, ValueError, EOFError, OSError) as error:
+        raise UserError(f"{where} cannot be read: it is damaged, or not what its name says") from error
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
+        raise UserError(f"{where} must hold real numbers")
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or values.size == 0:
+        raise UserError(f"{where} has the shape {values.shape}: it must have rows and columns, and one (grey) channel")
+    if not np.isfinite(values).all():
+        raise UserError(f"{where} must hold finite numbers")
+    return values.astype(np.float64)
+
+
+class ImageSampler:
+    """Draws points of an image with a density in proportion to its values, which are constant in each cell.
+
+    Parameters
+    ----------
+    weights
+        Values, not negative and not all 0, shape (rows, columns).
+    """
+
+    def __init__(self, weights: NDArray[np.float64]) -> None:
+        self.shape = weights.shape
+        of_rows = weights.sum(axis=1)
+        self._rows = mi.Float(np.cumsum(of_rows) / of_rows.sum())
+        # Rows without weight are never asked for.
+        columns = np.cumsum(weights, axis=1) / np.where(of_rows > 0, of_rows, 1)[:, None]
+        self._columns = mi.Float(columns.ravel())
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to points (row, column), counted in cells from the top left corner."""
+        rows, columns = self.shape
+        row, down = _choose(self._rows, mi.UInt32(0), rows, u.x)
+        column, across = _choose(self._columns, row * columns, columns, u.y)
+        return mi.Float(row) + down, mi.Float(column) + across
+
+
+def _choose(cdf: mi.Float, first: mi.UInt32, count: int, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """Choose one of `count` cells whose cumulative shares begin at `first`, and reuse the number for a place in it."""
+    cell = dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, cdf, first + mi.UInt32(i)) <= u)
+    cell = mi.UInt32(cell)
+    low = dr.select(cell > 0, dr.gather(mi.Float, cdf, first + cell - 1, cell > 0), 0)
+    return cell, dr.clip((u - low) / (dr.gather(mi.Float, cdf, first + cell) - low), 0, 1)

@@ -1,0 +1,264 @@
+"""Arrays of pixels: which pixel sees a tangent-plane point, and where to sample."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.rng import unit_points
+from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Rectangle, Sector
+from mitransient_lidar.transport.sensor.pixel_lookup import FovLookup
+
+logger = logging.getLogger(__name__)
+
+#: Names of the four pixels of the published receivers, in pixel order.
+PUBLISHED_NAMES = ("red", "green", "blue", "black")
+
+#: Layouts of more pixels than this are imagers unless the scene says otherwise.
+_LARGEST_LAYOUT = 16
+
+#: A receiver has no more pixels than this.
+MOST_PIXELS = 2**20
+
+#: Points in each pixel that find overlaps.
+_OVERLAP_POINTS = 4096
+
+FIELD_SHAPES = ("circle", "square")
+
+
+class PixelArray(ABC):
+    """The pixels of a receiver in tangent-plane angles [rad].
+
+    Attributes
+    ----------
+    names
+        One name a pixel.
+    layout
+        ``RxC``, ``hexN``, ``map`` or ``nested``.
+    grid
+        (rows, columns) of an imager, else None.
+    area
+        Area in which `sample` is uniform, counted once a pixel where pixels overlap [rad^2].
+    field_of_view
+        Full angle that holds all pixels [rad]: diameter or side about the axis.
+    field_of_view_shape
+        ``circle``, ``square``, ``rectangle`` or ``nested``.
+    """
+
+    names: list[str]
+    layout: str
+    grid: tuple[int, int] | None
+    area: float
+    field_of_view: float
+    field_of_view_shape: str
+
+    @property
+    def count(self) -> int:
+        """Number of pixels."""
+        return len(self.names)
+
+    @abstractmethod
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to points (angle_x, angle_y) of density: number of pixels there over `area`."""
+
+    @abstractmethod
+    def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Return the pixel at a point and how many pixels hold it (0 outside all).
+
+        Where pixels overlap, the uniform number `u` picks one of them.
+        """
+
+    @abstractmethod
+    def centres(self) -> NDArray[np.float64]:
+        """Return the pixels' centres (angle_x, angle_y) [rad], shape (pixels, 2)."""
+
+
+class LayoutPixels(PixelArray):
+    """A circular, square or rectangular field of view cut into rows and columns.
+
+    Points are drawn over the whole field of view and then given to the pixel that they fall into, so the number of
+    pixels costs nothing and the pixels sum to the single pixel of the same field of view, path by path.
+
+    Parameters
+    ----------
+    layout
+        ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the -angle_y edge. ``1x4`` is
+        the published receiver of four strips across range, the same as ``4x1``.
+    field_of_view
+        Diameter or side [rad], positive; of a rectangle (height along angle_x, width along angle_y).
+    shape
+        ``circle`` or ``square``; a pair of sides makes a rectangle of any.
+    imager
+        Whether rows and columns stay apart in the result; None decides by the number of pixels.
+    fill_factor
+        Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre. The circle cuts
+        what lies outside it, as a field stop does.
+    """
+
+    def __init__(
+        self,
+        layout: str,
+        field_of_view: float | tuple[float, float],
+        shape: str,
+        imager: bool | None = None,
+        fill_factor: float = 1.0,
+    ) -> None:
+        rows, columns = parse_layout(layout)
+        if shape not in FIELD_SHAPES:
+            raise UserError(f"field_of_view_shape = {shape!r} must be one of {', '.join(FIELD_SHAPES)}")
+        #: Sides along angle_x and angle_y [rad].
+        self.sides = field_of_view if isinstance(field_of_view, tuple) else (field_of_view, field_of_view)
+        height, width = (0.5 * side for side in self.sides)
+        if height != width:
+            shape = "rectangle"
+        self.field: FovShape = Sector(height) if shape == "circle" else Rectangle(-height, height, -width, width)
+        self.layout = layout
+        self.field_of_view = max(self.sides)
+        self.field_of_view_shape = shape
+        # Of cells that leave gaps the whole ones are sampled, though the circle cuts some.
+        self._shrink = math.sqrt(fill_factor)
+        self.area = fill_factor * self.sides[0] * self.sides[1] if fill_factor < 1 else self.field.area
+        self._rows, self._columns = rows, columns
+        self.grid = (rows, columns) if (rows * columns > _LARGEST_LAYOUT if imager is None else imager) else None
+        if (rows, columns) in ((2, 2), (4, 1)):
+            self.names = list(PUBLISHED_NAMES)
+        elif rows * columns == 1:
+            self.names = ["single"]
+        else:
+            self.names = [f"r{row}c{column}" for row in range(rows) for column in range(columns)]
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points of the field of view, or of its cells when they leave gaps."""
+        if self._shrink == 1:
+            return self.field.sample(u)
+        height, width = self.sides
+        row, column = u.x * self._rows, u.y * self._columns
+        row, column = (dr.lerp(dr.floor(g) + 0.5, g, self._shrink) for g in (row, column))
+        return 0.5 * height - row * (height / self._rows), column * (width / self._columns) - 0.5 * width
+
+    def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Return the pixel at a point and whether the field of view holds it (1 or 0)."""
+        height, width = self.sides
+        down, across = (
+            (0.5 * height - angle_x) * (self._rows / height),
+            (angle_y + 0.5 * width) * (self._columns / width),
+        )
+        row = dr.clip(mi.Int32(dr.floor(down)), 0, self._rows - 1)
+        column = dr.clip(mi.Int32(dr.floor(across)), 0, self._columns - 1)
+        inside = self.field.contains(angle_x, angle_y)
+        if self._shrink < 1:
+            off_centre = dr.maximum(dr.abs(down - row - 0.5), dr.abs(across - column - 0.5))
+            inside &= off_centre <= 0.5 * self._shrink
+        return mi.UInt32(row * self._columns + column), dr.select(inside, mi.Float(1), 0)
+
+    def centres(self) -> NDArray[np.float64]:
+        """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2); of the uncut cells in imagers."""
+        height, width = self.sides
+        far = 0.5 * height - (np.arange(self._rows) + 0.5) * height / self._rows
+        left = (np.arange(self._columns) + 0.5) * width / self._columns - 0.5 * width
+        centres = np.stack(np.meshgrid(far, left, indexing="ij"), axis=-1).reshape(-1, 2)
+        if self.count > _LARGEST_LAYOUT or self.field_of_view_shape != "circle":
+            return centres
+        ticks = 0.5 * height * (2 * (np.arange(400) + 0.5) / 400 - 1)
+        angle_x, angle_y = (g.ravel() for g in np.meshgrid(ticks, ticks))
+        pixel, count = (np.array(a) for a in self.pixel_at(mi.Float(angle_x), mi.Float(angle_y), mi.Float(0)))
+        for index in range(self.count):
+            inside = (pixel == index) & (count > 0)
+            if inside.any():
+                centres[index] = angle_x[inside].mean(), angle_y[inside].mean()
+        return centres
+
+
+class ShapedPixels(PixelArray):
+    """Pixels of any shape each, which may leave gaps and may overlap.
+
+    Parameters
+    ----------
+    fields
+        Shape of each pixel, at least one.
+    names
+        Name of each pixel, all different.
+    """
+
+    def __init__(self, fields: Sequence[FovShape], names: Sequence[str]) -> None:
+        if len(set(names)) < len(fields):
+            raise UserError(f"pixel_name: names must differ, got {', '.join(names)}")
+        self.fields = list(fields)
+        self.names = list(names)
+        self.layout = "nested" if len(fields) > 1 else "1x1"
+        self.grid = None
+        areas = np.array([field.area for field in fields])
+        self.area = float(areas.sum())
+        ends = np.cumsum(areas) / self.area
+        self._starts, self._per_share = mi.Float(np.append(0, ends[:-1])), mi.Float(1 / np.diff(ends, prepend=0))
+        self.field_of_view = 2 * float(np.abs([field.bounds() for field in fields]).max())
+        self.field_of_view_shape = "nested"
+        self._lookup = FovLookup(fields)
+        for first, second in self._overlaps():
+            logger.warning("pixels %r and %r overlap: light in both is counted in each", first, second)
+
+    def _overlaps(self) -> list[tuple[str, str]]:
+        """Return the names of pixels that overlap, found with 4096 points in each."""
+        neighbours = self._lookup.neighbours.tolist()
+        if not neighbours:
+            return []
+        points = unit_points(_OVERLAP_POINTS)
+        lane = dr.arange(mi.UInt32, _OVERLAP_POINTS * self.count)
+        pixel = lane // _OVERLAP_POINTS
+        angle_x, angle_y = self._sample_in(pixel, dr.gather(mi.Point2f, points, lane % _OVERLAP_POINTS))
+        _, held = self._lookup.find(angle_x, angle_y, mi.Float(0))
+        # Neighbours may share an edge to rounding: one point in 4096 is not an overlap.
+        shared = np.bincount(np.array(pixel)[np.array(held) > 1], minlength=self.count) > 1
+        found = []
+        for i, j in neighbours:
+            if shared[i] and dr.count(self.fields[j].contains(*self.fields[i].sample(points)))[0] > 1:
+                found.append((self.names[i], self.names[j]))
+        return found
+
+    def _sample_in(self, pixel: mi.UInt32, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to uniform points of the given pixels."""
+        angle_x, angle_y = dr.switch(pixel, [field.sample for field in self.fields], u)
+        return angle_x, angle_y
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to points: a pixel by its area, then uniform in it."""
+        last = len(self.fields) - 1
+        pixel = dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self._starts, i + 1) <= u.x)
+        start, per_share = (dr.gather(mi.Float, table, pixel) for table in (self._starts, self._per_share))
+        point = mi.Point2f(dr.clip((u.x - start) * per_share, 0, 1), u.y)
+        return self._sample_in(mi.UInt32(pixel), point)
+
+    def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Return one pixel at a point and how many pixels hold it."""
+        pixel, count = self._lookup.find(angle_x, angle_y, u)
+        return pixel, mi.Float(count)
+
+    def centres(self) -> NDArray[np.float64]:
+        """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2)."""
+        return np.array([field.centroid() for field in self.fields])
+
+
+def parse_layout(layout: str) -> tuple[int, int]:
+    """Return (rows, columns) of a layout such as ``2x2``; ``1x4`` is the published receiver of four strips.
+
+    Raises
+    ------
+    UserError
+        When the text is not two positive whole numbers with an x between them, or has more than 2^20 pixels.
+    """
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", layout)
+    if not match:
+        raise UserError(f"layout = {layout!r} must be rows x columns, such as 1x1, 2x2, 1x4 or 128x128, or hex7")
+    rows, columns = int(match.group(1)), int(match.group(2))
+    if rows * columns > MOST_PIXELS:
+        raise UserError(f"layout = {layout!r} has {rows * columns} pixels; allowed are at most {MOST_PIXELS}")
+    return (4, 1) if (rows, columns) == (1, 4) else (rows, columns)

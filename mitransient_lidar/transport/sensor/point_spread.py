@@ -1,0 +1,96 @@
+"""Optical blur of a receiver: the point-spread function of its optics."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import in_range, positive
+from mitransient_lidar.transport.sensor.image_sampling import ImageSampler, read_image
+
+#: Widest blur [mrad].
+_WIDEST = 1000.0
+
+
+class PointSpread(ABC):
+    """Where the light of one direction falls on the detector, relative to where sharp optics would focus it."""
+
+    @abstractmethod
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to displacements (angle_x, angle_y) [rad] that are distributed as the light is."""
+
+    @staticmethod
+    def from_properties(props: mi.Properties) -> PointSpread | None:
+        """Read ``blur_mrad``, or ``blur_file`` and ``blur_file_mrad``, of a sensor plugin; None is sharp.
+
+        Raises
+        ------
+        UserError
+            When a value is out of range, both kinds are given, or the file is no point-spread function.
+        """
+        if "blur_file" not in props:
+            if "blur_file_mrad" in props:
+                raise UserError("blur_file_mrad is the size of blur_file, which is missing")
+            width = in_range("blur_mrad", props.get("blur_mrad", 0.0), 0.0, _WIDEST)
+            return GaussianPointSpread(1e-3 * width) if width > 0 else None
+        if "blur_mrad" in props:
+            raise UserError("blur_mrad and blur_file: give one of them, not both")
+        if "blur_file_mrad" not in props:
+            raise UserError("blur_file_mrad is missing: the angle [mrad] over which the image blur_file reaches")
+        path = str(props["blur_file"])
+        values = read_image("blur_file", path)
+        if values.min() < 0 or values.max() <= 0:
+            raise UserError(f"blur_file = {path!r} must hold values that are not negative and not all 0")
+        width = in_range("blur_file_mrad", positive("blur_file_mrad", props["blur_file_mrad"]), 0.0, _WIDEST)
+        return MeasuredPointSpread(values, 1e-3 * width)
+
+
+class GaussianPointSpread(PointSpread):
+    """Light is spread as a round Gaussian.
+
+    Parameters
+    ----------
+    sigma
+        Standard deviation along each axis [rad], positive.
+    """
+
+    def __init__(self, sigma: float) -> None:
+        self.sigma = sigma
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to displacements (angle_x, angle_y) [rad].
+
+        Box and Muller 1958, doi:10.1214/aoms/1177706645.
+        """
+        radius = self.sigma * dr.sqrt(-2 * dr.log(1 - u.x))
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        return radius * cos, radius * sin
+
+
+class MeasuredPointSpread(PointSpread):
+    """Light is spread as an image shows it.
+
+    Parameters
+    ----------
+    values
+        Values in any unit, not negative and not all 0, shape (rows, columns), constant in each of the square cells. Row
+        0 is the far edge (+angle_x), column 0 the -angle_y edge, and the middle of the image is where sharp optics
+        focus.
+    width
+        Extent of the columns along angle_y [rad], positive.
+    """
+
+    def __init__(self, values: NDArray[np.float64], width: float) -> None:
+        self._sampler = ImageSampler(values)
+        self._cell = width / values.shape[1]
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to displacements (angle_x, angle_y) [rad]."""
+        row, column = self._sampler.sample(u)
+        rows, columns = self._sampler.shape
+        return (0.5 * rows - row) * self._cell, (column - 0.5 * columns) * self._cell

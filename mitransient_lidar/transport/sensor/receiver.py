@@ -1,0 +1,203 @@
+"""What every receiver has, whatever its pixels: pose, aperture, losses, and the sampling of its view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.validation import in_range, non_negative, positive
+from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import pass_streams, stratified_point, unit_points
+from mitransient_lidar.transport.sensor.pixels import PixelArray
+from mitransient_lidar.transport.sensor.point_spread import PointSpread
+
+#: The laser's footprint is worth sampling when the field of view holds at least this share of it.
+_SMALLEST_FOOTPRINT_SHARE = 0.05
+
+#: An aperture that is blocked as a whole receives nothing.
+_LARGEST_OBSCURATION = 0.999
+
+
+@dataclass(frozen=True)
+class ReceiverOptics:
+    """Aperture and losses of a receiver.
+
+    Parameters
+    ----------
+    aperture_area
+        Area [m^2] normal to every ray of the (small) field of view, positive.
+    optical_efficiency
+        Share of the collected light that reaches the detector, above 0 to 1.
+    two_way_atmospheric_transmittance
+        Share of the light that survives the way through the air and back, above 0 to 1.
+    response_time_ns
+        Time constant of the receiver's exponential (single-pole) impulse response [ns]; 0 is ideal.
+    obscuration
+        Share of the aperture's area that is blocked, as by a secondary mirror, 0 to below 1.
+    """
+
+    aperture_area: float
+    optical_efficiency: float
+    two_way_atmospheric_transmittance: float
+    response_time_ns: float
+    obscuration: float = 0.0
+
+    @classmethod
+    def from_properties(cls, props: mi.Properties) -> ReceiverOptics:
+        """Read the five parameters of a sensor plugin; raise UserError when one is out of range."""
+        name = "two_way_atmospheric_transmittance"
+        return cls(
+            positive("aperture_area", props.get("aperture_area", 0.025)),
+            in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0),
+            in_range(name, props.get(name, 0.9), 1e-12, 1.0),
+            non_negative("response_time_ns", props.get("response_time_ns", 0.0)),
+            in_range("obscuration", props.get("obscuration", 0.0), 0.0, _LARGEST_OBSCURATION),
+        )
+
+    @property
+    def collection(self) -> float:
+        """Detected energy per radiance and solid angle [m^2]: open area times efficiency times transmittance."""
+        open_area = self.aperture_area * (1 - self.obscuration)
+        return open_area * self.optical_efficiency * self.two_way_atmospheric_transmittance
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """What the integrators need of a sensor plugin, which holds it as ``receiver``.
+
+    Pixels are places on the detector: light from the direction g falls on g + delta, with delta drawn from the
+    point-spread function `blur`; sharp optics (None) have delta = 0.
+    """
+
+    pose: Pose
+    optics: ReceiverOptics
+    pixels: PixelArray
+    blur: PointSpread | None = None
+
+    def sensor_ray(
+        self, time: mi.Float, position: mi.Point2f, spread: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Serve Mitsuba's own integrators: a ray of the view whose weight turns radiance into energy."""
+        angle_x, angle_y = self.pixels.sample(position)
+        _, here = self.pixels.pixel_at(angle_x, angle_y, mi.Float(0))
+        if self.blur is not None:
+            dx, dy = self.blur.sample(spread)
+            angle_x, angle_y = angle_x - dx, angle_y - dy
+        ray = mi.Ray3f(mi.Point3f(self.pose.origin.tolist()), self.pose.direction(angle_x, angle_y))
+        ray.time = time
+        weight = self.optics.collection * self.pixels.area * solid_angle_factor(angle_x, angle_y)
+        return ray, mi.Spectrum(weight) & active & (here > 0)
+
+
+def solid_angle_factor(angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+    """Return the solid angle per tangent-plane area, (1 + g^2)^(-3/2)."""
+    return dr.rsqrt(dr.square(1 + angle_x * angle_x + angle_y * angle_y) * (1 + angle_x * angle_x + angle_y * angle_y))
+
+
+@dataclass(frozen=True)
+class SensorSample:
+    """One sample of the receiver's view for every path.
+
+    Attributes
+    ----------
+    direction
+        Unit direction of the ray.
+    pixel
+        Index of the pixel that sees it.
+    weight
+        Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
+    """
+
+    direction: mi.Vector3f
+    pixel: mi.UInt32
+    weight: mi.Float
+
+
+class SensorSampler:
+    """Samples the receiver's view, half of the paths over the field of view and half over the laser's footprint.
+
+    Both halves are weighted by the balance heuristic, so any beam and any field of view are served without bias.
+    Samples are stratified, and neighbouring ones look into neighbouring directions.
+
+    Where the optics blur, the first half draws the place p on the detector and looks along p - delta, and the second
+    half draws the direction g and receives it at g + delta. Both draw delta from the point-spread function, whose
+    density is in the integrand too and cancels.
+
+    Parameters
+    ----------
+    receiver
+        Pose, aperture and pixels.
+    transmitter
+        The ``lidar_transmitter`` plugin.
+    """
+
+    def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
+        self.receiver = receiver
+        spot = transmitter.pose.ground_point()
+        self.centre = [opaque(angle) for angle in receiver.pose.tangent_of_point(spot)]
+        ranges = (np.linalg.norm(spot - pose.origin) for pose in (transmitter.pose, receiver.pose))
+        self.sigma = opaque(transmitter.widest_angular_spread * float(next(ranges)) / float(next(ranges)))
+        self.use_footprint = self._footprint_share() > _SMALLEST_FOOTPRINT_SHARE
+
+    def _footprint_share(self) -> float:
+        """Return the share of the footprint's samples that fall inside a pixel."""
+        angle_x, angle_y = self._sample_footprint(unit_points(4096))
+        dx, dy = self._displacement(pass_streams(0, 0, 4096))
+        _, count = self.receiver.pixels.pixel_at(angle_x + dx, angle_y + dy, mi.Float(0.5))
+        return float(dr.mean(dr.select(count > 0, mi.Float(1), 0))[0])
+
+    def _displacement(self, rng: mi.PCG32) -> tuple[mi.Float, mi.Float]:
+        """Draw displacements on the detector; sharp optics use no random numbers."""
+        if self.receiver.blur is None:
+            return mi.Float(0), mi.Float(0)
+        return self.receiver.blur.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
+
+    def _sample_footprint(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        radius = self.sigma * dr.sqrt(-2 * dr.log(1 - u.x))
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        return dr.fma(radius, cos, self.centre[0]), dr.fma(radius, sin, self.centre[1])
+
+    def _footprint_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        x, y = (angle_x - self.centre[0]) / self.sigma, (angle_y - self.centre[1]) / self.sigma
+        return dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * self.sigma * self.sigma)
+
+    def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> SensorSample:
+        """Sample one view for each path.
+
+        Parameters
+        ----------
+        index
+            Number of the path, 0 to count - 1.
+        count
+            Number of paths.
+        rng
+            Random numbers of the paths.
+        """
+        if self.use_footprint:
+            of_footprint = (index & 1) == 1
+            point = stratified_point(index >> 1, (count + 1) // 2, rng)
+        else:
+            of_footprint, point = mi.Bool(False), stratified_point(index, count, rng)
+        # Places on the detector (px, py), and directions (angle_x, angle_y) whose light falls on them.
+        px, py = self.receiver.pixels.sample(point)
+        dx, dy = self._displacement(rng)
+        angle_x, angle_y = px - dx, py - dy
+        if self.use_footprint:
+            fx, fy = self._sample_footprint(point)
+            angle_x, angle_y = dr.select(of_footprint, fx, angle_x), dr.select(of_footprint, fy, angle_y)
+            px, py = dr.select(of_footprint, fx + dx, px), dr.select(of_footprint, fy + dy, py)
+        pixel, pixels_here = self.receiver.pixels.pixel_at(px, py, rng.next_float32())
+        density = pixels_here / self.receiver.pixels.area
+        if self.use_footprint:
+            density = 0.5 * (density + self._footprint_density(angle_x, angle_y))
+        # A point in several pixels stands for each of them in turn: weight by their number.
+        weight = (
+            pixels_here * (self.receiver.optics.collection / count) * solid_angle_factor(angle_x, angle_y) / density
+        )
+        return SensorSample(
+            self.receiver.pose.direction(angle_x, angle_y), pixel, dr.select(pixels_here > 0, weight, 0)
+        )

@@ -1,0 +1,413 @@
+"""Unidirectional volumetric path tracing with the surface connection: the reference, and pictures by daylight."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
+from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.path_step import PathStep, ScatteringEvent, Vertex
+from mitransient_lidar.transport.refracted_connection import (
+    ConnectedPath,
+    EmitterDirection,
+    RefractedEmitterSampler,
+    RefractedLaserSampler,
+    connect_laser,
+    trace_to_top_layer,
+)
+from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.scene import LidarScene, WaterScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+#: Asymmetry of the Henyey-Greenstein lobe towards the emitter from which guided directions are drawn. Of asymmetries
+#: 0.7 to 0.95 with probabilities 0.1 to 0.55 this one, with the default probability, was best in clear and turbid
+#: water.
+_GUIDING_ASYMMETRY = 0.87
+
+#: Number of the random streams within a pass.
+_STREAM = 3
+
+#: How connections are estimated: by both samplings with multiple importance sampling, or by one of them.
+CONNECTIONS = ("mis", "emitter", "phase")
+
+
+@dataclass(frozen=True)
+class VolpathOptions:
+    """Options of the path tracer; the plugin ``lidar_volpath`` documents them."""
+
+    max_scatterings: int = -1
+    roulette_threshold: float = 0.001
+    guiding_probability: float = 0.4
+    connection: str = "mis"
+    complement_only: bool = False
+
+
+@dataclass
+class ScatterEvaluation:
+    """Value and density of a direction at a scattering event or a solid.
+
+    Attributes
+    ----------
+    value
+        Phase function [1/sr], or BSDF times cosine.
+    pdf
+        Density with which the path's own sampling draws the direction [1/sr].
+    """
+
+    value: mi.Float
+    pdf: mi.Float
+
+
+class PathLight(ABC):
+    """Light that the vertices of paths are connected to, and the record of what arrives.
+
+    Attributes
+    ----------
+    sampler
+        Samples directions under water towards the emitter.
+    """
+
+    sampler: RefractedEmitterSampler
+
+    @abstractmethod
+    def connect(
+        self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Connect surface points to the emitter; return radiance along ``si.wi`` and length of the connection [m]."""
+
+    @abstractmethod
+    def receive(
+        self, path: ConnectedPath, pixel: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool
+    ) -> None:
+        """Record light that arrives along connected paths of an optical length [m]."""
+
+    @abstractmethod
+    def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
+        """Record light of connections that miss the end of the surface mesh, as if a flat surface were there.
+
+        `share` is the received energy per radiance above the surface at `crossing`.
+        """
+
+    @abstractmethod
+    def escape(self, path: ConnectedPath, pixel: mi.UInt32, weight: mi.Float, active: mi.Bool) -> None:
+        """Record light that meets paths which leave the scene."""
+
+    @abstractmethod
+    def reflect(
+        self,
+        path: ConnectedPath,
+        si: mi.SurfaceInteraction3f,
+        pixel: mi.UInt32,
+        weight: mi.Float,
+        rng: mi.PCG32,
+        active: mi.Bool,
+    ) -> None:
+        """Record light of other emitters that the dry side of the sea surface reflects."""
+
+    @abstractmethod
+    def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
+        """End paths that no more light can reach in time, or at random after very many scattering events."""
+
+
+class LaserLight(PathLight):
+    """The laser, and the record of a pass.
+
+    Parameters
+    ----------
+    scene
+        The lidar scene.
+    record
+        Record of the pass.
+    """
+
+    def __init__(self, scene: LidarScene, record: PassRecord) -> None:
+        self.scene, self.record = scene, record
+        self.sampler: RefractedLaserSampler = RefractedLaserSampler(scene)
+
+    def connect(
+        self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """Connect surface points to the laser."""
+        return connect_laser(self.scene, si, active)
+
+    def receive(
+        self, path: ConnectedPath, pixel: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool
+    ) -> None:
+        """Add energy to the histogram."""
+        # The connection goes up: from a vertex that was reached downwards it is one more reversal.
+        reversals = path.reversals + dr.select(path.downward > 0, mi.UInt32(1), 0)
+        self.record.receive(pixel, path.scatterings, reversals, length, energy, active)
+
+    def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
+        """Add to the energy lost because the surface mesh ends, for a flat surface at normal incidence."""
+        offset = opaque_point(self.scene.transmitter.pose.origin) - crossing
+        intensity = self.scene.transmitter.intensity(-dr.normalize(offset))
+        missing = share * level_transmittance(self.scene, emitter) * intensity / dr.squared_norm(offset)
+        self.record.lose(missing, missing > 0)
+
+    def escape(self, path: ConnectedPath, pixel: mi.UInt32, weight: mi.Float, active: mi.Bool) -> None:
+        """Record nothing: no path meets the laser by chance."""
+
+    def reflect(
+        self,
+        path: ConnectedPath,
+        si: mi.SurfaceInteraction3f,
+        pixel: mi.UInt32,
+        weight: mi.Float,
+        rng: mi.PCG32,
+        active: mi.Bool,
+    ) -> None:
+        """Record nothing: there is no other emitter."""
+
+    def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
+        """End paths whose light would arrive after the record."""
+        path.active &= path.length + dr.norm(self.sampler.laser - path.point) < self.scene.axis.path_end
+
+
+def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Float:
+    """Return the transmittance of radiance through a level surface, with Fresnel's factor for normal incidence."""
+    index = scene.refractive_index
+    return 4 * index / (1 + index) ** 2 * emitter.in_air.z / emitter.in_water.z
+
+
+class PathTracer:
+    """Traces paths from the receiver and connects their vertices to a light.
+
+    Each vertex under water samples a direction in which the emitter may appear through the surface, and traces it to
+    the real surface, where it is connected; where the path itself reaches the surface unscattered it is connected, too.
+    Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
+    doi:10.1145/218380.218498).
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    options
+        Options.
+    light
+        Light, and record of what arrives.
+    """
+
+    def __init__(self, scene: WaterScene, options: VolpathOptions, light: PathLight) -> None:
+        self.scene, self.options, self.light = scene, options, light
+        flight = scene.water.flight if scene.water is not None else None
+        self._step = PathStep(scene, flight, mi.TransportMode.Radiance)
+
+    def trace(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> mi.Float64:
+        """Follow paths to their ends; their light counts for their pixels with their weights. Return the ray count."""
+
+        def body(path: ConnectedPath, rng: mi.PCG32) -> tuple[ConnectedPath, mi.PCG32]:
+            self._extend(path, rng, pixel, weight)
+            return path, rng
+
+        path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="lidar_volpath")
+        return dr.sum(mi.Float64(path.rays))
+
+    def _extend(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> None:
+        """Go to the next vertex, connect it to the emitter, and choose the next direction."""
+        first = path.length == 0
+        vertex = self._step.next_vertex(path, rng)
+        wet = path.active & path.in_water & dr.isfinite(vertex.reach)
+        transmittance = dr.exp(-self._optical_depth(path.point, path.direction, vertex.reach, wet))
+        self.light.escape(path, pixel, weight, path.active & ~vertex.exists)
+        path.active &= vertex.exists
+        path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
+        if self.options.max_scatterings >= 0:
+            path.active &= path.scatterings <= self.options.max_scatterings
+        self._step.arrive(path, vertex)
+        event = self._step.scattering_event(path, vertex.scattered, rng)
+        if self.scene.water is not None:
+            path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
+        emitter = self.light.sampler.direction_from(path.point)
+        self._connect(path, rng, pixel, weight, vertex, event, emitter, transmittance, first)
+        self._redirect(path, rng, vertex, event, emitter)
+        path.emitter_ratio = dr.select(vertex.at_boundary, path.emitter_ratio / transmittance, path.emitter_ratio)
+        self._step.cross_boundary(path, vertex.at_boundary & path.active)
+        self._roulette(path, rng)
+        self.light.end_paths(path, rng)
+
+    def _connect(
+        self,
+        path: ConnectedPath,
+        rng: mi.PCG32,
+        pixel: mi.UInt32,
+        weight: mi.Float,
+        vertex: Vertex,
+        event: ScatteringEvent,
+        emitter: EmitterDirection,
+        transmittance: mi.Float,
+        first: mi.Bool,
+    ) -> None:
+        """Connect from under water through the surface, and from the surface and from solids in the air directly."""
+        scene, si, light = self.scene, vertex.si, self.light
+        submerged = self._submerged(vertex)
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        up, density = light.sampler.sample_in_layer(emitter, u, path.index_layer)
+        sampled = submerged & (density > 0) if self.options.connection != "phase" else mi.Bool(False)
+        scatter = self._evaluate(emitter, vertex, event, sampled, up)
+        ray = dr.select(vertex.scattered, mi.Ray3f(path.point, up), si.spawn_ray(up))
+        top = trace_to_top_layer(scene, ray, path.index_layer, sampled)
+        above = scene.ray_intersect(top.ray, sampled)
+        arrives = sampled & (top.factor > 0)
+        met = arrives & above.is_valid() & scene.is_surface(above.shape)
+        # Where the surface mesh ends, a flat sea takes its place in the account of what is lost.
+        lost = arrives & ~above.is_valid() & (top.ray.d.z > 0)
+        distance = dr.select(lost, dr.maximum(-top.ray.o.z, 0) / top.ray.d.z, above.t)
+        crossed = top.optical_depth + self._optical_depth(top.ray.o, top.ray.d, distance, met | lost)
+        clear = dr.exp(-crossed)
+        combined = density + (scatter.pdf * clear if self.options.connection == "mis" else 0)
+        connected = scatter.value * clear / combined * top.factor
+        factor = dr.select(met, connected, self._own_weight(path, transmittance))
+        crossing = dr.select(met, above, si)
+        direct = vertex.at_sea | (vertex.on_solid & ~vertex.in_water)
+        radiance, air_length = light.connect(crossing, emitter, met | direct)
+        water_length = dr.select(met, top.optical_length + above.t * scene.group_index, 0)
+        energy = weight * path.throughput * factor * radiance
+        if self.options.complement_only:
+            energy = dr.select(self._merged(path, vertex, first), 0, energy)
+        # One ray along the path, one up to the surface, one to the emitter.
+        path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(sampled, mi.UInt32(1), 0)
+        path.rays += dr.select(met | direct, mi.UInt32(1), 0)
+        light.receive(path, pixel, path.length + water_length + air_length, energy, radiance > 0)
+        light.reflect(path, si, pixel, weight, rng, vertex.at_sea & ~vertex.in_water)
+        # In what is lost, the density of the sampled direction stands for that of the surface's BSDF.
+        share = weight * path.throughput * connected * density
+        light.lose(emitter, dr.select(lost, share, 0), top.ray(distance))
+
+    @staticmethod
+    def _submerged(vertex: Vertex) -> mi.Bool:
+        """Return whether a vertex lies under water."""
+        return vertex.scattered | (vertex.on_solid & vertex.in_water)
+
+    def _merged(self, path: ConnectedPath, vertex: Vertex, first: mi.Bool) -> mi.Bool:
+        """Return whether the connections of a vertex are left to ``lidar_merging``."""
+        seen_through = self._submerged(vertex) | (vertex.at_sea & (path.scatterings > 0))
+        return (first & vertex.on_surface) | (path.before_first_solid & seen_through)
+
+    def _optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the optical depth of segments in water, 0 for inactive lanes."""
+        if self.scene.water is None:
+            return mi.Float(0)
+        return dr.select(active, self.scene.water.optical_depth(point, direction, length), 0)
+
+    def _evaluate(
+        self,
+        emitter: EmitterDirection,
+        vertex: Vertex,
+        event: ScatteringEvent,
+        active: mi.Bool,
+        direction: mi.Vector3f,
+    ) -> ScatterEvaluation:
+        """Return value and density of a direction at scattering events and solids."""
+        value, pdf = mi.Float(0), mi.Float(0)
+        probability, si = self.options.guiding_probability, vertex.si
+        guided = henyey_greenstein(dr.dot(direction, emitter.in_water), _GUIDING_ASYMMETRY)
+        if event.phase is not None:
+            at_event = vertex.scattered & active
+            context = mi.PhaseFunctionContext()
+            phase_value, phase_pdf = event.phase.eval_pdf(context, event.interaction, direction, at_event)
+            value = dr.select(at_event, phase_value[0], 0)
+            pdf = dr.select(at_event, dr.lerp(phase_pdf, guided, probability), 0)
+        on_solid = active & ~vertex.scattered
+        solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), on_solid)
+        solid_pdf = dr.select(_is_rough(si), dr.lerp(solid_pdf, guided, probability), solid_pdf)
+        return ScatterEvaluation(dr.select(on_solid, solid_value[0], value), dr.select(on_solid, solid_pdf, pdf))
+
+    def _own_weight(self, path: ConnectedPath, transmittance: mi.Float) -> mi.Float:
+        """Return the weight of a connection that the path's own sampling made, against the sampled connection."""
+        if self.options.connection == "phase":
+            return mi.Float(1)
+        if self.options.connection == "emitter":
+            return dr.select(path.emitter_ratio > 0, mi.Float(0), 1)
+        return dr.select(path.emitter_ratio > 0, transmittance / (transmittance + path.emitter_ratio), 1)
+
+    def _redirect(
+        self, path: ConnectedPath, rng: mi.PCG32, vertex: Vertex, event: ScatteringEvent, emitter: EmitterDirection
+    ) -> None:
+        """Draw the next direction, a part of them towards the emitter."""
+        probability, si = self.options.guiding_probability, vertex.si
+        pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        submerged = self._submerged(vertex)
+        # At scattering events and rough solids under water a part of the directions is drawn towards the emitter.
+        mixed = vertex.scattered | (submerged & vertex.on_surface & _is_rough(si))
+        guided = pick < probability
+        # The number that decides is rescaled and used again by the phase function and the BSDF.
+        rest = dr.clip((pick - probability) / (1 - probability), 0, 1)
+        u_bsdf = dr.select(mixed, rest, pick)
+        bs, bsdf_weight = si.bsdf().sample(self._step.context, si, u_bsdf, u, vertex.on_surface)
+        direction, pdf = si.to_world(bs.wo), bs.pdf
+        factor = dr.select(vertex.on_surface, bsdf_weight[0], 1)
+        if event.phase is not None:
+            context = mi.PhaseFunctionContext()
+            natural, _, _ = event.phase.sample(context, event.interaction, rest, u, vertex.scattered)
+            natural = dr.select(vertex.scattered, natural, direction)
+            cosine = sample_henyey_greenstein(u.x, _GUIDING_ASYMMETRY)
+            towards = deflect(mi.Frame3f(emitter.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
+            drawn = dr.select(guided, towards, natural)
+            scatter = self._evaluate(emitter, vertex, event, mixed, drawn)
+            direction = dr.select(mixed, dr.normalize(drawn), direction)
+            pdf = dr.select(mixed, scatter.pdf, pdf)
+            factor = dr.select(mixed, scatter.value / scatter.pdf, factor)
+        specular = vertex.on_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        passes = ~mixed & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        if self.options.complement_only:
+            # What follows is merged, too, unless a mirror or a solid in the air can still come in between.
+            path.active &= ~(path.before_first_solid & vertex.on_solid & ~passes & submerged & ~specular)
+            if not self.scene.has_specular_or_dry_solids:
+                path.active &= ~(path.before_first_solid & vertex.scattered)
+        turned = vertex.on_surface | vertex.scattered
+        sampler_pdf = self.light.sampler.pdf_in_layer(emitter, direction, path.index_layer)
+        ratio = dr.select(submerged & ~specular & (pdf > 0), sampler_pdf / pdf, 0)
+        path.emitter_ratio = dr.select(turned, ratio, path.emitter_ratio)
+        self._step.redirect(path, vertex, direction, factor, bs, passes)
+        path.specular = dr.select(turned, specular, path.specular)
+        reflected = vertex.at_sea & ~vertex.in_water & ~path.in_water
+        path.reflected_by_sea = dr.select(turned, reflected, path.reflected_by_sea)
+
+    def _roulette(self, path: ConnectedPath, rng: mi.PCG32) -> None:
+        """End paths of little throughput at random, and compensate in the others."""
+        survival = dr.minimum(path.throughput / max(self.options.roulette_threshold, 1e-30), 1)
+        path.active &= rng.next_float32() < survival
+        path.throughput = dr.select(path.active, path.throughput / survival, path.throughput)
+
+
+def _is_rough(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Return whether a surface has no mirror-like part, so that any direction can be drawn and weighted."""
+    return ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+
+
+def trace_connected(
+    scene: LidarScene, sampler: SensorSampler, options: VolpathOptions, record: PassRecord, seed: int, paths: int
+) -> None:
+    """Trace paths from the receiver and connect them to the laser, into a record."""
+    rng = pass_streams(seed, _STREAM, paths)
+    start = sampler.sample(dr.arange(mi.UInt32, paths), paths, rng)
+    path = ConnectedPath.start(scene.receiver.pose, start.direction, start.weight > 0)
+    tracer = PathTracer(scene, options, LaserLight(scene, record))
+    record.rays += tracer.trace(path, rng, start.pixel, start.weight)
+
+
+class VolpathRenderer(PassRenderer):
+    """Renders passes with the path tracer.
+
+    Parameters
+    ----------
+    scene, classes, paths
+        As for `PassRenderer`.
+    options
+        Options of the path tracer.
+    """
+
+    def __init__(self, scene: LidarScene, classes: PathClasses, paths: int, options: VolpathOptions) -> None:
+        super().__init__(scene, classes, paths)
+        self.options = options
+
+    def trace(self, record: PassRecord, seed: int, paths: int) -> None:
+        """Trace the paths of one pass into a record."""
+        trace_connected(self.scene, self.sampler, self.options, record, seed, paths)

@@ -1,0 +1,1 @@
+"""Phase functions of water and of what floats in it."""

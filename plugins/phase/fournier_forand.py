@@ -1,0 +1,63 @@
+"""Phase-function plugin ``fournier_forand``: the standard phase function of natural water."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.physics.water.phase import fournier_forand_backscatter_ratio, fournier_forand_parameters
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
+
+
+class FournierForand(TabulatedPhaseFunction):
+    r"""Fournier-Forand phase function (``fournier_forand``).
+
+    =================  =====  ==========================================================================================
+    Parameter          Type   Meaning
+    =================  =====  ==========================================================================================
+    backscatter_ratio  float  Backscattered share of the scattering bb/b, 3.4e-8 to 0.4999. Default: 0.0183
+    refractive_index,  float  Instead: index of the particles relative to water, above 1, and slope of their size
+    junge_slope               distribution, 3 to 5 (give both)
+    =================  =====  ==========================================================================================
+
+    Scattering by particles with a power-law size distribution (Fournier and Forand 1994; closed form of Fournier and
+    Jonasz 1999). A backscatter ratio alone picks index and slope on the line
+    :math:`n = 1.01 + 0.1542 (\mu - 3)` (Mobley, Sundman and Boss 2002, doi:10.1364/AO.41.001035).
+
+    The function rises without bound towards 0 degrees. It is tabulated as power laws of
+    :math:`s = \sin^2(\theta/2)` over twelve decades and sampled exactly, the core below 2 microradian included.
+
+    .. code-block:: xml
+
+        <phase type="fournier_forand">
+            <float name="backscatter_ratio" value="0.04"/>
+        </phase>
+
+    .. code-block:: python
+
+        {'type': 'fournier_forand', 'backscatter_ratio': 0.04}
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        if "refractive_index" in props or "junge_slope" in props:
+            if "backscatter_ratio" in props or not ("refractive_index" in props and "junge_slope" in props):
+                raise UserError("fournier_forand: give backscatter_ratio, or both refractive_index and junge_slope")
+            self.refractive_index = in_range("refractive_index", props["refractive_index"], 1.0001, 2.0)
+            self.junge_slope = in_range("junge_slope", props["junge_slope"], 3.0001, 4.9999)
+        else:
+            ratio = props.get("backscatter_ratio", 0.0183)
+            self.refractive_index, self.junge_slope = fournier_forand_parameters(ratio)
+        super().__init__(props, PowerLawTable.fournier_forand(self.refractive_index, self.junge_slope))
+        self.backscatter_ratio = fournier_forand_backscatter_ratio(self.refractive_index, self.junge_slope)
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return (
+            f"FournierForand[backscatter_ratio={self.backscatter_ratio:g}, refractive_index={self.refractive_index:g}, "
+            f"junge_slope={self.junge_slope:g}]"
+        )
+
+
+mi.register_phase("fournier_forand", lambda props: FournierForand(props))

@@ -1,0 +1,60 @@
+"""Phase-function plugin ``measured_phase``: a user's table of angles and values."""
+
+from __future__ import annotations
+
+import logging
+
+import mitsuba as mi
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.water.phase_file import read_phase_table
+from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
+
+logger = logging.getLogger(__name__)
+
+#: Share by which a table may miss the normalisation without a warning.
+_TOLERATED = 0.02
+
+
+class MeasuredPhase(TabulatedPhaseFunction):
+    r"""Measured phase function (``measured_phase``).
+
+    =========  ======  =================================================================================================
+    Parameter  Type    Meaning
+    =========  ======  =================================================================================================
+    filename   string  Text file of two columns: scattering angle [deg], increasing, at least 10, the last 170 or more;
+                       and value [1/sr]. Any other unit serves, a volume scattering function too: the values are
+                       normalised, with a warning when they were off by more than 2 %
+    =========  ======  =================================================================================================
+
+    Interpolated in log-log, and continued below the first angle with the power of the first two
+    (`mitransient_lidar.physics.water.phase_file.read_phase_table`). Sampled exactly into the forward peak.
+
+    .. code-block:: xml
+
+        <phase type="measured_phase">
+            <string name="filename" value="harbour.csv"/>
+        </phase>
+
+    .. code-block:: python
+
+        {'type': 'measured_phase', 'filename': 'harbour.csv'}
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        if "filename" not in props:
+            raise UserError("measured_phase: filename is missing: the file of angles and values")
+        self.filename = props["filename"]
+        table, integral = read_phase_table(self.filename)
+        if abs(integral - 1) > _TOLERATED:
+            logger.warning(
+                "%s: the values integrate to %.3g over the sphere; they are normalised", self.filename, integral
+            )
+        super().__init__(props, table)
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"MeasuredPhase[{self.filename}]"
+
+
+mi.register_phase("measured_phase", lambda props: MeasuredPhase(props))

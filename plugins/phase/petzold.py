@@ -1,0 +1,54 @@
+"""Phase-function plugin ``petzold``: measured phase functions of natural waters."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.phase import petzold_average_particle
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
+
+_AVERAGE = "average_particle"
+
+
+class Petzold(TabulatedPhaseFunction):
+    r"""Petzold's measured phase functions (``petzold``).
+
+    =========  ======  =================================================================================================
+    Parameter  Type    Meaning
+    =========  ======  =================================================================================================
+    water      string  ``average_particle``, or one of the measured waters ``clear`` (ocean off the Bahamas, bb/b
+                       0.044), ``coastal`` (off California, 0.013) and ``turbid`` (San Diego harbour, 0.020). Default:
+                       ``average_particle``
+    =========  ======  =================================================================================================
+
+    Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised; below 0.1 degrees they go on as
+    powers of the angle. The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a
+    backscatter ratio of 0.0183 and a mean cosine of 0.924. The three waters hold the scattering of the water itself.
+
+    .. code-block:: xml
+
+        <phase type="petzold">
+            <string name="water" value="coastal"/>
+        </phase>
+
+    .. code-block:: python
+
+        {'type': 'petzold', 'water': 'coastal'}
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.water = props.get("water", _AVERAGE)
+        if self.water != _AVERAGE and self.water not in PETZOLD_WATERS:
+            raise UserError(f"water = {self.water!r} must be one of {', '.join([_AVERAGE, *PETZOLD_WATERS])}")
+        measured = petzold_average_particle() if self.water == _AVERAGE else petzold_water(self.water)
+        super().__init__(props, PowerLawTable.from_function(measured))
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"Petzold[water={self.water}]"
+
+
+mi.register_phase("petzold", lambda props: Petzold(props))

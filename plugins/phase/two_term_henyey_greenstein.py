@@ -1,0 +1,90 @@
+"""Phase-function plugin ``two_term_henyey_greenstein``: a forward and a backward Henyey-Greenstein lobe."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio
+from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
+
+
+class TwoTermHenyeyGreenstein(mi.PhaseFunction):
+    r"""Two-term Henyey-Greenstein phase function (``two_term_henyey_greenstein``).
+
+    ==========  =====  =================================================================================================
+    Parameter   Type   Meaning
+    ==========  =====  =================================================================================================
+    weight      float  Share of the forward lobe, 0 to 1. Default: 0.98
+    g_forward   float  Asymmetry of the forward lobe, 0 to 0.999. Default: 0.9
+    g_backward  float  Asymmetry of the backward lobe, 0 to 0.999, as a positive number. Default: 0.3
+    ==========  =====  =================================================================================================
+
+    .. math:: p = w\, p_{HG}(g_f) + (1 - w)\, p_{HG}(-g_b)
+
+    (Haltrin 2002, doi:10.1364/AO.41.001022). Mean cosine :math:`w g_f - (1-w) g_b`.
+
+    .. code-block:: xml
+
+        <phase type="two_term_henyey_greenstein">
+            <float name="weight" value="0.98"/>
+            <float name="g_forward" value="0.93"/>
+            <float name="g_backward" value="0.3"/>
+        </phase>
+
+    .. code-block:: python
+
+        {'type': 'two_term_henyey_greenstein', 'weight': 0.98, 'g_forward': 0.93, 'g_backward': 0.3}
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.weight = in_range("weight", props.get("weight", 0.98), 0.0, 1.0)
+        self.g_forward = in_range("g_forward", props.get("g_forward", 0.9), 0.0, 0.999)
+        self.g_backward = in_range("g_backward", props.get("g_backward", 0.3), 0.0, 0.999)
+        self.backscatter_ratio = self.weight * henyey_greenstein_backscatter_ratio(self.g_forward) + (
+            1 - self.weight
+        ) * henyey_greenstein_backscatter_ratio(-self.g_backward)
+        self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
+
+    def eval_pdf(
+        self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """Return the phase function [1/sr] of a direction, which is its density, too."""
+        value = self._value(dr.dot(-mei.wi, wo))
+        return mi.Spectrum(value), value
+
+    def sample(
+        self,
+        ctx: mi.PhaseFunctionContext,
+        mei: mi.MediumInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
+        """Sample a direction distributed as the phase function."""
+        cosine = dr.select(
+            sample1 < self.weight,
+            sample_henyey_greenstein(sample2.x, self.g_forward),
+            sample_henyey_greenstein(sample2.x, -self.g_backward),
+        )
+        wo = deflect(mi.Frame3f(-mei.wi), 0.5 * (1 - cosine), dr.two_pi * sample2.y)
+        return wo, mi.Spectrum(1), self._value(cosine)
+
+    def _value(self, cosine: mi.Float) -> mi.Float:
+        forward = henyey_greenstein(cosine, self.g_forward)
+        return self.weight * forward + (1 - self.weight) * henyey_greenstein(cosine, -self.g_backward)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters: a changed phase function is loaded anew."""
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return (
+            f"TwoTermHenyeyGreenstein[weight={self.weight:g}, g_forward={self.g_forward:g}, "
+            f"g_backward={self.g_backward:g}]"
+        )
+
+
+mi.register_phase("two_term_henyey_greenstein", lambda props: TwoTermHenyeyGreenstein(props))

@@ -1,0 +1,22 @@
+"""Run commands in the process of the tests, and check how they refuse invalid input."""
+
+from __future__ import annotations
+
+from typer.testing import CliRunner
+
+from mitransient_lidar.cli.app import app
+
+
+def run(*arguments):
+    """Return the result of a command, whose arguments may be of any type."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def assert_refused(result, *parts):
+    """Check for one sentence on stderr that contains `parts`, nothing on stdout, and exit code 2."""
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for part in parts:
+        assert part in result.stderr

@@ -1,0 +1,232 @@
+"""Known echoes in noise and clutter: moments of samples, best weights, performance and times."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+from significance import FALSE_ALARM, largest_z
+
+from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
+from mitransient_lidar.analysis.detection.statistics import (
+    Cases,
+    clutter_covariance,
+    matched_weights,
+    sample_moments,
+    within_range,
+)
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
+from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+
+T = np.arange(60)
+LIGHT = 4e-8 * (0.2 + np.exp(-0.5 * ((T - 40) / 4) ** 2))
+GATE = slice(34, 44)
+
+LOGARITHM = ReceiverChain(
+    LinearDetector(0.5, 100.0, 1.5), Amplifier(2e3, 5.0, bandwidth_mhz=150.0), LogAmplifier(0.2, 1e-3)
+)
+SAMPLED = ReceiverChain(
+    LinearDetector(0.5, 100.0, 1.5),
+    Amplifier(2e4, 5.0, bandwidth_mhz=80.0, response="gaussian"),
+    digitiser=Digitiser(12, 1.0, -0.1, sampling_ghz=0.5),
+)
+
+
+@pytest.mark.parametrize(
+    ("chain", "gate", "scale"),
+    [
+        (RECEIVERS["apd"], GATE, 1.0),
+        (RECEIVERS["sipm"], GATE, 1.0),
+        (RECEIVERS["ideal"], GATE, 1.0),
+        (LOGARITHM, GATE, 10.0),
+        (SAMPLED, slice(15, 22), 1.0),
+    ],
+    ids=["apd", "sipm", "ideal", "logarithm", "sampled"],
+)
+def test_moments_are_those_of_drawn_shots(chain, gate, scale):
+    light = scale * np.array([LIGHT, 0.5 * LIGHT])
+    shots = 8000
+    drawn = chain.apply(light, 1.0, shots, 5, 1e-9).signal[..., gate].astype(float)
+    found = sample_moments(chain, light, 1.0, gate, 1e-9)
+    samples = drawn.shape[-1]
+    assert found.covariance.shape == (2, samples, samples)
+    for i in range(2):
+        variance = np.diag(found.covariance[i])
+        limit = largest_z(shots, 2 * samples**2 * 5)
+        assert np.max(np.abs(drawn[:, i].mean(axis=0) - found.mean[i]) / np.sqrt(variance / shots)) < limit
+        # Of normal samples, with a tenth for the fourth moments of what is not quite normal.
+        error = 1.1 * np.sqrt((np.outer(variance, variance) + found.covariance[i] ** 2) / shots)
+        assert np.max(np.abs(np.cov(drawn[:, i].T) - found.covariance[i]) / error) < limit
+
+
+def test_moments_know_correlations():
+    """A single pole of 200 MHz and bins of 1 ns leave neighbours a correlation of exp(-1.257) = 0.285, if coarse."""
+    found = sample_moments(RECEIVERS["apd"], LIGHT, 1.0, GATE)
+    variance = np.diag(found.covariance)
+    assert np.all(np.diag(found.covariance, 1) > 0.2 * np.sqrt(variance[1:] * variance[:-1]))
+    np.testing.assert_allclose(variance, RECEIVERS["apd"].expected(LIGHT, 1.0).variance[GATE])
+
+
+def test_range_is_kept_by_less_gain():
+    chain = RECEIVERS["apd"]
+    assert within_range(chain, LIGHT, 1.0, GATE) is chain
+    strong = within_range(chain, 100 * LIGHT, 1.0, GATE)
+    assert strong.amplifier.transimpedance_ohm < 0.5 * chain.amplifier.transimpedance_ohm
+    assert np.max(strong.expected(100 * LIGHT, 1.0).saturation[GATE]) < 1e-8
+    # Only as much less as it takes: two tenths more saturate.
+    more = replace(
+        strong, amplifier=replace(strong.amplifier, transimpedance_ohm=1.2 * strong.amplifier.transimpedance_ohm)
+    )
+    assert np.max(more.expected(100 * LIGHT, 1.0).saturation[GATE]) > 1e-4
+    assert within_range(RECEIVERS["ideal"], 100 * LIGHT, 1.0, GATE) is RECEIVERS["ideal"]
+
+
+def test_range_before_the_gate_does_not_count():
+    surface = LIGHT + 1e-3 * np.exp(-0.5 * ((T - 10) / 2) ** 2)
+    assert within_range(RECEIVERS["apd"], surface, 1.0, GATE) is RECEIVERS["apd"]
+
+
+def test_weights_subtract_what_is_correlated():
+    """C^-1 (1, 0) of a correlation r is (1, -r)/(1 - r^2), the square of its signal-to-noise ratio 1/(1 - r^2)."""
+    covariance = np.array([[1.0, 0.6], [0.6, 1.0]])
+    weights = matched_weights([1, 0], covariance)
+    np.testing.assert_allclose(weights, [1, -0.6])
+    assert 1 / (weights @ covariance @ weights) == pytest.approx(1 / (1 - 0.36))
+
+
+def test_samples_without_noise_take_no_part():
+    np.testing.assert_allclose(matched_weights([1, 5, 2], np.diag([1.0, 0.0, 1e-30])), [2.5e-31, 0, 0.5])
+
+
+def one_case(rise, covariance, factor=1.0):
+    null = np.zeros((1, len(rise)))
+    return Cases(null, covariance[None], null + rise, factor * covariance[None])
+
+
+def test_probability_of_detection_in_closed_form():
+    """3.0902 + 1.2816 standard deviations are found with 0.9 at a false alarm of 0.001."""
+    statistic = one_case(np.array([3.0, 4.0]) * 4.3718 / 5, np.eye(2)).statistic()
+    assert statistic.deflection == pytest.approx(4.3718)
+    assert float(statistic.detection(1e-3)) == pytest.approx(0.9, abs=1e-5)
+    assert statistic.area() == pytest.approx(norm.cdf(4.3718 / np.sqrt(2)))
+
+
+def test_noise_with_the_target_counts():
+    statistic = one_case(np.array([3.0]), np.eye(1), factor=4.0).statistic()
+    assert float(statistic.detection(1e-3)) == pytest.approx(norm.cdf((3 - norm.isf(1e-3)) / 2))
+
+
+def test_no_other_weights_do_better():
+    random = np.random.default_rng(1)
+    root = random.normal(size=(5, 5))
+    covariance, rise = root @ root.T, random.normal(size=5)
+    best = one_case(rise, covariance).statistic().deflection
+    assert best == pytest.approx(np.sqrt(rise @ np.linalg.inv(covariance) @ rise))
+    for weights in random.normal(size=(500, 5)):
+        assert weights @ rise / np.sqrt(weights @ covariance @ weights) < best
+
+
+def test_common_clutter_is_subtracted():
+    """Clutter c in both samples, the target in one: s C^-1 s = (1 + c^2)/(1 + 2 c^2), and 1/(1 + c^2) of one alone."""
+    random = np.random.default_rng(2)
+    clutter = np.repeat(random.normal(0, 3, (400, 1)), 2, axis=1)
+    noise = np.repeat(np.eye(2)[None], 400, axis=0)
+    cases = Cases(clutter, noise, clutter + np.array([1, 0]), noise)
+    both, alone = cases.statistic().deflection, cases.combined(np.array([[1.0, 0.0]])).statistic().deflection
+    # 400 seas know the clutter's spread, and so the deflection, to 3.5 %; little of it is left in the best weighting.
+    assert both == pytest.approx(np.sqrt(10 / 19), rel=0.02)
+    assert alone == pytest.approx(np.sqrt(1 / 10), rel=5 * 0.035)
+
+
+def test_no_sea_is_judged_by_weights_that_have_seen_it():
+    """Weights of 8 seas in 10 samples fit them: their own spread is below that on new seas."""
+    random = np.random.default_rng(3)
+    root = random.normal(size=(10, 10))
+    noise = np.repeat(0.01 * np.eye(10)[None], 9, axis=0)
+    stated, new, own = [], [], []
+    for _ in range(150):
+        seas = random.normal(size=(9, 10)) @ root
+        statistic = Cases(seas, noise, seas + 1, noise).statistic()
+        stated.append(statistic.null_sd**2)
+        learnt = Cases(seas, noise, seas + 1, noise).others(0)
+        weights = learnt.weights()
+        new.append(weights @ (root.T @ root + noise[0]) @ weights)
+        own.append(np.var(learnt.null_mean @ weights, ddof=1) + 0.01 * weights @ weights)
+    difference = np.array(stated) - np.array(new)
+    # The mean of 8 seas is not known either, which adds an eighth at most.
+    limit = largest_z(150) * difference.std(ddof=1) / np.sqrt(150)
+    assert -limit < difference.mean() < 0.125 * np.mean(new) + limit
+    gap = np.array(new) - np.array(own)
+    assert gap.mean() > largest_z(150) * gap.std(ddof=1) / np.sqrt(150)
+
+
+def test_clutter_of_many_cases_is_their_covariance():
+    random = np.random.default_rng(5)
+    truth = np.array([[4.0, 1.5], [1.5, 1.0]])
+    found = clutter_covariance(random.multivariate_normal([1, 2], truth, 20000))
+    np.testing.assert_allclose(found, truth, rtol=0.06)
+
+
+def test_clutter_of_few_cases_has_no_blind_direction():
+    few = np.random.default_rng(6).normal(size=(4, 12))
+    found = clutter_covariance(few)
+    np.testing.assert_allclose(np.diag(found), few.var(axis=0, ddof=1))
+    assert np.linalg.eigvalsh(np.cov(few.T))[0] < 1e-10
+    assert np.linalg.eigvalsh(found)[0] > 0.05
+    # Independent samples: more than half of their chance correlations is taken off.
+    assert np.abs(found - np.diag(np.diag(found))).mean() < 0.5 * np.abs(np.cov(few.T)[~np.eye(12, dtype=bool)]).mean()
+
+
+STEPS = np.linspace(-3, 3, 31)
+NOISE = 0.02
+
+
+def echoes(steps, width=3.0):
+    return np.exp(-0.5 * ((T[:40] - 20 - np.asarray(steps)[:, None]) / width) ** 2)
+
+
+def test_bound_of_the_delay_in_closed_form():
+    """White noise n a sample of 1 ns: the integral of s'^2 of a Gaussian of width w is sqrt(pi)/(2 w)."""
+    bound = delay_bound(echoes(STEPS), STEPS, NOISE**2 * np.eye(40))
+    assert bound == pytest.approx(NOISE / np.sqrt(np.sqrt(np.pi) / (2 * 3.0)), rel=0.005)
+
+
+def test_delays_reach_the_bound():
+    random = np.random.default_rng(8)
+    shots = 4000
+    true = 0.73
+    records = 2.5 * echoes([true]) + random.normal(0, NOISE, (shots, 40))
+    found = delays(records, echoes(STEPS), STEPS, NOISE**2 * np.eye(40))
+    bound = delay_bound(2.5 * echoes(STEPS), STEPS, NOISE**2 * np.eye(40))
+    # The parabola through steps of a fifteenth of the echo's width is off by less than 1e-3 ns.
+    assert abs(found.mean() - true) < largest_z(shots) * bound / np.sqrt(shots) + 1e-3
+    low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], shots - 1) / (shots - 1)
+    assert 0.97 * low < found.var(ddof=1) / bound**2 < 1.03 * high
+
+
+def test_delays_stay_within_the_search():
+    found = delays(echoes([9.0]), echoes(STEPS), STEPS, np.eye(40))
+    assert 2.8 <= found[0] <= 3.0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: sample_moments(RECEIVERS["apd"], LIGHT, 1.0, slice(60, 70)), "must choose one or more of 60"),
+        (lambda: sample_moments(RECEIVERS["apd"], LIGHT, 1.0, slice(0, 9, 2)), "without a step"),
+        (lambda: sample_moments(RECEIVERS["apd"], -LIGHT, 1.0, GATE), "must not be negative"),
+        (lambda: matched_weights([1, 2], np.eye(3)), r"covariance of shape \(3, 3\) must be \(2, 2\)"),
+        (lambda: matched_weights([0, 0], np.eye(2)), "signal must not be 0"),
+        (lambda: matched_weights([1, 0], np.ones((2, 2))), "covariance must be positive definite"),
+        (lambda: clutter_covariance(np.ones((1, 3))), "2 or more cases"),
+        (lambda: Cases(*[np.ones((2, 1)), np.ones((2, 1, 1))] * 2).statistic(), "cases = 2 must be 1 or at least 3"),
+        (lambda: delays(np.ones((2, 40)), echoes(STEPS[:2]), STEPS[:2], np.eye(40)), "templates of shape"),
+        (lambda: delays(np.ones((2, 40)), echoes(STEPS), STEPS**3, np.eye(40)), "equal steps"),
+        (lambda: delays(np.ones((2, 40)), echoes(STEPS), STEPS, np.ones((40, 40))), "must be positive definite"),
+        (lambda: delay_bound(echoes(STEPS), STEPS[:5], np.eye(40)), "templates of shape"),
+    ],
+)
+def test_invalid_input(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

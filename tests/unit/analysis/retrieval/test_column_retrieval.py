@@ -1,0 +1,91 @@
+"""Water and bottom from columns, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from oracles.lidar_equation import bottom_energy, column_power, cos_water
+
+from mitransient_lidar.analysis.retrieval.column_retrieval import (
+    backscatter_of_level,
+    bottom_class,
+    bottom_reflectance,
+    water_of_column,
+)
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.water.layers import WaterColumn
+
+THETA = math.radians(20)
+SYSTEM = LidarSystem(200, THETA, 3.645e-3, 0.025, 1.34, 1.364)
+A, BB = np.array([0.05, 0.15, 0.4]), np.array([0.002, 0.006, 0.03])
+KD = A + 4.18 * (1 - 0.52 * np.exp(-10.8 * A)) * BB  # Lee, Du and Arnone (2005)
+
+
+def test_level_of_the_lidar_equation():
+    water = WaterColumn([0], [0.3], [0.15], [0.006])
+    power = column_power(SYSTEM, water, 1.7e-3, 0.0, THETA)
+    gain = SYSTEM.water_gain(0.0, THETA)
+    assert backscatter_of_level(power, gain, 1.364) == pytest.approx(0.15 * 1.7e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize(("spot", "decay"), [(11.0, A + BB), (6.4, KD), (8.5, 0.5 * (A + BB + KD))])
+def test_water_of_its_own_model(spot, decay):
+    """K between a + bb and Kd by the spot; the level is 1.13 bb/(2 pi), steeper from 1.5 m on."""
+    level = 1.13 * BB / (2 * np.pi) * np.exp(2 * (decay - A - BB) * 1.5)
+    found = water_of_column(decay, level, spot, first_path=1.5)
+    np.testing.assert_allclose(found.absorption, A, rtol=1e-6)
+    np.testing.assert_allclose(found.backscattering, BB, rtol=1e-6)
+    np.testing.assert_allclose(found.kd, KD, rtol=1e-6)
+    np.testing.assert_allclose(found.attenuation, A + BB / 0.0183, rtol=1e-6)
+    np.testing.assert_allclose(found.attenuation_low, A + BB / 0.044, rtol=1e-6)
+    np.testing.assert_allclose(found.attenuation_high, A + BB / 0.01, rtol=1e-6)
+
+
+def test_columns_that_no_water_makes_are_nan():
+    found = water_of_column([0.05, np.nan, -0.1, 0.1], [0.1, 1e-3, 1e-3, np.nan], 11.0)
+    assert np.isnan(found.kd).all()
+    twice = water_of_column(0.1, 1e-3, 11.0, phase_factor=2.0)
+    assert twice.backscattering == pytest.approx(2 * np.pi * 1e-3 / (1.13 * 2))
+    with pytest.raises(ValueError, match="spot_diameter = 3 must be at least 6"):
+        water_of_column(0.1, 1e-3, 3.0)
+    with pytest.raises(ValueError, match="first_path = -1 must not be negative"):
+        water_of_column(0.1, 1e-3, 8.0, first_path=-1)
+    with pytest.raises(ValueError, match="phase_factor = 0 must be greater"):
+        water_of_column(0.1, 1e-3, 8.0, phase_factor=0)
+
+
+def test_reflectance_is_the_ratio_of_bottom_and_column():
+    """Both from the lidar equation, single scattering: what lies above cancels, at any depth."""
+    water = WaterColumn([0], [0.3], [0.15], [0.006])
+    for depth in (2.0, 8.0, 15.0):
+        energy = bottom_energy(SYSTEM, water, depth, 0.23, THETA)
+        power = column_power(SYSTEM, water, 1.7e-3, depth, THETA)
+        found = bottom_reflectance(energy, power, 0.15 * 1.7e-3, cos_water(SYSTEM, THETA), 1.364)
+        assert found == pytest.approx(0.23, rel=1e-12)
+    assert np.isnan(bottom_reflectance(1.0, 0.0, 1e-3, 1.0, 1.364))
+    assert bottom_reflectance(1e-12, 1e-4, 1e-3, 1.0, 1.0) == pytest.approx(math.pi * C0 / 2 * 1e-3 * 1e-8)
+
+
+def test_classes():
+    names, share = bottom_class([0.05, 0.1, 0.3, np.nan], [0.05, 0.02, 0.0, 0.1])
+    assert names == ["dark", "medium", "bright"]
+    # Normal distribution function at 1 and 3, and at 0 and 5.
+    np.testing.assert_allclose(share[0], [0.8413447, 0.9986501 - 0.8413447, 1 - 0.9986501], atol=1e-6)
+    np.testing.assert_allclose(share[1], [0.5, 0.5, 2.9e-7], atol=1e-6)
+    assert share[2].tolist() == [0, 0, 1]
+    assert np.isnan(share[3]).all()
+    assert bottom_class(0.3, 0.01, {"mud": 0, "sand": 0.15})[1].round(6).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("edges", [{}, {"mud": 0.1}, {"mud": 0.0, "sand": 0.0}])
+def test_classes_out_of_order(edges):
+    with pytest.raises(ValueError, match="must have lower edges that increase from 0"):
+        bottom_class(0.1, 0.01, edges)
+
+
+def test_bad_numbers():
+    with pytest.raises(ValueError, match="gain = 0 must be greater than 0"):
+        backscatter_of_level(1.0, 0.0, 1.34)
+    with pytest.raises(ValueError, match="stderr = -1 must not be negative"):
+        bottom_class(0.1, -1.0)

@@ -1,0 +1,194 @@
+"""Decay of the column signal: the fit and its error on synthetic records, and invalid input."""
+
+import logging
+
+import numpy as np
+import pytest
+from command_line import run
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.retrieval.column_slope import ColumnBins, effective_attenuation
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results.geometry import LidarGeometry
+from mitransient_lidar.studies.fov_sweep import fov_sweep, slope_and_error
+
+C0 = 0.299792458  # m/ns
+HEIGHT, INDEX, GROUP = 150.0, 1.33, 1.4
+
+
+def record(attenuation, noise=0.0, seed=0, **changes):
+    """A vertical lidar's ideal record: the solid angle of the aperture falls with 1/(n H + D)^2."""
+    start, width, bins = 2 * HEIGHT / C0 - 10, 0.5, 260
+    depth = C0 * (start + (np.arange(bins) + 0.5) * width - 2 * HEIGHT / C0) / (2 * GROUP)
+    energy = np.where(depth > 0, np.exp(-2 * attenuation * depth) / (INDEX * HEIGHT + depth) ** 2, 0)
+    energy = energy * (1 + noise * np.random.default_rng(seed).standard_normal(bins))
+    attributes = {"altitude": HEIGHT, "off_nadir_deg": 0.0, "refractive_index": INDEX, "group_index": GROUP}
+    attributes |= {"divergence_mrad": 2.0, "field_of_view_mrad": 10.0, **changes}
+    arrays = [np.array([energy, energy]), np.abs([noise * energy, noise * energy])] * 2
+    return results.build(
+        *arrays,
+        time=TimeAxis(start, width, bins),
+        pixel_names=["a", "b"],
+        pixel_centres_mrad=[(1, 0), (-1, 0)],
+        attributes=attributes,
+    )
+
+
+def test_slope_without_geometry():
+    k, _ = effective_attenuation(record(0.2), 0.5, 9.0)
+    # Without the solid angle it would be 1/(n H) = 0.005 too steep.
+    assert k == pytest.approx(0.2, abs=1e-9)
+
+
+def test_standard_error_is_the_scatter_of_the_slope():
+    found = np.array([effective_attenuation(record(0.2, noise=0.05, seed=seed), 1.0, 5.0) for seed in range(300)])
+    # Both pixels share their noise here, and count as independent: the error comes out by sqrt(2) too small.
+    pull = (found[:, 0] - 0.2) / found[:, 1] / np.sqrt(2)
+    assert abs(pull.mean()) < 0.2
+    assert pull.std() == pytest.approx(1, abs=0.12)
+
+
+def test_jackknife_sees_correlated_bins():
+    """Passes with bins correlated in blocks of eight: eight times the variance of independent bins."""
+    geometry = LidarGeometry.level(HEIGHT, 0.0, INDEX, GROUP)
+    time = TimeAxis(2 * HEIGHT / C0 - 0.25, 0.5, 100)
+    column = ColumnBins.between(geometry, 1e-3, time, 0.5, 5.0)
+    bins, rng = column.inside.size, np.random.default_rng(3)
+    ideal = np.exp(-0.4 * column.path) * column.gain
+    found = []
+    for _ in range(200):
+        blocks = np.repeat(rng.standard_normal((40, -(-bins // 8))), 8, axis=1)[:, :bins]
+        found.append(slope_and_error(column, ideal * (1 + 0.2 * blocks)))
+    slopes, errors = np.array(found).T
+    assert errors.mean() == pytest.approx(slopes.std(), rel=0.15)
+    _, independent = column.weights(ideal, ideal * 0.2 / np.sqrt(40))
+    assert errors.mean() > 2 * independent
+
+
+@pytest.mark.parametrize(
+    ("depths", "changes", "message"),
+    [
+        ((5, 1), {}, "max_depth = 1 m must be greater than min_depth = 5 m"),
+        ((-1, 5), {}, "min_depth = -1 must not be negative"),
+        ((1, np.nan), {}, "max_depth = nan must be finite"),
+        ((1, 40), {}, "the record must contain .* the depths from 1 to 40 m: change time_start_ns or bin_count"),
+        ((1, 1.05), {}, "have 1 bins between them and must have at least 3"),
+        # The beam's edge, 15 mrad out, is 1.533 m of air farther: 1.095 m of water, at cos 0.9266.
+        (
+            (0.5, 5),
+            {"off_nadir_deg": 30.0, "divergence_mrad": 10.0, "field_of_view_mrad": 40.0},
+            "min_depth = 0.5 m must be at least 1.01 m",
+        ),
+    ],
+)
+def test_depths_that_do_not_serve(depths, changes, message):
+    with pytest.raises(UserError, match=message):
+        effective_attenuation(record(0.2, **changes), *depths)
+
+
+def test_a_column_without_signal():
+    dark = record(0.2)
+    dark["impulse_response"][:, 100:] = 0.0
+    with pytest.raises(UserError, match="the column has no signal in"):
+        effective_attenuation(dark, 1, 5)
+    noisy = record(0.2)
+    noisy["impulse_response_stderr"] = 0.8 * noisy["impulse_response"]
+    with pytest.raises(UserError, match=r"relative standard error, 0\.57 in its worst bin, must be at most 0\.5"):
+        effective_attenuation(noisy, 1, 5)
+
+
+SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_start_ns": 1330, "bin_count": 80}
+
+
+@pytest.mark.parametrize(
+    ("fields", "options", "params", "message"),
+    [
+        ([], {}, {}, r"fov_mrad = \[\] must hold at least one angle"),
+        ([10, -2], {}, {}, r"fov_mrad = \[-2.0, 10.0\] must hold at least one angle, each greater than 0"),
+        ([10, np.inf], {}, {}, "fov_mrad holds inf"),
+        ([10, 6000], {}, {"off_nadir_deg": 20}, "fov_mrad = 6000 must be less than 5495"),
+        ([10], {"passes": 3}, {}, "passes = 3 must lie between 4 and 10000"),
+        (
+            [10],
+            {"max_depth": 7.9},
+            {"off_nadir_deg": 20, "time_start_ns": 1400},
+            r"max_depth = 7.9 m must be at most 7\.2.* 'bottom' can begin",
+        ),
+        ([10], {"max_depth": 7.0}, {"bin_count": 60}, "the record must contain"),
+        (
+            [10],
+            {},
+            {"layer_tops": "0, 3", "attenuation": "0.3, 0.4"},
+            "the water has 2 layers from min_depth = 1 m to max_depth = 5 m",
+        ),
+        ([10], {}, {"attenuation": 0.1, "scattering": 0, "backscattering": 0}, "the column has no signal"),
+        ([10], {}, {"bottom": 5}, "parameter 'bottom' is not one of scene table1"),
+    ],
+)
+def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
+    with pytest.raises(UserError, match=message):
+        fov_sweep("table1", fields, {**SCENE, "bin_count": 110, **params}, **{"passes": 4, **options})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--fov-mrad", "2,wide"], "--fov-mrad 2,wide is not of the form 2,5,8."),
+        (["--fov-mrad", "0,5"], "each greater than 0"),
+        (["--min-depth", "5", "--max-depth", "1"], "max_depth = 1 m must be greater than min_depth = 5 m"),
+        # The far edge, 15 mrad out, meets the surface 7.956 ns late: 0.845 m at the group index 1.364.
+        (["--min-depth", "0.1"], "min_depth = 0.1 m must be at least 0.845 m"),
+        (["--passes", "3"], "passes = 3 must lie between 4 and 10000"),
+        (["--seed", "-1"], "seed = -1 must lie between"),
+    ],
+)
+def test_command_says_one_sentence(tmp_path, arguments, message):
+    done = run("fov-sweep", "table1", "-q", "-o", tmp_path / "sweep.png", *arguments)
+    assert (done.exit_code, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.output
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_writes_table_plot_and_file(tmp_path):
+    target = tmp_path / "new" / "views.svg"
+    define = [part for name, value in SCENE.items() for part in ("-D", f"{name}={value}")]
+    command = [
+        "fov-sweep",
+        "table1",
+        *define,
+        "--fov-mrad",
+        "20,5",
+        "--passes",
+        "4",
+        "--max-depth",
+        "4",
+        "-q",
+        "-o",
+        str(target),
+    ]
+    done = run(*command)
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert lines[:2] == [str(target), str(target.with_suffix(".nc"))]
+    # 5 mrad from 200 m: a radius of 0.5 m, 0.15 attenuation lengths.
+    assert lines[4].split()[:3] == ["5", "0.5", "0.150"]
+    assert lines[5].split()[:3] == ["20", "2", "0.600"]
+    assert lines[6].startswith("c = 0.3000, Kd = 0.17")
+    import xarray as xr
+
+    with xr.open_dataset(target.with_suffix(".nc"), engine="h5netcdf") as found:
+        assert found["impulse_response"].shape == (2, 80)
+        assert found.attrs["scene.field_of_view_mrad"] == "20.0"
+    assert "<!-- field of view (mrad) -->" in target.read_text()  # matplotlib adds texts as comments
+
+
+def test_a_small_surface_is_warned_of(caplog):
+    turbid = {**SCENE, "off_nadir_deg": 20, "time_start_ns": 1400, "attenuation": 1, "scattering": 0.9}
+    patch = {"surface_size": 4, "surface_cell_size": 0.25}
+    with caplog.at_level(logging.WARNING):
+        fov_sweep("table1", [15], {**turbid, **patch}, passes=4, max_depth=3)
+        assert "the surface is smaller than the spread of the light" in caplog.text
+        caplog.clear()
+        fov_sweep("table1", [15], turbid, passes=4, max_depth=3)
+    assert caplog.text == ""

@@ -1,0 +1,314 @@
+"""Estimates from synthetic results: slopes, bottom and water of the lidar equation, files, drawings, the command."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+from scipy.stats import exponnorm, norm, truncnorm
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.retrieval import retrieve
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.plots import retrieval
+from mitransient_lidar.studies import shot_series
+
+C0 = 0.299792458  # m/ns
+N = 1.34
+THETA = math.radians(20)
+COS_WATER = math.sqrt(1 - (math.sin(THETA) / N) ** 2)
+DT, START, BINS = 0.5, 1385.0, 400
+EDGES = START + DT * np.arange(BINS + 1)
+TIME = EDGES[:-1] + 0.5 * DT
+SIGMA = 4.0 / FWHM_PER_SIGMA
+SURFACE = 2 * 200 / math.cos(THETA) / C0
+ANGLE_X = np.array([3.0, 3.0, -3.0, -3.0])
+ANGLE_Y = np.array([-3.0, 3.0, -3.0, 3.0])
+ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # pulse, optics, air, aperture [J m^2]
+A, BB, RHO, DEPTH = 0.12, 0.008, 0.25, 8.0
+ATTRIBUTES = {
+    "altitude": 200.0,
+    "off_nadir_deg": 20.0,
+    "refractive_index": N,
+    "group_index": N,
+    "pulse_fwhm_ns": 4.0,
+    "pulse_energy_mj": 5.0,
+    "aperture_area": 0.025,
+    "field_of_view_mrad": 60.0,
+    "divergence_mrad": 0.1,
+    "surface_time_ns": SURFACE,
+    "scene.optical_efficiency": "0.9",
+    "scene.two_way_atmospheric_transmittance": "0.9",
+}
+
+
+def normal_transmittance():
+    s = (math.cos(THETA) - N * COS_WATER) / (math.cos(THETA) + N * COS_WATER)
+    p = (N * math.cos(THETA) - COS_WATER) / (N * math.cos(THETA) + COS_WATER)
+    return 1 - 0.5 * (s**2 + p**2)
+
+
+def solid_angle(path):
+    """Per area of the aperture, from a path below a level sea."""
+    reach = 200 / math.cos(THETA)
+    ratio = COS_WATER / math.cos(THETA)
+    return 1 / ((N * reach + path) * (N * reach * ratio + path / ratio))
+
+
+def waveform(delay=0.0, share=0.25, glint=2e-13, factor=1.0, k=A + BB, depth=DEPTH):
+    """A pixel's share of the power [W] over a level sea; a sea surface factor on all that has crossed it."""
+    rate = C0 / N * k  # 1/ns
+    path = depth / COS_WATER
+    surface, bottom = SURFACE + delay, SURFACE + delay + 2 * N * path / C0
+    through = factor * share * ENERGY * normal_transmittance() ** 2
+    # 1.13 is the multiple scattering that `column_retrieval` assumes.
+    level = through * solid_angle(0.0) * 1.13 * BB / (2 * np.pi) * C0 * 1e9 / (2 * N)
+    echo = through * solid_angle(path) * RHO / np.pi * COS_WATER * math.exp(-2 * k * path)
+
+    def onset(at):
+        return level / rate * exponnorm.pdf(TIME, 1 / (rate * SIGMA), loc=at, scale=SIGMA)
+
+    def pulse(at, energy):
+        return energy / (DT * 1e-9) * np.diff(norm.cdf(EDGES, at, SIGMA))
+
+    spreading = solid_angle(np.clip((TIME - surface) * C0 / (2 * N), 0, path)) / solid_angle(0.0)
+    column = (onset(surface) - math.exp(-rate * (bottom - surface)) * onset(bottom)) * spreading
+    return pulse(surface, share * glint) + column + pulse(bottom, echo)
+
+
+def plane_delays(along, across):
+    """Two-way delays [ns] of the pixels over a plane through the origin, from rays as vectors."""
+    ray = np.array([math.sin(THETA), 0, -math.cos(THETA)]) + 1e-3 * (
+        np.outer(ANGLE_X, [math.cos(THETA), 0, math.sin(THETA)]) + np.outer(ANGLE_Y, [0, 1, 0])
+    )
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    normal = np.array([-along, -across, 1])
+    return -2 / C0 * (np.array([-200 * math.tan(THETA), 0, 200]) @ normal) / (ray @ normal) - SURFACE
+
+
+def result(values=None, **attributes):
+    values = np.stack([waveform(delay) for delay in plane_delays(0.0, 0.0)]) if values is None else values
+    return results.build(
+        values * DT * 1e-9,
+        1e-4 * values * DT * 1e-9,
+        values,
+        1e-4 * values + 1e-9,
+        time=TimeAxis(START, DT, BINS),
+        pixel_names=["red", "green", "blue", "black"][: len(values)],
+        pixel_centres_mrad=np.stack([ANGLE_X, ANGLE_Y], axis=1)[: len(values)],
+        attributes={**ATTRIBUTES, **attributes},
+    )
+
+
+def series(shots):
+    return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
+
+
+def on_axis(**changes):
+    """Four pixels that all see the axis: what a bottom and a column are without the spread of arrivals."""
+    return result(np.stack([waveform(**changes)] * 4))
+
+
+LEVEL = xr.Dataset({"slope_along": 0.0, "slope_across": 0.0, "surface_range": 200 / math.cos(THETA)})
+
+
+def test_slopes_of_shots():
+    planes = [(0.0, 0.0), (0.1, -0.05), (-0.15, 0.08)]
+    shots = series([result(np.stack([waveform(t) for t in plane_delays(*one)])) for one in planes])
+    found = retrieve.surface_slopes(shots)
+    assert found["slope_along"].dims == ("shot",)
+    # 0.01 ns of an echo's time are 0.0015 of a slope here.
+    np.testing.assert_allclose(found["slope_along"], [along for along, _ in planes], atol=2e-3)
+    np.testing.assert_allclose(found["slope_across"], [across for _, across in planes], atol=2e-3)
+    np.testing.assert_allclose(found["surface_height"], 0, atol=0.01)
+    assert float(found["slope_direction_deg"][1]) == pytest.approx(math.degrees(math.atan2(-0.05, 0.1)), abs=2)
+    assert float(found["slope_deg"][2]) == pytest.approx(math.degrees(math.atan(0.17)), abs=0.15)
+    assert found["slope_along"].attrs["units"] == "1"
+
+
+def test_prior_weighs_slopes():
+    outlines = [
+        np.array([[0, 0], [x, 0], [x, y], [0, y]]).ravel().tolist()
+        for x, y in zip(2 * ANGLE_X, 2 * ANGLE_Y, strict=True)
+    ]
+    shot = result(pixel_outlines=json.dumps([[line] for line in outlines]), divergence_mrad=10.0)
+    raw = retrieve.surface_slopes(shot)
+    # Squares of 6 mrad in a beam of 5 mrad: Gaussians cut at 0 and 6.
+    light = truncnorm(0, 1.2, scale=5e-3)
+    assert retrieve.pixel_light(shot).angle_x == pytest.approx(np.sign(ANGLE_X) * light.mean(), rel=1e-3)
+    # Far and near pair with two facets each, alike by 0.4; the time tells tan(theta - tilt).
+    slope = float(raw["slope_along"])
+    tilt = math.atan(slope)
+    lever = light.std() * math.sqrt(1.4) / (2 * light.mean()) * (math.cos(THETA - tilt) / math.cos(tilt)) ** 2
+    level = lever * math.tan(THETA)
+    expected = lever * math.hypot(math.tan(THETA - math.atan(0.5 * slope)), level / math.sqrt(2))
+    assert float(raw["slope_along_stderr"]) == pytest.approx(expected, rel=0.01)
+    weighed = retrieve.surface_slopes(shot, slope_deviation=(0.05, 0.04))
+    error = float(raw["slope_along_stderr"])
+    assert float(weighed["slope_along_stderr"]) == pytest.approx(0.05 * error / math.hypot(0.05, error))
+
+
+def test_bottom_and_water_of_the_lidar_equation():
+    shot = on_axis()
+    seabed = retrieve.bottom(shot, LEVEL)
+    np.testing.assert_allclose(seabed["depth_m"].sel(correction=["level", "slope"]), DEPTH, atol=0.01)
+    # The backscatter that the column shows is 1.13 times that of bb.
+    np.testing.assert_allclose(seabed["reflectance"], RHO, rtol=0.02)
+    assert seabed["class_probability"].sel(bottom_class="bright") > 0.9
+    found = retrieve.water(shot)
+    assert float(found["column_attenuation"]) == pytest.approx(A + BB, rel=0.01)
+    assert float(found["absorption"]) == pytest.approx(A, rel=0.01)
+    assert float(found["backscattering"]) == pytest.approx(BB, rel=0.02)
+    assert float(found["kd"]) == pytest.approx(A + 4.18 * (1 - 0.52 * math.exp(-10.8 * A)) * BB, rel=0.02)
+    assert found["attenuation_low"] < A + BB / 0.02 < found["attenuation_high"]
+    given = retrieve.water(shot, efficiency=0.5 * 0.81 * 0.9)
+    assert float(given["backscattering"]) == pytest.approx(2 * BB, rel=0.02)
+
+
+def test_what_the_surface_does_to_a_shot_is_taken_out():
+    """Three shots through surfaces that pass 1, 0.7 and 1.4 times the light, which echo and column share."""
+    shots = series([on_axis(factor=factor) for factor in (1.0, 0.7, 1.4)])
+    slopes = LEVEL.expand_dims(shot=3)
+    found = retrieve.bottom(shots, slopes)["reflectance"]
+    np.testing.assert_allclose(found.sel(correction="column") / found.sel(correction="column").mean(), 1, atol=2e-3)
+    shares = found.sel(correction="level").values
+    np.testing.assert_allclose(shares / shares[0], [1.0, 0.7, 1.4], rtol=1e-3)
+
+
+def test_depth_follows_height_and_slope():
+    """A surface 0.3 m above the mean level: as far from the lidar, and as much deeper, as vectors say."""
+    height, along = 0.3, 0.1
+    reach = (200 - height) / math.cos(THETA)
+    tilt = math.atan(along)
+    angle = tilt + math.asin(math.sin(THETA - tilt) / N)
+    path = (DEPTH + height) / math.cos(angle)
+    delay = 2 * reach / C0 - SURFACE
+    shot = on_axis(delay=delay, depth=path * COS_WATER)
+    slopes = LEVEL.assign(slope_along=along, surface_range=reach)
+    found = retrieve.bottom(shot, slopes)["depth_m"]
+    assert float(found.sel(correction="slope")) == pytest.approx(DEPTH, abs=0.01)
+    assert abs(float(found.sel(correction="level")) - DEPTH) > 0.03
+
+
+def test_estimate_has_all_known_quantities():
+    whole = retrieve.retrieve(result())
+    assert {"slope_along", "reflectance", "kd"} <= set(whole)
+    narrow = retrieve.retrieve(result(field_of_view_mrad=20.0))
+    assert "kd" not in narrow
+    dark = result(np.stack([waveform(delay, depth=30.0) for delay in plane_delays(0, 0)]))
+    assert np.isnan(retrieve.retrieve(dark)["depth_m"]).all()
+
+
+def short(bins=0, depth=DEPTH):
+    """Four pixels whose record ends before the bottom, or whose column is too short to be fitted."""
+    shot = result(np.stack([waveform(delay, depth=depth) for delay in plane_delays(0.1, 0.0)]))
+    return shot.isel(time=slice(0, bins or None))
+
+
+def test_estimates_without_a_column(tmp_path, caplog):
+    """A record that ends 15 ns behind the surface, and a bottom 1.6 m deep, whose echo leaves no column free."""
+    for shot, depth in ((short(bins=100), math.nan), (short(depth=1.6), 1.6)):
+        caplog.clear()
+        found = retrieve.retrieve(shot)
+        assert float(found["slope_along"]) == pytest.approx(0.1, abs=0.02)
+        assert float(found["depth_m"].sel(correction="slope")) == pytest.approx(depth, abs=0.1, nan_ok=True)
+        assert np.isnan(found["reflectance"]).all()
+        assert np.isnan(found["class_probability"]).all()
+        assert np.isnan(found["kd"])
+        assert caplog.messages == [
+            "no waveform has a column long enough for a fit: the reflectance of the bottom is unknown"
+        ]
+        results.save(shot, tmp_path / "short.nc")
+        done = run("retrieve", tmp_path / "short.nc")
+        assert done.exit_code == 0, done.output
+        for text in ("slope along: +0.1", "bottom: ", "water: no column that can be fitted"):
+            assert text in done.output
+        assert "nan" not in done.output
+
+
+def test_no_estimate():
+    with pytest.raises(UserError, match="nothing can be estimated: no waveform has a surface echo"):
+        retrieve.retrieve(result(np.full((4, BINS), 1e-12)))
+
+
+def test_command(tmp_path):
+    results.save(result(), tmp_path / "shot.nc")
+    written = tmp_path / "out" / "found.nc"
+    done = run("retrieve", tmp_path / "shot.nc", "-o", written, "--slope-deviation", "0.1,0.1")
+    assert done.exit_code == 0, done.output
+    for text in ("slope along: ", "bottom: 8.0", "bright 9", "water (1/m): a 0.1", "c is a guess: "):
+        assert text in done.output
+    expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
+    xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
+    results.save(result(field_of_view_mrad=20.0), tmp_path / "narrow.nc")
+    assert "too narrow" in run("retrieve", tmp_path / "narrow.nc").output
+    for options, sentence in (
+        (["--slope-deviation", "0.1"], "--slope-deviation 0.1 is not of the form 2,5."),
+        (["--efficiency", "2"], "efficiency = 2 must"),
+        (["-o", "found.txt"], "--output found.txt must end in .nc."),
+    ):
+        assert_refused(run("retrieve", tmp_path / "shot.nc", *options), sentence)
+
+
+def test_errors_of_the_drawing(tmp_path):
+    rng = np.random.default_rng(5)
+    truth = rng.normal(0, 0.05, 400)
+    slopes = xr.Dataset(
+        {
+            "true_slope_along": ("shot", truth),
+            "slope_along": ("shot", truth + 0.01 + rng.normal(0, 0.05, 400)),
+            "true_slope_across": ("shot", truth),
+            "slope_across": ("shot", np.full(400, np.nan)),
+        }
+    )
+    guess = slopes["slope_along"].values
+    one = retrieval.slope_statistics(truth, guess)
+    # Equal variances of slope and error: a correlation of 0.71; Fisher's z has the standard error 0.05.
+    assert abs(math.atanh(one["correlation"]) - math.atanh(math.sqrt(0.5))) < 4.5 * 0.05
+    assert one["low"] < one["correlation"] < one["high"]
+    assert one["bias_deg"] == pytest.approx(math.degrees(0.01), abs=4.5 * math.degrees(0.05) / 20)
+    assert one["rms_deg"] == pytest.approx(math.degrees(math.hypot(0.05, 0.01)), rel=0.16)
+    (ax,) = retrieval.plot_slopes({"1x4": slopes}).axes
+    # Across nothing is known, and nothing is drawn but the diagonal.
+    dots, diagonal = ax.lines
+    np.testing.assert_allclose(dots.get_data(), np.degrees(np.arctan([truth, guess])))
+    assert (diagonal.get_slope(), diagonal.get_xy1()) == (1, (0, 0))
+    label = f"towards the lidar: r = {one['correlation']:.2f}, bias {one['bias_deg']:+.1f}°, RMS {one['rms_deg']:.1f}°"
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == [label]
+    assert ax.get_title() == "1x4, 400 shots"
+    with pytest.raises(UserError, match="must hold at least one"):
+        retrieval.plot_slopes({}, tmp_path / "slope.png")
+    with pytest.raises(UserError, match="slopes of 2 shots are known"):
+        retrieval.slope_statistics(truth[:2], truth[:2])
+
+
+def drop(name):
+    shot = result()
+    del shot.attrs[name]
+    return shot
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
+        (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
+        (lambda: retrieve.surface_slopes(result(), slope_deviation=(0.1, 0.0)), "slope_deviation = 0 must be"),
+        (lambda: retrieve.surface_slopes(result(), facets=-1), "facets = -1 must be greater"),
+        (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
+        (lambda: retrieve.bottom(result(), LEVEL, relative_error=2), "relative_error = 2 must lie between"),
+        (lambda: retrieve.bottom(drop("scene.optical_efficiency"), LEVEL), "efficiency must be given"),
+        (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
+        (lambda: retrieve.water(result(), efficiency=3), "efficiency = 3 must lie between"),
+        (lambda: retrieve.water(result().isel(pixel=0)), r"waveform has the dimensions \('time',\)"),
+        (lambda: shot_series.render_shots("fig09_2x2", count=1), "count = 1 must lie between 2"),
+    ],
+)
+def test_invalid_input(call, sentence):
+    with pytest.raises(UserError, match=sentence) as refused:
+        call()
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,210 @@
+"""Planes through surface echoes, against rays that are intersected with planes as vectors."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.analysis.retrieval.surface_slope import PixelLight, fit_plane, steepest, with_prior
+
+C0 = 0.299792458  # m/ns
+THETA = math.radians(20)
+ANGLE_X = np.array([2.8e-3, 2.8e-3, -2.8e-3, -2.8e-3])
+ANGLE_Y = np.array([-2.8e-3, 2.8e-3, -2.8e-3, 2.8e-3])
+POINTS = PixelLight(ANGLE_X, ANGLE_Y, np.zeros(4))
+
+
+def plane_times(angle_x, angle_y, along, across, height=0.0, altitude=200.0, theta=THETA):
+    """Two-way times [ns] of rays to the plane z = height + along x + across y, by vectors."""
+    axis = np.array([math.sin(theta), 0, -math.cos(theta)])
+    far = np.array([math.cos(theta), 0, math.sin(theta)])
+    ray = axis + np.outer(angle_x, far) + np.outer(angle_y, [0.0, 1.0, 0.0])
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    origin = np.array([-altitude * math.tan(theta), 0, altitude])
+    normal = np.array([-along, -across, 1])
+    return 2 / C0 * (np.array([0, 0, height]) - origin) @ normal / (ray @ normal)
+
+
+@pytest.mark.parametrize("theta", [0.0, THETA, math.radians(60)])
+@pytest.mark.parametrize(
+    ("along", "across", "height"), [(0, 0, 0), (0.12, 0, 0.3), (-0.2, 0.07, -0.4), (0.05, -0.3, 0)]
+)
+def test_a_plane_is_found_exactly(theta, along, across, height):
+    """Any sign, factor or convention that is wrong shows: the fit has no approximation."""
+    times = plane_times(ANGLE_X, ANGLE_Y, along, across, height, theta=theta)
+    plane = fit_plane(times[np.newaxis], POINTS, theta)
+    assert plane.along[0] == pytest.approx(along, abs=1e-9)
+    assert plane.across[0] == pytest.approx(across, abs=1e-9)
+    on_axis = plane_times(np.zeros(1), np.zeros(1), along, across, height, theta=theta)[0] * C0 / 2
+    assert plane.range_m[0] == pytest.approx(on_axis, abs=1e-7)
+    assert plane.misfit_ns[0] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_face_towards_the_lidar_gathers_the_echoes():
+    """Published: far and near echoes come closer together, and red before green is a rise to the left."""
+    level, towards = (plane_times(ANGLE_X, ANGLE_Y, slope, 0.0) for slope in (0.0, 0.2))
+    assert towards[:2].mean() - towards[2:].mean() < level[:2].mean() - level[2:].mean()
+    # Green, on the left, looks down on higher water and is earlier there.
+    left = fit_plane(np.array([[1423.0, 1422.0, 1418.0, 1417.0]]), POINTS, THETA)
+    assert left.across[0] > 0
+
+
+def test_undetermined_slopes_are_nan():
+    times = plane_times(ANGLE_X, ANGLE_Y, 0.1, 0.05)
+    some = np.stack([times] * 4)
+    some[1, 3] = np.nan
+    some[2, 2:] = np.nan
+    some[3, 1:] = np.nan
+    plane = fit_plane(some, POINTS, THETA)
+    np.testing.assert_allclose(plane.along[:2], 0.1, atol=1e-9)
+    np.testing.assert_allclose(plane.across[:2], 0.05, atol=1e-9)
+    assert np.isnan(plane.along[2:]).all()
+    assert np.isnan(plane.across[2:]).all()
+    assert np.isnan(plane.misfit_ns[1])
+    assert np.isfinite(plane.range_m).all()
+    strips = PixelLight(np.array([5.1e-3, 1.8e-3, -1.8e-3, -5.1e-3]), np.zeros(4), np.zeros(4))
+    strip = fit_plane(plane_times(strips.angle_x, strips.angle_y, -0.1, 0.0)[np.newaxis], strips, THETA)
+    assert strip.along[0] == pytest.approx(-0.1, abs=1e-9)
+    assert np.isnan(strip.across[0])
+    empty = fit_plane(np.full((1, 4), np.nan), POINTS, THETA)
+    assert np.isnan([empty.along[0], empty.range_m[0]]).all()
+
+
+def test_standard_errors_are_those_of_noise():
+    """Variance of 4000 noisy fits over the stated one: chi-squared with 3999 degrees, within 5 standard deviations."""
+    rng = np.random.default_rng(7)
+    error = np.array([0.1, 0.2, 0.3, 0.15])
+    times = plane_times(ANGLE_X, ANGLE_Y, 0.1, -0.05) + error * rng.normal(size=(4000, 4))
+    plane = fit_plane(times, POINTS, THETA, stderr_ns=np.broadcast_to(error, times.shape))
+    for name, truth in (("along", 0.1), ("across", -0.05)):
+        values, stated = getattr(plane, name), getattr(plane, f"{name}_stderr")
+        assert abs(np.mean(((values - truth) / stated) ** 2) - 1) < 5 * math.sqrt(2 / 4000)
+    reach = plane.range_m - plane_times(np.zeros(1), np.zeros(1), 0.1, -0.05)[0] * C0 / 2
+    assert abs(reach.mean()) < 5 * reach.std() / math.sqrt(4000)
+
+
+def test_uneven_light_counts_as_error():
+    """One facet anywhere in each pixel, drawn with a spread of 1 mrad on a level sea, alike by 0.4 side by side.
+
+    That estimates are steeper than the sea, and each states the error of its own slope, leaves 2 %.
+    """
+    rng = np.random.default_rng(3)
+    spread = np.full(4, 1e-3)
+    draws = math.sqrt(0.6) * rng.normal(size=(1500, 4)) + math.sqrt(0.4) * np.repeat(rng.normal(size=(1500, 2)), 2, 1)
+    times = np.array([plane_times(ANGLE_X + spread * one, ANGLE_Y, 0, 0) for one in draws])
+    plane = fit_plane(times, PixelLight(ANGLE_X, ANGLE_Y, spread), THETA)
+    for name in ("along", "across"):
+        z = getattr(plane, name) / getattr(plane, f"{name}_stderr")
+        assert abs(np.mean(z**2) - 1) < 0.04 + 5 * math.sqrt(2 / 1500)
+    # Of the sums of a pair the variance is (1 + 0.4)/2, of the differences (1 - 0.4)/2.
+    assert np.median(plane.along_stderr / plane.across_stderr) == pytest.approx(
+        math.sqrt(1.4 / 0.6) * math.cos(THETA), rel=0.01
+    )
+    more = fit_plane(times[:1], PixelLight(ANGLE_X, ANGLE_Y, spread), THETA, facets=4)
+    assert more.along_stderr[0] == pytest.approx(0.5 * plane.along_stderr[0], rel=0.02)
+
+
+@pytest.mark.parametrize("slope", [-0.3, 0.3])
+def test_faces_turned_away_are_known_worse(slope):
+    """Half the slope counts: the angle of incidence is that much larger, and moves the time by its tangent."""
+    light = PixelLight(ANGLE_X, ANGLE_Y, np.full(4, 3e-4))
+    one, level = (fit_plane(plane_times(ANGLE_X, ANGLE_Y, at, 0.0)[np.newaxis], light, THETA) for at in (slope, 0.0))
+    tilt = math.atan(slope)
+    per_relative = (math.cos(THETA - tilt) / math.cos(tilt) / math.cos(THETA)) ** 2
+    steepness = math.tan(THETA - math.atan(0.5 * slope)) / math.tan(THETA)
+    expected = per_relative * steepness
+    assert one.along_stderr[0] / level.along_stderr[0] == pytest.approx(expected, rel=0.01)
+
+
+# Centres and spread of the light in quarters and strips of a circle of 15 mrad, and in quarters of 30 mrad.
+QUARTERS, WIDE = (
+    PixelLight(x * np.array([1, 1, -1, -1]), x * np.array([-1, 1, -1, 1]), np.full(4, spread))
+    for x, spread in ((2.822e-3, 1.874e-3), (3.916e-3, 2.898e-3))
+)
+STRIPS = PixelLight(
+    1e-3 * np.array([5.143, 1.768, -1.768, -5.143]), np.zeros(4), 1e-3 * np.array([0.954, 1.066, 1.066, 0.954])
+)
+
+
+@pytest.mark.parametrize(("view", "light"), [("s22", QUARTERS), ("s14", STRIPS), ("s22w", WIDE)])
+def test_stated_errors_are_those_of_a_rendered_sea(view, light):
+    """200 shots each at 6 m/s: times of the surface echoes, and slopes averaged over the beam's footprint.
+
+    The file holds what `shot_series.render_shots` made of fig09_2x2 with 8 passes, and the times that
+    `waveforms.extract` read. Sea slopes differ by 0.055 along and 0.039 across. A spread of 200 is known to 5 %.
+    """
+    with (Path(__file__).parent / "slope_shots.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["view"] == view]
+    times = np.array([[float(row[f"t{pixel}"]) for pixel in range(4)] for row in rows])
+    plane = fit_plane(times, light, THETA)
+    for name, deviation in (("along", 0.0546), ("across", 0.0387)):
+        truth = np.array([float(row[name]) for row in rows])
+        found = (getattr(plane, name), getattr(plane, f"{name}_stderr"))
+        if np.isnan(found[0]).all():
+            assert name == "across"
+            assert view == "s14"
+            continue
+        for slope, error in (found, with_prior(*found, deviation)):
+            z = ((slope - truth) / error)[np.isfinite(slope)]
+            assert z.size > 190
+            assert 0.7 < np.sqrt(np.mean(z**2)) < 1.4
+        z = ((found[0] - truth) / found[1])[truth < -0.03]
+        # Errors that do not grow with the slope were 1.3 to 2.1 times too small for faces turned away.
+        if name == "along":
+            assert np.sqrt(np.nanmean(z**2)) < 1.4
+
+
+def test_light_in_a_quarter_circle():
+    angle = np.linspace(0, np.pi / 2, 400)
+    quarter = np.vstack([[0, 0], np.stack([np.cos(angle), np.sin(angle)], axis=1)]) * 7.5e-3
+    even = PixelLight.of_outlines([[quarter]], 1.0)
+    assert even.angle_x[0] == pytest.approx(4 * 7.5e-3 / (3 * np.pi), rel=2e-3)
+    assert even.spread[0] == pytest.approx(7.5e-3 * math.sqrt(0.25 - (4 / (3 * np.pi)) ** 2), rel=5e-3)
+    # A beam far narrower than the pixel: the mean and deviation of half a Gaussian.
+    half = PixelLight.of_outlines([[np.array([[0, -1], [1, -1], [1, 1], [0, 1]]) * 0.02]], 5e-3)
+    assert half.angle_x[0] == pytest.approx(5e-3 * math.sqrt(2 / np.pi), rel=2e-3)
+    assert half.angle_y[0] == pytest.approx(0, abs=1e-9)
+    assert half.spread[0] == pytest.approx(5e-3 * math.sqrt(1 - 2 / np.pi), rel=5e-3)
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 1e-2
+    ring = PixelLight.of_outlines([[square, 0.5 * square]], 1.0)
+    # Variance of a square less that of its hole, by areas 4 and 1 (of a side of 1 and 0.5).
+    assert ring.spread[0] == pytest.approx(1e-2 * math.sqrt((4 / 3 - 0.25 / 3) / 3), rel=5e-3)
+
+
+def test_prior_and_direction():
+    slope, error = with_prior([0.2, np.nan], [0.1, np.nan], 0.1)
+    np.testing.assert_allclose(slope, [0.1, 0.0])
+    np.testing.assert_allclose(error, [0.1 / math.sqrt(2), 0.1])
+    angle, direction = steepest([0.1, 0.0, -0.1], [0.0, 0.1, -0.1])
+    np.testing.assert_allclose(np.degrees(direction), [0, 90, -135])
+    np.testing.assert_allclose(np.tan(angle), [0.1, 0.1, 0.1 * math.sqrt(2)])
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"time_ns": [[1.0, 2.0]]}, r"time_ns of shape \(1, 2\)"),
+        ({"time_ns": [[-1.0, 1, 1, 1]]}, "time_ns = -1 must be greater than 0"),
+        ({"off_nadir": 2.0}, "off_nadir = 2 must lie between"),
+        ({"stderr_ns": -1.0}, "stderr_ns = -1 must not be negative"),
+        ({"facets": 0}, "facets = 0 must be greater than 0"),
+        ({"light": PixelLight(ANGLE_X, ANGLE_Y, -ANGLE_X)}, "spread = -0.0028 must not be negative"),
+    ],
+)
+def test_bad_input(change, sentence):
+    arguments = {"time_ns": [[1420.0] * 4], "light": POINTS, "off_nadir": THETA} | change
+    with pytest.raises(ValueError, match=sentence):
+        fit_plane(**arguments)
+
+
+def test_bad_outlines_and_priors():
+    with pytest.raises(ValueError, match="sigma = 0 must be greater"):
+        PixelLight.of_outlines([], 0)
+    with pytest.raises(ValueError, match="outlines of pixel 0 must be lines of at least 3 points"):
+        PixelLight.of_outlines([[[[0, 0], [1, 1]]]], 1.0)
+    with pytest.raises(ValueError, match="outlines of pixel 0 must contain a part of the beam"):
+        PixelLight.of_outlines([[[[1, 1], [2, 1], [2, 2]]]], 1e-3)
+    with pytest.raises(ValueError, match="deviation = -1 must be greater"):
+        with_prior(0.0, 1.0, -1)

@@ -1,0 +1,99 @@
+"""Agreement of two results: detection of known differences, and false alarms."""
+
+import numpy as np
+import pytest
+from command_line import run
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis import comparison
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+TRUE = np.exp(-np.arange(100) / 40) * np.array([[1.0], [0.5]])  # J, two pixels
+
+
+def result(seed, passes=6, factor=1.0, relative=0.05, bins=100, **attributes):
+    """Return the mean of normal passes and its standard error."""
+    drawn = TRUE[:, :bins] * (factor + relative * np.random.default_rng(seed).normal(size=(passes, 2, bins)))
+    mean, error = drawn.mean(axis=0), drawn.std(axis=0, ddof=1) / np.sqrt(passes)
+    return results.build(
+        mean,
+        error,
+        mean,
+        error,
+        time=TimeAxis(0.0, 1.0, bins),
+        pixel_names=["near", "far"],
+        pixel_centres_mrad=[(1, 0), (-1, 0)],
+        attributes={"passes": passes, "integrator": "lidar_volpath", **attributes},
+    )
+
+
+def test_false_alarm_rate_of_differences():
+    """Over 400 pairs of few passes: taken for normal, Student's t would exceed the limit in a third of them."""
+    pairs = [comparison.compare(result(2 * seed), result(2 * seed + 1)) for seed in range(400)]
+    assert {pair.bin_count for pair in pairs} == {200}
+    alarms = sum(not pair.agrees for pair in pairs)
+    # Binomial with chance 0.01: 4 +- 2; twice that is 6 standard deviations off.
+    assert alarms <= 12
+    rms = np.array([pair.rms for pair in pairs])
+    # A bin's error is never taken smaller than its neighbours': a little more than it is.
+    assert 0.85 < rms.mean() < 1.02
+
+
+def test_a_difference_in_one_bin_or_in_all_is_found():
+    first, second = result(1, passes=40), result(2, passes=40)
+    second["impulse_response"][1, 30] += 8 * second["impulse_response_stderr"][1, 30] * np.sqrt(2)
+    outcome = comparison.compare(first, second)
+    assert not outcome.agrees
+    assert np.unravel_index(np.nanargmax(np.abs(outcome.z)), outcome.z.shape) == (1, 30)
+    assert outcome.z[1, 30] > 0
+    everywhere = comparison.compare(result(1, passes=40), result(2, passes=40, factor=1.05))
+    assert everywhere.energy_ratio == pytest.approx(1.05, abs=4 * everywhere.energy_ratio_stderr)
+    assert everywhere.energy_ratio_stderr < 0.002
+    assert not everywhere.agrees
+
+
+def test_bins_outside_the_window_or_badly_known_do_not_count():
+    window = {"window_start_ns": 20.0, "window_end_ns": 60.0}
+    outcome = comparison.compare(result(1, **window), result(2, **window))
+    assert outcome.bin_count == 80  # bins 20 to 59 with their centres within, of two pixels
+    noisy = result(2)
+    noisy["impulse_response_stderr"][0] = noisy["impulse_response"][0] * 0.4
+    assert comparison.compare(result(1), noisy).bin_count == 100
+
+
+def test_sidak_limit_has_the_significance():
+    """Among 200 numbers; Bonferroni's is 0.2 % of z higher, no correction 1.3 lower."""
+    from scipy.stats import norm
+
+    limit = comparison.sidak_limit(200)
+    assert (1 - 2 * norm.sf(limit)) ** 200 == pytest.approx(0.99, rel=1e-9)
+    assert comparison.sidak_limit(1) == pytest.approx(norm.isf(0.005))
+
+
+def test_results_that_cannot_be_compared_are_rejected():
+    with pytest.raises(UserError, match="2 pixels x 100 bins and 2 pixels x 90 bins: they must have the same"):
+        comparison.compare(result(1), result(2, bins=90))
+    with pytest.raises(UserError, match="0 and 6 passes: both must have at least 2"):
+        comparison.compare(result(1, passes=6).assign_attrs(passes=0), result(2))
+    unknown = result(1)
+    unknown["impulse_response_stderr"][:] = unknown["impulse_response"]
+    with pytest.raises(UserError, match="share no bin"):
+        comparison.compare(unknown, result(2))
+
+
+def test_command_draws_and_answers(tmp_path):
+    for name, factor, seed in (("a", 1.0, 1), ("b", 1.0, 2), ("c", 1.2, 3)):
+        results.save(result(seed, factor=factor), tmp_path / f"{name}.nc")
+    same = run("compare", tmp_path / "a.nc", tmp_path / "b.nc")
+    assert same.exit_code == 0, same.output
+    assert same.stdout.splitlines()[0] == str(tmp_path / "a_b.png")
+    assert same.stdout.splitlines()[1].startswith("agree: 200 bins")
+    assert (tmp_path / "a_b.png").read_bytes().startswith(b"\x89PNG")
+    other = run("compare", tmp_path / "a.nc", tmp_path / "c.nc", "-o", tmp_path / "d.svg")
+    assert other.exit_code == 1
+    assert "differ" in other.stdout
+    assert "<!-- difference (standard errors) -->" in (tmp_path / "d.svg").read_text()
+    wrong = run("compare", tmp_path / "a.nc", tmp_path / "b.nc", "-o", tmp_path / "d.txt")
+    assert wrong.exit_code == 2
+    assert not (tmp_path / "d.txt").exists()

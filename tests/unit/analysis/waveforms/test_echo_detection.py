@@ -1,0 +1,220 @@
+"""Detection and measurement of echoes in waveforms: bias, standard errors and flags."""
+
+import numpy as np
+import pytest
+from scipy.stats import exponnorm, norm
+
+from mitransient_lidar.analysis.waveforms import echo_estimators
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+
+DT = 0.5
+TIME = (np.arange(400) + 0.5) * DT
+FWHM = 5.0
+SIGMA = FWHM / FWHM_PER_SIGMA
+PULSE = Pulse.gaussian(FWHM)
+TEMPLATE = Template.of(PULSE, DT)
+EDGES = np.arange(401) * DT
+
+
+def echoes(arrivals, amplitude=1.0, sigma=SIGMA, tau=0.0):
+    """Means over the bins of echoes of a Gaussian pulse, from cumulative distributions of another library."""
+    arrivals = np.atleast_1d(arrivals)[:, np.newaxis]
+    if tau:
+        shares = np.diff(exponnorm.cdf(EDGES, tau / sigma, loc=arrivals, scale=sigma), axis=1)
+    else:
+        shares = np.diff(norm.cdf(EDGES, arrivals, sigma), axis=1)
+    return amplitude * np.sqrt(2 * np.pi) * sigma / DT * shares
+
+
+def column(start, end=np.inf, level=1.0, decay=0.035, sigma=SIGMA):
+    """An exponential from `start` to `end`, blurred by a Gaussian, at the bins' centres."""
+
+    def onset(at):
+        return level / decay * exponnorm.pdf(TIME, 1 / (decay * sigma), loc=at, scale=sigma)
+
+    return onset(start) - (np.exp(-decay * (end - start)) * onset(end) if np.isfinite(end) else 0)
+
+
+def read(method, records, template, width, place, flags):
+    window = echo_estimators.Window.around(records, place, width)
+    top = echo_estimators.summit(window, flags)
+
+    def time_of(window, top):
+        if method == "centroid":
+            return echo_estimators.centroid(window, top.time_ns, width)
+        if method == "peak":
+            return top.time_ns, top.time_stderr
+        fraction = float(method)
+        return echo_estimators.leading_edge(window, top, template, fraction)
+
+    offset = 0.0
+    if method in ("centroid", "peak"):
+        offset = echo_estimators.calibrate(time_of, template, records.bin_ns, width)
+    time, error = time_of(window, top)
+    return time - offset, error
+
+
+def test_template_is_the_pulse_averaged_over_bins_and_after_the_response():
+    # Convolution adds variances: that of a bin is dt^2/12. Its full width follows for an almost Gaussian shape.
+    assert Template.of(PULSE, 0.5).fwhm_ns == pytest.approx(
+        FWHM_PER_SIGMA * np.hypot(SIGMA, 0.5 / np.sqrt(12)), rel=1e-4
+    )
+    tailed = Template.of(PULSE, 0.5, response_time_ns=1.5)
+    shape = exponnorm(1.5 / SIGMA, scale=SIGMA)
+    expected = shape.cdf(tailed.time_ns + 0.25) - shape.cdf(tailed.time_ns - 0.25)
+    np.testing.assert_allclose(tailed.power, expected / expected.max(), atol=2e-4)
+    assert tailed.time_ns[np.argmax(tailed.power)] == pytest.approx(tailed.time_ns[np.argmax(expected)], abs=0.03)
+
+
+def test_edge_of_the_template_is_that_of_the_gaussian():
+    level = np.array([0.1, 0.5, 0.9])
+    sigma = np.hypot(SIGMA, DT / np.sqrt(12))
+    time, per_level = TEMPLATE.rise(level)
+    np.testing.assert_allclose(time, -sigma * np.sqrt(-2 * np.log(level)), atol=2e-3)
+    np.testing.assert_allclose(per_level, sigma**2 / level / -time, rtol=0.02)
+
+
+@pytest.mark.parametrize("method", ["peak", "centroid", "0.1", "0.5", "0.8"])
+@pytest.mark.parametrize("tau", [0.0, 1.5])
+def test_times_of_isolated_echoes_have_no_bias(method, tau):
+    """Arrivals at all parts of a bin. Taking bin centres for left edges would give 0.25 ns, the response 1.5 ns."""
+    arrivals = 60 + np.linspace(0, 1, 21)
+    template = Template.of(PULSE, DT, tau)
+    records = Records.of(echoes(arrivals, tau=tau), TIME)
+    found = find_echoes(records, template.fwhm_ns)
+    time, _ = read(method, records, template, template.fwhm_ns, found.surface, found.flags[0])
+    np.testing.assert_allclose(time, arrivals, atol=0.02)
+
+
+def test_leading_edge_of_a_stretched_echo_comes_early_and_its_peak_does_not():
+    sigma = 1.6 * SIGMA
+    records = Records.of(echoes(60.0, sigma=sigma), TIME)
+    place, flags = np.array([120]), np.zeros(1, int)
+    width = sigma * FWHM_PER_SIGMA
+    assert read("peak", records, TEMPLATE, width, place, flags)[0] == pytest.approx(60.0, abs=0.01)
+    early = 60.0 - 0.6 * SIGMA * np.sqrt(2 * np.log(2))
+    assert read("0.5", records, TEMPLATE, width, place, flags)[0] == pytest.approx(early, abs=0.03)
+
+
+def test_amplitude_width_and_energy_of_an_isolated_echo():
+    records = Records.of(echoes([60.1, 60.3], amplitude=2.0), TIME)
+    window = echo_estimators.Window.around(records, np.array([120, 120]), TEMPLATE.fwhm_ns)
+    top = echo_estimators.summit(window, np.zeros(2, int))
+    # Averaging over the bins lowers and widens the summit.
+    sigma = np.hypot(SIGMA, DT / np.sqrt(12))
+    np.testing.assert_allclose(top.width_ns, FWHM_PER_SIGMA * sigma, rtol=1e-3)
+    np.testing.assert_allclose(top.amplitude, 2.0 * SIGMA / sigma, rtol=1e-3)
+    energy, _ = echo_estimators.gate_energy(window, top.time_ns, TEMPLATE.fwhm_ns)
+    np.testing.assert_allclose(energy, 2.0 * np.sqrt(2 * np.pi) * SIGMA * 1e-9, rtol=1e-3)
+
+
+@pytest.mark.parametrize("method", ["peak", "centroid", "0.5", "threshold", "amplitude", "width", "energy"])
+def test_errors_are_those_of_the_noise(method):
+    count, noise = 800, 0.02
+    rng = np.random.default_rng(7)
+    arrivals = 60 + rng.random(count)
+    records = Records.of(echoes(arrivals) + noise * rng.normal(size=(count, TIME.size)), TIME, noise)
+    found = find_echoes(records, TEMPLATE.fwhm_ns)
+    width = TEMPLATE.fwhm_ns
+    window = echo_estimators.Window.around(records, found.surface, width)
+    top = echo_estimators.summit(window, found.flags[0])
+    if method in ("amplitude", "width"):
+        sigma = np.hypot(SIGMA, DT / np.sqrt(12))
+        name, truth = ("amplitude", SIGMA / sigma) if method == "amplitude" else ("width_ns", FWHM_PER_SIGMA * sigma)
+        value, error = getattr(top, name), getattr(top, name.removesuffix("_ns") + "_stderr")
+    elif method == "energy":
+        value, error = echo_estimators.gate_energy(window, top.time_ns, width)
+        truth = np.sqrt(2 * np.pi) * SIGMA * 1e-9
+    elif method == "threshold":
+        level = np.full(count, 0.2)
+        value, error = echo_estimators.crossing(window, top, level, np.zeros(count), TEMPLATE)
+        truth = arrivals
+    else:
+        value, error = read(method, records, TEMPLATE, width, found.surface, found.flags[0])
+        truth = arrivals
+    z = (value - truth) / error
+    assert np.isfinite(z).all()
+    # Standard error of a standard deviation of normal numbers: 1/sqrt(2 n). Samples taken by their height share noise
+    # with what they are compared with, which costs up to 5 %.
+    assert abs(z.std(ddof=1) - 1) < 4.5 / np.sqrt(2 * count) + 0.05
+    assert abs(z.mean()) < 4.5 / np.sqrt(count) + 0.1
+
+
+def test_surface_target_and_bottom_are_found_on_a_column():
+    signal = column(40, 120) + echoes(40, 0.3)[0] + echoes(85.2, 0.3)[0] + echoes(120.1, 2.0)[0]
+    found = find_echoes(Records.of(signal[np.newaxis], TIME), FWHM)
+    assert TIME[found.bins[1][0]] == pytest.approx(85.2, abs=DT)
+    assert TIME[found.bins[2][0]] == pytest.approx(120.1, abs=DT)
+    assert 40 < TIME[found.surface[0]] < 48  # the peak is the column's
+    assert (found.flags[0], found.flags[1], found.flags[2]) == ([0], [0], [0])
+
+
+def test_a_column_is_no_echo_nor_is_a_step_down_in_it():
+    smooth = column(40)
+    step = column(40, 80) + column(80, level=0.4 * np.exp(-0.035 * 40))
+    found = find_echoes(Records.of(np.stack([smooth, step]), TIME), FWHM)
+    assert found.bins[2].tolist() == [-1, -1]
+    assert found.flags[2].tolist() == [EchoFlag.NO_ECHO] * 2
+
+
+def test_a_weak_bottom_is_found_as_often_as_its_signal_allows_and_noise_hardly_ever():
+    rng = np.random.default_rng(3)
+    noise = 0.02
+    clean = column(40, 120) + echoes(120.0, 0.5)[0]
+    noisy = clean + noise * rng.normal(size=(500, TIME.size))
+    found = find_echoes(Records.of(noisy, TIME, noise), FWHM)
+    assert np.mean(np.abs(TIME[found.bins[2]] - 120) < 3) > 0.99
+    dark = find_echoes(Records.of(noise * rng.normal(size=(2000, TIME.size)), TIME, noise), FWHM)
+    # Some 130 independent values of 5 sigma, each with the chance 2.9e-7: 0.07 alarms are expected.
+    assert np.count_nonzero(dark.surface >= 0) <= 3
+    assert (dark.flags[0][dark.surface < 0] == EchoFlag.NO_ECHO).all()
+
+
+def test_echoes_nearer_than_a_pulse_are_flagged_as_merged():
+    resolved = echoes(60, 1.0)[0] + echoes(60 + 1.3 * FWHM, 1.0)[0]
+    near = echoes(60, 1.0)[0] + echoes(60 + 1.1 * FWHM, 1.0)[0]
+    single = echoes(60, 1.0)[0]
+    hidden = echoes(60, 1.0)[0] + echoes(60 + 0.6 * FWHM, 1.0)[0]
+    found = find_echoes(Records.of(np.stack([resolved, near, single, hidden]), TIME), FWHM)
+    assert (found.bins[2] >= 0).tolist() == [True, True, False, False]
+    merged = EchoFlag.MERGED
+    assert (found.flags[0] & merged).astype(bool).tolist() == [False, True, False, True]
+    assert (found.flags[2] & merged).astype(bool).tolist() == [False, True, False, True]
+
+
+def test_an_echo_at_the_end_of_the_record_is_cut():
+    records = Records.of(echoes([30.0, 199.5]), TIME)
+    found = find_echoes(records, FWHM)
+    top = echo_estimators.summit(echo_estimators.Window.around(records, found.surface, FWHM), found.flags[0])
+    assert (top.flags & EchoFlag.CUT).astype(bool).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((np.ones((1, 9)), np.arange(8), 0.0), r"waveforms of shape \(1, 9\) must have the shape \(n, 8\)"),
+        ((np.ones((1, 8)), np.arange(8)[::-1], 0.0), "time_ns must increase in equal steps"),
+        ((np.ones((1, 8)), np.arange(8) ** 2, 0.0), "time_ns must increase in equal steps"),
+        ((np.ones((1, 3)), np.arange(3), 0.0), "at least 8 times"),
+        ((np.full((1, 8), np.nan), np.arange(8), 0.0), "waveforms holds nan"),
+        ((np.ones((1, 8)), np.arange(8), -1.0), "noise = -1 must not be negative"),
+        ((np.ones((2, 8)), np.arange(8), np.ones((2, 4))), "noise of shape"),
+    ],
+)
+def test_invalid_records(arguments, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        Records.of(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"threshold": 0}, "threshold = 0 must be greater than 0"),
+        ({"contrast": 1.0}, "contrast = 1 must be at least 0 and below 1"),
+        ({"echo_fwhm_ns": -1.0}, "echo_fwhm_ns = -1 must be greater than 0"),
+    ],
+)
+def test_invalid_detection_options(options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        find_echoes(Records.of(echoes(60.0), TIME), **{"echo_fwhm_ns": FWHM, **options})

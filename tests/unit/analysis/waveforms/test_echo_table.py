@@ -1,0 +1,406 @@
+"""Tables of echoes: dimensions, units, flags, noise, files, the command, and echoes of rendered results."""
+
+import csv
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+from scipy.stats import exponnorm, norm
+
+import mitransient_lidar
+from mitransient_lidar import results
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+DT = 0.5
+BINS = 320
+START = 1380.0
+TIME = START + (np.arange(BINS) + 0.5) * DT
+EDGES = START + np.arange(BINS + 1) * DT
+SIGMA = 5.0 / FWHM_PER_SIGMA
+DECAY = 0.035
+# At nadir from 200 m with n = n_g = 1.34: no spread over the footprint, and 0.1119 m of water a nanosecond.
+SURFACE = 2e9 * 212.84 / 299792458
+PER_NS = 0.299792458 / (2 * 1.34)
+ATTRIBUTES = {
+    "altitude": 212.84,
+    "off_nadir_deg": 0.0,
+    "refractive_index": 1.34,
+    "group_index": 1.34,
+    "pulse_fwhm_ns": 5.0,
+    "response_time_ns": 0.0,
+    "surface_time_ns": SURFACE,
+    "layout": "2x2",
+}
+
+
+def echo(arrival, energy):
+    """Mean power [W] in each bin of an ideal echo of an energy [J]."""
+    return energy / (DT * 1e-9) * np.diff(norm.cdf(EDGES, arrival, SIGMA))
+
+
+def column(start, end, level):
+    def onset(at):
+        return level / DECAY * exponnorm.pdf(TIME, 1 / (DECAY * SIGMA), loc=at, scale=SIGMA)
+
+    return onset(start) - np.exp(-DECAY * (end - start)) * onset(end)
+
+
+def waveform(surface=SURFACE, bottom=70.0, target=0.0):
+    found = echo(surface, 2e-13) + column(surface, surface + bottom, 3e-5) + echo(surface + bottom, 6e-13)
+    return found + (echo(surface + 40, target) if target else 0)
+
+
+def result(values=None, grid=None, **attributes):
+    values = np.stack([waveform(SURFACE + shift) for shift in (2.3, 2.1, -1.8, -2.2)]) if values is None else values
+    count = len(values)
+    return results.build(
+        values * DT * 1e-9,
+        0 * values,
+        values,
+        0 * values,
+        time=TimeAxis(START, DT, BINS),
+        pixel_names=["red", "green", "blue", "black"][:count],
+        pixel_centres_mrad=np.arange(2.0 * count).reshape(count, 2),
+        grid=grid,
+        attributes={**ATTRIBUTES, **attributes},
+    )
+
+
+def recorded(clean, shots, noise, seed=1, offset=0.3):
+    """Shots of a receiver that turns 1 W into 1e5 V, with an offset."""
+    rng = np.random.default_rng(seed)
+    signal = offset + 1e5 * clean + noise * rng.normal(size=(shots, *clean.shape))
+    base = result(clean)
+    return xr.Dataset(
+        {"signal": (("shot", "pixel", "time"), signal, {"units": "V"})},
+        {**{name: base.coords[name] for name in ("pixel", "angle_x", "angle_y", "time")}, "shot": np.arange(shots)},
+        base.attrs,
+    )
+
+
+@pytest.mark.parametrize("estimator", echo_table.ESTIMATORS)
+def test_isolated_echoes_without_noise(estimator):
+    """Surface and bottom of a lake without a column: times within 0.02 ns, depth within 2 mm."""
+    bottom = np.array([50.0, 60.13, 70.29, 80.41])
+    values = np.stack([echo(SURFACE + 0.1, 3e-13) + echo(SURFACE + delay, 6e-13) for delay in bottom])
+    table = echo_table.extract(result(values), estimator)
+    assert table["time_ns"].dims == ("pixel", "echo")
+    assert list(table["echo"].values) == list(echo_table.ECHOES)
+    surface, seabed = table.sel(echo="surface"), table.sel(echo="bottom")
+    np.testing.assert_allclose(surface["time_ns"], SURFACE + 0.1, atol=0.02)
+    np.testing.assert_allclose(seabed["time_ns"], SURFACE + bottom, atol=0.02)
+    np.testing.assert_allclose(seabed["depth_m"], (bottom - 0.1) * PER_NS, atol=0.004)
+    np.testing.assert_allclose(seabed["energy"], 6e-13, rtol=0.02)
+    assert (table["flags"].sel(echo=["surface", "bottom"]) == 0).all()
+    assert (table["flags"].sel(echo="target") == EchoFlag.NO_ECHO).all()
+    assert seabed["energy"].attrs["units"] == "J"
+    assert table["amplitude"].attrs["units"] == "W"
+
+
+def test_surface_column_target_and_bottom_of_every_pixel():
+    shifts = np.array([2.3, 2.1, -1.8, -2.2])
+    values = np.stack([waveform(SURFACE + shift, target=2e-13) for shift in shifts])
+    table = echo_table.extract(result(values))
+    for name, delay in (("surface", 0), ("target", 40), ("bottom", 70)):
+        np.testing.assert_allclose(table["time_ns"].sel(echo=name), SURFACE + shifts + delay, atol=0.05)
+    np.testing.assert_allclose(table["depth_m"].sel(echo="bottom"), 70 * PER_NS, atol=0.006)
+    np.testing.assert_allclose(table["energy"].sel(echo="target"), 2e-13, rtol=0.01)
+    # Half of exp(-0.035 t); at 200 m the distance takes 1 % of the decay over these depths, which is taken out.
+    np.testing.assert_allclose(table["width_ns"].sel(echo="column"), np.log(2) / DECAY, rtol=0.05)
+    np.testing.assert_allclose(table["amplitude"].sel(echo="column"), 3e-5, rtol=0.03)
+
+
+def test_attenuation_is_along_the_path_without_the_loss_by_distance():
+    """K of exp(-2 K s), s the way in the water, behind 1/(n H + s)^2 at nadir."""
+    way = np.maximum(TIME - SURFACE, 0) * PER_NS
+    signal = np.where(TIME > SURFACE, 3e-5 * np.exp(-2 * 0.2 * way) * (1.34 * 212.84 / (1.34 * 212.84 + way)) ** 2, 0)
+    table = echo_table.extract(result(signal[np.newaxis]))
+    assert float(table["attenuation"][0]) == pytest.approx(0.2, rel=1e-4)
+
+
+def test_depths_from_the_mean_surface():
+    table = echo_table.extract(result(), depth_from="mean")
+    np.testing.assert_allclose(table["depth_m"].sel(echo="surface") / PER_NS, [2.3, 2.1, -1.8, -2.2], atol=0.05)
+    np.testing.assert_allclose(
+        table["depth_m"].sel(echo="bottom") / PER_NS, 70 + np.array([2.3, 2.1, -1.8, -2.2]), atol=0.05
+    )
+
+
+def test_several_estimators_have_a_dimension_of_their_own():
+    table = echo_table.extract(result(), ["peak", "gaussian"])
+    assert table["time_ns"].dims == ("pixel", "estimator", "echo")
+    one = echo_table.extract(result(), "gaussian")
+    xr.testing.assert_equal(table["time_ns"].sel(estimator="gaussian", drop=True), one["time_ns"])
+    # On the column, the peak is late.
+    late = table["time_ns"].sel(echo="surface", estimator="peak") - one["time_ns"].sel(echo="surface")
+    assert (late > 0.5).all()
+
+
+def test_imager_and_blocks_give_the_same_as_pixels():
+    flat = echo_table.extract(result())
+    image = echo_table.extract(result(grid=(2, 2)), block=3)
+    assert image["time_ns"].dims == ("row", "column", "echo")
+    np.testing.assert_array_equal(image["time_ns"].values.reshape(4, 4), flat["time_ns"].values)
+    assert "angle_x" in image.coords
+
+
+def test_shots_of_a_receiver_have_true_errors():
+    """600 shots: scatter against stated errors, offset removed, energies in V s."""
+    dataset = recorded(np.stack([waveform(), waveform(bottom=75.3)]), 600, 0.05)
+    table = echo_table.extract(dataset)
+    assert table["time_ns"].dims == ("shot", "pixel", "echo")
+    assert table["energy"].attrs["units"] == "V s"
+    for name, truth in (("surface", [0, 0]), ("bottom", [70.0, 75.3])):
+        time_ns, error = table["time_ns"].sel(echo=name), table["time_ns_stderr"].sel(echo=name)
+        z = (time_ns - SURFACE - truth) / error
+        assert np.abs(z.std("shot") - 1).max() < 4.5 / np.sqrt(2 * 600) + 0.05
+        assert np.abs(time_ns.mean("shot") - SURFACE - truth).max() < 0.03
+    energy = table["energy"].sel(echo="bottom")
+    assert float(energy.mean()) == pytest.approx(6e-13 * 1e5, rel=0.01)
+
+
+def test_signals_behind_a_logarithm_are_expanded():
+    """Echoes of a tenth of the light have a tenth of the energy, as behind the same photomultiplier without logarithm.
+
+    Ten times the light would saturate the linear one. Behind the logarithm it is 0.25 V more, of 0.84 V.
+    """
+    clean = np.maximum(np.stack([waveform(), waveform(bottom=75.3)]), 0)
+    tables = {
+        (name, scale): echo_table.extract(detect_waveforms(result(scale * clean), name, 400, 3), saturation_level=level)
+        for name, scale, level in (("pmt_log", 0.03, 0.9), ("pmt_log", 0.003, 0.9), ("pmt", 0.003, None))
+    }
+    strong, weak, linear = (table.sel(echo="bottom") for table in tables.values())
+    for one, other, ratio in ((strong, weak, 10), (weak, linear, 1)):
+        difference = one["energy"].mean("shot") - ratio * other["energy"].mean("shot")
+        error = np.hypot(one["energy"].std("shot"), ratio * other["energy"].std("shot")) / np.sqrt(400)
+        assert (abs(difference) < 4.5 * error).all()
+        assert (error < 4e-3 * one["energy"].mean("shot")).all()
+    for table in (strong, weak):
+        for name in ("energy", "time_ns"):
+            ratio = table[name].std("shot") / table[f"{name}_stderr"].mean("shot")
+            assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * 400) + 0.05
+        assert (table["flags"] & EchoFlag.SATURATED == 0).all()
+    # 0.835 V is the strong record's highest sample.
+    low = echo_table.extract(detect_waveforms(result(0.03 * clean), "pmt_log", 20, 3), saturation_level=0.8)
+    assert (low["flags"].sel(echo="bottom") & EchoFlag.SATURATED).all()
+    assert (low["flags"].sel(echo="surface") & EchoFlag.SATURATED == 0).all()
+
+
+def test_a_single_record_behind_a_logarithm_is_expanded():
+    """A record without the dimension shot, and without the mean that its deviation belongs to."""
+    clean = np.maximum(np.stack([waveform()]), 0)
+    shots = detect_waveforms(result(0.03 * clean), "pmt_log", 2, 3)
+    both = echo_table.extract(shots)
+    one = echo_table.extract(shots.isel(shot=0, drop=True).drop_vars("signal_mean"))
+    np.testing.assert_allclose(one["energy"], both["energy"].isel(shot=0), rtol=0.02)
+
+
+def test_a_logarithm_needs_both_its_numbers():
+    shots = recorded(np.stack([waveform()]), 2, 0.01)
+    shots.attrs["receiver.logarithm.knee_v"] = 1e-3
+    with pytest.raises(UserError, match=r"no attribute receiver.logarithm.volts_per_decade"):
+        echo_table.extract(shots)
+
+
+def test_correlated_noise_has_larger_errors():
+    """Noise averaged over 4 bins has half the spread, and means of many bins have that of the noise before."""
+    dataset = recorded(np.stack([waveform()]), 400, 0.0)
+    white = 0.1 * np.random.default_rng(4).normal(size=(400, 1, BINS + 3))
+    alike = np.lib.stride_tricks.sliding_window_view(white, 4, axis=2).mean(axis=-1)
+    dataset["signal"] = dataset["signal"] + alike
+    table = echo_table.extract(dataset)
+    bottom = table.sel(echo="bottom")
+    ratio = float(bottom["time_ns"].std() / bottom["time_ns_stderr"].mean())
+    assert 0.8 < ratio < 1.25  # as if independent: 1.6
+
+
+def test_waveforms_in_the_noise_are_flagged():
+    dataset = recorded(np.stack([waveform(), 0 * TIME]), 20, 0.05)
+    table = echo_table.extract(dataset, ["gaussian", "peak", "deconvolution"])
+    dark = table.isel(pixel=1)
+    assert np.isnan(dark["time_ns"]).all()
+    assert (dark["flags"] == EchoFlag.NO_ECHO).all()
+    assert np.isfinite(table["time_ns"].isel(pixel=0).sel(echo="bottom")).all()
+
+
+def test_saturated_echoes_are_flagged_by_mask_and_by_level():
+    values = np.stack([waveform()] * 2)
+    clipped = result(np.minimum(values, 8e-5))
+    table = echo_table.extract(clipped, "peak", saturation_level=8e-5)
+    assert (table["flags"].sel(echo="bottom") & EchoFlag.SATURATED).all()
+    assert not (table["flags"].sel(echo="surface") & EchoFlag.SATURATED).any()
+    dataset = recorded(values, 2, 0.01)
+    mask = np.zeros(dataset["signal"].shape, dtype=bool)
+    mask[1, 0, np.argmax(values[0])] = True
+    table = echo_table.extract(dataset.assign(saturated=(dataset["signal"].dims, mask)))
+    flagged = (table["flags"] & EchoFlag.SATURATED).astype(bool)
+    assert flagged.sel(echo="bottom").values.tolist() == [[False, False], [True, False]]
+    assert not flagged.sel(echo="surface").any()
+
+
+def test_a_bottom_nearer_than_a_pulse_is_flagged():
+    values = np.stack([echo(SURFACE, 3e-13) + echo(SURFACE + delay, 3e-13) for delay in (3.2, 20.0)])
+    flags = echo_table.extract(result(values))["flags"]
+    merged = (flags & EchoFlag.MERGED).astype(bool).sel(echo=["surface", "bottom"])
+    assert merged.values.tolist() == [[True, True], [False, False]]
+
+
+def test_layers_of_the_water_are_found():
+    """Half the backscatter from 3 m down."""
+    step = 3.0 / PER_NS
+    below = column(SURFACE + step, SURFACE + 70, -1.5e-5 * np.exp(-DECAY * step))
+    table = echo_table.extract(result(np.stack([waveform(), waveform() + below])), layers=1)
+    assert table["layer_p_value"].dims == ("pixel", "layer")
+    assert float(table["layer_p_value"][0, 0]) > 0.01
+    assert float(table["layer_p_value"][1, 0]) < 1e-6
+    assert float(table["layer_depth_m"][1, 0]) == pytest.approx(3.0, abs=0.1)
+    assert float(table["layer_step"][1, 0]) == pytest.approx(np.log(0.5), abs=0.07)
+
+
+def test_the_pulse_may_be_given():
+    """A ramp of 6 ns: centroid 2 ns before its end. Taken for a Gaussian, times would be that much early."""
+    pulse = Pulse.sampled([0, 6, 6.01], [0, 1, 0])
+    shares = np.diff(pulse.cumulative(EDGES - SURFACE - 0.2))
+    values = (3e-13 / (DT * 1e-9) * shares)[np.newaxis]
+    table = echo_table.extract(result(values), "centroid", pulse=pulse)
+    assert float(table["time_ns"].sel(echo="surface")[0]) == pytest.approx(SURFACE + 0.2, abs=0.05)
+
+
+def test_csv_and_command(tmp_path):
+    results.save(result(), tmp_path / "shot.nc")
+    done = run("waveforms", tmp_path / "shot.nc", "--csv", tmp_path / "echoes.csv", "--layers", 1)
+    assert done.exit_code == 0, done.output
+    assert "attenuation of the column (1/m): median" in done.output
+    assert done.output.count("bottom") == 4
+    with (tmp_path / "echoes.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 16
+    table = echo_table.extract(result())
+    line = next(line for line in lines if line["pixel"] == "blue" and line["echo"] == "bottom")
+    expected = table.sel(pixel="blue", echo="bottom")
+    for name in ("time_ns", "depth_m", "energy", "time_ns_stderr", "attenuation"):
+        assert float(line[name]) == pytest.approx(float(expected[name]), rel=1e-8)
+    missing = next(line for line in lines if line["echo"] == "target")
+    assert (missing["time_ns"], missing["flags"]) == ("", "no_echo")
+    table.to_netcdf(tmp_path / "table.nc", engine="h5netcdf")
+    xr.testing.assert_equal(xr.load_dataset(tmp_path / "table.nc", engine="h5netcdf"), table)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--estimator", "best"], "estimator 'best' must be one of threshold, leading_edge"),
+        (["--csv", "echoes.txt"], "--csv echoes.txt must end in .csv."),
+        (["--no-table"], "--no-table leaves nothing to do"),
+        (["--layers", "9"], "layers = 9 must lie between 0 and 8"),
+        (["--threshold", "0"], "threshold = 0 must be greater than 0"),
+    ],
+)
+def test_invalid_options(tmp_path, options, sentence):
+    results.save(result(), tmp_path / "shot.nc")
+    assert_refused(run("waveforms", tmp_path / "shot.nc", *options), sentence)
+
+
+def test_command_reads_what_a_receiver_recorded(tmp_path):
+    """Shots hold a signal and no result's variables; other files are rejected."""
+    shots = recorded(np.stack([waveform()]), 3, 0.01)
+    shots.to_netcdf(tmp_path / "shots.nc", engine="h5netcdf")
+    done = run("waveforms", tmp_path / "shots.nc", "--no-table", "--csv", tmp_path / "echoes.csv")
+    assert done.exit_code == 0, done.output
+    with (tmp_path / "echoes.csv").open() as file:
+        found = [float(line["depth_m"]) for line in csv.DictReader(file) if line["echo"] == "bottom"]
+    assert found == pytest.approx([70 * PER_NS] * 3, abs=0.05)
+    shots.rename(signal="sound").to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    (tmp_path / "short.nc").write_bytes((tmp_path / "other.nc").read_bytes()[:100])
+    for name, sentence in (
+        ("other.nc", "holds neither a signal nor a waveform over time."),
+        ("short.nc", "is damaged or truncated"),
+        ("missing.nc", "No such file or directory"),
+    ):
+        assert_refused(run("waveforms", tmp_path / name), sentence)
+
+
+def test_flag_names():
+    assert csv_tables.flag_names(0) == ""
+    assert csv_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
+
+
+def drop(name):
+    shot = result()
+    del shot.attrs[name]
+    return shot
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options", "sentence"),
+    [
+        (result().transpose("time", "pixel"), {}, r"waveform has the dimensions \('time', 'pixel'\)"),
+        (result().drop_vars("pixel"), {}, "the dataset has no coordinate pixel"),
+        (result().drop_vars("time"), {}, "the dataset has no coordinate time"),
+        (result().drop_vars("waveform"), {}, "neither signal nor waveform"),
+        (drop("altitude"), {}, "the dataset has no attribute altitude"),
+        (drop("pulse_fwhm_ns"), {}, "the dataset has no attribute pulse_fwhm_ns"),
+        (result(np.full((1, BINS), np.nan)), {}, "waveform holds values that are not finite"),
+        (result(), {"estimators": "best"}, "estimator 'best' must be one of"),
+        (result(), {"estimators": []}, "estimator '' must be one of"),
+        (result(), {"threshold": -1.0}, "threshold = -1 must be greater than 0"),
+        (result(), {"layers": 20}, "layers = 20 must lie between 0 and 8"),
+        (result(), {"block": 0}, "block = 0 must lie between 1"),
+        (result(), {"depth_from": "top"}, "depth_from = 'top' must be 'echo' or 'mean'"),
+        (result(), {"noise": [1.0, 2.0]}, r"noise of shape \(2,\) must be a number"),
+        (recorded(np.stack([waveform()]), 2, 0.1).isel(time=slice(60, None)), {}, "at least 4 bins before"),
+    ],
+)
+def test_invalid_input(dataset, options, sentence):
+    with pytest.raises(UserError, match=sentence) as refused:
+        echo_table.extract(dataset, **options)
+    assert "\n" not in str(refused.value)
+
+
+def test_thousands_of_shots_take_seconds():
+    """10 000 shots of 4 pixels and 512 bins must take less than 30 s with a receiver's simulation: a tenth of them."""
+    clean = np.stack([waveform(SURFACE + shift) for shift in (2.3, 2.1, -1.8, -2.2)])
+    dataset = recorded(clean, 1000, 0.05)
+    start = time.perf_counter()
+    echo_table.extract(dataset)
+    assert time.perf_counter() - start < 4.0
+
+
+def test_published_biases_of_depth_appear_in_rendered_results():
+    """Turbid water: depths too large at nadir, too small far off it, by undercutting (Guenther and Thomas 1984)."""
+    depths = {}
+    for off_nadir in (5.0, 50.0):
+        for scattering, backscattering in ((0.02, 0.0005), (0.8, 0.008)):
+            params = {"off_nadir_deg": off_nadir, "spectrum": "flat", "slope_variance": 0.01}
+            params |= {"attenuation": scattering + 0.1, "scattering": scattering, "backscattering": backscattering}
+            params |= {"divergence_mrad": 2, "pulse_fwhm_ns": 4, "field_of_view_mrad": 60, "bottom_reflectance": 0.5}
+            first = round(2e9 * 200 / np.cos(np.radians(off_nadir)) / 299792458 - 60)
+            params |= {"time_start_ns": first, "bin_width_ns": 1, "bin_count": 200}
+            shot = mitransient_lidar.render("fig09_1x1", params=params, passes=6, seed=1)
+            table = echo_table.extract(shot, ["leading_edge", "peak"], depth_from="mean")
+            bottom = table.sel(echo="bottom").isel(pixel=0)
+            depths[off_nadir, scattering] = bottom["depth_m"]
+    clear, turbid = (depths[5.0, scattering].sel(estimator="peak") for scattering in (0.02, 0.8))
+    assert float(clear) == pytest.approx(8.0, abs=0.05)
+    assert 0.05 < float(turbid - clear) < 0.3
+    clear, turbid = (depths[50.0, scattering].sel(estimator="leading_edge") for scattering in (0.02, 0.8))
+    assert -0.6 < float(turbid - clear) < -0.1
+    # The beam's footprint alone makes a leading edge early there; the peak is where the axis meets the bottom.
+    assert float(depths[50.0, 0.02].sel(estimator="peak")) == pytest.approx(8.0, abs=0.06)
+
+
+def test_shot_at_a_slope_facing_away_is_shallower():
+    """Published (2006): about 0.1 m, the path in the water being steeper; times of the red pixel's bottom echo."""
+    times = []
+    for number in (1, 2, 3):
+        shot = mitransient_lidar.render(f"fig11_shot{number}", passes=3, seed=2)
+        times.append(float(echo_table.extract(shot)["time_ns"].sel(pixel="red", echo="bottom")))
+    metres_per_ns = 0.299792458 / (2 * 1.34) * 0.9669
+    assert 0.05 < (np.mean(times[:2]) - times[2]) * metres_per_ns < 0.15

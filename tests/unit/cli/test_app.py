@@ -1,0 +1,243 @@
+"""The command line: output, sentences and exit codes."""
+
+import dataclasses
+import subprocess
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+
+from mitransient_lidar import __version__, results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import catalogue, variants
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.studies import bench
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    done: int = 1
+    planned: int | None = 2
+    unit: str = "pass"
+    elapsed_s: float = 0.1
+    error_median: float | None = 0.02
+    error_p95: float | None = 0.03
+    target_error: float | None = 0.01
+    remaining_s: float | None = 3.0
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    (folder / "fig09.xml").write_text('<!-- Flat bottom. -->\n<scene version="3.0.0"/>\n')
+    monkeypatch.setattr(catalogue, "_folder", lambda: folder)
+    return "fig09"
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Replace the renderer; return what it was called with."""
+    seen = []
+    extra = {}
+
+    def render(scene, **options):
+        seen.append((scene, options))
+        if options["progress"] is not None:
+            options["progress"](Progress())
+            options["progress"](Progress(2, None, "pass", 0.2, None, None, None, None))
+        if "error" in extra:
+            raise extra["error"]
+        waveform = np.array([[1e-6, 3e-6, 2e-6], [1e-6, 5e-6, 2e-6]])
+        attributes = {"scene": "fig09", "passes": 4, "elapsed_s": 1.5, "error_median": 0.0123, "error_p95": 0.04}
+        attributes |= {"altitude": 200.0, "off_nadir_deg": 20.0}
+        return results.build(
+            waveform,
+            waveform,
+            waveform,
+            waveform,
+            time=TimeAxis(0, 1, waveform.shape[1]),
+            pixel_names=["[red]", "green"],
+            pixel_centres_mrad=[(1, 0), (-1, 0)],
+            attributes=attributes | extra,
+        )
+
+    module = ModuleType("mitransient_lidar.rendering.render")
+    module.render = render
+    monkeypatch.setitem(sys.modules, "mitransient_lidar.rendering.render", module)
+    monkeypatch.setattr("mitransient_lidar.rendering.render", module, raising=False)
+    seen_and_extra = ModuleType("calls")
+    seen_and_extra.seen, seen_and_extra.extra = seen, extra
+    return seen_and_extra
+
+
+@pytest.mark.parametrize("kind", ["--gif", "--mp4", "--html"])
+def test_a_scene_without_gates_has_none_to_show(scene, calls, tmp_path, kind):
+    assert_refused(run("render", scene, "-o", tmp_path / "out", kind), "fig09 has no gates to show", "gate_count")
+    assert calls.seen == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
+    out = tmp_path / "new" / "folder"
+    result = run("render", scene, "-o", out, "-D", "wind_speed=3", "-D", "file=a=b", "--passes", 4, "--seed", 7)
+    assert result.exit_code == 0, result.output
+    names = ["fig09.exr", "fig09.nc", "fig09.png", "fig09_layout.png"]
+    assert result.stdout.splitlines() == [str(out / name) for name in names]
+    assert sorted(path.name for path in out.iterdir()) == ["fig09.exr", "fig09.nc", "fig09.png", "fig09_layout.png"]
+    assert results.open(out / "fig09.exr").attrs["passes"] == 4
+    ((name, options),) = calls.seen
+    assert name == "fig09"
+    assert options.pop("progress") is not None
+    assert options == {
+        "params": {"wind_speed": "3", "file": "a=b"},
+        "integrator": None,
+        "target_error": None,
+        "max_time": None,
+        "passes": 4,
+        "seed": 7,
+        "max_memory": None,
+        "variant": None,
+    }
+    for part in ("1.23", "peak power, [red] (W)", "3e-06", "5e-06", "1.50"):
+        assert part in result.stderr
+
+
+def test_render_quiet_without_plot(scene, calls, tmp_path):
+    result = run("render", scene, "-o", tmp_path, "--quiet", "--no-plot", "--target-error", "0.01", "--max-time", "5")
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    assert result.stdout.splitlines() == [str(tmp_path / "fig09.exr"), str(tmp_path / "fig09.nc")]
+    assert not (tmp_path / "fig09.png").exists()
+    assert calls.seen[0][1]["target_error"] == 0.01
+    assert calls.seen[0][1]["max_time"] == 5.0
+
+
+def test_interrupted_render_is_kept(scene, calls, tmp_path):
+    calls.extra["interrupted"] = 1
+    result = run("render", scene, "-o", tmp_path, "--quiet")
+    assert result.exit_code == 130
+    assert "interrupted after 4 passes" in result.stderr
+    assert len(result.stdout.splitlines()) == 4
+    assert results.open(tmp_path / "fig09.nc").attrs["interrupted"] == 1
+
+
+def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
+    calls.extra["error"] = KeyboardInterrupt()
+    result = run("render", scene, "-o", tmp_path / "out", "--quiet")
+    assert result.exit_code == 130
+    assert result.stderr == "interrupted.\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--target-error", "0"], "target_error = 0 must be greater than 0"),
+        (["--target-error", "nan"], "target_error = nan must be finite"),
+        (["--max-time", "-1"], "max_time = -1 must be greater than 0"),
+        (["--max-time", "inf"], "max_time = inf must be finite"),
+        (["--passes", "1"], "passes = 1 must be at least 2"),
+        (["-D", "wind"], "-D wind is not of the form name=value."),
+        (["-D", "=3"], "-D =3 is not of the form name=value."),
+    ],
+)
+def test_render_rejects_options(tmp_path, arguments, sentence):
+    assert_refused(run("render", "table1", "-o", tmp_path / "out", *arguments), sentence)
+    assert not (tmp_path / "out").exists()
+
+
+def test_render_of_an_unknown_scene(scene, calls, tmp_path):
+    assert_refused(run("render", "fig9", "-o", tmp_path / "out"), "'fig9'", "did you mean fig09")
+    assert not calls.seen
+
+
+def test_unwritable_output_is_noticed_before_rendering(scene, calls, tmp_path):
+    (tmp_path / "file").write_text("regular")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert_refused(run("render", scene, "-o", folder), f"cannot write to folder {folder}: Not a directory.")
+    (tmp_path / "fig09.nc").mkdir()
+    assert_refused(run("render", scene, "-o", tmp_path), f"cannot write {tmp_path / 'fig09.nc'}: it is a folder.")
+    assert not calls.seen
+
+
+def test_mistake_found_by_the_renderer(scene, calls, tmp_path):
+    calls.extra["error"] = UserError("backscattering = 0.5 must not exceed scattering = 0.15.")
+    result = run("render", scene, "-o", tmp_path / "out", "--quiet")
+    assert_refused(result, "backscattering = 0.5 must not exceed scattering = 0.15.")
+    assert not (tmp_path / "out").exists()
+
+
+def test_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):
+    calls.extra["error"] = ValueError("bug")
+    result = run("render", scene, "-o", tmp_path)
+    assert isinstance(result.exception, ValueError)
+    assert not isinstance(result.exception, UserError)
+
+
+def test_plot(scene, calls, tmp_path):
+    run("render", scene, "-o", tmp_path, "--no-plot", "--quiet")
+    result = run("plot", tmp_path / "fig09.exr")
+    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.png'}\n")
+    both = (tmp_path / "fig09.png").read_bytes()
+    for option in ("--log", "--linear"):
+        result = run("plot", tmp_path / "fig09.nc", option, "-o", tmp_path / "b.png")
+        assert result.exit_code == 0, result.output
+        # One panel is less high than two; the height stands in bytes 20 to 24.
+        assert (tmp_path / "b.png").read_bytes()[20:24] < both[20:24]
+    assert_refused(run("plot", tmp_path / "missing.nc"), "missing.nc", "No such file")
+    assert_refused(run("plot", tmp_path / "fig09.nc", "-o", tmp_path / "a.txt"), "must end in .png")
+
+
+def test_scenes(scene, tmp_path):
+    for arguments in (["scenes"], ["scenes", "list"]):
+        result = run(*arguments)
+        assert (result.exit_code, result.stdout) == (0, "fig09  Flat bottom.\n")
+    assert run("scenes", "show", "fig09").stdout == catalogue.scene_text("fig09")
+    assert_refused(run("scenes", "show", "fig9"), "did you mean fig09")
+    result = run("scenes", "copy", "fig09", tmp_path)
+    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'fig09.xml'}\n")
+    assert_refused(run("scenes", "copy", "fig09", tmp_path), "exists already")
+
+
+def test_water(tmp_path):
+    plain = run("water", "secchi", 6)
+    assert plain.exit_code == 0, plain.output
+    assert plain.stdout.splitlines()[-1].startswith("mitransient-lidar render table1 -D attenuation=")
+    drawn = run("water", "secchi", 6, "-o", tmp_path / "a.svg")
+    assert drawn.stdout == f"{plain.stdout}{tmp_path / 'a.svg'}\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
+    assert_refused(run("water", "secchi", 6, "-o", tmp_path / "a.jpg"), "must end in .png, .pdf or .svg")
+    assert_refused(run("water", "mud"), "kind = 'mud'", "petzold, profile, pure")
+    for word in ("petzold", "profile", "--tolerance", "--output"):
+        assert word in run("water", "--help").stdout
+
+
+def test_info_and_bench(monkeypatch):
+    seen = []
+    monkeypatch.setattr(variants, "describe", lambda: {"mitsuba": "3.9.1", "LLVM": "none"})
+    monkeypatch.setattr(bench, "run", lambda **options: seen.append(options))
+    assert run("info").stdout == "mitsuba  3.9.1\nLLVM     none\n"
+    assert run("bench", "--quick", "--case", "clear", "--target-error", "0.02").exit_code == 0
+    assert seen == [{"quick": True, "json": False, "case": "clear", "target_error": 0.02}]
+
+
+def test_bench_refuses_a_negative_error():
+    assert_refused(run("bench", "--target-error", "-1"), "target_error = -1 must be greater than 0")
+
+
+def test_version_and_help():
+    assert run("--version").stdout == f"{__version__}\n"
+    assert "render" in run("--help").stdout
+
+
+def test_command_line_imports_nothing_slow():
+    code = (
+        "import sys, mitransient_lidar; before = set(sys.modules); import mitransient_lidar.cli.app;"
+        "new = {name.partition('.')[0] for name in set(sys.modules) - before};"
+        "print(new & {'mitsuba', 'xarray', 'matplotlib', 'OpenEXR', 'scipy', 'numpy', 'rich'})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

@@ -1,0 +1,146 @@
+"""The command that cuts gates: files, their names, and sentences."""
+
+import command_line
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitransient_lidar import results
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results import gate_files
+
+TRAIN = ("--start-ns", 1410, "--width-ns", 5, "--count", 6)
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """A small imager's result, in a file."""
+    rng = np.random.default_rng(1)
+    time = 1400 + 0.5 * (np.arange(120) + 0.5)
+    power = 1e-5 * (np.exp(-0.5 * ((time - 1415) / 2) ** 2) + np.where(time > 1415, np.exp(-(time - 1415) / 10), 0))
+    waveform = rng.uniform(0.5, 1.5, (12, 1)) * power
+    energy = waveform * 0.5e-9
+    dataset = results.build(
+        energy,
+        0.05 * energy,
+        waveform,
+        0.05 * waveform,
+        time=TimeAxis(1400.0, 0.5, waveform.shape[1]),
+        pixel_names=[],
+        pixel_centres_mrad=np.stack(np.meshgrid([-2.0, -1, 0, 1], [1.0, 0, -1]), -1).reshape(-1, 2)[:, ::-1],
+        grid=(3, 4),
+        attributes={
+            "scene": "gated",
+            "altitude": 199.0,
+            "surface_time_ns": 1415.0,
+            "refractive_index": 1.34,
+            "group_index": 1.34,
+            "off_nadir_deg": 20.0,
+            "pulse_fwhm_ns": 4.0,
+        },
+    )
+    path = tmp_path / "scene.nc"
+    results.save(dataset, path)
+    return path, dataset
+
+
+def run(*arguments):
+    return command_line.run("gates", *arguments)
+
+
+def test_files_beside_the_result(stored):
+    path, dataset = stored
+    result = run(path, *TRAIN)
+    assert result.exit_code == 0, result.output
+    names = ["scene_gates.exr", "scene_gates.png", "scene_depth.png"]
+    assert result.stdout.split() == [str(path.with_name(name)) for name in names]
+    for name in names[1:]:
+        with Image.open(path.with_name(name)) as picture:
+            assert (picture.format, picture.width) == ("PNG", 1536)
+    stack = gate_files.open_stack(path.with_name("scene_gates.exr"))
+    # Bins 20 to 29 make up gate 0; EXR files hold 32 bits.
+    expected = dataset["waveform"][:, :, 20:30].sum("time") * 0.5e-9
+    np.testing.assert_allclose(stack["gate_energy"][:, :, 0], expected, rtol=1e-6)
+
+
+def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
+    path, _ = stored
+    folder = tmp_path / "new" / "folder"
+    result = run(path, *TRAIN, "--output", folder, "--no-plot", "--sequence", "--gif", "--html", "--quiet")
+    assert result.exit_code == 0, result.output
+    numbered = [f"scene_gate{gate:03d}.exr" for gate in range(6)]
+    names = ["scene_gates.exr", "scene_gates.gif", "scene_gates.html", *numbered]
+    assert result.stdout.split() == [str(folder / name) for name in names]
+    assert sorted(file.name for file in folder.iterdir()) == sorted(names)
+
+
+def test_gates_from_a_depth(stored):
+    path, _ = stored
+    assert run(path, "--start-depth", 1, "--width-ns", 4, "--step-ns", 2, "--count", 5, "--no-plot").exit_code == 0
+    stack = gate_files.open_stack(path.with_name("scene_gates.exr"))
+    # 1 m is 2 * 1.34 / (c0 cos 14.8 deg) = 9.245 ns under the surface at 1415 ns.
+    assert float(stack["gate_start"][0]) == pytest.approx(1424.245, abs=2e-3)
+    np.testing.assert_allclose(np.diff(stack["gate_start"]), 2)
+
+
+def test_few_gates_have_no_depths(stored):
+    path, _ = stored
+    result = run(path, "--start-ns", 1412, "--width-ns", 10, "--count", 2)
+    assert result.exit_code == 0, result.output
+    assert "no drawing of depths" in result.stderr
+    assert not path.with_name("scene_depth.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ((), "one start"),
+        (("--start-ns", 1410), "one shape"),
+        (("--start-ns", 1401, "--width-ns", 5), "gate train before the surface"),
+        (("--start-ns", 1450, "--width-ns", 5, "--count", 3), "within the record"),
+        (("--start-ns", 1410, "--width-ns", 5, "--count", 0), "count = 0 must lie between 1 and 100000"),
+        (("--start-ns", 1410, "--width-ns", 5, "--pulses", 0), "pulses = 0 must lie between 1 and"),
+    ],
+)
+def test_sentences(stored, arguments, part):
+    result = run(stored[0], *arguments)
+    assert result.exit_code == 2, result.output
+    assert part in result.stderr
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_a_stack_of_gates_has_no_histogram(stored):
+    path, _ = stored
+    run(path, *TRAIN, "--no-plot")
+    result = run(path.with_name("scene_gates.exr"), *TRAIN)
+    assert result.exit_code == 2
+    assert "kept its histogram" in result.stderr
+
+
+def test_missing_files(tmp_path):
+    result = run(tmp_path / "none.nc", *TRAIN)
+    assert result.exit_code == 2
+    assert "cannot read" in result.stderr
+
+
+def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
+    path, _ = stored
+    assert run(path, *TRAIN, "--no-plot").exit_code == 0
+    cut = path.with_name("scene_gates.exr")
+    result = run(cut, "--html", "-o", tmp_path / "again", "--quiet")
+    assert result.exit_code == 0, result.output
+    names = ["scene_gates.exr", "scene_gates.png", "scene_depth.png", "scene_gates.html"]
+    assert result.stdout.split() == [str(tmp_path / "again" / name) for name in names]
+    again = gate_files.open_stack(tmp_path / "again" / "scene_gates.exr")
+    np.testing.assert_array_equal(again["gate_energy"], gate_files.open_stack(cut)["gate_energy"])
+
+
+def test_a_movie_that_cannot_be_leaves_no_files(stored, tmp_path, monkeypatch):
+    path, _ = stored
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = run(path, *TRAIN, "-o", tmp_path / "out", "--mp4")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert ".mp4 needs the program ffmpeg" in result.stderr
+    assert not (tmp_path / "out").exists()

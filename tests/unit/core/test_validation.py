@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import (
+    finite,
+    finite_array,
+    in_range,
+    increasing_array,
+    integer,
+    non_negative,
+    non_negative_array,
+    positive,
+    time_samples,
+)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, "deep", None])
+def test_scalars_must_be_finite_numbers(bad):
+    with pytest.raises(UserError, match="depth"):
+        finite("depth", bad)
+
+
+def test_clean_values():
+    assert positive("x", 1) == 1.0
+    assert integer("x", 3.0, 1, 5) == 3
+    assert in_range("x", "7", 1, np.inf) == 7.0
+    values = np.arange(3)
+    assert not np.shares_memory(finite_array("x", values), values)
+    assert increasing_array("x", values).dtype == np.float64
+    assert [v.tolist() for v in time_samples([0, 1], "power", [2, 3])] == [[0, 1], [2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: positive("x", 0), "x = 0 must be greater than 0"),
+        (lambda: non_negative("x", -1), "x = -1 must not be negative"),
+        (lambda: in_range("x", 2, 0, 1), "x = 2 must lie between 0 and 1"),
+        (lambda: in_range("x", 0.5, 1, np.inf), r"x = 0\.5 must be at least 1$"),
+        (lambda: integer("x", 1.5, 0, 9), r"x = 1\.5 must be an integer"),
+        (lambda: finite_array("x", [1, np.nan]), "x holds nan but every value must be finite"),
+        (lambda: finite_array("x", ["a"]), "must hold numbers only"),
+        (lambda: non_negative_array("x", [1, -2, -3]), "x = -3 must not be negative"),
+        (lambda: increasing_array("x", [1]), r"x of shape \(1,\) must be a list of at least 2 numbers"),
+        (lambda: increasing_array("x", [[1, 2]]), r"x of shape \(1, 2\) must be a list"),
+        (lambda: increasing_array("x", [0, 2, 2]), "x must increase strictly, but 2 is followed by 2"),
+        (lambda: time_samples([0, 1], "power", [1]), r"power of shape \(1,\) must have equal lengths"),
+    ],
+)
+def test_invalid_values_are_rejected(call, message):
+    with pytest.raises(UserError, match=message):
+        call()

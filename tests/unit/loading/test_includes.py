@@ -1,0 +1,195 @@
+"""Scene files that include others."""
+
+import mitsuba as mi
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import catalogue, scenes
+from mitransient_lidar.loading.includes import flat_text
+
+SCENE = """<?xml version="1.0" encoding="utf-8"?>
+<!-- A level sea -->
+<!--
+  Over a bottom.
+-->
+<scene version="3.0.0">
+
+    <default name="radius" value="2"/>
+    <!-- Chosen here -->
+    <default name="grey" value="0.5"/>  <!-- light &amp; dark -->
+
+    <include filename="parts/ball.xml"/>
+    <!-- Below -->
+    <shape type="rectangle" id="floor">
+        <include name="bsdf" filename="parts/matt.xml"/>
+    </shape>
+    <!-- The end -->
+</scene>
+"""
+
+BALL = """<!-- Shared part -->
+<scene version="3.0.0">
+
+    <!-- All parameters -->
+
+    <!-- Ball -->
+    <default name="radius" value="1"/>  <!-- m -->
+    <default name="depth"  value="3"/>
+    <default name="grey"   value="0.1"/>  <!-- reflectance -->
+
+    <include filename="point.xml"/>
+
+    <shape type="sphere" id="ball">
+        <!-- Nearly "round" -->
+        <float name="radius" value="$radius"/>  <!-- half
+            the diameter -->
+        <point name="center" x="0" y="0" z="-$depth"/>
+    </shape>
+
+</scene>
+"""
+
+POINT = '<scene version="3.0.0"><default name="power" value="7"/></scene>'
+
+MATT = """<bsdf version="3.0.0" type="diffuse">
+  <!-- Matt -->
+  <default name="gain" value="1"/>
+  <spectrum name="reflectance" value="$grey"/>
+</bsdf>
+"""
+
+FLAT = """<!-- A level sea -->
+<!--
+  Over a bottom.
+-->
+<scene version="3.0.0">
+
+    <!-- All parameters -->
+
+    <!-- Ball -->
+    <default name="radius" value="2"/>  <!-- m -->
+    <default name="depth" value="3"/>
+    <!-- Chosen here -->
+    <default name="grey" value="0.5"/>  <!-- light &amp; dark -->
+
+    <default name="power" value="7"/>
+    <!-- Matt -->
+    <default name="gain" value="1"/>
+
+    <shape type="sphere" id="ball">
+        <!-- Nearly "round" -->
+        <float name="radius" value="$radius"/>  <!-- half
+            the diameter -->
+        <point name="center" x="0" y="0" z="-$depth"/>
+    </shape>
+
+    <!-- Below -->
+    <shape type="rectangle" id="floor">
+        <bsdf type="diffuse" name="bsdf">
+            <spectrum name="reflectance" value="$grey"/>
+        </bsdf>
+    </shape>
+    <!-- The end -->
+
+</scene>
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    parts = {"ball.xml": BALL, "matt.xml": MATT, "point.xml": POINT}
+    (tmp_path / "parts").mkdir()
+    for name, text in parts.items():
+        (tmp_path / "parts" / name).write_text(text, "utf-8")
+    path = tmp_path / "own.xml"
+    path.write_text(SCENE, "utf-8")
+    return path
+
+
+def test_flat_text(scene):
+    assert flat_text(scene) == FLAT
+    assert catalogue.scene_parameters(scene) == {"radius": "2", "depth": "3", "grey": "0.5", "power": "7", "gain": "1"}
+
+
+def test_text_without_includes_is_unchanged(scene):
+    text = '<scene  version="3.0.0"><default name="a" value="1"/>\n\n\n<!-- b --></scene>'
+    scene.write_text(text, "utf-8")
+    assert flat_text(scene) == text
+    scene.write_text(FLAT, "utf-8")
+    assert flat_text(scene) == FLAT
+
+
+def test_mitsuba_reads_the_same(scene):
+    config = mi.parser.ParserConfig(mi.variant())
+    for given in ({}, {"radius": "5", "grey": "0.2"}):
+        states = (
+            mi.parser.parse_file(config, str(scene), **given),
+            mi.parser.parse_string(config, flat_text(scene), **given),
+        )
+        first, second = ([(node.type, str(node.props)) for node in state.nodes] for state in states)
+        assert first == second
+        assert f'"radius" -> {given.get("radius", "2")}' in first[1][1]
+
+
+def test_scene_with_includes_loads(scene):
+    unused = POINT.replace("power", "depth")
+    (scene.parent / "parts" / "point.xml").write_text(unused, "utf-8")
+    (scene.parent / "parts" / "matt.xml").write_text(MATT.replace('"gain" value="1"', '"radius" value="1"'), "utf-8")
+    loaded, name, parameters = scenes.load_scene(scene, {"depth": 4})
+    assert (name, parameters) == ("own", {"depth": "4", "radius": "2", "grey": "0.5"})
+    assert [shape.id() for shape in loaded.shapes()] == ["ball", "floor"]
+    with pytest.raises(UserError, match="parameter 'dept' is not one of scene own: did you mean depth"):
+        scenes.load_scene(scene, {"dept": 4})
+
+
+def test_value_that_refers_to_a_parameter_follows_it(scene):
+    text = """<scene version="3.0.0">
+    <default name="a" value="1"/>
+    <default name="b" value="$a"/>  <!-- as a -->
+    <include filename="part.xml"/>
+    <shape type="sphere"><float name="radius" value="$b"/></shape>
+</scene>"""
+    part = '<scene version="3.0.0"><default name="b" value="2"/><default name="a" value="2"/> <!-- m --></scene>'
+    scene.write_text(text, "utf-8")
+    scene.with_name("part.xml").write_text(part, "utf-8")
+    assert list(catalogue.scene_parameters(scene).items()) == [("a", "1"), ("b", "$a")]
+    assert '<default name="a" value="1"/>  <!-- m -->\n    <default name="b" value="$a"/>  <!-- as a -->' in (
+        flat_text(scene)
+    )
+    config = mi.parser.ParserConfig(mi.variant())
+    assert mi.parser.parse_string(config, flat_text(scene), a="9").nodes[1].props["radius"] == 9
+
+
+def test_part_beside_the_including_file_is_found(scene):
+    """Mitsuba looks in the folder of the part first, then in those of the files that include it."""
+    (scene.parent / "parts" / "point.xml").rename(scene.with_name("point.xml"))
+    assert flat_text(scene) == FLAT
+
+
+@pytest.mark.parametrize(
+    ("part", "text", "sentence"),
+    [
+        (
+            "own.xml",
+            '<scene><include filename="gone.xml"/></scene>',
+            r"own\.xml includes 'gone\.xml', which is not found",
+        ),
+        ("own.xml", "<scene><include/></scene>", "own.xml includes '', which is not found"),
+        (
+            "parts/matt.xml",
+            '<bsdf><include filename="ball.xml"/>',
+            r"scene .*matt\.xml is not well-formed XML: .*line 1",
+        ),
+        (
+            "parts/point.xml",
+            '<scene><include filename="ball.xml"/></scene>',
+            r"includes 'ball\.xml', which includes it",
+        ),
+        ("parts/point.xml", b"\xff\xfe\x00", r"scene .*point\.xml is not a UTF-8 text file"),
+    ],
+)
+def test_wrong_includes(scene, part, text, sentence):
+    (scene.parent / part).write_bytes(text if isinstance(text, bytes) else text.encode())
+    for use in (flat_text, catalogue.scene_parameters, catalogue.copy_scene, scenes.load_scene):
+        with pytest.raises(UserError, match=sentence):
+            use(scene)

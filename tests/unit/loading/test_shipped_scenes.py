@@ -1,0 +1,163 @@
+"""Shipped scenes: parameters, files that differ, and self-contained texts."""
+
+import difflib
+import itertools
+
+import mitsuba as mi
+import pytest
+
+from mitransient_lidar.loading import catalogue, scenes
+
+#: Parameters of table1 in their order.
+TABLE = {
+    **{"pulse_energy_mj": "5", "pulse_fwhm_ns": "5", "divergence_mrad": "10", "wavelength_nm": "532"},
+    **{"optical_efficiency": "0.9", "field_of_view_mrad": "30", "layout": "2x2", "aperture_area": "0.025"},
+    **{"two_way_atmospheric_transmittance": "0.9", "response_time_ns": "0"},
+    **{"altitude": "200", "off_nadir_deg": "20", "aim_x": "0", "aim_y": "0"},
+    **{"time_start_ns": "1390", "bin_width_ns": "1", "bin_count": "150"},
+    **{"wind_speed": "3", "wind_direction_deg": "0", "spectrum": "elfouhaily", "slope_variance": "cox_munk"},
+    **{"surface_seed": "1", "surface_time": "0"},
+    **{"surface_refined_size": "auto", "surface_cell_size": "auto", "surface_size": "1000"},
+    **{"refractive_index": "1.34", "group_index": "1.364", "layer_tops": "0"},
+    **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "0"},
+    **{"phase": "fournier_forand", "phase_g": "0.924"},
+    **{"bottom_depth": "8", "bottom_reflectance": "0.1"},
+}
+
+INDEX = {"group_index": "1.34"}
+SPHERE = {"target_y": "0", "target_size": "1", "target_reflectance": "0.1"}
+SHOT = {**INDEX, "field_of_view_mrad": "15", "wind_speed": "6", "bottom_depth": "5"}
+FINE = {"time_start_ns": "1400", "bin_width_ns": "0.25"}
+PLACES = (("25.15", "-47.56"), ("42.42", "-57.40"), ("20.35", "-32.63"))
+SQUARE = {
+    **{**INDEX, "field_of_view_mrad": "35", "bin_count": "175", "surface_seed": "8", "bottom_depth": "12"},
+    **{"target_x": "0", "target_y": "0", "target_depth": "8", "target_size": "1.5", "target_reflectance": "0.1"},
+}
+LAYERS = {
+    **{**INDEX, "field_of_view_mrad": "35", "layer_tops": "0, 3"},
+    **{"attenuation": "0.9, 0.5", "scattering": "0.45, 0.25", "backscattering": "0.018, 0.010"},
+}
+GATES = {
+    **{**INDEX, "divergence_mrad": "12", "field_of_view_mrad": "20", "layout": "128x128", "bin_width_ns": "0.5"},
+    **{"blur_mrad": "0", "gate_rise_ns": "0", "gate_fall_ns": "0", "pulses": "1", "surface_cell_size": "0.06"},
+}
+
+#: Parameters of each scene that table1 lacks or has with another value.
+OWN = {
+    "table1": {},
+    "fig02_mine": {
+        **{**INDEX, **SPHERE, "layout": "1x1", "bin_count": "170"},
+        **{"target_x": "2.4", "target_depth": "9", "bottom_depth": "12"},
+    },
+    "fig04_mast": {
+        **{**INDEX, "divergence_mrad": "5", "field_of_view_mrad": "10", "altitude": "15", "off_nadir_deg": "84.6"},
+        **{"time_start_ns": "985", "bin_count": "240"},
+        **{"target_depth": "1", "target_x": "1.11", "target_tilt_deg": "48", "target_reflectance": "0.3"},
+    },
+    "fig09_1x1": {**INDEX, "layout": "1x1"},
+    "fig09_2x2": INDEX,
+    **{f"fig10_shot{i}": {**SHOT, **FINE, "aim_x": x, "aim_y": y} for i, (x, y) in enumerate(PLACES, 1)},
+    **{f"fig11_shot{i}": {**SHOT, "aim_x": x, "aim_y": y} for i, (x, y) in enumerate(PLACES, 1)},
+    "fig13_2x2": SQUARE,
+    "fig14_1x4": {**SQUARE, "layout": "1x4"},
+    "fig15_1x1": {**LAYERS, "layout": "1x1"},
+    "fig15_2x2": LAYERS,
+    "fresh_water_lens": {
+        **{"refractive_index": "1.33667, 1.34240", "group_index": "1.35839, 1.36476", "layer_tops": "0, 2"},
+        **{"attenuation": "0.6, 0.3", "scattering": "0.35, 0.15", "backscattering": "0.007, 0.003"},
+    },
+    "gated_mine": {
+        **{**GATES, "gate_start_depth": "4.4", "gate_width_ns": "5", "gate_step_ns": "2", "gate_count": "20"},
+        **{"bin_count": "260", "wind_speed": "1", "surface_refined_size": "12"},
+        **{**SPHERE, "target_x": "1.5", "target_y": "-0.5", "target_depth": "6", "target_reflectance": "0.25"},
+        **{"plate_x": "2.2", "plate_y": "1.2", "plate_size": "1.2", "plate_tilt_deg": "10", "plate_height": "0.2"},
+        **{"plate_reflectance": "0.6", "bottom_reflectance": "0.3"},
+        **{"ripple_height": "0.15", "ripple_length": "0.8", "ripple_bearing_deg": "60"},
+    },
+    "gated_waves": {
+        **{**GATES, "gate_start_depth": "1.44", "gate_width_ns": "10", "gate_step_ns": "17.88", "gate_count": "3"},
+        **{"off_nadir_deg": "0", "time_start_ns": "1330", "bin_count": "200", "wind_speed": "4"},
+        **{"surface_refined_size": "10"},
+        **{"depth_left": "2", "depth_middle": "4", "depth_right": "6", "step_reflectance": "0.5"},
+    },
+    "nepheloid_layer": {
+        **{"layer_tops": "0, 6.5", "attenuation": "0.398, 2.190"},
+        **{"scattering": "0.219, 1.824", "backscattering": "0.00293, 0.03643"},
+    },
+    "passive_sea": {
+        **{**INDEX, "divergence_mrad": "160", "field_of_view_mrad": "240", "layout": "128x128", "off_nadir_deg": "35"},
+        **{"time_start_ns": "1490", "bin_width_ns": "10", "bin_count": "42", "wind_speed": "6"},
+        **{"surface_refined_size": "100", "surface_cell_size": "0.2", "bottom_reflectance": "0.3"},
+        **{"sun_zenith_deg": "40", "sun_azimuth_deg": "70"},
+        **{"plate_x": "3", "plate_y": "10", "plate_depth": "7.9", "plate_size": "8", "plate_reflectance": "0.9"},
+        **{"sphere_x": "1", "sphere_y": "-10", "sphere_depth": "4", "sphere_size": "4", "sphere_reflectance": "0.03"},
+    },
+    "ship_wake": {
+        **{**INDEX, "wake_speed": "6", "ship_length": "20", "ship_bearing_deg": "90", "ship_x": "0", "ship_y": "60"},
+        **{"plume_scattering": "0.5", "plume_width": "8", "plume_depth": "2"},
+    },
+    "thin_layer": {
+        **{"layer_tops": "0, 4, 4.4", "attenuation": "0.229, 2.649, 0.229"},
+        **{"scattering": "0.170, 2.429, 0.170", "backscattering": "0.00237, 0.01190, 0.00237"},
+    },
+}
+
+#: The steps of gated_waves replace the bottom.
+MISSING = {"gated_waves": {"bottom_depth", "bottom_reflectance"}}
+
+
+def test_every_scene_is_listed():
+    assert catalogue.scene_names() == sorted(OWN)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_parameters(name):
+    table = {key: value for key, value in TABLE.items() if key not in MISSING.get(name, ())}
+    assert catalogue.scene_parameters(name) == {**table, **OWN[name]}
+
+
+def test_order_of_parameters():
+    assert list(catalogue.scene_parameters("table1")) == list(TABLE)
+    assert [key for key in catalogue.scene_parameters("gated_mine") if key in TABLE] == list(TABLE)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_text_equals_the_file_with_its_includes(name):
+    """Mitsuba reads the same plugins with the same parameters in the same order from both."""
+    config = mi.parser.ParserConfig(mi.variant())
+    text = catalogue.scene_text(name)
+    states = (mi.parser.parse_file(config, str(catalogue.scene_path(name))), mi.parser.parse_string(config, text))
+    file, flat = ([(str(node.type), str(node.props)) for node in state.nodes] for state in states)
+    assert len(flat) >= 9
+    assert flat == file
+    assert "<include" not in text
+    assert text.count("<scene") == text.count("</scene>") == 1
+    assert text.count("<default") == len(catalogue.scene_parameters(name))
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_copy_loads_to_the_same_scene(name, tmp_path):
+    image = {"layout": "2x2", "surface_cell_size": "0.5"} if OWN[name].get("layout") == "128x128" else {}
+    included, _, parameters = scenes.load_scene(name, image)
+    flat, _, again = scenes.load_scene(catalogue.copy_scene(name, tmp_path), image)
+    assert list(tmp_path.iterdir()) == [tmp_path / f"{name}.xml"]
+    assert again == parameters
+    for kind in ("shapes", "emitters", "sensors"):
+        first, second = ([(item.id(), str(item)) for item in getattr(scene, kind)()] for scene in (included, flat))
+        assert first == second
+    assert str(flat.integrator()) == str(included.integrator())
+
+
+def test_gates_are_named_in_the_text_of_gated_scenes_alone():
+    assert [name for name in OWN if "gate_count" in catalogue.scene_text(name)] == ["gated_mine", "gated_waves"]
+
+
+def test_scenes_share_few_lines():
+    """No two scene files have more than seven successive lines in common."""
+    lines = {
+        name: [" ".join(line.split()) for line in catalogue.scene_path(name).read_text("utf-8").splitlines() if line]
+        for name in OWN
+    }
+    for first, second in itertools.combinations(lines, 2):
+        matcher = difflib.SequenceMatcher(None, lines[first], lines[second], autojunk=False)
+        assert matcher.find_longest_match().size <= 7, (first, second)

@@ -1,0 +1,99 @@
+"""Finding LLVM and choosing a variant, with readable errors where neither works."""
+
+import os
+import subprocess
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import variants
+
+
+def test_the_wheels_llvm_is_found_through_its_metadata():
+    path = variants.find_llvm()
+    assert path is None or (path.is_file() and path.name.startswith("libLLVM.so."))
+
+
+@pytest.mark.parametrize("name", ["libLLVM-15.so.1", "libLLVM.so.16.0", "libLLVM-14.so", "libLLVM.so.15"])
+def test_llvm_releases_that_abort_are_refused_by_name(tmp_path, name):
+    (tmp_path / name).touch()
+    with pytest.raises(UserError, match=r"LLVM 1[456] .* install LLVM 17 or newer .*karellen-llvm-core"):
+        variants.check_llvm_path(str(tmp_path / name))
+
+
+def test_a_link_to_an_old_llvm_is_refused_too(tmp_path):
+    (tmp_path / "libLLVM-15.so.1").touch()
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM-15.so.1")
+    with pytest.raises(UserError, match="LLVM 15"):
+        variants.check_llvm_path(str(tmp_path / "libLLVM.so"))
+
+
+@pytest.mark.parametrize("name", ["libLLVM.so.19.1", "libLLVM-23.so", "libLLVM.so"])
+def test_other_releases_pass(tmp_path, name):
+    (tmp_path / name).touch()
+    variants.check_llvm_path(str(tmp_path / name))
+
+
+def test_unsupported_variants_are_named():
+    for name in ("scalar_rgb", "nonsense"):
+        with pytest.raises(UserError, match=f"'{name}' is not supported: allowed are cuda_ad_mono, llvm_ad_mono"):
+            variants.set_variant(name)
+
+
+def test_cuda_without_a_gpu_is_refused():
+    if dr.has_backend(dr.JitBackend.CUDA):
+        assert variants.set_variant("cuda_ad_mono") == "cuda_ad_mono"
+    else:
+        with pytest.raises(UserError, match="needs an NVIDIA GPU"):
+            variants.set_variant("cuda_ad_mono")
+
+
+def test_old_llvm_in_the_process_says_to_import_first(monkeypatch):
+    monkeypatch.setattr(variants, "loaded_llvm", lambda: (15, 0, 6))
+    with pytest.raises(UserError, match=r"LLVM 15 does not work with Dr\.Jit"):
+        variants.check_llvm()
+    monkeypatch.setattr(variants, "find_llvm", lambda: None)
+    with pytest.raises(UserError, match="install LLVM 17 or newer"):
+        variants.check_llvm()
+
+
+def test_importing_without_a_usable_llvm_is_a_readable_error(tmp_path):
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(tmp_path / "missing.so")}
+    done = subprocess.run(
+        [sys.executable, "-c", "import mitransient_lidar"], env=environment, capture_output=True, text=True, check=False
+    )
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        assert done.returncode != 0
+        assert "ImportError: DRJIT_LIBLLVM_PATH" in done.stderr
+        assert "is not a file: install LLVM" in done.stderr
+
+
+def test_the_users_own_llvm_wins():
+    llvm = os.environ.get("DRJIT_LIBLLVM_PATH")
+    assert llvm, "importing the package sets the path where the wheel is installed"
+    # The same library under another name: what the package finds by itself is spelled without the dot.
+    own = os.path.join(os.path.dirname(llvm), ".", os.path.basename(llvm))
+    code = "import os, mitransient_lidar; print(os.environ['DRJIT_LIBLLVM_PATH'])"
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": own}
+    assert subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip() == own
+
+
+def test_plugins_follow_the_variant():
+    """Another variant registers none of ours; coming back they work again."""
+    ours = mi.variant()
+    mi.set_variant("scalar_rgb")
+    try:
+        with pytest.raises(RuntimeError, match="not found"):
+            mi.load_dict({"type": "petzold"})
+    finally:
+        mi.set_variant(ours)
+    assert mi.load_dict({"type": "petzold"}).backscatter_ratio > 0
+
+
+def test_description_names_versions_and_llvm():
+    described = variants.describe()
+    assert {"mitransient-lidar", "mitsuba", "drjit", "python", "variant", "LLVM", "GPU", "threads"} == set(described)
+    assert described["variant"] == mi.variant()

@@ -1,0 +1,338 @@
+"""Gates: shapes, trains, weights of echoes, contrast and range images."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import ndtr
+from scipy.stats import binom, chi2, exponnorm, norm
+
+from mitransient_lidar.analysis.gates.range_images import contrast, range_from_gates
+from mitransient_lidar.physics.lidar.gate_shape import GateShape
+from mitransient_lidar.physics.lidar.gate_train import GateTrain, depth_of_time, time_of_depth
+from mitransient_lidar.physics.lidar.pulse import Pulse
+
+PROFILE = GateShape.sampled([100, 101, 103, 104, 107], [0, 0.8, 0.8, 0.4, 0])
+
+
+def level_crossing(shape, level, low, high):
+    """Bisect for the time at which the transmission passes a level."""
+    rising = shape.transmission(high) > shape.transmission(low)
+    for _ in range(60):
+        middle = (low + high) / 2
+        if (shape.transmission(middle) < level) == rising:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def test_edges_have_the_stated_times_and_half_heights():
+    shape = GateShape.edges(12.0, 3.0, 5.0)
+    first, last = shape.span_ns
+    rise = [level_crossing(shape, level, first, 6.0) for level in (0.1, 0.5, 0.9)]
+    fall = [level_crossing(shape, level, 6.0, last) for level in (0.9, 0.5, 0.1)]
+    assert rise[1] == pytest.approx(0, abs=1e-12)
+    assert fall[1] == pytest.approx(12, abs=1e-12)
+    assert rise[2] - rise[0] == pytest.approx(3, abs=1e-9)
+    assert fall[2] - fall[0] == pytest.approx(5, abs=1e-9)
+    # A raised cosine is 1/(1 - 2 acos(0.8)/pi) = 1.694 times as long as its 10-90 % part.
+    assert first == pytest.approx(-1.694 * 3 / 2, rel=1e-3)
+    np.testing.assert_array_equal(shape.transmission([first - 1e-9, 6.0, last + 1e-9]), [0, 1, 0])
+
+
+def test_sharp_gates_are_half_open():
+    shape = GateShape.edges(4.0)
+    np.testing.assert_array_equal(shape.transmission([-1e-12, 0, 4 - 1e-12, 4]), [0, 1, 1, 0])
+
+
+def test_width_and_edges_of_measured_gates():
+    # Half of the largest transmission, 0.4, is passed at 100.5 and last at 104; 10 % and 90 % are 0.08 and 0.72.
+    assert PROFILE.width_ns == pytest.approx(3.5)
+    assert PROFILE.rise_ns == pytest.approx(0.8)
+    assert PROFILE.fall_ns == pytest.approx((104 + 3 * 0.8) - (103 + 0.2))
+    assert PROFILE.transmission(0.0) == pytest.approx(0.4)
+    assert PROFILE.span_ns == (-0.5, 6.5)
+    assert PROFILE.open_time(99.0) == pytest.approx(0.4 + 1.6 + 0.6 + 0.6)
+
+
+def test_profile_files(tmp_path):
+    path = tmp_path / "gate.csv"
+    path.write_text("# ns, transmission\n0, 0\n1 1\n\n3,0 # end\n")
+    assert GateShape.from_file(path).width_ns == pytest.approx(1.5)
+    path.write_text("1 2 3\n4 5 6\n")
+    with pytest.raises(ValueError, match="line 1: '1 2 3' must be two numbers, time in ns and transmission"):
+        GateShape.from_file(path)
+
+
+@pytest.mark.parametrize("shape", [GateShape.edges(7.0), GateShape.edges(7.0, 2.0, 6.0), PROFILE])
+def test_open_time_is_the_integral_of_the_transmission(shape):
+    first, last = shape.span_ns
+    points = [p for p in (0.0, 0.5, shape.width_ns, 2.5, 3.5) if first < p < last]
+    for t in np.linspace(first, last, 5)[1:]:
+        inside = [p for p in points if p < t]
+        expected = quad(lambda x: float(shape.transmission(x)), first, t, points=inside, limit=200)[0]
+        assert float(shape.open_time(t)) == pytest.approx(expected, abs=1e-8)
+    assert shape.open_time(first - 5) == 0
+    assert shape.open_time(last + 5) == pytest.approx(float(shape.open_time(last)))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"width_ns": 0}, "width_ns = 0 must be greater than 0"),
+        ({"step_ns": -1}, "step_ns = -1 must be greater than 0"),
+        ({"count": 0}, "count = 0 must lie between 1"),
+        ({"count": 2.5}, "count = 2.5 must be an integer"),
+        ({"rise_ns": -1}, "rise_ns = -1 must not be negative"),
+        ({"rise_ns": 6, "fall_ns": 6.1}, "must add up to at most 11.8"),
+        ({"pulses": 0}, "pulses = 0 must lie between 1"),
+        ({"start_ns": np.nan}, "start_ns = nan must be finite"),
+        ({"profile": PROFILE}, "must be those of the profile"),
+    ],
+)
+def test_invalid_trains_are_rejected(values, message):
+    with pytest.raises(ValueError, match=message):
+        GateTrain(**{"start_ns": 1400.0, "width_ns": 10.0, "step_ns": 5.0, "count": 3} | values)
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (([0], [1]), "must be a list of at least 2 numbers"),
+        (([0, 0], [1, 1]), "increase strictly"),
+        (([0, 1], [0, 1.1]), "transmission = 1.1 must lie between 0 and 1"),
+        (([0, 1], [-0.1, 1]), "transmission = -0.1 must lie between 0 and 1"),
+        (([0, 1], [0, 0]), "greater than 0 somewhere"),
+    ],
+)
+def test_invalid_profiles_are_rejected(samples, message):
+    with pytest.raises(ValueError, match=message):
+        GateShape.sampled(*samples)
+
+
+def test_gates_follow_each_other():
+    train = GateTrain(1400.0, 10.0, 2.5, 5, 1.0, 2.0)
+    np.testing.assert_array_equal(train.starts_ns, [1400, 1402.5, 1405, 1407.5, 1410])
+    np.testing.assert_array_equal(train.middles_ns, train.starts_ns + 5)
+    np.testing.assert_allclose(train.spans_ns - train.starts_ns[:, None], [train.shape.span_ns] * 5)
+    for gate in range(5):
+        # A gate too late or early by one step would be off by 5 bins.
+        first, weights = train.gate_bins(gate, 1390.0, 0.5, 100)
+        assert first == train.gate_bins(0, 1390.0, 0.5, 100)[0] + 5 * gate
+        np.testing.assert_allclose(weights, train.gate_bins(0, 1390.0, 0.5, 100)[1], atol=1e-12)
+    with pytest.raises(ValueError, match="gate = 5 must lie between 0 and 4"):
+        train.gate_bins(5, 1390.0, 0.5, 100)
+
+
+@pytest.mark.parametrize("train", [GateTrain(1403.2, 7.0, 3.3, 4, 2.0, 4.0), GateTrain.measured(PROFILE, 1402, 1.7, 6)])
+def test_weights_of_bins_are_exact_means(train):
+    weights = np.zeros((60, train.count))
+    for gate in range(train.count):
+        first, column = train.gate_bins(gate, 1400.0, 0.5, 60)
+        weights[first : first + column.size, gate] = column
+    fine = train.shape.transmission((1400 + 0.5 * (np.arange(60 * 500) + 0.5) / 500)[:, None] - train.starts_ns)
+    # The midpoint rule with 500 points a bin is right to h^2 g''/24 and to h at a profile's steps of slope.
+    np.testing.assert_allclose(weights, fine.reshape(60, 500, -1).mean(axis=1), atol=2e-5)
+    np.testing.assert_allclose(0.5 * weights.sum(axis=0), float(train.shape.open_time(99.0)), rtol=1e-12)
+
+
+def test_weights_of_sharp_gates_are_shares_of_bins():
+    first, weights = GateTrain(1401.2, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)
+    assert first == 2
+    np.testing.assert_allclose(weights, [0.6, 1, 1, 1, 0.4])
+    # Only the part of a gate within the record counts, and none of a gate beside it.
+    first, weights = GateTrain(1399.0, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)
+    assert (first, weights.tolist()) == (0, [1, 1])
+    assert GateTrain(900.0, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)[1].size == 0
+    assert GateTrain(9000.0, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)[1].size == 0
+
+
+def test_response_of_a_sharp_gate_is_the_difference_of_two_distributions():
+    train = GateTrain(1400.0, 8.0, 4.0, 3)
+    table = train.response_weights(Pulse.gaussian(5.0), 2.0)
+    t = np.linspace(1360, 1430, 701)
+    sigma = 5 / 2.3548200450309493
+    late = exponnorm(2.0 / sigma, scale=sigma)
+    # An echo at t counts when pulse and response bring it between the edges. Added delays with the wrong sign, or a
+    # table half a step off, would change this by 3e-3 or more.
+    expected = late.cdf(1408 - t) - late.cdf(1400 - t)
+    np.testing.assert_allclose(table.at(t), expected, rtol=0, atol=2e-5)
+    assert table.values[0] == table.values[-1] == 0
+    assert table.at(table.end_ns + 1) == 0
+    # Light that arrives before the gate opens still counts, through the response.
+    assert table.at(1395.0) > 0.1 > norm.sf(5 / sigma)
+
+
+def test_response_of_a_gate_with_edges_agrees_with_quadrature():
+    train = GateTrain(1400.0, 8.0, 4.0, 3, 2.0, 6.0)
+    table = train.response_weights(Pulse.gaussian(3.0))
+    sigma = 3 / 2.3548200450309493
+    for t in (1396.0, 1399.0, 1403.0, 1406.5, 1411.0):
+        expected = quad(
+            lambda tau, t=t: norm.pdf(tau, scale=sigma) * float(train.shape.transmission(t + tau - train.start_ns)),
+            -8 * sigma,
+            8 * sigma,
+            points=[1400 - t, 1408 - t],
+            limit=200,
+        )[0]
+        assert float(table.at(t)) == pytest.approx(expected, abs=2e-5)
+    # Its area is the open time, whatever the pulse.
+    assert table.step_ns * table.values.sum() == pytest.approx(8.0, rel=1e-9)
+
+
+def test_response_of_a_sampled_pulse():
+    # A triangle of base 2 ns in a sharp gate of 10 ns: half of it passes at the edges.
+    table = GateTrain(50.0, 10.0, 10.0, 1).response_weights(Pulse.sampled([-1, 0, 1], [0, 1, 0]))
+    np.testing.assert_allclose(
+        table.at([48.9, 49.5, 50, 50.5, 55, 60, 61.1]), [0, 0.125, 0.5, 0.875, 1, 0.5, 0], atol=2e-5
+    )
+
+
+def test_response_takes_a_step_but_not_too_many():
+    train = GateTrain(1400.0, 8.0, 4.0, 3)
+    assert train.response_weights(Pulse.gaussian(5.0), step_ns=0.25).step_ns == 0.25
+    with pytest.raises(ValueError, match="at most 262144 are allowed"):
+        train.response_weights(Pulse.gaussian(5.0), step_ns=1e-6)
+    # A long response of a short pulse chooses a step that fits.
+    assert train.response_weights(Pulse.gaussian(0.01), 50.0).values.size <= 2**18
+
+
+def test_depth_and_time():
+    # 8 m of water under n_g = 1.364, axis at 14.8 degrees in the water: 2 * 1.364 * 8 / cos / c0 = 75.29 ns.
+    cosine = np.cos(np.radians(14.8))
+    assert float(time_of_depth(8.0, 1420.0, 1.364, cosine)) == pytest.approx(1420 + 75.295, abs=2e-3)
+    depths = np.array([-1.0, 0, 3, 20])
+    np.testing.assert_allclose(
+        depth_of_time(time_of_depth(depths, 1420, 1.34, 0.9), 1420, 1.34, 0.9), depths, atol=1e-9
+    )
+    with pytest.raises(ValueError, match="cos_water = 0 must be greater than 0"):
+        time_of_depth(1.0, 1420, 1.34, 0.0)
+    with pytest.raises(ValueError, match=r"group_index = 0\.9 must lie between 1 and 2"):
+        time_of_depth(1.0, 1420, 0.9, 1.0)
+
+
+def test_contrast_and_its_error():
+    found = contrast([3.0, 1.0], [1.0, 0.0], [0.2, 0.1], [0.1, 0.1])
+    np.testing.assert_allclose(found.michelson, [0.5, 1.0])
+    np.testing.assert_allclose(found.weber, [2.0, np.nan])
+    # 2/(a+b)^2 sqrt(b^2 0.2^2 + a^2 0.1^2) and sqrt(0.2^2 + (a/b)^2 0.1^2)/b
+    assert found.michelson_stderr[0] == pytest.approx(np.sqrt(0.04 + 0.09) / 8)
+    assert found.weber_stderr[0] == pytest.approx(np.sqrt(0.04 + 0.09))
+    with pytest.raises(ValueError, match="a_stderr = -1 must not be negative"):
+        contrast(1.0, 1.0, -1.0, 1.0)
+
+
+@pytest.mark.parametrize("correlation", [-0.6, 0.0, 0.8])
+def test_contrast_error_is_the_spread(correlation):
+    draws, a, b, sa, sb = 20_000, 5.0, 2.0, 0.05, 0.04
+    covariance = correlation * sa * sb
+    sample = np.random.default_rng(5).multivariate_normal([a, b], [[sa**2, covariance], [covariance, sb**2]], draws)
+    seen, stated = contrast(*sample.T, sa, sb, correlation), contrast(a, b, sa, sb, correlation)
+    # The spread of 20 000 draws is known to 0.5 %; six comparisons at 5 standard errors, and second order below 0.1 %.
+    for name in ("michelson", "weber"):
+        ratio = np.std(getattr(seen, name), ddof=1) / float(getattr(stated, f"{name}_stderr"))
+        assert abs(ratio - 1) < 5 / np.sqrt(2 * draws) + 1e-3
+
+
+MID = 0.5 + 0.25 * np.arange(64)
+
+
+def echoes(depth, decay=0.6, amplitude=6.0, width=0.35):
+    """Energies of an exponential column that ends at an echo, both spread as a Gaussian."""
+    depth = np.asarray(depth)[..., None]
+    column = np.exp(-decay * MID) * ndtr((depth - MID) / width)
+    return column + amplitude * np.exp(-decay * depth) * np.exp(-0.5 * ((MID - depth) / width) ** 2)
+
+
+def test_range_of_a_noiseless_echo():
+    depth = np.random.default_rng(2).uniform(4, 12, 500)
+    energy = echoes(depth)
+    found = range_from_gates(energy, 1e-4 * energy + 1e-9, MID, reach=4)
+    # The column is 8000 times as bright at the top as at the deepest echo. A gate is 0.25 m: taken with the column,
+    # the centroid would lie more than 0.1 m too shallow, and the middle of the strongest gate off by up to 0.125 m.
+    assert np.abs(found.depth - depth).max() < 0.03
+    assert found.confidence.min() > 1 - 1e-9
+
+
+def test_range_is_not_drawn_by_a_column_alone():
+    energy = np.exp(-0.6 * MID)[None]
+    found = range_from_gates(energy, 1e-3 * energy, MID)
+    assert found.confidence[0] < 1e-3
+    # The echo alone
+    found = range_from_gates(energy * 0 + np.exp(-0.5 * ((MID - 9.1) / 0.3) ** 2), 1e-3 * energy, MID, reach=4)
+    assert found.depth[0] == pytest.approx(9.1, abs=1e-3)
+
+
+def test_range_error_is_the_spread():
+    """Over 3000 noise realisations, centroids spread as the stated error says: without a column, where it is exact."""
+    draws, rng = 3000, np.random.default_rng(3)
+    energy = 1000 * np.exp(-0.5 * ((MID - 8.03) / 0.35) ** 2)
+    error = np.full(MID.size, 3.0)
+    found = range_from_gates(energy + error * rng.standard_normal((draws, MID.size)), np.tile(error, (draws, 1)), MID)
+    z = (found.depth - 8.03) / found.sigma
+    # Five gates cut the tails of the echo off, which moves the centroid: compare the spread, not the mean.
+    low, high = chi2.ppf([5e-6, 1 - 5e-6], draws - 1) / (draws - 1)
+    # The floor of the column is the error of the gates: clipped weights shrink the spread by some per cent.
+    assert np.sqrt(low) - 0.1 < np.std(z, ddof=1) < np.sqrt(high)
+    assert abs(np.median(found.depth) - 8.03) < 0.02
+
+
+def test_range_with_a_noisy_column():
+    depth = np.random.default_rng(8).uniform(4, 12, 2000)
+    truth = echoes(depth, amplitude=10.0)
+    error = 0.05 * truth + 1e-5
+    seen = truth + error * np.random.default_rng(9).standard_normal(truth.shape)
+    found = range_from_gates(seen, error, MID, reach=4)
+    off = found.depth - depth
+    assert np.mean(np.abs(off) < 0.3) > 0.995
+    assert 0.5 < np.std((off / found.sigma)[np.abs(off) < 0.3]) < 1.3
+
+
+def test_confidence_in_noise():
+    """Where there is only noise, a confidence above p comes in at most a fraction 1 - p of the pixels."""
+    pixels = 20_000
+    noise = np.random.default_rng(4).standard_normal((pixels, MID.size))
+    found = range_from_gates(noise, np.ones_like(noise), MID)
+    for level in (0.5, 0.9, 0.99):
+        allowed = binom.ppf(1 - 2e-6, pixels, 1 - level)
+        assert np.count_nonzero(found.confidence > level) <= allowed
+    # An echo of 8 standard errors is beyond doubt, one of 1 is not.
+    noise[:, 40] += np.where(np.arange(pixels) % 2 == 0, 12, 1)
+    found = range_from_gates(noise, np.ones_like(noise), MID)
+    assert np.median(found.confidence[::2]) > 0.999
+    assert np.median(found.confidence[1::2]) < 0.5
+
+
+def test_range_without_light_or_with_holes():
+    energy = np.stack([np.zeros(64), echoes(8.0), echoes(8.0)])
+    energy[2, 5] = np.nan
+    found = range_from_gates(energy, np.zeros_like(energy), MID, reach=4)
+    np.testing.assert_array_equal(np.isnan(found.depth), [True, False, True])
+    np.testing.assert_array_equal(found.confidence, [0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        ((np.ones((2, 4)), np.ones((2, 5)), np.arange(4)), {}, "must be equal, with the 4 gates"),
+        ((np.ones(2), np.ones(2), np.arange(2)), {}, "2 gates and must have at least 3"),
+        ((np.ones(3), np.ones(3), [0, 2, 1]), {}, "gate_mid must increase strictly"),
+        ((np.ones(3), -np.ones(3), [0, 1, 2]), {}, "stderr = -1 must not be negative"),
+        ((np.ones(9), np.ones(9), np.arange(9)), {"reach": 4}, "reach = 4 must lie between 0 and 3"),
+    ],
+)
+def test_range_refuses_bad_input(arguments, options, message):
+    with pytest.raises(ValueError, match=message):
+        range_from_gates(*arguments, **options)
+
+
+def test_range_of_a_large_image_is_fast():
+    depth = np.random.default_rng(6).uniform(4, 12, (256, 256))
+    energy = echoes(depth)
+    start = time.process_time()
+    found = range_from_gates(energy, 0.05 * energy + 1e-6, MID)
+    assert found.depth.shape == (256, 256)
+    # A loop over pixels would take minutes; this takes 0.3 to 0.7 s.
+    assert time.process_time() - start < 5

@@ -1,0 +1,122 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import exponnorm
+
+from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
+
+SIGMA_5 = 5 / 2.3548200450309493
+
+
+def test_gaussian_width_and_peak():
+    pulse = Pulse.gaussian(5.0)
+    step = 1e-4
+    density = [np.diff(pulse.cumulative([t - step, t + step]))[0] / (2 * step) for t in (0, 2.5, -2.5)]
+    # Peak of a Gaussian of unit energy is 1/(1.064467 FWHM).
+    np.testing.assert_allclose(density, np.array([1, 0.5, 0.5]) / (1.064467 * 5), rtol=1e-6)
+    assert pulse.cumulative(0.0) == pytest.approx(0.5)
+
+
+def test_sampled_pulse_is_shifted_and_normalised():
+    pulse = Pulse.sampled([10, 11, 14], [0, 6, 0])
+    np.testing.assert_allclose(pulse.times_ns, [-1, 0, 3])
+    # Triangle of base 4 and unit area
+    np.testing.assert_allclose(pulse.power, [0, 0.5, 0])
+    np.testing.assert_allclose(pulse.cumulative([-5, -1, 0, 3, 9]), [0, 0, 0.25, 1, 1])
+    assert pulse.cumulative(1.5) == pytest.approx(0.25 + 1.5 * 0.375)
+
+
+def test_pulse_file(tmp_path):
+    path = tmp_path / "pulse.csv"
+    path.write_text("# time, power\n0, 0\n1 2\n\n3,0 # tail\n")
+    np.testing.assert_allclose(Pulse.from_file(path).times_ns, [-1, 0, 2])
+    path.write_text("0 1 2\n1 2 3\n")
+    with pytest.raises(ValueError, match="line 1: '0 1 2' must be two numbers, time in ns and power"):
+        Pulse.from_file(path)
+
+
+@pytest.mark.parametrize("bin_width", [0.1, 0.5, 5.0, 200.0])
+@pytest.mark.parametrize("response", [0.0, 1e-4, 2.0, 50.0])
+def test_gaussian_kernel(bin_width, response):
+    first, weights = Pulse.gaussian(5.0).kernel(bin_width, response)
+    assert isinstance(first, int)
+    assert weights.sum() == pytest.approx(1, abs=1e-12)
+    edges = (first + np.arange(weights.size + 1) - 0.5) * bin_width
+    if response >= 2:
+        reference = exponnorm.cdf(edges, response / SIGMA_5, scale=SIGMA_5)
+        np.testing.assert_allclose(weights, np.diff(reference), atol=2e-10)
+    if bin_width < 1:
+        # The centroid is delayed by the time constant.
+        assert np.sum(weights * (edges[:-1] + edges[1:]) / 2) == pytest.approx(response, abs=1e-6)
+
+
+def test_gaussian_kernel_moments():
+    first, weights = Pulse.gaussian(5.0).kernel(0.5)
+    t = 0.5 * (first + np.arange(weights.size))
+    # Variance of the pulse plus that of a bin
+    assert np.sum(weights * t**2) == pytest.approx(SIGMA_5**2 + 0.25 / 12, rel=1e-6)
+    assert first == -(first + weights.size - 1)
+
+
+@pytest.mark.parametrize("response", [0.3, 5.0, 500.0])
+def test_sampled_kernel_with_response_matches_quadrature(response):
+    pulse = Pulse.sampled([0, 1, 2.5, 6], [0.5, 3, 1, 0])
+    first, weights = pulse.kernel(1.0, response)
+
+    def arrived(t):
+        lag = t - pulse.times_ns
+        points = np.sort(lag[(lag > 0) & (lag < 30 * response)])
+        parts = np.concatenate(([0], points, [30 * response]))
+        f = lambda u: pulse.cumulative(t - u) * np.exp(-u / response) / response  # noqa: E731
+        return sum(quad(f, a, b, epsabs=1e-13)[0] for a, b in pairwise(parts))
+
+    for m in (0, 1, 3, 8):
+        expected = arrived(first + m + 0.5) - arrived(first + m - 0.5)
+        assert weights[m] == pytest.approx(expected, abs=2e-9)
+    assert weights.sum() == pytest.approx(1, abs=1e-9)
+
+
+def test_waveform_of_one_echo():
+    energy = np.zeros((2, 60))
+    energy[1, 30] = 2e-12
+    first, weights = Pulse.sampled([0, 1, 6], [0, 1, 0]).kernel(0.5)
+    power = waveform(energy, 0.5, (first, weights))
+    assert not power[0].any()
+    # Causal order: the steep edge comes first, so most of the energy arrives after the echo's bin.
+    np.testing.assert_allclose(power[1, 30 + first : 30 + first + weights.size], 2e-12 * weights / 0.5e-9)
+    assert power[1, :30].sum() < power[1, 31:].sum()
+    assert np.sum(power) * 0.5e-9 == pytest.approx(2e-12)
+
+
+def test_waveform_matches_direct_sum_within_the_record():
+    rng = np.random.default_rng(5)
+    energy = rng.random((3, 20))
+    kernel = (-7, rng.random(40))
+    expected = np.zeros_like(energy)
+    for t in range(20):
+        for m, w in enumerate(kernel[1]):
+            if 0 <= t - (m - 7) < 20:
+                expected[:, t] += energy[:, t - (m - 7)] * w
+    np.testing.assert_allclose(waveform(energy, 2.0, kernel), expected / 2e-9, rtol=1e-12)
+    np.testing.assert_array_equal(waveform(energy, 2.0, (25, np.ones(3))), 0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Pulse.gaussian(0), "fwhm_ns = 0 must be greater than 0"),
+        (lambda: Pulse.gaussian(np.inf), "fwhm_ns = inf must be finite"),
+        (lambda: Pulse.sampled([0, 1, 1], [0, 1, 0]), "must increase strictly"),
+        (lambda: Pulse.sampled([0, 1], [0, -1]), "power = -1 must not be negative"),
+        (lambda: Pulse.sampled([0, 1], [0, 0]), "power must be greater than 0 somewhere"),
+        (lambda: Pulse.sampled([0], [1]), "times_ns of shape \\(1,\\) must be a list of at least 2"),
+        (lambda: Pulse.gaussian(5).kernel(0), "bin_width_ns = 0"),
+        (lambda: Pulse.gaussian(5).kernel(1, -1), "response_time_ns = -1"),
+        (lambda: waveform(1.0, 1.0, (0, np.ones(1))), "time axis"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+from oracles.echo_times import bottom_time_ns, layered_time_ns
+
+from mitransient_lidar.physics.lidar.refraction import (
+    fresnel,
+    refracted_path,
+    snell,
+    solid_angle_per_area,
+    surface_time_ns,
+)
+
+THETA, N, HEIGHT = np.radians(20), 1.34, 200.0
+
+
+def test_snell():
+    assert np.degrees(snell(THETA, N)) == pytest.approx(14.78774, abs=1e-5)
+    assert snell(np.pi / 2, N) == pytest.approx(np.arcsin(1 / N))
+
+
+def test_fresnel():
+    reflectance, transmittance = fresnel([0, THETA], N)
+    np.testing.assert_allclose(reflectance, [0.021112, 0.021298], atol=5e-7)
+    np.testing.assert_allclose(transmittance, [1 - 0.021112, 0.978702], atol=5e-7)
+    # At Brewster's angle only s-polarised light is reflected: ((n^2 - 1)/(n^2 + 1))^2 / 2.
+    assert fresnel(np.arctan(N), N)[0] == pytest.approx(0.5 * ((N**2 - 1) / (N**2 + 1)) ** 2, rel=1e-12)
+    assert fresnel(np.pi / 2, N)[0] == pytest.approx(1)
+
+
+def test_fresnel_from_below():
+    inside = snell(THETA, N)
+    assert fresnel(inside, 1 / N)[0] == pytest.approx(fresnel(THETA, N)[0], rel=1e-12)
+    np.testing.assert_array_equal(fresnel(np.arcsin(1 / N) + np.array([1e-6, 0.3]), 1 / N)[0], [1, 1])
+
+
+def test_refracted_path_of_the_reference_geometry():
+    theta, phi = refracted_path(HEIGHT * np.tan(THETA) + 2.1119, HEIGHT, 8, N)
+    assert theta == pytest.approx(THETA, abs=2e-7)
+    assert np.degrees(phi) == pytest.approx(14.78774, abs=1e-5)
+
+
+def test_refracted_path_closes_over_all_scales():
+    rng = np.random.default_rng(3)
+    rho, height, depth = rng.choice([-1, 1], 2000) * 10 ** rng.uniform(-6, 4, (3, 2000))
+    theta, phi = refracted_path(rho, np.abs(height), np.abs(depth), N)
+    # Hand check of tan, without cancellation at grazing incidence where tan(theta) is huge
+    np.testing.assert_allclose(np.abs(height) * np.tan(theta) + np.abs(depth) * np.tan(phi), rho, rtol=1e-6)
+    np.testing.assert_allclose(np.sin(theta), N * np.sin(phi), rtol=1e-12)
+
+
+def test_refracted_path_edges():
+    assert refracted_path(0, 200, 8, N)[0] == 0
+    assert refracted_path(100, 100, 0, N)[0] == pytest.approx(np.pi / 4)
+    assert refracted_path(3, 4, 5, 1.0)[0] == pytest.approx(np.arctan(3 / 9))
+
+
+def test_solid_angle():
+    # 0.025 m^2 aperture; at depth 0 the n^2 law, at nadir 1/(nH + D)^2
+    solid_angle = 0.025 * solid_angle_per_area(HEIGHT, [0, 8, 20], THETA, N)
+    assert solid_angle[0] == pytest.approx(2.987e-7, rel=2e-4)
+    np.testing.assert_allclose(solid_angle[1:], [2.82550e-7, 2.60657e-7], rtol=3e-6)
+    assert solid_angle_per_area(HEIGHT, 8, 0, N) == pytest.approx(1 / (N * HEIGHT + 8) ** 2)
+
+
+def test_solid_angle_is_the_jacobian_of_the_refracted_path():
+    # Spread a small cone of directions in the water and measure the area it covers at the receiver, normal to the ray.
+    phi, depth, step = snell(THETA, N), 8.0, 1e-5
+
+    def offset(angle):
+        return HEIGHT * np.tan(np.arcsin(N * np.sin(angle))) + depth * np.tan(angle)
+
+    polar = np.cos(THETA) * (offset(phi + step) - offset(phi - step)) / (2 * step)
+    sagittal = offset(phi) / np.sin(phi)
+    assert solid_angle_per_area(HEIGHT, depth, THETA, N) == pytest.approx(1 / (polar * sagittal), rel=1e-8)
+
+
+def test_echo_times():
+    assert surface_time_ns(HEIGHT, THETA) == pytest.approx(1419.8860, abs=1e-4)
+    depth = np.array([1, 2, 4, 8, 10, 16, 20])
+    delay = bottom_time_ns(HEIGHT, depth, THETA, N, N) - surface_time_ns(HEIGHT, THETA)
+    np.testing.assert_allclose(delay, [9.2458, 18.4915, 36.9830, 73.9660, 92.4576, 147.9321, 184.9151], atol=6e-5)
+    # The group index changes the travel time but not the direction.
+    delay = bottom_time_ns(HEIGHT, 1, THETA, N, 1.3638) - surface_time_ns(HEIGHT, THETA)
+    assert delay == pytest.approx(9.40997, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("mrad", "surface", "bottom"),
+    [(-15, -7.5515, -7.7593), (-5, -2.5616, -2.6319), (5, 2.6065, 2.6778), (15, 7.9557, 8.1729)],
+)
+def test_echo_times_across_the_field_of_view(mrad, surface, bottom):
+    # Tangent-plane coordinates: 15 mrad is arctan(0.015) away from the axis.
+    theta = THETA + np.arctan(mrad * 1e-3)
+    assert surface_time_ns(HEIGHT, theta) - surface_time_ns(HEIGHT, THETA) == pytest.approx(surface, abs=2e-3)
+    shift = bottom_time_ns(HEIGHT, 8, theta, N, N) - bottom_time_ns(HEIGHT, 8, THETA, N, N)
+    assert shift == pytest.approx(bottom, abs=2e-3)
+
+
+def test_layers_add_up():
+    total = bottom_time_ns(HEIGHT, 8, THETA, N, 1.36)
+    assert layered_time_ns(HEIGHT, [3, 5], THETA, [N, N], [1.36, 1.36]) == pytest.approx(total, rel=1e-14)
+    # A denser lower layer: its segment has sin(theta)/n of the layer itself.
+    lower = 2e9 * 1.40 * 5 / np.sqrt(1 - (np.sin(THETA) / 1.38) ** 2) / 299792458
+    mixed = layered_time_ns(HEIGHT, [3, 5], THETA, [N, 1.38], [1.36, 1.40])
+    assert mixed == pytest.approx(bottom_time_ns(HEIGHT, 3, THETA, N, 1.36) + lower, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: snell(0.1, 0.9), "n = 0.9 must be at least 1"),
+        (lambda: snell(np.nan, N), "theta holds nan"),
+        (lambda: refracted_path(1, 0, 1, N), "height = 0 must be greater than 0"),
+        (lambda: refracted_path(1, 1, -1, N), "depth = -1 must not be negative"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

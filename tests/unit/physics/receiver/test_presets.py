@@ -1,0 +1,205 @@
+"""Receiver chains: 10 000 shots against the closed form, and that against numbers made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
+from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+
+SHOTS = 10_000
+# Two-sided 2e-9: below 1e-5 for the few thousand comparisons of the file.
+LIMIT = 6.0
+ELECTRON = 1.602176634e-19
+PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # J
+
+
+def power(bins=64, scale=1.0):
+    t = np.arange(bins)
+    water = np.where(t > 12, np.exp(-(t - 12) / 20), 0)
+    pulse = 5 * np.exp(-0.5 * ((t - 12) / 2) ** 2) + np.exp(-0.5 * ((t - 45) / 2) ** 2)
+    return scale * np.stack([pulse + water + 0.3, 0.3 * (pulse + water) + 0.2])
+
+
+def assert_expected(record, expected, shots=SHOTS, fewest=-np.inf):
+    """Compare shots with mean, variance and saturation, in samples that have `fewest` counts or more."""
+    error = np.sqrt(np.maximum(expected.saturation * (1 - expected.saturation), 1e-3) / shots)
+    assert np.max(np.abs(record.saturated.mean(axis=0) - expected.saturation) / error) < LIMIT
+    # Where all but a few samples are at a limit, those few make the variance.
+    often = (expected.mean * shots >= fewest) & ((1 - expected.saturation) * shots > 100)
+    samples = record.signal.astype(np.float64)[:, often]
+    mean, variance = expected.mean[often], expected.variance[often]
+    found = samples.var(axis=0, ddof=1)
+    fourth = ((samples - samples.mean(axis=0)) ** 4).mean(axis=0)
+    rounding = 1e-6 * np.max(np.abs(mean))  # of 32 bits
+    z = (samples.mean(axis=0) - mean) / np.sqrt(variance / shots + rounding**2)
+    assert np.max(np.abs(z)) < LIMIT
+    error = np.sqrt((fourth - found**2) / shots + rounding**4)
+    assert np.max(np.abs(found - variance) / error) < LIMIT
+
+
+DIODE = LinearDetector(0.6)
+BRIGHT = 2e-6  # W: some thousand photoelectrons a bin
+STAGES = {
+    "photons": (ReceiverChain(DIODE), 1e-8),
+    "dark": (ReceiverChain(LinearDetector(0.6, dark_current_na=3.0, leakage_current_na=5.0)), 0.0),
+    "avalanche": (ReceiverChain(LinearDetector.avalanche(0.6, 100.0, 0.02)), 1e-8),
+    "tube": (ReceiverChain(LinearDetector.photomultiplier(0.2, [5.0, 4.0, 4.0])), 1e-7),
+    "cells": (ReceiverChain(SiliconPhotomultiplier(0.3, 200, 10.0, 0.1, 1e6, 1e6, 0.1)), 3e-8),
+    "counter": (ReceiverChain(SinglePhotonDetector(0.5, 10.0, 1e6)), 3e-10),
+    "paralysed counter": (ReceiverChain(SinglePhotonDetector(0.5, 10.0, paralyzable=True)), 1e-10),
+    "amplifier": (ReceiverChain(DIODE, Amplifier(1e4, 5.0, load_ohm=1e3)), 0.0),
+    "amplifier and pole": (ReceiverChain(DIODE, Amplifier(1e4, 5.0, bandwidth_mhz=80.0)), 0.0),
+    "photons and Gaussian": (ReceiverChain(DIODE, Amplifier(1e4, bandwidth_mhz=80.0, response="gaussian")), 1e-8),
+    "cells and pole": (
+        ReceiverChain(SiliconPhotomultiplier(0.3, 300, 9.0, 0.1), Amplifier(1e4, bandwidth_mhz=60.0)),
+        3e-8,
+    ),
+    "limit": (ReceiverChain(DIODE, Amplifier(1e4, 5.0, limit_v=9e-3)), BRIGHT),
+    "digitiser": (ReceiverChain(DIODE, Amplifier(1e4, 5.0), digitiser=Digitiser(8, 0.1, -0.02)), BRIGHT),
+    "coarse digitiser": (ReceiverChain(DIODE, Amplifier(1e4, 9.0), digitiser=Digitiser(5, 0.03, 0.0)), BRIGHT),
+    "logarithm": (ReceiverChain(DIODE, Amplifier(1e4, 5.0), LogAmplifier(0.2, 2e-3)), BRIGHT),
+    "together": (
+        ReceiverChain(
+            LinearDetector.avalanche(0.6, 20.0, 0.02, 0.1, 10.0),
+            Amplifier(2e3, 20.0, load_ohm=1e4, bandwidth_mhz=120.0, limit_v=0.15),
+            LogAmplifier(0.2, 2e-3),
+            Digitiser(12, 0.6, -0.1, sampling_ghz=0.5),
+        ),
+        BRIGHT,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_stages_alone_and_together(name):
+    chain, scale = STAGES[name]
+    light = power(scale=scale)
+    fewest = 100 if isinstance(chain.detector, SinglePhotonDetector) else -np.inf
+    assert_expected(chain.apply(light, 1.0, SHOTS, 11, 3e-10), chain.expected(light, 1.0, 3e-10), fewest=fewest)
+
+
+@pytest.mark.parametrize("name", sorted(set(RECEIVERS) - {"pmt_log"}))
+def test_receivers_in_use(name):
+    chain = RECEIVERS[name]
+    light = power(scale={"ideal": 1e-9, "sipm": 2e-8, "spad": 1e-10}.get(name, 3e-7))
+    fewest = 100 if name == "spad" else -np.inf
+    assert_expected(chain.apply(light, 1.0, SHOTS, 12, 1e-10), chain.expected(light, 1.0, 1e-10), fewest=fewest)
+    assert chain.source
+
+
+def test_logarithmic_receiver_with_much_light():
+    chain = RECEIVERS["pmt_log"]
+    light = power(scale=1e-7) + 3e-7
+    record, expected = chain.apply(light, 1.0, 2000, 13), chain.expected(light, 1.0)
+    # Tens of photoelectrons are normally distributed to a few per cent of their standard deviation.
+    assert np.max(np.abs(record.signal.mean(axis=0) - expected.mean) / np.sqrt(expected.variance)) < 0.15
+    np.testing.assert_allclose(record.signal.var(axis=0), expected.variance, rtol=0.25)
+
+
+def test_signal_and_shot_noise_by_hand():
+    # Steady light: signal R = P eta e/(h nu) M, shot noise 2 e R M F per Hz over the noise bandwidth pi/2 f.
+    gain, noise, ohm, frequency = 50.0, 2.96, 1e4, 40e6
+    detector = LinearDetector(0.6, gain, noise)
+    chain = ReceiverChain(detector, Amplifier(ohm, 4.0, bandwidth_mhz=40.0))
+    expected = chain.expected(np.full(3000, 1e-8), 0.02, 2e-9)
+    current = 1.2e-8 * 0.6 * ELECTRON / PHOTON
+    density = 2 * ELECTRON * current * gain**2 * noise + (4e-12) ** 2
+    assert expected.mean[-1] == pytest.approx(current * gain * ohm, rel=1e-6)
+    assert expected.variance[-1] == pytest.approx(density * np.pi / 2 * frequency * ohm**2, rel=4e-3)
+    # The background is not signal.
+    snr = chain.snr(np.full(3000, 1e-8), 0.02, 2e-9)[-1]
+    assert snr == pytest.approx(current / 1.2 * gain / np.sqrt(density * np.pi / 2 * frequency), rel=4e-3)
+    # Before the record there is the background alone: the first bin has not risen, its noise has.
+    assert expected.mean[0] < 0.25 * expected.mean[-1]
+    dark = chain.expected(np.zeros(600), 0.02, 2e-9)
+    np.testing.assert_allclose(dark.variance, dark.variance[-1], rtol=1e-9)
+
+
+def test_noise_of_neighbouring_samples_is_correlated():
+    chain = ReceiverChain(DIODE, Amplifier(1e4, 5.0, bandwidth_mhz=20.0))
+    samples = chain.apply(np.zeros(40), 1.0, SHOTS, 14).signal.astype(np.float64)
+    found = np.mean(samples[:, 20] * samples[:, 25]) / np.mean(samples[:, 20] ** 2)
+    # exp(-t/tau), tau = 1/(2 pi f); a correlation of n pairs has the error (1 - rho^2)/sqrt(n).
+    rho = np.exp(-5 * 2e-3 * np.pi * 20)
+    assert abs(found - rho) < LIMIT * (1 - rho**2) / np.sqrt(SHOTS) + 1e-3
+
+
+def test_quiet_logarithm_divides_the_noise_by_the_signal():
+    light = np.full(8, 1e-5)
+    linear = ReceiverChain(DIODE, Amplifier(1e4, 5.0))
+    chain = replace(linear, logarithm=LogAmplifier(0.2, 1e-5))
+    before, after = linear.expected(light, 1.0), chain.expected(light, 1.0)
+    np.testing.assert_allclose(after.mean, 0.2 * np.log10(before.mean / 1e-5), rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(after.variance), 0.2 / np.log(10) / before.mean * np.sqrt(before.variance), rtol=1e-2
+    )
+
+
+def test_snr_of_photons_and_of_saturated_samples():
+    # n photoelectrons on a background of m: n/sqrt(n + m).
+    chain = ReceiverChain(LinearDetector(1.0))
+    watt = PHOTON / 1e-9
+    np.testing.assert_allclose(chain.snr([9 * watt, 0], 1.0, 16 * watt), [9 / 5, 0], rtol=1e-9)
+    stuck = ReceiverChain(DIODE, Amplifier(1e4, 5.0, limit_v=1e-3))
+    assert np.isnan(stuck.snr([1e-4], 1.0)[0])
+
+
+def test_seeds():
+    chain, light = RECEIVERS["apd"], power(scale=1e-7)
+    one, two, three = (chain.apply(light, 1.0, 30, seed) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one.signal, two.signal)
+    assert not np.array_equal(one.signal, three.signal)
+    # More shots than one block holds: all differ.
+    many = chain.apply(np.full(4096, 1e-7), 1.0, 600, 5).signal
+    assert len(np.unique(many[:, 100:104], axis=0)) == 600
+
+
+def test_shapes_and_background_per_record():
+    chain = replace(RECEIVERS["pmt"], digitiser=Digitiser(10, 1.0, -0.05, sampling_ghz=0.25))
+    record = chain.apply(np.zeros((2, 3, 30)), 1.0, 7, 1, np.full((2, 3), 1e-9))
+    assert record.signal.shape == (7, 2, 3, 8)
+    assert record.signal.dtype == np.float32
+    assert record.saturated.shape == record.signal.shape
+    expected = chain.expected(np.zeros((2, 3, 30)), 1.0, 1e-7 * np.arange(6).reshape(2, 3))
+    assert expected.mean.shape == (2, 3, 8)
+    np.testing.assert_allclose(np.diff(expected.mean[..., 4].ravel()), expected.mean[0, 1, 4] - expected.mean[0, 0, 4])
+    assert chain.units == "V"
+    assert RECEIVERS["spad"].units == "1"
+
+
+def test_saturation_of_a_strong_echo_is_marked():
+    chain = RECEIVERS["apd"]
+    light = np.full(40, 1e-8)
+    light[20] = 1e-3
+    record = chain.apply(light, 1.0, 20, 1)
+    assert record.saturated[:, 20].all()
+    assert not record.saturated[:, :20].any()
+    assert record.signal[:, 20] == pytest.approx(np.full(20, chain.digitiser.top_v))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ReceiverChain(DIODE, digitiser=Digitiser(8, 1.0)), "digitiser needs an amplifier"),
+        (lambda: ReceiverChain(DIODE, logarithm=LogAmplifier(0.2, 1e-3)), "logarithm needs an amplifier"),
+        (
+            lambda: ReceiverChain(SinglePhotonDetector(0.5, 20.0), Amplifier(1.0)),
+            "SinglePhotonDetector, which outputs counts",
+        ),
+        (lambda: ReceiverChain(DIODE, wavelength_nm=0.0), "wavelength_nm = 0"),
+        (lambda: RECEIVERS["apd"].apply([-1e-9], 1.0, 1, 1), "power = -1e-09 must not be negative"),
+        (lambda: RECEIVERS["apd"].apply([np.nan], 1.0, 1, 1), "power holds nan"),
+        (lambda: RECEIVERS["apd"].apply(1.0, 1.0, 1, 1), "time axis"),
+        (lambda: RECEIVERS["apd"].apply([1e-9], 1.0, 0, 1), "shots = 0"),
+        (lambda: RECEIVERS["apd"].apply([1e-9], 1.0, 1, -1), "seed = -1"),
+        (lambda: RECEIVERS["apd"].apply([1e-9], 1.0, 1, 1, -1e-9), "background = -1e-09 must not be negative"),
+        (lambda: RECEIVERS["apd"].apply([1e-9], 1.0, 1, 1, [1e-9, 1e-9]), r"background of shape \(2,\)"),
+        (lambda: RECEIVERS["apd"].expected([1e-9], 0.0), "bin_width_ns = 0"),
+    ],
+)
+def test_invalid_values_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,248 @@
+"""Kelvin wake against stationary phase, direct quadrature, the wave equation and Michell's resistance."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
+
+GRAVITY = 9.81
+
+
+def at_points(x, y, *ship, **more):
+    """Heights at pairs (x, y), from the grids of 2 x 2 points that begin there."""
+    side = np.array([0.0, 1e-3])
+    return np.array([kelvin_wake(a + side, b + side, *ship, **more)[0, 0] for a, b in zip(x, y, strict=True)])
+
+
+def source_amplitude(theta, speed, length, beam, draught):
+    """A(theta) [m] of Havelock's sources -2 U dY/dx on the centre plane, integrated numerically."""
+    k0 = GRAVITY / speed**2
+    nodes, weights = np.polynomial.legendre.leggauss(96)
+    x, z = nodes * length / 2, (nodes - 1) * draught / 2
+    slope = -4 * beam * x[:, None] / length**2 * (1 - (z / draught) ** 2)
+    sources = slope * np.outer(weights * length / 2, weights * draught / 2)
+    sec = 1 / np.cos(theta)
+    along, down = np.exp(-1j * k0 * np.outer(sec, x)), np.exp(k0 * np.outer(sec**2, z))
+    return -2 * k0 / np.pi * sec**3 * np.einsum("tz,tz->t", along @ sources, down)
+
+
+def michell_resistance(density, speed, length, beam, draught):
+    """Wave resistance [N] of a parabolic hull by Michell's integral over lambda = cosh(u)."""
+    k0 = GRAVITY / speed**2
+
+    def integrand(u):
+        wave = k0 * math.cosh(u)
+        # dY/dx is odd along the hull: of exp(i wave x), the sine remains.
+        along = quad(lambda x: -4 * beam * x / length**2 * math.sin(wave * x), -length / 2, length / 2)[0]
+        down = quad(lambda z: (1 - (z / draught) ** 2) * math.exp(wave**2 / k0 * z), -draught, 0)[0]
+        return (along * down * math.cosh(u)) ** 2
+
+    integral = quad(integrand, 0, 3, epsrel=1e-4, limit=100)[0]
+    return 4 * density * GRAVITY**2 / (np.pi * speed**2) * integral
+
+
+def test_track_shows_transverse_waves_of_closed_form():
+    speed, length, beam, draught = 10.0, 2.0, 0.3, 0.05
+    k0 = GRAVITY / speed**2
+    wavelength = 2 * np.pi / k0
+    x = -np.linspace(90, 60, 1001) * wavelength
+    # Only waves of k < 5 k0 are left: the divergent ones on the track are all shorter.
+    heights = kelvin_wake(x, [-1, 0, 1], speed, 0.0, length, beam, draught, smallest_wavelength=wavelength / 5)[1]
+    # A ship much shorter than its waves is a dipole of its volume; stationary phase at theta = 0.
+    volume = 4 / 9 * length * beam * draught
+    closed = -(k0**2) * volume / np.pi * np.sqrt(2 * np.pi / (k0 * -x)) * np.sin(k0 * -x + np.pi / 4)
+    # Far and near end: a decay with 1/r, or r^(-1/3), would be 20 % or 7 % off at one of them.
+    for window in (slice(0, 200), slice(-200, None)):
+        assert np.abs(heights - closed)[window].max() < 0.015 * closed[window].max()
+    crossings = x[:-1][np.diff(np.sign(heights)) > 0]
+    assert np.diff(crossings).mean() == pytest.approx(wavelength, rel=2e-3)
+
+
+def test_cusp_line_has_waves_of_closed_form():
+    # At this length dA/dtheta = sqrt(9/8) A at the cusp, for which the next term of the expansion vanishes.
+    speed, length, beam, draught = 5.0, 11.976, 1.0, 0.5
+    k0 = GRAVITY / speed**2
+    r = np.linspace(100, 1600, 60) * 2 * np.pi / k0
+    # Kelvin's angle, asin(1/3), where both stationary phases meet at tan(theta)^2 = 1/2.
+    x, y = -r * math.sqrt(8) / 3, r / 3
+    amplitude = source_amplitude(np.array([math.atan(math.sqrt(0.5))]), speed, length, beam, draught)[0]
+    # Phase k0 r (-sqrt(3/4) + sqrt(3/2)/2 (theta - theta_c)^3): its integral decays with r^(-1/3).
+    spread = 2 * math.gamma(4 / 3) * math.cos(math.pi / 6) * (math.sqrt(1.5) / 2 * k0 * r) ** (-1 / 3)
+    closed = (amplitude * np.exp(-1j * math.sqrt(0.75) * k0 * r)).real * spread
+    heights = at_points(x, y, speed, 0.0, length, beam, draught, smallest_wavelength=2.0)
+    envelope = abs(amplitude) * spread
+    # From the near to the far end, a decay with r^(-1/2) would lose another 37 %.
+    assert np.all(np.abs(heights - closed) < 0.005 * envelope)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_energy_lies_within_kelvins_angle_and_is_densest_at_its_edge(side):
+    speed, length = 5.0, 10.0
+    wavelength = 2 * np.pi * speed**2 / GRAVITY
+    behind = 60.5 * wavelength
+    x = np.linspace(-61, -60, 41) * wavelength
+    y = np.linspace(0, 0.6 * behind, 1500)
+    heights = kelvin_wake(x, y if side > 0 else -y[::-1], speed, 0.0, length, smallest_wavelength=wavelength / 8)
+    energy = (heights**2).sum(axis=1)[::side]
+    angle = np.degrees(np.arctan(y / behind))
+    kelvin = math.degrees(math.asin(1 / 3))
+    assert kelvin == pytest.approx(19.47, abs=0.005)
+    assert kelvin - 1 < angle[energy.argmax()] < kelvin
+    assert energy[angle < kelvin].sum() > 0.9 * energy.sum()
+    # The cusp wave of width (k0 r)^(-2/3) = 0.9 degrees reaches a little further.
+    assert energy[angle > kelvin + 1].sum() < 1e-3 * energy.sum()
+
+
+def test_heights_agree_with_direct_quadrature():
+    speed, length, beam, draught = 4.0, 12.0, 1.5, 0.6
+    k0 = GRAVITY / speed**2
+    # The first is beside the hull, halfway from amidships to the stern.
+    x, y = np.array([-3.0, -9, -15, -30, -30, -47]), np.array([4, 3, -5, 7.5, -9.5, 16])
+    share = np.array([0.5, 1, 1, 1, 1, 1])
+    theta = (np.arange(20000) + 0.5) / 20000 * np.pi - np.pi / 2
+    k = k0 / np.cos(theta) ** 2
+    amplitude = np.zeros(theta.size, dtype=complex)
+    kept = k < 60
+    amplitude[kept] = source_amplitude(theta[kept], speed, length, beam, draught)
+    amplitude *= np.exp(-((k / 20) ** 4))  # off the track, short waves do not matter
+    phase = k * (np.outer(x, np.cos(theta)) + np.outer(y, np.sin(theta)))
+    direct = (amplitude * np.exp(1j * phase)).real.sum(axis=1) * np.pi / theta.size
+    assert at_points(x, y, speed, 0.0, length, beam, draught) == pytest.approx(direct * share, abs=1e-4)
+
+
+@pytest.mark.parametrize("froude", [0.3, 0.45])
+def test_wave_resistance_is_michells(froude):
+    length, density = 16.0, 1025.0
+    beam, draught = 0.1 * length, 0.0625 * length
+    speed = froude * math.sqrt(GRAVITY * length)
+    k0 = GRAVITY / speed**2
+    # Transverse cuts through the wake, as in a towing tank: they hold exp(i ky y) (c cos(kx x) + s sin(kx x)).
+    x, y = np.linspace(-70, -30, 401), np.arange(-512, 512) * 0.1
+    heights = kelvin_wake(x, y, speed, 0.0, length, beam, draught)
+    ky = 2 * np.pi * np.fft.fftfreq(y.size, 0.1)
+    cuts = np.fft.fft(heights, axis=0) * 0.1 / (2 * np.pi)
+    k = (k0 + np.sqrt(k0**2 + 4 * ky**2)) / 2
+    density_of_ky = np.empty(ky.size)
+    for n, kx in enumerate(np.sqrt(k0 * k)):
+        waves = np.stack([np.cos(kx * x), np.sin(kx * x)], axis=1)
+        c, s = np.linalg.lstsq(waves, cuts[n], rcond=None)[0]
+        density_of_ky[n] = abs(c) ** 2 + abs(s) ** 2
+    # A dtheta = density dky, and cos^3 dky/dtheta = k0 (1 + sin^2) = k0 (2 - k0/k).
+    resistance = math.pi / 2 * density * speed**2 * np.sum(density_of_ky * k0 * (2 - k0 / k)) * (ky[1] - ky[0])
+    assert resistance == pytest.approx(michell_resistance(density, speed, length, beam, draught), rel=0.01)
+
+
+def test_waves_stand_still_for_the_ship():
+    # Of waves that run with the ship, omega = U kx, so that kx^4 = k0^2 (kx^2 + ky^2): a differential equation.
+    speed, step = 5.0, 0.25
+    k0 = GRAVITY / speed**2
+    x, y = np.arange(-60, -20, step), np.arange(-20, 20, step)
+    h = kelvin_wake(x, y, speed, 0.0, 10.0, smallest_wavelength=5.0)
+    inner = h[2:-2, 2:-2]
+    along = h[2:-2, :-4] + h[2:-2, 4:] - 4 * (h[2:-2, 1:-3] + h[2:-2, 3:-1]) + 6 * inner
+    laplacian = h[2:-2, 1:-3] + h[2:-2, 3:-1] + h[1:-3, 2:-2] + h[3:-1, 2:-2] - 4 * inner
+    along, laplacian = along / step**4, k0**2 * laplacian / step**2
+    assert np.abs(along + laplacian).max() < 0.02 * np.abs(laplacian).max()
+
+
+@pytest.mark.parametrize("bearing", [0.7, np.pi / 2, -2.5])
+def test_wake_turns_and_moves_with_the_ship(bearing):
+    x, y = np.linspace(-20, 25, 46), np.linspace(-30, 12, 43)
+    ship = {"length": 9.0, "smallest_wavelength": 3.0}
+    heights = kelvin_wake(x, y, 4.0, bearing, ship_x=5.0, ship_y=-7.0, **ship)
+    pick = np.random.default_rng(1).integers(0, [[46], [43]], size=(2, 200))
+    east, north = x[pick[0]] - 5, y[pick[1]] + 7
+    ahead = np.cos(bearing) * east + np.sin(bearing) * north
+    port = np.cos(bearing) * north - np.sin(bearing) * east
+    # Seen by the ship. Only the images of the wake lie elsewhere.
+    expected = at_points(ahead, port, 4.0, 0.0, **ship)
+    assert np.abs(expected).max() > 0.05
+    assert heights[pick[1], pick[0]] == pytest.approx(expected, abs=1e-5)
+
+
+def test_waves_grow_from_amidships_to_the_stern():
+    length, x, y = 20.0, np.linspace(-40, 40, 161), np.linspace(-10, 10, 41)
+    heights = kelvin_wake(x, y, 6.0, 0.0, length)
+    assert np.all(heights[:, x >= 0] == 0)
+    # Port and starboard are alike.
+    assert heights == pytest.approx(heights[::-1], abs=1e-12)
+    # A step in the heights amidships would be a wall of water; at a fifth of the way there are 6 % of them.
+    assert np.abs(heights[:, (x < 0) & (x >= -2)]).max() < 0.06 * np.abs(heights).max()
+
+
+@pytest.mark.parametrize("speed", [3.0, 8.0, 25.0])
+def test_heights_do_not_depend_on_how_far_the_grid_goes(speed):
+    # A larger grid has finer nodes of the integral: twice as many here.
+    small = np.linspace(-40, 40, 81)
+    large = np.linspace(-160, 160, 321)
+    inner = slice(120, 201)
+    part = kelvin_wake(small, small, speed, 0.4, 15.0)
+    full = kelvin_wake(large, large, speed, 0.4, 15.0)[inner, inner]
+    assert np.abs(part - full).max() < 2e-5 * np.abs(full).max()
+
+
+def test_coarse_lines_show_no_waves_that_they_cannot_resolve():
+    fine = np.linspace(-30, 10, 161)
+    coarse = np.concatenate([[-160, -130, -100, -70, -50, -40], fine])
+    speed = 3.0  # waves of 5.8 m at most
+    uneven = kelvin_wake(coarse, fine, speed, 0.0, 8.0)
+    even = kelvin_wake(fine, fine, speed, 0.0, 8.0)
+    # The first fine line counts its coarse neighbour.
+    assert uneven[:, 7:] == pytest.approx(even[:, 1:], abs=1e-5 * np.abs(even).max())
+    assert np.all(uneven[:, :7] == 0)
+    assert np.abs(even[:, 0]).max() > 0.1 * np.abs(even).max()
+
+
+def test_short_waves_fade_and_slow_ships_leave_nothing():
+    x = np.linspace(-20, -10, 401)
+    y = np.linspace(-3, 3, 241)
+    heights = kelvin_wake(x, y, 4.0, 0.0, 6.0, smallest_wavelength=1.0)
+    window = np.hanning(x.size) * np.hanning(y.size)[:, None]
+    kx, ky = (2 * np.pi * np.fft.fftfreq(lines.size, 0.025) for lines in (x, y))
+    power = np.abs(np.fft.fft2(heights * window)) ** 2
+    short = np.hypot(kx, ky[:, None]) > 2 * np.pi / 1.0 + 3
+    assert power[short].sum() < 1e-4 * power.sum()
+    # 2 pi U^2/g = 0.16 m
+    assert np.all(kelvin_wake(x, y, 0.5, 0.0, 6.0, smallest_wavelength=0.17) == 0)
+
+
+def test_heights_grow_as_the_beam():
+    x, y = np.linspace(-30, -10, 41), np.linspace(-8, 8, 33)
+    default = kelvin_wake(x, y, 4.0, 0.0, 8.0)
+    assert default == pytest.approx(kelvin_wake(x, y, 4.0, 0.0, 8.0, 1.0, 0.4), rel=1e-12)
+    assert 2 * default == pytest.approx(kelvin_wake(x, y, 4.0, 0.0, 8.0, beam=2.0), rel=1e-12)
+
+
+def test_300_by_300_points_take_less_than_half_a_second():
+    lines = np.linspace(-150, 150, 300)
+    start = time.perf_counter()
+    kelvin_wake(lines, lines, 10.0, 0.7, 30.0)
+    assert time.perf_counter() - start < 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"speed": 0}, "speed = 0 must be greater than 0"),
+        ({"bearing": np.inf}, "bearing = inf must be finite"),
+        ({"length": -2}, "length = -2 must be greater than 0"),
+        ({"beam": 0}, "beam = 0 must be greater than 0"),
+        ({"draught": -0.1}, "draught = -0.1 must be greater than 0"),
+        ({"ship_x": np.nan}, "ship_x = nan must be finite"),
+        ({"ship_y": "far"}, "ship_y = 'far' must be a number"),
+        ({"smallest_wavelength": 0}, "smallest_wavelength = 0 must be greater than 0"),
+        ({"x": [1.0]}, "x of shape (1,) must be a list of at least 2 numbers"),
+        ({"y": [[0, 1]]}, "y of shape (1, 2) must be a list of at least 2 numbers"),
+        ({"y": [0, 2, 2]}, "y must increase strictly, but 2 is followed by 2"),
+        ({"x": [0, np.nan]}, "x holds nan but every value must be finite"),
+    ],
+)
+def test_errors(change, message):
+    given = {"x": [0, 1], "y": [0, 1], "speed": 5, "bearing": 0, "length": 10, **change}
+    with pytest.raises(ValueError) as error:  # noqa: PT011, the full message is compared
+        kelvin_wake(**given)
+    assert str(error.value) == message

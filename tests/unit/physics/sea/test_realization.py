@@ -1,0 +1,327 @@
+"""Waves in space and time: dispersion, realised seas against their spectra, and the slopes of a mesh."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import trapezoid
+
+from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.physics.sea.realization import angular_frequency, mesh_slope_variance, realise
+from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
+from mitransient_lidar.physics.sea.swell import SwellSpectrum
+from mitransient_lidar.physics.sea.tabulated_spectrum import TabulatedSpectrum
+from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, JonswapSpectrum, PiersonMoskowitzSpectrum
+
+G = 9.81
+
+
+def hump_table(kx, ky, **options):
+    """Return a table with all waves within 0.1 rad/m of (kx, ky)."""
+    offsets = np.array([-0.1, 0.0, 0.1])
+    return TabulatedSpectrum(kx + offsets, ky + offsets, np.outer([0, 1, 0], [0, 1, 0]), **options)
+
+
+SPECTRA = {
+    "elfouhaily": ElfouhailySpectrum(6, direction=0.3),
+    "pierson_moskowitz": PiersonMoskowitzSpectrum(4, direction=2.0),
+    "jonswap": JonswapSpectrum(5, 3000, direction=-1.0),
+    "swell": SwellSpectrum(0.5, 8, 0.5),
+    "table": hump_table(0.9, -0.7, direction=0.4),
+    "matched": MatchedSpectrum(ElfouhailySpectrum(3, direction=1.0), *cox_munk(3)),
+    "sea": SeaState((ElfouhailySpectrum(3, direction=0.3), SwellSpectrum(0.5, 8, 1.9), hump_table(0.9, -0.7))),
+}
+
+
+def fourier(heights):
+    """Return the complex amplitudes of all waves, row and column 0 those of the longest against the axes."""
+    return np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(heights))) / heights.size
+
+
+def wavenumbers(period, cells):
+    """Return kx and ky of `fourier`'s amplitudes, for broadcasting."""
+    k = 2 * np.pi / period * np.arange(-cells // 2, cells // 2)
+    return k, k[:, None]
+
+
+def single_wave(wavelength, direction):
+    """Return swell that is one wave of a period of 64 m."""
+    return SwellSpectrum(0.5, wavelength, direction, relative_bandwidth=1e-3, directional_spread=1e-3)
+
+
+def test_angular_frequency_in_its_limits():
+    assert angular_frequency(0.1) ** 2 == pytest.approx(G * 0.1, rel=1e-6)
+    # The slowest wave has 23 cm/s at 370 rad/m: slower than its neighbours.
+    speeds = angular_frequency([365.0, 370.0, 375.0]) / [365.0, 370.0, 375.0]
+    assert speeds[1] == pytest.approx(np.sqrt(2 * G / 370))
+    assert speeds[1] == pytest.approx(0.23, abs=1e-3)
+    assert speeds[1] < min(speeds[0], speeds[2])
+    # Ripples of 1 mm: surface tension of clean water, 0.0728 N/m
+    assert angular_frequency(6283.0) ** 2 == pytest.approx(0.0728e-3 * 6283.0**3, rel=0.03)
+    # Shallow: all waves run at sqrt(g h)
+    assert angular_frequency(0.001, depth=2.0) / 0.001 == pytest.approx(np.sqrt(G * 2), rel=1e-5)
+    assert angular_frequency(0.5, depth=2.0) ** 2 == pytest.approx(G * 0.5 * np.tanh(1.0), rel=1e-5)
+    assert angular_frequency(0.0) == angular_frequency(0.0, 3.0) == 0
+    np.testing.assert_array_equal(angular_frequency([[0.1, 2.0]], 1e4), angular_frequency([[0.1, 2.0]]))
+
+
+def test_realised_variances_are_the_spectrum_s_integrals():
+    """50 seas at wind oblique to the grid; squared amplitudes are exponential, which gives the standard errors."""
+    spectrum, period, cells, seeds = ElfouhailySpectrum(3, direction=0.6), 82.0, 128, 50
+    kx, ky = wavenumbers(period, cells)
+    k_max = 4.0
+    along, across = np.cos(0.6) * kx + np.sin(0.6) * ky, np.cos(0.6) * ky - np.sin(0.6) * kx
+    low = np.hypot(kx, ky) <= k_max
+    k = np.linspace(0.05, k_max, 4000)
+    expected = np.array([trapezoid(spectrum.omnidirectional(k), k), *spectrum.slope_variance(k_max)])
+    psi = spectrum.directional(kx, ky) * (2 * np.pi / period) ** 2
+    # Each pair of waves, k and -k, has a variance 2 psi times an exponential number.
+    weights = np.array([1.0 * low, along**2 * low, across**2 * low])
+    error = np.sqrt(2 * np.sum((psi * weights) ** 2, axis=(1, 2)) / seeds)
+    assert np.all(error < 0.02 * expected)
+    power = sum(np.abs(fourier(realise(spectrum, period, cells, seed))) ** 2 for seed in range(seeds)) / seeds
+    z = (np.sum(power * weights, axis=(1, 2)) - expected) / error
+    # The waves that fit make up the integrals within a third of an error.
+    assert np.all(np.abs(np.sum(psi * weights, axis=(1, 2)) - expected) < error / 3)
+    assert np.all(np.abs(z) < 3.5)
+
+
+def test_realised_waves_have_the_variances_of_their_kind():
+    """Waves along the axes too: without the mirrored column those of kx = 0 would have half their variance."""
+    period, cells, seeds = 40.0, 32, 50
+    for spectrum in (SPECTRA["elfouhaily"], SPECTRA["sea"]):
+        index = np.arange(-cells // 2, cells // 2)
+        variances = spectrum.mode_variances(index, index, 2 * np.pi / period)
+        scaled = np.array([fourier(realise(spectrum, period, cells, seed, 5.0)) for seed in range(seeds)])
+        scaled = scaled[:, 1:, 1:] / np.sqrt(np.where(variances > 0, variances, 1.0)[1:, 1:])
+        half = cells // 2
+        rows = {
+            "kx = 0": scaled[:, half:, half - 1],
+            "ky = 0": scaled[:, half - 1, half:],
+            "other": scaled[:, :, half:],
+        }
+        for name, amplitudes in rows.items():
+            # Mean square 1 with standard error 1/sqrt(n); the mean of squares, 0, shows phases that prefer an angle.
+            error = 1 / np.sqrt(amplitudes.size)
+            assert abs(np.mean(np.abs(amplitudes) ** 2) - 1) < 4 * error, name
+            assert abs(np.mean(amplitudes**2)) < 4 * np.sqrt(2) * error, name
+            assert abs(np.mean(amplitudes)) < 4 * error, name
+
+
+@pytest.mark.parametrize("kind", ["elfouhaily", "single"])
+def test_slopes_are_gaussian(kind):
+    """One slope of each of 2000 seas. Waves of fixed amplitude would leave a single wave an arcsine law."""
+    if kind == "single":
+        spectrum, period, cells = single_wave(16.0, 0.0), 64.0, 16
+    else:
+        spectrum, period, cells = ElfouhailySpectrum(4, direction=0.5), 16.0, 16
+    step, slopes = period / cells, []
+    for seed in range(2000):
+        heights = realise(spectrum, period, cells, seed, 1.0)
+        slopes.append((heights[8, 9] - heights[8, 7]) / (2 * step))
+    index = np.arange(-cells // 2 + 1, cells // 2)
+    dk = 2 * np.pi / period
+    # A central difference has the transfer sin(kx d)/d.
+    variance = np.sum(spectrum.mode_variances(index, index, dk) * (np.sin(index * dk * step) / step) ** 2)
+    assert stats.kstest(np.array(slopes) / np.sqrt(variance), "norm").pvalue > 1e-3
+    assert abs(stats.skew(slopes)) < 4 * np.sqrt(6 / 2000)
+    assert abs(stats.kurtosis(slopes)) < 4 * np.sqrt(24 / 2000)
+
+
+@pytest.mark.parametrize(("time", "depth", "current"), [(0.0, np.inf, (0, 0)), (7.3, 3.0, (0.4, -0.2))])
+@pytest.mark.parametrize("kind", SPECTRA)
+def test_coarse_realisation_is_the_low_passed_fine_one(kind, time, depth, current):
+    options = {"time": time, "depth": depth, "current": current}
+    fine, coarse = (realise(SPECTRA[kind], 40, cells, 9, **options) for cells in (128, 32))
+    low = fourier(fine)[48:80, 48:80].copy()
+    low[0, :] = low[:, 0] = 0
+    kept = np.fft.fftshift(np.fft.ifft2(np.fft.ifftshift(low)).real) * 32**2
+    np.testing.assert_allclose(coarse, kept, atol=1e-13)
+    # The origin is vertex (cells/2, cells/2) of both.
+    assert abs(coarse[16, 16] - kept[16, 16]) < 1e-13 < abs(coarse[16, 16] - kept[0, 0])
+    assert abs(fine.mean()) < 1e-14
+
+
+def test_seeds_differ_and_repeat():
+    spectrum = ElfouhailySpectrum(6)
+    first = realise(spectrum, 40, 32, 1)
+    np.testing.assert_array_equal(first, realise(spectrum, 40, 32, 1))
+    other = realise(spectrum, 40, 32, 2)
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.6
+    assert np.isfinite(realise(spectrum, 40, 32, -5)).all()
+    # Values frozen on purpose: stored scenes must show the same sea in later versions.
+    np.testing.assert_allclose(first[16, 15:18], [0.188771089, 0.184545047, 0.199352481], atol=1e-9)
+
+
+def test_components_of_a_sea_have_independent_waves():
+    wind = ElfouhailySpectrum(6, direction=0.3)
+    alone = realise(wind, 40, 64, 3)
+    np.testing.assert_allclose(realise(SeaState((wind,)), 40, 64, 3), alone, atol=1e-14)
+    second = realise(SeaState((wind, wind)), 40, 64, 3) - alone
+    third = realise(SeaState((wind, wind, wind)), 40, 64, 3) - alone - second
+    k = wavenumbers(40, 64)
+    scale = np.sqrt(np.maximum(wind.directional(*k), 1e-300)) * 2 * np.pi / 40
+    parts = [(fourier(part) / scale)[1:, 33:] for part in (alone, second, third)]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        # |a|^2 is exponential: products of independent amplitudes have standard error 1/sqrt(n).
+        n = parts[a].size
+        assert abs(np.mean(parts[a] * parts[b].conj())) < 4 / np.sqrt(n)
+        assert abs(np.mean(parts[a] * parts[b])) < 4 / np.sqrt(n)
+        assert np.mean(np.abs(parts[b]) ** 2) == pytest.approx(1, abs=4 / np.sqrt(n))
+    # Nor is the second component the first, with columns or rows exchanged.
+    first = fourier(realise(SwellSpectrum(0.5, 8, 0.0), 40, 64, 3))
+    assert np.unique(np.round(np.abs(np.r_[first.ravel(), fourier(second).ravel()]), 15)).size > 64 * 32
+
+
+@pytest.mark.parametrize(
+    ("direction", "shift"), [(0.0, (0, 4)), (np.pi / 2, (4, 0)), (np.pi, (0, -4)), (-np.pi / 2, (-4, 0))]
+)
+def test_single_wave_runs_along_its_direction(direction, shift):
+    wave, k = single_wave(16.0, direction), 2 * np.pi / 16
+    period = 2 * np.pi / np.sqrt(G * k * (1 + (k / 370) ** 2))
+    start = realise(wave, 64.0, 64, 5)
+    assert start.std() > 0.05
+    np.testing.assert_allclose(realise(wave, 64.0, 64, 5, period), start, atol=1e-13)
+    # A quarter of 16 m is 4 cells: row j is y, column i is x.
+    np.testing.assert_allclose(realise(wave, 64.0, 64, 5, period / 4), np.roll(start, shift, (0, 1)), atol=1e-13)
+    # Shallow water slows it: after the same time it lags, after its own period it is back.
+    assert np.abs(realise(wave, 64.0, 64, 5, period, depth=2.0) - start).max() > 0.1 * start.std()
+    slow = period / np.sqrt(np.tanh(k * 2.0))
+    np.testing.assert_allclose(realise(wave, 64.0, 64, 5, slow, depth=2.0), start, atol=1e-13)
+
+
+def test_every_wave_runs_towards_the_half_plane_of_its_direction():
+    """The phase of each wave between two times, against k . direction; half turned the wrong way would be as likely."""
+    direction = 2.2
+    spectrum = ElfouhailySpectrum(6, direction=direction)
+    before, after = (fourier(realise(spectrum, 40, 32, 4, time)) for time in (0.0, 0.1))
+    kx, ky = wavenumbers(40, 32)
+    turned = np.angle((after / np.where(before == 0, 1, before))[1:, 1:])
+    along = (np.cos(direction) * kx + np.sin(direction) * ky)[1:, 1:]
+    expected = -np.sign(along) * angular_frequency(np.hypot(kx, ky)[1:, 1:]) * 0.1
+    np.testing.assert_allclose(np.where(along == 0, 0, turned), expected, atol=1e-6)
+
+
+def test_table_of_running_waves_runs_along_its_wavenumbers_and_a_frozen_one_along_its_direction():
+    dk = 2 * np.pi / 64
+    k = (-6 * dk, 3 * dk)
+    quarter = np.pi / 2 / float(angular_frequency(np.hypot(*k)))
+
+    def phase_change(table):
+        before, after = (fourier(realise(table, 64, 32, 5, time))[16 + 3, 16 - 6] for time in (0.0, quarter))
+        return np.degrees(np.angle(after / before))
+
+    # The wave exp(i k x - i omega t) has turned by -90 degrees, whatever direction slopes refer to.
+    assert phase_change(hump_table(*k, direction=0.0)) == pytest.approx(-90)
+    assert phase_change(hump_table(*k, direction=np.pi)) == pytest.approx(-90)
+    assert phase_change(hump_table(-k[0], -k[1], direction=0.0)) == pytest.approx(90)
+    assert phase_change(hump_table(*k, direction=0.0, one_sided=False)) == pytest.approx(90)
+    assert phase_change(hump_table(*k, direction=np.pi, one_sided=False)) == pytest.approx(-90)
+
+
+def test_table_realised_over_seeds_has_its_height():
+    table = TabulatedSpectrum([-1, 0, 1, 2], [0, 1, 2], [[0, 1, 0, 0], [1, 2, 1, 0], [0, 1, 0, 0]], direction=0.3)
+    index = np.arange(-15, 16)
+    variances = table.mode_variances(index, index, 2 * np.pi / 30)
+    assert variances.sum() == pytest.approx(table.elevation_variance())
+    expected = table.elevation_variance() - variances[15, 15]
+    for time in (0.0, 20.0):
+        seas = [realise(table, 30, 32, seed, time) for seed in range(100)]
+        # The table has variance at k = 0 too, but the sea level no waves.
+        assert max(abs(sea.mean()) for sea in seas) < 1e-14
+        squares = [np.mean(sea**2) for sea in seas]
+        error = np.sqrt(2 * np.sum(variances**2) / 100)
+        assert abs(np.mean(squares) - expected) < 4 * error < 0.1 * expected
+
+
+@pytest.mark.parametrize("kind", ["elfouhaily", "table", "sea"])
+def test_current_carries_the_sea_along(kind):
+    still = realise(SPECTRA[kind], 64, 64, 3, 4.0)
+    carried = realise(SPECTRA[kind], 64, 64, 3, 4.0, current=(1.0, -0.5))
+    # 4 s at 1 m/s are 4 cells along x, and 2 cells against y.
+    np.testing.assert_allclose(carried, np.roll(still, (-2, 4), (0, 1)), atol=1e-12)
+
+
+def test_no_wind_gives_a_flat_sea():
+    spectrum = ElfouhailySpectrum(0)
+    assert not realise(spectrum, 10, 32, 1, 3.0).any()
+    assert mesh_slope_variance(spectrum, 10, 32) == (0, 0)
+
+
+@pytest.mark.parametrize("wind", [1e-6, 0.5, 1.5, 30])
+def test_extreme_winds_stay_finite(wind):
+    assert np.all(np.isfinite(realise(ElfouhailySpectrum(wind, inverse_wave_age=2.0), 10, 16, 1, 1e4)))
+
+
+def test_the_longest_waves_of_a_wide_patch_have_no_negative_variance():
+    """Far below the peak Delta rounds to 1, and the density across the wind to either side of 0."""
+    assert np.all(np.isfinite(realise(ElfouhailySpectrum(3), 2700, 128, 1)))
+
+
+def test_facet_slopes_have_the_predicted_variance():
+    size, n, wind_direction = 8.0, 32, 0.6
+    spectrum = ElfouhailySpectrum(6, direction=wind_direction)
+    d = size / n
+    cos, sin = np.cos(wind_direction), np.sin(wind_direction)
+    measured = []
+    for seed in range(1000):
+        h = realise(spectrum, size, n, seed)
+        sx, sy = (np.roll(h, -1, 1) - h) / d, (np.roll(h, -1, 0) - h) / d
+        upwind = crosswind = 0.0
+        # Triangles with the right angle at (i, j) and at (i + 1, j + 1)
+        for a, b in ((sx, sy), (np.roll(sx, -1, 0), np.roll(sy, -1, 1))):
+            upwind += 0.5 * np.mean((cos * a + sin * b) ** 2)
+            crosswind += 0.5 * np.mean((cos * b - sin * a) ** 2)
+        measured.append((upwind, crosswind))
+    measured = np.array(measured)
+    expected = mesh_slope_variance(spectrum, size, n)
+    error = measured.std(axis=0) / np.sqrt(len(measured))
+    np.testing.assert_array_less(np.abs(measured.mean(axis=0) - expected), 4 * error)
+    # Without the facets' low-pass the crosswind prediction would be a sixth higher.
+    k = 2 * np.pi / size * np.arange(-n // 2 + 1, n // 2)
+    across = cos * k[:, None] - sin * k
+    unfiltered = np.sum(spectrum.directional(k, k[:, None]) * across**2) * (2 * np.pi / size) ** 2
+    assert unfiltered - expected[1] > 8 * error[1]
+
+
+def test_fine_mesh_resolves_the_spectrum_and_a_sea_the_sum_of_its_components():
+    swell = SwellSpectrum(0.8, 16.0, 0.7, directional_spread=0.3)
+    assert mesh_slope_variance(swell, 256, 512) == pytest.approx(swell.slope_variance(), rel=0.01)
+    wind = ElfouhailySpectrum(4, direction=0.7 + np.pi / 2)
+    # Swell across the wind: along the one is across the other.
+    expected = np.add(mesh_slope_variance(wind, 64, 128), mesh_slope_variance(swell, 64, 128)[::-1])
+    assert mesh_slope_variance(SeaState((wind, swell)), 64, 128) == pytest.approx(tuple(expected))
+    table = hump_table(0.9, -0.7)
+    expected = mesh_slope_variance(table, 64, 128)
+    assert mesh_slope_variance(SeaState((table, table)), 64, 128) == pytest.approx((2 * expected[0], 2 * expected[1]))
+
+
+def test_physics_of_the_sea_imports_no_scipy():
+    """SciPy's FFT takes longer to import than a sea to compute, and is only needed when there is one."""
+    code = (
+        "import sys; import mitransient_lidar as package; before = 'scipy' in sys.modules; "
+        "from mitransient_lidar.physics.sea import cox_munk, realization, sea_surface; "
+        "sys.exit('scipy' in sys.modules and not before)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: realise(ElfouhailySpectrum(5), 10, 15, 1), "cells = 15 must be an even integer of at least 2"),
+        (lambda: realise(ElfouhailySpectrum(5), 10, 0, 1), "cells = 0 must be an even"),
+        (lambda: realise(ElfouhailySpectrum(5), -1, 16, 1), "period = -1 must be greater than 0"),
+        (lambda: realise(ElfouhailySpectrum(5), 10, 16, 1, np.nan), "time = nan must be finite"),
+        (lambda: realise(ElfouhailySpectrum(5), 10, 16, 1, depth=0), "depth = 0 must be greater than 0"),
+        (lambda: realise(ElfouhailySpectrum(5), 10, 16, 1, current=(1, np.inf)), "current holds inf"),
+        (lambda: realise(ElfouhailySpectrum(5), 10, 16, 1, current=1), r"current of shape \(\) must be two velocities"),
+        (lambda: angular_frequency(1.0, -1), "depth = -1 must be greater than 0"),
+        (lambda: mesh_slope_variance(ElfouhailySpectrum(5), 10, 3), "cells = 3 must be an even"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,476 @@
+"""Wave spectra: published heights, lengths and slopes, and integrals that agree with each other."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad, trapezoid
+from scipy.special import exp1
+
+from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
+from mitransient_lidar.physics.sea.swell import SwellSpectrum
+from mitransient_lidar.physics.sea.tabulated_spectrum import TabulatedSpectrum
+from mitransient_lidar.physics.sea.wind_spectra import (
+    ElfouhailySpectrum,
+    JonswapSpectrum,
+    PiersonMoskowitzSpectrum,
+    inverse_wave_age,
+)
+
+G = 9.81
+
+
+def significant_wave_height(spectrum):
+    """Return four standard deviations of the elevation [m]."""
+    return 4 * np.sqrt(spectrum.elevation_variance())
+
+
+def swell_table(**options):
+    """Return the table of waves that run along (0.5, 0.3) rad/m, and of as many that run along (-0.2, 0.6)."""
+    kx, ky = np.linspace(-0.6, 0.9, 76), np.linspace(-0.1, 0.9, 51)
+    x, y = kx, ky[:, None]
+    humps = [np.exp(-(((x - a) / 0.08) ** 2) - ((y - b) / 0.06) ** 2) for a, b in ((0.5, 0.3), (-0.2, 0.6))]
+    return TabulatedSpectrum(kx, ky, 0.1 * (humps[0] + humps[1]), **options)
+
+
+SPECTRA = {
+    "elfouhaily": ElfouhailySpectrum(6, direction=0.7),
+    "pierson_moskowitz": PiersonMoskowitzSpectrum(4, direction=-2.0),
+    "jonswap": JonswapSpectrum(5, 4000, direction=2.0),
+    "swell": SwellSpectrum(1.5, 40, 0.5),
+    "narrow_swell": SwellSpectrum(0.5, 20, 4.0, 0.03, 0.05),
+    "table": swell_table(direction=0.4),
+    "frozen_table": swell_table(direction=0.4, one_sided=False),
+    "matched": MatchedSpectrum(ElfouhailySpectrum(3, direction=1.0), *cox_munk(3)),
+    "sea": SeaState((JonswapSpectrum(4, 2000, direction=0.3), SwellSpectrum(1, 30, 1.9), swell_table())),
+}
+
+
+def elfouhaily_written_out(wind):
+    """Return S(k) and Delta(k) of a fully developed sea, from PHYSICS.md with nothing shared with the package."""
+    c = lambda k: np.sqrt(G / k * (1 + (k / 370.0) ** 2))  # noqa: E731
+    peak = G * 0.84**2 / wind**2
+    friction = np.sqrt(0.00144) * wind
+    alpha_m = 0.01 * (1 + (1 if friction <= 0.23 else 3) * np.log(friction / 0.23))
+    sigma = 0.08 * (1 + 4 / 0.84**3)
+
+    def density(k):
+        common = np.exp(-1.25 * (peak / k) ** 2) * 1.7 ** np.exp(-((np.sqrt(k / peak) - 1) ** 2) / (2 * sigma**2))
+        low = 0.003 * np.sqrt(0.84) * c(peak) / c(k) * np.exp(-0.84 / np.sqrt(10) * (np.sqrt(k / peak) - 1))
+        high = 0.5 * alpha_m * 0.23 / c(k) * np.exp(-0.25 * (k / 370 - 1) ** 2)
+        return common * (low + high) / k**3
+
+    def delta(k):
+        return np.tanh(np.log(2) / 4 + 4 * (c(k) / c(peak)) ** 2.5 + 0.13 * friction / 0.23 * (0.23 / c(k)) ** 2.5)
+
+    return density, delta, peak
+
+
+@pytest.mark.parametrize(
+    ("wind", "height", "wavelength", "up", "cross"),
+    [
+        (3, 0.232, 8.2, 0.01545, 0.00998),
+        (6, 0.937, 32.7, 0.02170, 0.01478),
+        (10, 2.633, 90.8, 0.03551, 0.02480),
+    ],
+)
+def test_elfouhaily_totals(wind, height, wavelength, up, cross):
+    spectrum = ElfouhailySpectrum(wind)
+    assert significant_wave_height(spectrum) == pytest.approx(height, abs=5.1e-4)
+    assert 2 * np.pi / spectrum.peak_wavenumber == pytest.approx(wavelength, abs=0.051)
+    assert spectrum.slope_variance() == pytest.approx((up, cross), abs=1e-5)
+
+
+def test_elfouhaily_at_the_wind_of_the_measured_pulses():
+    spectrum = ElfouhailySpectrum(7.23)
+    assert significant_wave_height(spectrum) == pytest.approx(1.369, abs=5.1e-4)
+    assert 2 * np.pi / spectrum.peak_wavenumber == pytest.approx(47, abs=0.6)
+    assert sum(spectrum.slope_variance()) == pytest.approx(0.04496, abs=1e-5)
+
+
+@pytest.mark.parametrize("wind", [3, 7.23, 15])
+def test_elfouhaily_against_the_formula_and_another_quadrature(wind):
+    density, delta, peak = elfouhaily_written_out(wind)
+
+    def integral(function):
+        pieces = np.geomspace(peak / 10, 7400, 40)
+        return sum(
+            quad(lambda u: function(np.exp(u)) * np.exp(u), np.log(a), np.log(b), epsrel=1e-9)[0]
+            for a, b in pairwise(pieces)
+        )
+
+    spectrum = ElfouhailySpectrum(wind)
+    assert significant_wave_height(spectrum) == pytest.approx(4 * np.sqrt(integral(density)), rel=1e-6)
+    up = integral(lambda k: k**2 * density(k) * (0.5 + delta(k) / 4))
+    cross = integral(lambda k: k**2 * density(k) * (0.5 - delta(k) / 4))
+    assert spectrum.slope_variance() == pytest.approx((up, cross), rel=1e-6)
+    assert spectrum.peak_wavenumber == pytest.approx(peak)
+
+
+@pytest.mark.parametrize(
+    ("wind", "spacing", "up", "cross"),
+    [
+        (3, 0.05, 0.01235, 0.00749),
+        (3, 0.10, 0.01076, 0.00619),
+        (3, 0.25, 0.00816, 0.00416),
+        (3, 0.50, 0.00607, 0.00270),
+        (3, 1.00, 0.00396, 0.00150),
+        (6, 0.05, 0.01532, 0.00989),
+        (6, 0.10, 0.01419, 0.00896),
+        (6, 0.25, 0.01230, 0.00740),
+        (6, 0.50, 0.01045, 0.00590),
+        (6, 1.00, 0.00836, 0.00427),
+        (10, 0.05, 0.01927, 0.01306),
+        (10, 0.10, 0.01729, 0.01146),
+        (10, 0.25, 0.01528, 0.00979),
+        (10, 0.50, 0.01370, 0.00847),
+        (10, 1.00, 0.01182, 0.00693),
+    ],
+)
+def test_elfouhaily_cumulative_slopes(wind, spacing, up, cross):
+    assert ElfouhailySpectrum(wind).slope_variance(np.pi / spacing) == pytest.approx((up, cross), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("fetch", "heights"), [(20e3, (0.158, 0.405, 0.723)), (100e3, (0.217, 0.674, 1.43))], ids=["20km", "100km"]
+)
+def test_elfouhaily_heights_at_a_fetch(fetch, heights):
+    for wind, height in zip((3, 6, 10), heights, strict=True):
+        spectrum = ElfouhailySpectrum(wind, inverse_wave_age(wind, fetch))
+        # The heights are given with three digits.
+        assert significant_wave_height(spectrum) == pytest.approx(height, abs=0.5 * 10 ** (-2 if height > 1 else -3))
+
+
+def test_inverse_wave_age_ends_at_full_development_and_at_the_youngest_sea():
+    assert inverse_wave_age(5, 1e9) == pytest.approx(0.84)
+    assert inverse_wave_age(0, 1e3) == 0.84
+    with pytest.raises(ValueError, match=r"fetch = 100 must be at least (\d+) m at a wind speed of 10 m/s") as error:
+        inverse_wave_age(10, 100)
+    shortest = float(str(error.value).split("at least ")[1].split()[0])
+    assert inverse_wave_age(10, 1.01 * shortest) == pytest.approx(5, rel=0.02)
+
+
+@pytest.mark.parametrize("wind", [1e-6, 0.5, 1.5, 30])
+def test_extreme_winds_stay_finite_and_non_negative(wind):
+    for spectrum in (
+        ElfouhailySpectrum(wind, inverse_wave_age=2.0),
+        PiersonMoskowitzSpectrum(wind),
+        JonswapSpectrum(wind, 1000 * wind**2 / G),
+        MatchedSpectrum(ElfouhailySpectrum(wind), *cox_munk(wind)),
+    ):
+        k = np.geomspace(1e-4, 1e5, 500)
+        s = spectrum.omnidirectional(k)
+        assert np.all(np.isfinite(s))
+        assert np.all(s >= 0)
+        assert np.all(np.abs(spectrum.spreading(k)) <= 1)
+        assert spectrum.omnidirectional([0, -1]) == pytest.approx([0, 0], abs=0)
+
+
+def test_no_wind_gives_a_flat_sea():
+    for spectrum in (
+        ElfouhailySpectrum(0),
+        PiersonMoskowitzSpectrum(0),
+        MatchedSpectrum(ElfouhailySpectrum(0), *cox_munk(0)),
+        SwellSpectrum(0, 10),
+    ):
+        assert spectrum.slope_variance() == (0, 0)
+        assert significant_wave_height(spectrum) == 0
+        assert not spectrum.directional([0.0, 1.0], 1.0).any()
+    assert ElfouhailySpectrum(0).peak_wavenumber == PiersonMoskowitzSpectrum(0).peak_wavenumber == np.inf
+
+
+@pytest.mark.parametrize(("wind", "height", "slope"), [(3, 0.202, 0.0161), (6, 0.808, 0.0217), (10, 2.245, 0.0258)])
+def test_pierson_moskowitz(wind, height, slope):
+    spectrum = PiersonMoskowitzSpectrum(wind)
+    upper = 1.026 * wind  # wind at 19.5 m
+    # Closed form; the waves beyond the cut-off, alpha/(4 k^2) of the variance, are negligible.
+    assert significant_wave_height(spectrum) == pytest.approx(2 * np.sqrt(8.1e-3 / 0.74) * upper**2 / G, rel=1e-5)
+    assert significant_wave_height(spectrum) == pytest.approx(height, abs=1e-3)
+    assert np.sqrt(G * spectrum.peak_wavenumber) == pytest.approx(0.877 * G / upper, rel=1e-3)
+    assert sum(spectrum.slope_variance(62.8)) == pytest.approx(slope, abs=5.1e-5)
+    for k in (62.8, spectrum.CUT_OFF):
+        exact = 8.1e-3 / 4 * exp1(0.74 * (G / (upper**2 * k)) ** 2)
+        assert sum(spectrum.slope_variance(k)) == pytest.approx(exact, rel=1e-5)
+    # There are no waves beyond the cut-off, which the total thus includes.
+    assert spectrum.slope_variance() == spectrum.slope_variance(spectrum.CUT_OFF)
+    assert spectrum.omnidirectional(371) == 0 < spectrum.omnidirectional(369)
+
+
+@pytest.mark.parametrize(
+    ("wind", "fetch", "height"), [(3, 1e4, 0.204), (6, 1e4, 0.377), (10, 1e4, 0.594), (10, 1e5, 2.139)]
+)
+def test_jonswap(wind, fetch, height):
+    spectrum = JonswapSpectrum(wind, fetch)
+    assert significant_wave_height(spectrum) == pytest.approx(height, abs=5.1e-4)
+    peak = 22 * (G**2 / (wind * fetch)) ** (1 / 3)
+    assert np.sqrt(G * spectrum.peak_wavenumber) == pytest.approx(peak)
+    for ratio in (0.7, 0.95, 1.0, 1.1, 3.0):
+        omega = ratio * peak
+        width = 0.07 if ratio <= 1 else 0.09
+        density = 0.076 * (wind**2 / (fetch * G)) ** 0.22 * G**2 / omega**5 * np.exp(-1.25 / ratio**4)
+        density *= 3.3 ** np.exp(-((ratio - 1) ** 2) / (2 * width**2))
+        k = omega**2 / G
+        # S(k) dk = S(omega) d omega in deep water
+        assert spectrum.omnidirectional(k) == pytest.approx(density * 0.5 * np.sqrt(G / k), rel=1e-9)
+    plain = JonswapSpectrum(wind, fetch, peak_enhancement=1)
+    k = spectrum.peak_wavenumber
+    assert spectrum.omnidirectional(k) / plain.omnidirectional(k) == pytest.approx(3.3)
+
+
+def test_jonswap_ends_where_the_sea_is_fully_developed():
+    """100 km at 3 m/s would make waves of 0.735 m, three times those of a fully developed sea."""
+    with pytest.raises(ValueError, match=r"fetch = 100000 must not exceed 1\.56e\+04 m .* sea is fully developed"):
+        JonswapSpectrum(3, 1e5)
+    oldest = JonswapSpectrum(3, 15.6e3)
+    assert oldest.peak_wavenumber == pytest.approx(PiersonMoskowitzSpectrum(3).peak_wavenumber, rel=2e-3)
+
+
+def test_swell_has_the_height_and_the_length_asked_for():
+    swell = SwellSpectrum(2.0, 80.0, 0.3, relative_bandwidth=0.05, directional_spread=0.1)
+    assert significant_wave_height(swell) == pytest.approx(2.0, rel=1e-7)
+    assert swell.peak_wavenumber == pytest.approx(2 * np.pi / 80)
+    along, across = swell.slope_variance()
+    # <k^2> = k0^2 (1 + b^2), and <cos 2 phi> = e^(-2 s^2) of a Gaussian hump.
+    curvature = 0.25 * swell.peak_wavenumber**2 * (1 + 0.05**2)
+    assert along + across == pytest.approx(curvature, rel=1e-6)
+    assert along - across == pytest.approx(curvature * np.exp(-2 * 0.1**2), rel=1e-6)
+
+
+def test_swell_variance_is_conserved_in_a_short_period():
+    """Taken at the waves alone, swell of 60 m would be 0.2 m or 30 m high in periods of a few lengths."""
+    swell = SwellSpectrum(1.0, 60.0, 0.4, relative_bandwidth=0.02, directional_spread=0.03)
+    index = np.arange(-60, 61)
+    for period in (61, 200, 256, 1100):
+        variances = swell.mode_variances(index, index, 2 * np.pi / period)
+        assert 4 * np.sqrt(variances.sum()) == pytest.approx(1.0, rel=1e-6)
+        np.testing.assert_array_equal(variances, variances[::-1, ::-1])
+    # The wave that fits best holds most of it: 256/60 = 4.3 periods along 0.4 rad
+    variances = swell.mode_variances(index, index, 2 * np.pi / 256)
+    j, i = np.unravel_index(np.argmax(variances), variances.shape)
+    assert (abs(index[i]), abs(index[j])) == (4, 2)
+    assert index[i] * index[j] > 0
+
+
+@pytest.mark.parametrize(("period", "cell_integrals"), [(850.0, True), (950.0, False)])
+def test_swell_at_dense_waves_has_its_slopes(period, cell_integrals):
+    """Cells as wide as the hump agree with points except for the variance dk^2/12 of k within a cell (Sheppard)."""
+    swell = SwellSpectrum(1.0, 30.0, 0.0, relative_bandwidth=0.0335, directional_spread=0.1)
+    index, dk = np.arange(-60, 61), 2 * np.pi / period
+    variances = swell.mode_variances(index, index, dk)
+    assert variances.sum() == pytest.approx(1 / 16, rel=1e-5)
+    along, across = swell.slope_variance()
+    within = variances.sum() * dk**2 / 12 if cell_integrals else 0
+    assert np.sum(variances * (index * dk) ** 2) == pytest.approx(along + within, rel=3e-5)
+    assert np.sum(variances.T * (index * dk) ** 2) == pytest.approx(across + within, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", SPECTRA)
+def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
+    """A direction counted clockwise, or along taken for across, changes the slopes by a fifth and more."""
+    spectrum = SPECTRA[kind]
+    k = np.geomspace(2e-3, 8000, 12000)
+    if kind not in ("elfouhaily", "pierson_moskowitz", "jonswap", "matched"):
+        k = k[k < 400][::2]
+    k = k[:, None]
+    count = 256 if kind not in ("elfouhaily", "matched") else 8
+    phi = (np.arange(count) + 0.5) * 2 * np.pi / count
+    kx, ky = k * np.cos(phi), k * np.sin(phi)
+    ring = spectrum.directional(kx, ky) * k**2 * 2 * np.pi
+
+    def integral(weight):
+        return trapezoid((ring * weight).mean(axis=1), np.log(k[:, 0]))
+
+    # Steps at a cut-off or at the edge of a table cost the plain rule here some 1e-4.
+    assert spectrum.elevation_variance() == pytest.approx(integral(1), rel=1e-3)
+    covariance = np.array([[integral(kx * kx), integral(kx * ky)], [integral(kx * ky), integral(ky * ky)]])
+    np.testing.assert_allclose(spectrum.slope_covariance(), covariance, atol=1e-3 * np.trace(covariance))
+    axis = np.array([np.cos(spectrum.direction), np.sin(spectrum.direction)])
+    along, across = spectrum.slope_variance()
+    assert along == pytest.approx(axis @ covariance @ axis, abs=1e-3 * np.trace(covariance))
+    assert along + across == pytest.approx(np.trace(covariance), rel=1e-3)
+    middle = np.array([0.3, 0.5, 1.0])[:, None]
+    rings = 2 * np.pi * middle * spectrum.directional(middle * np.cos(phi), middle * np.sin(phi))
+    np.testing.assert_allclose(spectrum.omnidirectional(middle[:, 0]), rings.mean(axis=1), rtol=2e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", SPECTRA)
+def test_partial_slopes_are_those_of_the_waves_up_to_a_wavenumber(kind):
+    spectrum, k_max = SPECTRA[kind], 0.62
+    k = np.linspace(0, k_max, 3001)[1:] - k_max / 6000
+    expected = np.sum(spectrum.omnidirectional(k) * k**2) * k_max / 3000
+    assert sum(spectrum.slope_variance(k_max)) == pytest.approx(expected, rel=3e-3)
+
+
+@pytest.mark.parametrize("kind", SPECTRA)
+def test_opposite_waves_count_alike(kind):
+    kx, ky = np.random.default_rng(1).uniform(-1, 1, (2, 200))
+    spectrum = SPECTRA[kind]
+    there, back = spectrum.directional(kx, ky), spectrum.directional(-kx, -ky)
+    np.testing.assert_allclose(there, back, rtol=1e-12)
+    assert there.any()
+
+
+@pytest.mark.parametrize("kind", ["elfouhaily", "pierson_moskowitz", "jonswap", "matched", "swell"])
+def test_mode_variances_are_the_directional_spectrum(kind):
+    """For these as fast as each |k| is looked up once; a mirrored or turned lookup would show."""
+    spectrum = SPECTRA[kind]
+    ix, iy, dk = np.arange(0, 40), np.r_[0:20, -20:0], 0.011
+    expected = spectrum.directional(ix * dk, iy[:, None] * dk) * dk**2
+    np.testing.assert_allclose(spectrum.mode_variances(ix, iy, dk), expected, rtol=1e-9, atol=1e-18)
+
+
+def test_table_is_bilinear_and_nothing_outside():
+    table = TabulatedSpectrum([1, 2, 4], [-1, 1], [[1, 2, 0], [3, 4, 0]])
+    # Half the value: the other half belongs to the opposite wave.
+    assert table.directional(1.5, 0.0) == pytest.approx(0.5 * 2.5)
+    assert table.directional(-1.5, 0.0) == pytest.approx(0.5 * 2.5)
+    assert table.directional(3.0, -0.5) == pytest.approx(0.5 * 0.5 * (0.75 * 2 + 0.25 * 4))
+    assert table.directional([0.99, 4.01, 2.0], [0.0, 0.0, 1.01]) == pytest.approx([0, 0, 0], abs=0)
+    # Mean of four corners times area, cell by cell
+    assert table.elevation_variance() == pytest.approx(2 * 2.5 + 4 * 1.5)
+    assert table.peak_wavenumber == pytest.approx(np.sqrt(5))
+    # The edges of the cells of the waves lie anywhere in the table's; together they hold it all.
+    index = np.arange(-30, 31)
+    assert table.mode_variances(index, index, 0.19).sum() == pytest.approx(11.0, rel=1e-12)
+
+
+def test_slopes_of_a_table_are_exact():
+    """Of a density 1 on 1 x 2 rad/m: integrals of kx^2, kx ky and ky^2, which no rule of one point an interval has."""
+    table = TabulatedSpectrum([0, 1], [0, 2], np.ones((2, 2)), direction=np.pi / 2)
+    np.testing.assert_allclose(table.slope_covariance(), [[2 / 3, 1], [1, 8 / 3]], rtol=1e-12)
+    assert table.slope_variance() == pytest.approx((8 / 3, 2 / 3))
+    # A quarter of a disc of radius 1: pi/4 over both axes, each integral of k^2 cos^2 is pi/16.
+    assert table.slope_variance(1.0) == pytest.approx((np.pi / 16, np.pi / 16), rel=1e-3)
+
+
+def test_table_of_a_spectrum_is_that_spectrum():
+    spectrum = ElfouhailySpectrum(6, direction=0.7)
+    k = np.linspace(-3, 3, 601)
+    table = TabulatedSpectrum(k, k, spectrum.directional(k, k[:, None]), direction=0.7, one_sided=False)
+    assert significant_wave_height(table) == pytest.approx(significant_wave_height(spectrum), rel=0.01)
+    assert table.slope_variance(2.5) == pytest.approx(spectrum.slope_variance(2.5), rel=0.01)
+
+
+def test_sea_is_the_sum_of_its_components_along_the_axes_of_the_first():
+    wind, swell = ElfouhailySpectrum(5, direction=0.2), SwellSpectrum(1, 50, 0.2 + np.pi / 2)
+    sea = SeaState([wind, swell])
+    assert sea.direction == 0.2
+    assert significant_wave_height(sea) == pytest.approx(
+        np.hypot(significant_wave_height(wind), significant_wave_height(swell))
+    )
+    # Swell across the wind swaps its axes.
+    assert sea.slope_variance() == pytest.approx(np.add(wind.slope_variance(), swell.slope_variance()[::-1]))
+    assert sea.peak_wavenumber == swell.peak_wavenumber
+    assert SeaState((wind, SwellSpectrum(0.1, 50))).peak_wavenumber == wind.peak_wavenumber
+
+
+@pytest.mark.parametrize("wind", [1, 3, 6, 10, 15, 30])
+@pytest.mark.parametrize("kind", [ElfouhailySpectrum, PiersonMoskowitzSpectrum, JonswapSpectrum])
+def test_matched_totals(kind, wind):
+    options = {"fetch": 3000 * wind**2 / G} if kind is JonswapSpectrum else {}
+    plain = kind(wind, direction=0.8, **options)
+    matched = MatchedSpectrum(plain, *cox_munk(wind))
+    # No approximation: each wave is scaled, and nothing had to be clipped.
+    assert matched.slope_variance() == pytest.approx(cox_munk(wind), rel=1e-12)
+    assert min(matched.scales) > 0
+    assert matched.direction == 0.8
+    # Long waves, and with them the height, are left as they were.
+    assert matched.scaled_from == 2 * np.pi
+    k = np.geomspace(0.01, 6.28, 30)
+    np.testing.assert_array_equal(matched.omnidirectional(k), plain.omnidirectional(k))
+    np.testing.assert_allclose(matched.spreading(k), plain.spreading(k), rtol=1e-12)
+    # Short ones have the factors along and across.
+    k = np.geomspace(6.29, 350, 30)
+    for sign, scale in zip((1, -1), matched.scales, strict=True):
+        ratio = matched.omnidirectional(k) * (0.5 + sign * matched.spreading(k) / 4)
+        ratio /= plain.omnidirectional(k) * (0.5 + sign * plain.spreading(k) / 4)
+        np.testing.assert_allclose(ratio, scale, rtol=1e-9)
+    # Another quadrature, which does not step over the jump at 1 m either
+    long, short = np.geomspace(plain.peak_wavenumber / 10, 2 * np.pi, 20001), np.geomspace(2 * np.pi, 7400, 200001)
+    short[0] *= 1 + 1e-12
+    if plain.peak_wavenumber < 2 * np.pi:
+        total = sum(trapezoid(matched.omnidirectional(k) * k**3, np.log(k)) for k in (long, short))
+        assert total == pytest.approx(sum(cox_munk(wind)), rel=1e-5 if kind is ElfouhailySpectrum else 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("plain", "upwind", "crosswind"),
+    [
+        (ElfouhailySpectrum(6), 0.0010, 0.0005),  # less than the waves longer than 1 m have
+        (ElfouhailySpectrum(6), 0.0300, 0.0105),  # ratios that clip some waves
+        (ElfouhailySpectrum(1), 0.0030, 0.0011),
+        (PiersonMoskowitzSpectrum(6), 0.004, 0.011),
+    ],
+)
+def test_matched_totals_far_from_the_spectrum(plain, upwind, crosswind):
+    matched = MatchedSpectrum(plain, upwind, crosswind)
+    assert matched.slope_variance() == pytest.approx((upwind, crosswind), rel=1e-10)
+    assert min(matched.scales) >= 0
+    assert np.all(np.abs(matched.spreading(np.geomspace(0.01, 1000, 500))) <= 1)
+    k = 0.99 * matched.scaled_from
+    assert matched.omnidirectional(k) == plain.omnidirectional(k)
+    assert matched.scaled_from <= 2 * np.pi
+
+
+@pytest.mark.parametrize("wind", [0.01, 0.1, 0.2, 0.35])
+def test_matched_totals_are_not_exceeded_where_no_waves_can_have_them(wind):
+    """Cox and Munk leave 0.003 crosswind at no wind; the density of no wave is more than cos^2 across the wind."""
+    wanted = cox_munk(wind)
+    matched = MatchedSpectrum(ElfouhailySpectrum(wind), *wanted)
+    along, across = matched.slope_variance()
+    assert along <= wanted[0] * (1 + 1e-9)
+    assert across <= 3 * wanted[0] * (1 + 1e-9) < wanted[1]
+    if wind > 0.05:
+        assert (along, across) == pytest.approx((wanted[0], 3 * wanted[0]), rel=1e-6)
+    else:
+        assert (along, across) == (0, 0)
+
+
+def test_matched_totals_of_too_large_a_ratio_miss_the_larger():
+    assert MatchedSpectrum(ElfouhailySpectrum(6), 0.03, 0.005).slope_variance() == pytest.approx((0.015, 0.005))
+    assert MatchedSpectrum(ElfouhailySpectrum(6), 0.005, 0.03).slope_variance() == pytest.approx((0.005, 0.015))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ElfouhailySpectrum(31), "wind_speed = 31 must lie between 0 and 30"),
+        (lambda: ElfouhailySpectrum(np.nan), "wind_speed = nan must be finite"),
+        (lambda: ElfouhailySpectrum(5, 0.5), "inverse_wave_age = 0.5 must lie between 0.84 and 5"),
+        (lambda: ElfouhailySpectrum(5, direction=np.inf), "direction = inf must be finite"),
+        (lambda: ElfouhailySpectrum(5).slope_variance(0), "k_max = 0"),
+        (lambda: swell_table().slope_covariance(-1), "k_max = -1"),
+        (lambda: inverse_wave_age(5, 0), "fetch = 0 must be greater than 0"),
+        (lambda: PiersonMoskowitzSpectrum(-1), "wind_speed = -1 must lie"),
+        (lambda: PiersonMoskowitzSpectrum(1, np.nan), "direction = nan"),
+        (lambda: JonswapSpectrum(0, 100), "wind_speed = 0 must be greater than 0"),
+        (lambda: JonswapSpectrum(5, -1), "fetch = -1 must be greater than 0"),
+        (lambda: JonswapSpectrum(10, 0.5), "fetch = 0.5 must be at least 1.02 m at a wind speed of 10 m/s"),
+        (lambda: JonswapSpectrum(10, 1e4, 0.9), "peak_enhancement = 0.9 must lie between 1 and 7"),
+        (lambda: JonswapSpectrum(10, 1e4, direction="x"), "direction = 'x' must be a number"),
+        (lambda: SwellSpectrum(-1, 10), "height = -1 must not be negative"),
+        (lambda: SwellSpectrum(2, 10), "height = 2 must not exceed 1.43 m, a seventh of the wavelength"),
+        (lambda: SwellSpectrum(1, 0), "wavelength = 0 must be greater than 0"),
+        (lambda: SwellSpectrum(1, 20, np.nan), "direction = nan"),
+        (lambda: SwellSpectrum(1, 20, 0, 0), "relative_bandwidth = 0 must be greater than 0"),
+        (lambda: SwellSpectrum(1, 20, 0, 0.4), "relative_bandwidth = 0.4 must lie between 0 and 0.3"),
+        (lambda: SwellSpectrum(1, 20, 0, 0.1, 0.7), "directional_spread = 0.7 must lie between 0 and 0.6"),
+        (lambda: TabulatedSpectrum([0, 1], [0, 1], [[0, -1], [0, 1]]), "density = -1 must not be negative"),
+        (lambda: TabulatedSpectrum([0, 1], [0, 1], [[0, np.nan], [0, 1]]), "density holds nan"),
+        (lambda: TabulatedSpectrum([0, 1], [0, 1], np.zeros((2, 2))), "density must be greater than 0 somewhere"),
+        (lambda: TabulatedSpectrum([0, 1, 2], [0, 1], np.ones((3, 2))), r"shape \(3, 2\) must have shape .* \(2, 3\)"),
+        (lambda: TabulatedSpectrum([0, 0], [0, 1], np.ones((2, 2))), "kx must increase strictly"),
+        (lambda: TabulatedSpectrum([0, 1], [0], np.ones((1, 2))), r"ky of shape \(1,\) must be a list of at least 2"),
+        (lambda: TabulatedSpectrum([0, 1], [0, 1], np.ones((2, 2)), np.nan), "direction = nan"),
+        (lambda: SeaState(()), "components must hold at least one"),
+        (lambda: SeaState((3,)), "components holds 3 but every component must be a wave spectrum"),
+        (lambda: MatchedSpectrum(SwellSpectrum(1, 20), 0.1, 0.1), "spectrum = SwellSpectrum.* must be one of wind"),
+        (lambda: MatchedSpectrum(ElfouhailySpectrum(5), -0.1, 0.1), "upwind = -0.1 must not be negative"),
+        (lambda: MatchedSpectrum(ElfouhailySpectrum(5), 0.1, np.nan), "crosswind = nan"),
+        (lambda: MatchedSpectrum(ElfouhailySpectrum(5), 0.1, 0.1, 0), "k_from = 0 must be greater than 0"),
+    ],
+)
+def test_bad_parameters_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,89 @@
+"""Petzold's waters against numbers printed in his report: sums, medians, normalised values."""
+
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+
+from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+
+# Summary pages of SIO Ref. 72-78: c and bb/b; median angle [deg]; fraction of b and power below 0.1 degree;
+# p at 20, 40, 45 and 90 degrees [1/sr].
+REPORT = {
+    "clear": (0.151, 0.044, 6.252, 0.033751, -1.191, (0.29474, 0.050931, 0.036785, 0.0065953)),
+    "coastal": (0.398, 0.013, 2.534, 0.12541, -1.545, (0.20184, 0.027421, 0.018892, 0.0023897)),
+    "turbid": (2.190, 0.020, 4.680, 0.052323, -1.346, (0.24405, 0.043377, 0.032108, 0.0046105)),
+}
+# The tables' volume scattering functions [1/(m sr)] at 0.1, 1, 10 and 180 degrees.
+PRINTED = {
+    "clear": (53.182, 2.4976, 0.041620, 5.0190e-4),
+    "coastal": (653.29, 16.623, 0.21554, 1.0302e-3),
+    "turbid": (3262.0, 132.88, 2.1107, 5.6857e-3),
+}
+# bb/b and mean cosine of the same tables by the trapezoidal rule
+TRAPEZOID = {"clear": (0.0438, 0.873), "coastal": (0.0133, 0.9475), "turbid": (0.0198, 0.9205)}
+
+WATERS = pytest.mark.parametrize("name", REPORT)
+
+
+def fraction(p, low, high):
+    """Share of the light scattered between two angles [rad], by Simpson's rule in ln(theta)."""
+    x = np.linspace(np.log(low), np.log(high), 100_001)
+    theta = np.exp(x)
+    return simpson(2 * np.pi * p(theta) * np.sin(theta) * theta, x=x)
+
+
+@WATERS
+def test_normalised_and_divided_as_the_report_says(name):
+    p = petzold_water(name)
+    _, ratio, median, below, _, _ = REPORT[name]
+    # The cone below 1e-12 rad still holds 8e-6 of the steepest.
+    assert fraction(p, 1e-12, np.pi) == pytest.approx(1, abs=1e-5)
+    assert fraction(p, np.pi / 2, np.pi) == pytest.approx(ratio, abs=5e-4)
+    assert fraction(p, 1e-12, np.radians(median)) == pytest.approx(0.5, abs=1e-3)
+    assert fraction(p, 1e-12, np.radians(0.1)) == pytest.approx(below, rel=1.2e-2)
+
+
+@WATERS
+def test_values_are_the_printed_ones(name):
+    p = petzold_water(name)
+    np.testing.assert_allclose(p(np.radians([20, 40, 45, 90])), REPORT[name][-1], rtol=4e-3)
+    theta = np.radians([0.1, 1, 10, 180])
+    np.testing.assert_allclose(p(theta) / p(np.pi), np.divide(PRINTED[name], PRINTED[name][-1]), rtol=1e-12)
+    # Times b, which the report gives to 1e-3 1/m, they are the volume scattering function.
+    _, b = PETZOLD_WATERS[name]
+    np.testing.assert_allclose(b * p(theta), PRINTED[name], rtol=6e-3)
+
+
+@WATERS
+def test_between_angles_and_below_the_first_it_is_a_power(name):
+    p = petzold_water(name)
+    # 15 and 20 degrees are neighbours in the table.
+    assert p(np.radians(np.sqrt(15 * 20))) == pytest.approx(np.sqrt(p(np.radians(15)) * p(np.radians(20))), rel=1e-12)
+    power = np.log10(p(1e-5) / p(1e-6))
+    assert power == pytest.approx(REPORT[name][4], abs=0.01)
+    assert power == pytest.approx(np.log10(p(np.radians(0.1)) / p(np.radians(0.01))), rel=1e-9)
+    # From theta^-2 on the integral would diverge.
+    assert power > -2
+    assert p(0.0) == np.inf
+
+
+@WATERS
+def test_backscattering_and_mean_cosine_of_the_sampled_table(name):
+    table = PowerLawTable.from_function(petzold_water(name))
+    ratio, mean_cosine = TRAPEZOID[name]
+    # The trapezoidal rule cuts the corners of a steep function: its b is 1 % too large.
+    assert table.backscatter_ratio == pytest.approx(ratio, rel=1.2e-2)
+    assert table.mean_cosine == pytest.approx(mean_cosine, abs=1.6e-3)
+
+
+def test_absorption_and_scattering_add_up_to_the_attenuation():
+    assert PETZOLD_WATERS.keys() == REPORT.keys()
+    for name, (absorption, scattering) in PETZOLD_WATERS.items():
+        assert absorption + scattering == pytest.approx(REPORT[name][0], abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["harbour", "Clear", ""])
+def test_unknown_water_is_rejected(name):
+    with pytest.raises(ValueError, match=f"^name = '{name}' must be one of clear, coastal, turbid$"):
+        petzold_water(name)

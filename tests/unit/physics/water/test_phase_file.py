@@ -1,0 +1,136 @@
+"""Phase functions from files: sampled closed forms, and rejected files."""
+
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.physics.water.phase import (
+    henyey_greenstein,
+    henyey_greenstein_backscatter_ratio,
+    petzold_average_particle,
+)
+from mitransient_lidar.physics.water.phase_file import read_phase_table
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+
+
+def uneven_angles():
+    """150 angles [deg] from 0.05 to 180, with gaps of 2 to 10 % of the angle."""
+    gaps = np.random.default_rng(11).uniform(0.2, 1, 149)
+    return 0.05 * 3600 ** np.append(0, np.cumsum(gaps) / gaps.sum())
+
+
+def write(path, degrees, values, separator=","):
+    path.write_text("\n".join(f"{d!r}{separator}{v!r}" for d, v in zip(degrees.tolist(), values.tolist(), strict=True)))
+    return path
+
+
+@pytest.mark.parametrize("g", [0.5, 0.85, 0.95])
+def test_henyey_greenstein_at_uneven_angles(tmp_path, g):
+    """Values taken as per degree, or integrated without the sine, would be off by far."""
+    degrees = uneven_angles()
+    path = write(tmp_path / "hg.csv", degrees, henyey_greenstein(np.radians(degrees), g))
+    table, integral = read_phase_table(path)
+    theta = np.radians(np.geomspace(0.001, 180, 2000))
+    np.testing.assert_allclose(table.eval(theta), henyey_greenstein(theta, g), rtol=1e-2)
+    assert table.mean_cosine == pytest.approx(g, abs=1e-3)
+    assert table.backscatter_ratio == pytest.approx(henyey_greenstein_backscatter_ratio(g), rel=3e-3)
+    assert integral == pytest.approx(1, abs=3e-3)
+
+
+@pytest.mark.parametrize("factor", [3.0, 4 * np.pi, 0.15])
+def test_factor_of_unnormalised_values(tmp_path, factor):
+    degrees = uneven_angles()
+    values = henyey_greenstein(np.radians(degrees), 0.9)
+    expected = read_phase_table(write(tmp_path / "one.csv", degrees, values))
+    read = read_phase_table(write(tmp_path / "many.csv", degrees, factor * values))
+    assert read.integral == pytest.approx(factor * expected.integral, rel=1e-12)
+    assert read.integral == pytest.approx(factor, rel=5e-3)
+    np.testing.assert_allclose(read.table.value, expected.table.value, rtol=1e-12)
+
+
+def test_petzold_is_read_like_the_one_that_is_shipped():
+    """The file integrates to 0.9929; its first two angles give the power -1.345, the paper's is -1.346."""
+    path = resources.files("mitransient_lidar.physics.water").joinpath("petzold_average_particle.csv")
+    table, integral = read_phase_table(path)
+    assert integral == pytest.approx(0.9929, abs=1e-4)
+    theta = np.radians(np.geomspace(0.001, 180, 500))
+    # Kinks at the rows: the fine table has its nodes beside them.
+    np.testing.assert_allclose(table.eval(theta), petzold_average_particle()(theta), rtol=1e-2)
+    shipped = PowerLawTable.from_function(petzold_average_particle(), table.count)
+    assert table.mean_cosine == pytest.approx(shipped.mean_cosine, abs=1e-5)
+    assert table.backscatter_ratio == pytest.approx(shipped.backscatter_ratio, rel=1e-4)
+
+
+def test_power_towards_zero_is_that_of_the_first_angles(tmp_path):
+    degrees = np.geomspace(0.5, 180, 30)
+    table, _ = read_phase_table(write(tmp_path / "power.txt", degrees, degrees**-1.5, " "))
+    core = table.eval(np.radians([0.001, 0.01, 0.1]))
+    np.testing.assert_allclose(core[:-1] / core[1:], 10**1.5, rtol=1e-4)
+
+
+def test_values_that_fall_towards_zero_end_flat(tmp_path):
+    degrees = np.geomspace(0.5, 180, 30)
+    table, _ = read_phase_table(write(tmp_path / "hole.txt", degrees, degrees**0.5, "\t"))
+    core = table.eval(np.radians([0.001, 0.1, 0.5, 1.0]))
+    np.testing.assert_allclose(core / core[2], [1, 1, 1, 2**0.5], rtol=1e-3)
+
+
+def test_an_angle_of_zero_counts(tmp_path):
+    """Between 0 and the next angle ln p is linear in theta^2: half-way a quarter of the drop."""
+    degrees = np.array([0.0, *np.linspace(5, 180, 36)])
+    values = np.array([8.0, *np.geomspace(2, 0.01, 36)])
+    table, integral = read_phase_table(write(tmp_path / "zero.txt", degrees, values, "  "))
+    read = table.eval(np.radians([0.001, 2.5, 5.0])) * integral
+    np.testing.assert_allclose(read, [8, 8 / 4**0.25, 2], rtol=1e-3)
+
+
+def test_last_value_holds_to_the_end(tmp_path):
+    degrees = np.linspace(1, 170, 60)
+    table, integral = read_phase_table(write(tmp_path / "short.txt", degrees, 2 - degrees / 180, " "))
+    read = table.eval(np.radians([168.0, 171.0, 175.0, 180.0])) * integral
+    np.testing.assert_allclose(read, 2 - np.array([168, 170, 170, 170]) / 180, rtol=1e-3)
+
+
+def test_headings_and_comments_are_skipped(tmp_path):
+    rows = [f"{angle}\t{200 - angle} # seen" for angle in range(10, 190, 10)]
+    path = tmp_path / "table.txt"
+    path.write_text("\n".join(["# a cruise", "", "angle (deg), value (1/sr)", *rows]), "utf-8-sig")
+    table, integral = read_phase_table(path)
+    assert table.eval(np.radians(90)) * integral == pytest.approx(110, rel=1e-3)
+
+
+GOOD = [f"{angle} 1" for angle in range(10, 190, 10)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([], "phase.txt has 0 angles but must have at least 10"),
+        (GOOD[-9:], "has 9 angles but must have at least 10"),
+        (GOOD[:-2], "ends at 160 degrees but its last angle must be at least 170"),
+        (["# x", *GOOD[:3], "nan 1", *GOOD[4:]], "phase.txt, line 5: angle = nan must lie between 0 and 180 degrees"),
+        ([*GOOD[:3], "40 nan", *GOOD[4:]], "line 4: value = nan must be finite and greater than 0"),
+        ([*GOOD[:3], "40 inf", *GOOD[4:]], "line 4: value = inf must be finite and greater than 0"),
+        ([*GOOD[:3], "40 0", *GOOD[4:]], "line 4: value = 0 must be finite and greater than 0"),
+        (["-1 1", *GOOD], "line 1: angle = -1 must lie between 0 and 180 degrees"),
+        ([*GOOD, "181 1"], "line 19: angle = 181 must lie between 0 and 180 degrees"),
+        ([*GOOD[:3], "", "30 1", *GOOD[3:]], "line 5: angle = 30 follows 30 but angles must increase"),
+        ([*GOOD, "1 2 3"], "line 19: '1 2 3' must be two numbers, angle in degrees and value"),
+        ([*GOOD, "high low"], "line 19: 'high low' must be two numbers"),
+        (["8 1.9", *GOOD], r"rises as theta\^-2.88 from 10 to 8 degrees, but the power must be above -2"),
+    ],
+)
+def test_invalid_tables_are_rejected(tmp_path, lines, message):
+    path = tmp_path / "phase.txt"
+    path.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=message):
+        read_phase_table(path)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match=r"cannot read .*none.txt: No such file or directory"):
+        read_phase_table(tmp_path / "none.txt")
+    (tmp_path / "phase.txt").write_bytes(b"\xff")
+    with pytest.raises(ValueError, match=r"phase.txt is not a text file in UTF-8"):
+        read_phase_table(tmp_path / "phase.txt")

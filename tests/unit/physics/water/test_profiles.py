@@ -1,0 +1,302 @@
+"""Continuous profiles: from files, and as layers whose optical depths are those of the linear profile."""
+
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.integrate import quad
+
+from mitransient_lidar.physics.water.profiles import BACKSCATTERING_FLOOR, COEFFICIENT_FLOOR, Profile, read_profile
+
+# a and b do not change alike, bb/b neither; the first node lies below the surface.
+DEPTH = np.array([0.5, 2.0, 3.0, 3.2, 6.0, 11.0, 14.0])
+A = np.array([0.10, 0.12, 0.40, 0.15, 0.15, 0.05, 0.05])
+B = np.array([0.20, 0.80, 0.60, 0.10, 0.30, 0.02, 0.02])
+BB = np.array([0.004, 0.008, 0.012, 0.001, 0.006, 0.001, 0.001])
+WATER = {"a": A, "b": B, "c": A + B, "omega": B / (A + B)}
+
+
+@pytest.fixture
+def profile():
+    return Profile(DEPTH, A, B, BB)
+
+
+@pytest.fixture
+def noisy():
+    """A thousand nodes whose values scatter by less and by more than a tolerance of 1 %."""
+    rng = np.random.default_rng(3)
+    z = np.linspace(0, 40, 1000)
+    b = np.exp(np.where(z < 20, 0.003, 0.02) * rng.standard_normal(z.size) - z / 20)
+    return Profile(z, 0.2 * b, b, 0.02 * b)
+
+
+def write_csv(path, columns, heading="# a station"):
+    names, rows = ", ".join(columns), zip(*columns.values(), strict=True)
+    path.write_text("\n".join([heading, names, *(", ".join(repr(float(v)) for v in row) for row in rows)]))
+    return path
+
+
+def deviations(profile, tolerance):
+    """Return deviations of layers from the profile at many depths over the tolerance, shape (3, depths)."""
+    water = profile.layers(tolerance)
+    z = np.sort(np.append(np.linspace(0, profile.depth[-1] * 1.2, 40_001), np.nextafter(water.layer_tops[1:], 0)))
+    layer = water.layer_at(z)
+    pairs = (
+        (profile.attenuation, water.attenuation, COEFFICIENT_FLOOR),
+        (profile.scattering, water.scattering, COEFFICIENT_FLOOR),
+        (profile.backscattering, water.backscattering, BACKSCATTERING_FLOOR),
+    )
+    truths = [(np.interp(z, profile.depth, nodes), means[layer], floor) for nodes, means, floor in pairs]
+    return np.array([np.abs(mean - q) / (tolerance * np.maximum(q, floor)) for q, mean, floor in truths])
+
+
+@pytest.mark.parametrize("tolerance", [0.2, 0.01, 0.002])
+def test_optical_depth_is_exact_at_every_edge(profile, tolerance):
+    """Values from the layers' centres instead of means miss the edges in layers that cross a node."""
+    water = profile.layers(tolerance)
+    coefficients = (
+        (profile.attenuation, water.attenuation),
+        (profile.scattering, water.scattering),
+        (profile.backscattering, water.backscattering),
+    )
+    layer_tops = np.append(water.layer_tops, 20.0)
+    some = np.unique(np.append(np.arange(0, water.count, 1 + water.count // 40), water.count - 1))
+    for nodes, means in coefficients:
+        for i in some:
+            knots = DEPTH[(layer_tops[i] < DEPTH) & (layer_tops[i + 1] > DEPTH)]
+            area, _ = quad(
+                lambda z, q=nodes: np.interp(z, DEPTH, q), layer_tops[i], layer_tops[i + 1], points=knots, epsrel=1e-12
+            )
+            assert means[i] * (layer_tops[i + 1] - layer_tops[i]) == pytest.approx(area, rel=1e-9)
+    total, _ = quad(lambda z: np.interp(z, DEPTH, A + B), 0, 20, points=DEPTH, epsrel=1e-12, limit=200)
+    assert water.cumulative(20.0) == pytest.approx(total, rel=1e-10)
+
+
+@pytest.mark.parametrize("tolerance", [0.2, 0.01, 0.002])
+def test_optical_depth_within_layers(profile, tolerance):
+    """Off the edges by at most tolerance/2 of the layer's own; a layer of 1 % and 0.1 m is off by 5e-4 at c = 1."""
+    water = profile.layers(tolerance)
+    fine = np.sort(np.concatenate((np.linspace(0, 16, 20_001), DEPTH)))
+    c = np.interp(fine, DEPTH, A + B)
+    exact = np.append(0, np.cumsum(np.diff(fine) * (c[1:] + c[:-1]) / 2))
+    layer = water.layer_at(fine)
+    own = (water.attenuation * np.append(np.diff(water.layer_tops), 16 - water.layer_tops[-1]))[layer]
+    assert np.all(np.abs(water.cumulative(fine) - exact) <= tolerance / 2 * own + 1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [0.2, 0.01, 0.002])
+def test_layers_keep_the_tolerance_and_use_it(profile, noisy, tolerance):
+    for water in (profile, noisy):
+        worst = deviations(water, tolerance).max()
+        assert worst == pytest.approx(1, abs=2e-2)
+        assert worst <= 1 + 1e-6
+
+
+def test_clear_water_needs_the_floors():
+    """Towards 0 a relative tolerance alone would never end."""
+    profile = Profile([0, 4, 8], [0.05, 0.05, 0], [0.1, 0, 0], [0.002, 0, 0])
+    assert profile.layers(0.01).count < 1000
+    assert deviations(profile, 0.01).max() <= 1 + 1e-6
+
+
+@pytest.mark.parametrize("nodes", [2, 50, 1000])
+@pytest.mark.parametrize("order", [1, -1])
+def test_fewest_layers_of_a_straight_profile(nodes, order):
+    """A layer may span a ratio of 1 + 2 tolerance; nodes in line change nothing. The last layer has no end."""
+    z = np.linspace(0, 10, nodes)
+    b = np.linspace(0.1, 0.8, nodes)[::order]
+    count = Profile(z, b, b, 0.02 * b).layers(0.01).count
+    assert count == np.ceil(np.log(8) / np.log(1.02)) + 1
+
+
+def test_number_of_layers_goes_with_the_inverse_tolerance(profile):
+    coarse, fine = profile.layers(0.004).count, profile.layers(0.0004).count
+    assert fine / coarse == pytest.approx(10, rel=0.03)
+
+
+def test_hardly_two_neighbours_could_be_one(noisy):
+    """Nodes that vary by less than the tolerance are joined in layers; 500 of them above 20 m need about 70."""
+    tolerance = 0.01
+    water = noisy.layers(tolerance)
+    assert np.sum(water.layer_tops < 20) < 100
+    c, layer_tops = noisy.attenuation, water.layer_tops
+    thick = np.diff(layer_tops)
+    merged = (water.attenuation[:-2] * thick[:-1] + water.attenuation[1:-1] * thick[1:]) / (thick[:-1] + thick[1:])
+    superfluous = 0
+    for mean, top, end in zip(merged, layer_tops[:-2], layer_tops[2:], strict=True):
+        q = np.append(np.interp([top, end], noisy.depth, c), c[(noisy.depth > top) & (noisy.depth < end)])
+        superfluous += np.max(np.abs(mean - q) / q) < tolerance
+    assert superfluous < 0.04 * water.count
+
+
+def test_constant_parts_are_one_layer():
+    assert Profile([1, 2], [0.2, 0.2], [0.1, 0.1], [0.002, 0.002]).layers().count == 1
+    water = Profile([3, 4, 5, 9], [0.2, 0.2, 0.1, 0.1], [0.1] * 4, [0.002] * 4).layers()
+    assert water.layer_tops[1] > 4
+    assert water.layer_tops[-1] == 5
+    np.testing.assert_allclose(water.attenuation[[0, -1]], [0.3, 0.2], rtol=2e-2)
+
+
+def test_a_cliff_has_layers_of_finite_thickness():
+    water = Profile([0, 3, 3 + 1e-9, 5], [0.4, 0.4, 0.1, 0.1], [0.5, 0.5, 0.4, 0.4], [0.01] * 4).layers()
+    np.testing.assert_allclose(water.layer_tops, [0, 3, 3 + 1e-9], atol=2e-4)
+    assert water.cumulative(5.0) == pytest.approx(0.9 * 3 + 0.5 * 2, rel=1e-6)
+
+
+def test_ten_thousand_layers_are_quick():
+    z = np.linspace(0, 50, 1000)
+    b = 0.3 + 0.2 * np.sin(z)
+    profile = Profile(z, np.full(z.size, 0.05), b, 0.02 * b)
+    seconds = []
+    for _ in range(3):
+        start = time.process_time()
+        count = profile.layers(0.00128).count
+        seconds.append(time.process_time() - start)
+    assert count == pytest.approx(10_000, rel=0.1)
+    assert min(seconds) < 0.2
+
+
+@pytest.mark.parametrize("tolerance", [0, 0.6, np.nan])
+def test_tolerance_is_checked(profile, tolerance):
+    with pytest.raises(ValueError, match="tolerance = "):
+        profile.layers(tolerance)
+
+
+@pytest.mark.parametrize(
+    "names", ["ab", "ac", "bc", "a,omega", "b,omega", "c,omega", "abc", "ab,omega", "bc,omega", "abc,omega"]
+)
+def test_every_pair_gives_the_same_water(tmp_path, names):
+    letters, _, omega = names.partition(",")
+    chosen = [*letters, omega] if omega else list(letters)
+    given = {"depth": DEPTH, **{name: WATER[name] for name in chosen}, "bb": BB}
+    read = read_profile(write_csv(tmp_path / "water.csv", given))
+    np.testing.assert_array_equal(read.depth, DEPTH)
+    np.testing.assert_allclose(read.absorption, A, rtol=1e-12)
+    np.testing.assert_allclose(read.scattering, B, rtol=1e-12)
+    np.testing.assert_allclose(read.attenuation, A + B, rtol=1e-12)
+    np.testing.assert_array_equal(read.backscattering, BB)
+
+
+def test_backscattering_by_ratio_and_by_default(tmp_path):
+    given = {"depth": DEPTH, "a": A, "b": B}
+    path = write_csv(tmp_path / "water.csv", {**given, "bb_ratio": BB / B})
+    np.testing.assert_allclose(read_profile(path).backscattering, BB, rtol=1e-12)
+    # Petzold's average particle
+    np.testing.assert_allclose(read_profile(write_csv(path, given)).backscattering, 0.0183 * B, rtol=1e-12)
+
+
+def test_csv_and_netcdf_give_the_same_layers(tmp_path, profile):
+    columns = {"c": A + B, "b": B, "bb": BB}
+    csv = write_csv(tmp_path / "water.csv", {"depth": DEPTH, **columns})
+    netcdf = tmp_path / "water.nc"
+    variables = {name: ("depth", values) for name, values in columns.items()}
+    # What does not go with depth alone is none of the profile's.
+    xr.Dataset({**variables, "station": 7}, {"depth": DEPTH}).to_netcdf(netcdf, engine="h5netcdf")
+    expected = profile.layers()
+    for path in (csv, str(netcdf)):
+        water = read_profile(path).layers()
+        for name in ("layer_tops", "attenuation", "scattering", "backscattering"):
+            np.testing.assert_allclose(getattr(water, name), getattr(expected, name), rtol=1e-7)
+
+
+def test_comments_and_blank_lines(tmp_path):
+    path = tmp_path / "water.CSV"
+    path.write_text("# x\n\nb, depth ,c # 1/m\n0.1,0,0.3\n\n#0.1,0.5,nan\n 0.2 , 1, 0.4 # deep\n", "utf-8-sig")
+    read = read_profile(path)
+    np.testing.assert_allclose(read.depth, [0, 1])
+    np.testing.assert_allclose(read.scattering, [0.1, 0.2])
+    np.testing.assert_allclose(read.absorption, [0.2, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"water.csv has the columns none: needed are depth and two of a, b, c, omega\.$"),
+        ("a,b\n0,0\n0,0", "has the columns a, b: needed are depth and two of a, b, c, omega"),
+        ("depth,c,bb\n0,1,0\n1,1,0", "has the columns depth, c, bb: needed are depth and two of a, b, c, omega"),
+        ("depth,a,b,Bb\n0,0,0,0\n", "has an unknown column 'Bb': allowed are depth, a, b, c, omega, bb, bb_ratio"),
+        ("depth,a,b,a\n0,0,0,0\n", "has 2 columns 'a' but must have only one of them"),
+        ("depth,a,b,bb,bb_ratio\n0,0,0,0,0\n", "columns bb and bb_ratio, but must have only one"),
+        ("depth,a,b\n0,1,1\n", "has 1 depths but a profile must have at least 2"),
+        ("depth,a,b\n# x\n0,1,1\n1,1\n", r"water.csv, line 4 has 2 values but must have 3, one for each column\.$"),
+        ("depth,a,b\n0,1,1\n1,,1\n", r"line 3: a = '' must be a number"),
+        ("depth,a,b\n0,1,1\n1,1,clear\n", "line 3: b = 'clear' must be a number"),
+        ("depth,a,b\n0,1,nan\n1,1,1\n", r"water.csv, line 2: b = nan must be finite\.$"),
+        ("depth,a,b\n0,1,1\ninf,1,1\n", "line 3: depth = inf must be finite"),
+        ("depth,a,b\n-1,1,1\n1,1,1\n", "line 2: depth = -1 must not be negative"),
+        ("depth,a,b\n0,1,1\n\n2,1,1\n2,1,1\n", "line 5: depth = 2 m follows 2 m but depths must increase"),
+        ("depth,a,b\n0,1,1\n2,-0.1,1\n", "line 3: a = -0.1 must not be negative"),
+        ("depth,b,c\n0,1,1\n2,0.4,0.3\n", "line 3: b = 0.4 1/m must not exceed c = 0.3 1/m"),
+        ("depth,a,c\n0,1,1\n2,0.4,0.3\n", "line 3: a = 0.4 1/m must not exceed c = 0.3 1/m"),
+        ("depth,a,b,bb\n0,1,1,0\n2,1,0.4,0.5\n", "line 3: bb = 0.5 1/m must not exceed b = 0.4 1/m"),
+        ("depth,a,b,bb_ratio\n0,1,1,0\n2,1,0.4,1.1\n", "line 3: bb_ratio = 1.1 must lie between 0 and 1"),
+        ("depth,c,omega\n0,1,1.01\n2,1,1\n", "line 2: omega = 1.01 must lie between 0 and 1"),
+        ("depth,a,omega\n0,1,1\n2,1,1\n", "line 2: omega = 1 must be below 1 if b is to follow from a = 1 1/m"),
+        ("depth,b,omega\n0,1,0\n2,1,1\n", "line 2: omega = 0 must be greater than 0 if a is to follow from b = 1 1/m"),
+        ("depth,a,b,c\n0,1,1,2\n2,1,1,2.1\n", "line 3: c = 2.1 contradicts a = 1 and b = 1, which give 2"),
+        (
+            "depth,b,c,omega\n0,1,2,0.5\n2,1,2,0.55\n",
+            "line 3: omega = 0.55 contradicts b = 1 and c = 2, which give 0.5",
+        ),
+    ],
+)
+def test_invalid_csv_files_are_rejected(tmp_path, text, message):
+    path = tmp_path / "water.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_profile(path)
+
+
+def test_rounded_decimals_do_not_contradict(tmp_path):
+    path = tmp_path / "water.csv"
+    path.write_text("depth,a,b,c,omega\n0,0.16,0.155,0.31,0.49\n1,0,0,0,0.3")
+    read = read_profile(path)
+    np.testing.assert_allclose(read.attenuation, [0.315, 0])
+
+
+def test_invalid_netcdf_files_are_rejected(tmp_path):
+    path = tmp_path / "water.nc"
+
+    def write(coords=None, **columns):
+        xr.Dataset({name: ("depth", v) for name, v in columns.items()}, coords).to_netcdf(path, engine="h5netcdf")
+        return path
+
+    depth = {"depth": [0.0, 1.0]}
+    with pytest.raises(ValueError, match=r"water.nc, index 1 of depth: a = nan must be finite"):
+        read_profile(write(depth, a=[0.1, np.nan], b=[0.1, 0.1]))
+    with pytest.raises(ValueError, match=r"water.nc has an unknown column 'BB'"):
+        read_profile(write(depth, a=[0.1, 0.1], b=[0.1, 0.1], BB=[0.1, 0.1]))
+    with pytest.raises(ValueError, match=r"columns a, b: needed are depth and two"):
+        read_profile(write(a=[0.1, 0.1], b=[0.1, 0.1]))
+    with pytest.raises(ValueError, match=r"water.nc has a of type .*, but it must hold real numbers"):
+        read_profile(write(depth, a=["x", "y"], b=[0.1, 0.1]))
+    path.write_bytes(b"no NetCDF")
+    with pytest.raises(ValueError, match=r"water.nc is damaged, or is not a NetCDF-4 file"):
+        read_profile(path)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match=r"cannot read .*none.csv: No such file or directory\.$"):
+        read_profile(tmp_path / "none.csv")
+    with pytest.raises(ValueError, match=r"cannot read .*water.xlsx: the name of a profile must end in .csv, .nc\.$"):
+        read_profile(tmp_path / "water.xlsx")
+    (tmp_path / "water.csv").write_bytes(b"depth,a,b\n\xff")
+    with pytest.raises(ValueError, match=r"water.csv is not a text file in UTF-8"):
+        read_profile(tmp_path / "water.csv")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([0], [1], [1], [0]), r"depth of shape \(1,\) must be a list of one value per depth, of 2 depths or more"),
+        (([0, 1], [1, 1, 1], [1, 1], [0, 0]), r"absorption of shape \(3,\) must be a list of one value per depth"),
+        (([0, 1], [1, np.nan], [1, 1], [0, 0]), "absorption holds nan"),
+        (([0, 1], [1, -1], [1, 1], [0, 0]), r"absorption = -1 must not be negative, in row 1 counted from 0\.$"),
+        (([1, 0], [1, 1], [1, 1], [0, 0]), "depth = 0 m follows 1 m but depths must increase, in row 1"),
+        (([0, 1], [1, 1], [1, 1], [0, 2]), "bb = 2 1/m must not exceed b = 1 1/m, in row 1"),
+    ],
+)
+def test_bad_arrays_are_rejected(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Profile(*arguments)

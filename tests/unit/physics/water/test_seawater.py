@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+
+from mitransient_lidar.physics.water.seawater import (
+    group_index,
+    refractive_index,
+    water_absorption,
+    water_phase_function,
+    water_scattering,
+)
+
+
+def test_refractive_index_is_quan_and_fry():
+    n = refractive_index(532, [20, 20, 10, 10], [0, 35, 35, 7])
+    np.testing.assert_allclose(n, [1.335035, 1.341510, 1.342395, 1.337056], rtol=0, atol=1e-6)
+
+
+def test_refractive_index_is_relative_to_air():
+    # Pure water at 20 degrees C and 589.3 nm has 1.33299 relative to air; relative to vacuum it would be 1.33336.
+    assert refractive_index(589.3, 20, 0) == pytest.approx(1.33299, abs=5e-5)
+
+
+def test_group_index_at_532():
+    np.testing.assert_allclose(group_index(532, [20, 10], [35, 7]), [1.363796, 1.358813], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("wavelength", [410, 532, 690])
+@pytest.mark.parametrize(("temperature", "salinity"), [(0, 0), (5, 38), (30, 7)])
+def test_group_index_is_the_derivative_of_the_index(wavelength, temperature, salinity):
+    step = 0.01
+    up, down = (refractive_index(wavelength + s, temperature, salinity) for s in (step, -step))
+    expected = refractive_index(wavelength, temperature, salinity) - wavelength * (up - down) / (2 * step)
+    assert group_index(wavelength, temperature, salinity) == pytest.approx(float(expected), abs=2e-9)
+
+
+def test_indices_fall_with_wavelength_and_temperature_and_rise_with_salt():
+    for index in (refractive_index, group_index):
+        assert np.all(np.diff(index(np.linspace(400, 700, 31))) < 0)
+        assert np.all(np.diff(index(532, np.linspace(2, 30, 15))) < 0)
+        assert np.all(np.diff(index(532, 20, np.linspace(0, 40, 11))) > 0)
+
+
+def test_inputs_broadcast():
+    assert refractive_index([[500], [532]], [5, 10, 20], 35).shape == (2, 3)
+    assert water_scattering(532.0).shape == ()
+
+
+def test_absorption_is_pope_and_fry():
+    np.testing.assert_array_equal(
+        water_absorption([525, 527.5, 530, 532.5, 535]), [0.0417, 0.0428, 0.0434, 0.0447, 0.0452]
+    )
+    np.testing.assert_array_equal(water_absorption([400, 600, 700]), [0.00663, 0.2224, 0.624])
+    assert water_absorption(532) == pytest.approx(0.04444, abs=1e-8)
+
+
+def test_absorption_has_its_published_minimum():
+    # 0.0044 1/m at 418 nm (abstract)
+    wavelengths = np.linspace(400, 700, 601)
+    values = water_absorption(wavelengths)
+    assert wavelengths[np.argmin(values)] == pytest.approx(418, abs=1)
+    assert values.min() == pytest.approx(0.0044, abs=5e-5)
+
+
+def test_scattering_is_zhang_hu_and_he():
+    b = water_scattering(532, [20, 10, 10, 20], [35, 35, 7, 0])
+    np.testing.assert_allclose(b, [0.001962, 0.002004, 0.001633, 0.001510], rtol=0, atol=6e-7)
+
+
+def test_volume_scattering_function_is_zhang_hu_and_he():
+    beta = water_scattering(532) * water_phase_function(np.radians([90, 180]))
+    np.testing.assert_allclose(beta, [1.1936e-4, 2.2975e-4], rtol=1e-4)
+
+
+def test_scattering_agrees_with_morels_measurements():
+    # Morel (1974) has 0.00288 1/m at 500 nm and 38.4 per mille, made with a depolarisation of 0.09; his data fall with
+    # the power -4.32 by himself and -4.24 by Jonasz and Fournier. The fourth power alone would give -4.
+    b = water_scattering([450, 500, 550], 20, 38.4, 0.09)
+    assert b[1] == pytest.approx(0.00288, rel=0.02)
+    assert np.log(b[2] / b[0]) / np.log(550 / 450) == pytest.approx(-4.24, abs=0.05)
+
+
+def test_depolarisation_raises_scattering_by_the_cabannes_factor():
+    # (6 + 6 d)/(6 - 7 d) (2 + d)/(1 + d) at 0.09 over 0
+    ratio = water_scattering(532, depolarisation=0.09) / water_scattering(532, depolarisation=0)
+    assert ratio == pytest.approx((6 * 2.09) / (6 - 0.63) / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("depolarisation", [0.0, 0.039, 0.09])
+def test_phase_function_is_normalised_and_symmetric(depolarisation):
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    values = water_phase_function(np.arccos(nodes), depolarisation)
+    assert 2 * np.pi * np.sum(weights * values) == pytest.approx(1, rel=1e-13)
+    np.testing.assert_allclose(values, values[::-1], rtol=1e-13)
+
+
+def test_phase_function_is_rayleigh_without_depolarisation_and_morel_with_his():
+    assert water_phase_function(np.pi, 0) == pytest.approx(0.119366, abs=1e-6)
+    assert water_phase_function(np.pi / 2, 0.09) == pytest.approx(0.06225, abs=5e-6)
+    assert water_phase_function(0, 0.09) == pytest.approx(0.06225 * 1.835, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: refractive_index(399), "wavelength_nm = 399 must lie between 400 and 700"),
+        (lambda: group_index(701), "wavelength_nm = 701 must lie between 400 and 700"),
+        (lambda: group_index(532, -1), "temperature = -1 must lie between 0 and 30"),
+        (lambda: refractive_index(532, [20, 31]), "temperature = 31 must lie between 0 and 30"),
+        (lambda: water_scattering(532, 20, 41), "salinity = 41 must lie between 0 and 40"),
+        (lambda: water_scattering(532, depolarisation=0.3), r"depolarisation = 0\.3 must lie between 0 and 0\.2"),
+        (lambda: water_phase_function(0, -0.1), r"depolarisation = -0\.1 must lie between 0 and 0\.2"),
+        (lambda: water_absorption(720), "wavelength_nm = 720 must lie between 400 and 700"),
+        (lambda: water_absorption(np.nan), "wavelength_nm holds nan"),
+    ],
+)
+def test_bad_values_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,193 @@
+import numpy as np
+import pytest
+
+from mitransient_lidar.physics.water.seawater import water_absorption
+from mitransient_lidar.physics.water.water_types import (
+    InherentProperties,
+    chlorophyll,
+    from_kd,
+    from_secchi,
+    jerlov,
+    pure_seawater,
+)
+
+JERLOV_KD = {
+    "I": 0.0486,
+    "IA": 0.0533,
+    "IB": 0.0590,
+    "II": 0.0796,
+    "III": 0.1171,
+    "1C": 0.1272,
+    "3C": 0.1972,
+    "5C": 0.3072,
+    "7C": 0.4816,
+    "9C": 0.738,
+}
+
+
+def test_derived_properties():
+    water = InherentProperties(0.1, 0.3, 0.006)
+    assert water.attenuation == pytest.approx(0.4)
+    assert water.albedo == pytest.approx(0.75)
+    assert water.backscatter_ratio == pytest.approx(0.02)
+    # 0.1 + 4.18 (1 - 0.52 exp(-1.08)) 0.006
+    assert water.kd == pytest.approx(0.1206511, abs=1e-7)
+
+
+def test_nothing_in_the_water():
+    water = InherentProperties(0, 0, 0)
+    assert (water.albedo, water.backscatter_ratio, water.kd) == (0, 0, 0)
+
+
+def test_pure_seawater_at_532():
+    water = pure_seawater()
+    assert water.absorption == pytest.approx(0.04444, abs=1e-6)
+    assert water.scattering == pytest.approx(0.001962, abs=1e-6)
+    assert water.backscatter_ratio == 0.5
+
+
+@pytest.mark.parametrize(("water_type", "kd"), JERLOV_KD.items())
+def test_jerlov_types_have_jerlovs_kd(water_type, kd):
+    assert jerlov(water_type).kd == pytest.approx(kd, rel=1e-9)
+
+
+@pytest.mark.parametrize("water_type", JERLOV_KD)
+def test_jerlov_types_agree_with_kirks_formula(water_type):
+    # Kirk's (a^2 + 0.256 a b)^(1/2) uses the scattering instead of the backscattering.
+    water = jerlov(water_type)
+    kirk = np.sqrt(water.absorption**2 + 0.256 * water.absorption * water.scattering)
+    assert kirk == pytest.approx(water.kd, rel=0.15)
+
+
+def test_jerlov_types_are_ordered_and_plausible():
+    waters = [jerlov(name) for name in JERLOV_KD]
+    assert np.all(np.diff([w.attenuation for w in waters]) > 0)
+    assert np.all(np.diff([w.absorption for w in waters]) > 0)
+    assert waters[0].absorption > water_absorption(532)
+    assert all(0.015 < w.backscatter_ratio < 0.04 for w in waters[2:])
+
+
+@pytest.mark.parametrize(
+    ("water_type", "absorption", "scattering"),
+    [
+        ("IB", 0.0532, 0.124),
+        ("II", 0.0618, 0.179),
+        ("III", 0.0812, 0.290),
+        ("1C", 0.0951, 0.432),
+        ("3C", 0.128, 0.651),
+        ("5C", 0.168, 1.21),
+        ("7C", 0.222, 2.49),
+        ("9C", 0.407, 3.31),
+    ],
+)
+def test_jerlov_types_have_the_published_properties(water_type, absorption, scattering):
+    water = jerlov(water_type)
+    assert (water.absorption, water.scattering) == (absorption, scattering)
+
+
+def test_backscattering_of_a_jerlov_type():
+    # (0.0796 - 0.0618) / (4.18 (1 - 0.52 exp(-10.8 * 0.0618)))
+    assert jerlov("II").backscattering == pytest.approx(0.0058077, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("concentration", "kd"), [(0.1, 0.0558), (0.3, 0.0670), (1, 0.0936), (3, 0.1457), (10, 0.2696)]
+)
+def test_chlorophyll_has_the_published_kd(concentration, kd):
+    # The reference interpolates chi and e from 525 to 550 nm, the table here from 530 to 535 nm: up to 0.9 %.
+    assert chlorophyll(concentration).kd == pytest.approx(kd, rel=0.01)
+
+
+def test_chlorophyll_at_a_node_of_the_table():
+    # Kd(550) = 0.0565 + bw/2 + 0.04111 C^0.64927
+    water = pure_seawater(550)
+    expected = 0.0565 + water.backscattering + 0.04111 * 2**0.64927
+    assert chlorophyll(2, 550).kd == pytest.approx(expected, rel=1e-9)
+
+
+def test_particle_scattering_at_550():
+    water, sea = chlorophyll(0.1, 550), pure_seawater(550)
+    particles = 0.416 * 0.1**0.766
+    assert water.scattering - sea.scattering == pytest.approx(particles, rel=1e-12)
+    assert water.backscattering - sea.backscattering == pytest.approx((0.002 + 0.01 * 0.75) * particles, rel=1e-12)
+
+
+def test_particle_scattering_in_the_blue():
+    # v = (lg 0.1 - 0.3)/2 = -0.65 below 2 mg/m^3, 0 from there on
+    clear, sea = chlorophyll(0.1, 440), pure_seawater(440)
+    particles = 0.416 * 0.1**0.766
+    assert clear.scattering - sea.scattering == pytest.approx(particles * 0.8**-0.65, rel=1e-12)
+    expected = (0.002 + 0.0075 * 0.8**-0.65) * particles
+    assert clear.backscattering - sea.backscattering == pytest.approx(expected, rel=1e-12)
+    assert chlorophyll(5, 440).scattering - sea.scattering == pytest.approx(0.416 * 5**0.766, rel=1e-12)
+
+
+@pytest.mark.parametrize("wavelength", [400, 440, 532, 590, 700])
+def test_chlorophyll_never_clears_water(wavelength):
+    waters = [chlorophyll(c, wavelength) for c in np.geomspace(0.01, 30, 20)]
+    assert waters[0].absorption >= water_absorption(wavelength)
+    assert np.all(np.diff([w.absorption for w in waters]) >= 0)
+    assert np.all(np.diff([w.scattering for w in waters]) > 0)
+
+
+@pytest.mark.parametrize("water_type", JERLOV_KD)
+def test_kd_of_a_jerlov_type_gives_that_type(water_type):
+    water, expected = from_kd(JERLOV_KD[water_type]), jerlov(water_type)
+    assert water.absorption == pytest.approx(expected.absorption, rel=1e-9)
+    assert water.scattering == pytest.approx(expected.scattering, rel=1e-9)
+    assert water.backscattering == pytest.approx(expected.backscattering, rel=1e-9)
+
+
+@pytest.mark.parametrize("kd", [0.05, 0.1, 0.6])
+def test_water_from_kd_has_that_kd(kd):
+    water = from_kd(kd)
+    assert water.kd == pytest.approx(kd, rel=1e-9)
+    assert water.absorption > water_absorption(532)
+
+
+def test_water_from_kd_with_albedo_and_backscatter_ratio():
+    water = from_kd(0.2, albedo=0.9, backscatter_ratio=0.01)
+    assert water.kd == pytest.approx(0.2, rel=1e-9)
+    assert water.albedo == pytest.approx(0.9, rel=1e-9)
+    assert water.backscatter_ratio == pytest.approx(0.01, rel=1e-9)
+
+
+@pytest.mark.parametrize("depth", [0.5, 5, 25])
+def test_water_from_secchi_depth_keeps_both_rules(depth):
+    water = from_secchi(depth, 0.02)
+    assert water.kd * depth == pytest.approx(1.7, rel=1e-9)
+    assert (water.attenuation + water.kd) * depth == pytest.approx(8.7, rel=1e-9)
+    assert water.backscatter_ratio == pytest.approx(0.02, rel=1e-9)
+
+
+@pytest.mark.parametrize("water_type", ["III", "1C", "3C", "5C"])
+def test_secchi_depth_fits_jerlovs_waters(water_type):
+    # Independent of each other: measured a and b of a type, and the Secchi depth in water of its Kd.
+    expected = jerlov(water_type)
+    water = from_secchi(1.7 / expected.kd)
+    assert water.absorption == pytest.approx(expected.absorption, rel=0.4)
+    assert water.attenuation == pytest.approx(expected.attenuation, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: InherentProperties(-0.1, 0.1, 0), r"absorption = -0\.1 must not be negative"),
+        (lambda: InherentProperties(0.1, 0.1, 0.2), r"backscattering = 0\.2 must not exceed scattering = 0\.1"),
+        (lambda: InherentProperties(0.1, np.nan, 0), "scattering = nan must be finite"),
+        (lambda: jerlov("IV"), "water_type = 'IV' must be one of I, IA, IB, II, III, 1C, 3C, 5C, 7C, 9C"),
+        (lambda: jerlov("II", 450), "wavelength_nm = 450 must lie between 531 and 533: .* at 532 nm only"),
+        (lambda: chlorophyll(0), r"concentration = 0 must lie between 0\.01 and 30"),
+        (lambda: chlorophyll(1, 390), "wavelength_nm = 390 must lie between 400 and 700"),
+        (lambda: from_kd(0.04), r"kd = 0\.04 must lie between 0\.0486 and 0\.738"),
+        (lambda: from_kd(0.1, albedo=1), r"albedo = 1 must lie between 0 and 0\.98"),
+        (lambda: from_kd(0.1, backscatter_ratio=0.5), r"backscatter_ratio = 0\.5 must lie between 0\.001 and 0\.1"),
+        (lambda: from_kd(0.05, albedo=0.9), r"kd = 0\.05 with albedo = 0\.9 .* pure water, 0\.04444 1/m, but gives"),
+        (lambda: from_secchi(30), r"depth = 30 must lie between 0\.5 and 25"),
+        (lambda: from_secchi(25, 0.04), r"depth = 25 with backscatter_ratio = 0\.04 .* pure water, 0\.04444 1/m"),
+        (lambda: from_secchi(5, 0.1), r"backscatter_ratio = 0\.1 must lie between 0\.001 and 0\.04"),
+    ],
+)
+def test_bad_values_are_rejected(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,50 @@
+"""Figure of a comparison: both results, and their differences."""
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.comparison import compare
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.plots.comparison import plot_comparison
+
+DECAY = 1e-3 * np.exp(-np.arange(60) / 20) * np.array([[1.0], [0.5]])  # W, two pixels
+
+
+def result(factor, **attributes):
+    error = 0.02 * DECAY
+    return results.build(
+        1e-9 * factor * DECAY,
+        1e-9 * error,
+        factor * DECAY,
+        error,
+        time=TimeAxis(0.0, 1.0, 60),
+        pixel_names=["near", "far"],
+        pixel_centres_mrad=[(1, 0), (-1, 0)],
+        attributes={"passes": 50, "scene": "made", **attributes},
+    )
+
+
+def test_curves_bands_and_differences():
+    first, second = result(1.0, integrator="one"), result(1.1, integrator="two")
+    outcome = compare(first, second)
+    figure = plot_comparison(first, second, outcome)
+    upper, lower = figure.axes
+    assert [line.get_linestyle() for line in upper.lines] == ["-", "-", "--", "--"]
+    for line, values in zip(upper.lines, [*DECAY, *(1.1 * DECAY)], strict=True):
+        np.testing.assert_allclose(line.get_ydata(), values)
+    colours = [to_hex(line.get_color()) for line in upper.lines]
+    assert colours[:2] == colours[2:]
+    assert colours[0] != colours[1]
+    # Bands of two standard errors of 2 %.
+    assert upper.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(1.04e-3)
+    assert [text.get_text() for text in upper.get_legend().get_texts()] == ["one", "two"]
+    assert upper.get_yscale() == "log"
+    np.testing.assert_allclose([line.get_ydata() for line in lower.lines[:2]], outcome.z)
+    assert [line.get_ydata()[0] for line in lower.lines[2:]] == pytest.approx([-outcome.limit, outcome.limit])
+    low, high = lower.get_ylim()
+    assert low < -outcome.largest
+    assert high > outcome.largest
+    assert lower.get_ylabel() == "difference (standard errors)"
+    assert figure.get_suptitle().startswith(f"made: 120 bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f}")

@@ -1,0 +1,97 @@
+"""Elements shared by the figures."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.plots import drawing
+
+
+def image(rows, columns):
+    angle_x, angle_y = np.meshgrid(6.0 - 4.0 * np.arange(rows), 3.0 * np.arange(columns), indexing="ij")
+    return xr.Dataset(coords={"angle_x": (("row", "column"), angle_x), "angle_y": (("row", "column"), angle_y)})
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "extent"),
+    [
+        (4, 5, (-1.5, 13.5, -8.0, 8.0)),
+        # The pixels of a single row or column are square.
+        (1, 3, (-1.5, 7.5, 4.5, 7.5)),
+        (3, 1, (-2.0, 2.0, -4.0, 8.0)),
+        (1, 1, (-0.5, 0.5, 5.5, 6.5)),
+    ],
+)
+def test_extent_reaches_half_a_pixel_beyond_the_centres(rows, columns, extent):
+    assert drawing.image_extent(image(rows, columns)) == pytest.approx(extent)
+    assert drawing.image_extent(image(rows, columns).transpose("column", "row")) == pytest.approx(extent)
+
+
+def test_images_have_the_far_row_on_top():
+    ax = Figure().subplots()
+    drawn = drawing.draw_image(ax, np.arange(20.0).reshape(4, 5), image(4, 5), cmap="gray")
+    assert (drawn.origin, drawn.get_extent()) == ("upper", [-1.5, 13.5, -8.0, 8.0])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("across, angle_y (mrad)", "away from nadir, angle_x (mrad)")
+
+
+@pytest.mark.parametrize(
+    ("largest", "factor", "prefix"),
+    [(3.2e-6, 1e-6, "µ"), (999.0, 1.0, ""), (1000.0, 1e3, "k"), (2e-21, 1e-18, "a"), (5e12, 1e9, "G"), (0.0, 1.0, "")],
+)
+def test_prefixes_scale_to_between_1_and_1000(largest, factor, prefix):
+    assert drawing.si_prefix(largest) == (pytest.approx(factor), prefix)
+
+
+@pytest.mark.parametrize(("count", "distinct"), [(1, 1), (3, 3), (4, 4), (10, 10), (40, 40)])
+def test_colours_of_pixels_differ(count, distinct):
+    colours = drawing.pixel_colours(count)
+    assert len(colours) == len({tuple(colour) for colour in colours}) == distinct
+
+
+def test_bands_end_at_the_lowest_value():
+    ax = Figure().subplots()
+    x, y, error = np.arange(3.0), np.array([1.0, 2.0, 3.0]), np.array([0.5, 2.5, 0.5])
+    drawing.draw_band(ax, x, y, error, lowest=0.1, color="red")
+    band = ax.collections[0].get_paths()[0].vertices
+    ends = [(band[band[:, 0] == time, 1].min(), band[band[:, 0] == time, 1].max()) for time in x]
+    np.testing.assert_allclose(ends, [(0.5, 1.5), (0.1, 4.5), (2.5, 3.5)])
+    np.testing.assert_array_equal(ax.collections[0].get_facecolor()[0, :3], [1, 0, 0])
+
+
+def test_top_axis_is_linear():
+    ax = Figure().subplots()
+    ax.set_xlim(0, 10)
+    top = drawing.add_top_axis(ax, 5.0, 2.0, "value")
+    ax.figure.draw_without_rendering()
+    assert top.axes.get_xlim() == pytest.approx((5.0, 25.0))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "limits"),
+    [
+        # 6 % of the window of 50 ns on both sides, within the record.
+        ({"window_start_ns": 20.0, "window_end_ns": 70.0}, (17.0, 73.0)),
+        ({"window_start_ns": 1.0, "window_end_ns": 101.0}, (0.0, 100.0)),
+        ({"window_start_ns": 200.0, "window_end_ns": 300.0}, (0.0, 100.0)),
+        ({"window_start_ns": 20.0}, (0.0, 100.0)),
+        ({}, (0.0, 100.0)),
+    ],
+)
+def test_time_limits_hold_the_window_of_the_echoes(attributes, limits):
+    record = xr.Dataset(coords={"time": 0.5 + np.arange(100)}, attrs={"bin_width_ns": 1.0, **attributes})
+    assert drawing.time_limits(record) == pytest.approx(limits)
+
+
+def test_figures_replace_a_file_only_on_success(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_text("before")
+    figure = drawing.new_figure(path, 2.0, 1.0)
+    figure.set_layout_engine("none")
+    figure.savefig = lambda *_, **__: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    with pytest.raises(UserError, match=r"cannot write .*a\.png: No space left on device"):
+        drawing.save(figure, path)
+    assert (path.read_text(), len(list(tmp_path.iterdir()))) == ("before", 1)
+    with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
+        drawing.new_figure(tmp_path / "a.gif", 2.0, 1.0)

@@ -1,0 +1,167 @@
+"""File of the page of gate stacks: embedded data, size limit, and refused arguments."""
+
+import base64
+import json
+import logging
+import re
+import zlib
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.plots.gate_viewer.page import write_page
+
+ROWS, COLUMNS, GATES, BINS = 30, 21, 40, 120
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Stack and render of random numbers."""
+    rng = np.random.default_rng(5)
+    angles = {
+        "angle_x": (("row", "column"), np.repeat(np.linspace(3, -3, ROWS)[:, None], COLUMNS, 1)),
+        "angle_y": (("row", "column"), np.repeat(np.linspace(-2, 2, COLUMNS)[None], ROWS, 0)),
+    }
+    gates = {"gate_start": ("gate", 1400 + 2.0 * np.arange(GATES)), "gate_width": ("gate", np.full(GATES, 4.0))}
+    depth = {"gate_depth": ("gate", 0.22 * np.arange(GATES) - 0.5)}
+    energy = rng.uniform(1, 2, (2, ROWS, COLUMNS, GATES))
+    power = rng.uniform(1, 2, (2, ROWS, COLUMNS, BINS))
+    names = ("gate_energy", "gate_energy_stderr"), ("waveform", "waveform_stderr")
+    stack = {name: (("row", "column", "gate"), values) for name, values in zip(names[0], energy, strict=True)}
+    render = {name: (("row", "column", "time"), values) for name, values in zip(names[1], power, strict=True)}
+    attributes = {"scene": "a & b", "note": "</script><!--<script>", "seed": 3}
+    return (
+        xr.Dataset(stack, angles | gates | depth, attributes),
+        xr.Dataset(render, angles | {"time": 1400.5 + np.arange(BINS)}),
+    )
+
+
+def embedded(path):
+    """Return the metadata and the arrays of a page, and the encoded lengths of the arrays."""
+    elements = dict(re.findall(r'<script type="[^"]*" id="(\w+)">([^<]*)</script>', path.read_text(encoding="utf-8")))
+    metadata = json.loads(elements.pop("metadata"))
+    arrays = {}
+    for name, text in elements.items():
+        planes = np.frombuffer(zlib.decompress(base64.b64decode(text), -15), np.uint8).reshape(4, -1)
+        arrays[name] = np.ascontiguousarray(planes.T).view("<f4").ravel()
+    return metadata, arrays, {name: len(text) for name, text in elements.items()}
+
+
+def means(variable, block):
+    """Return means over blocks of pixels, one after the other."""
+    values = variable.values
+    rows, columns = (range(0, count, block) for count in (ROWS, COLUMNS))
+    return np.array([[values[r : r + block, c : c + block].mean((0, 1)) for c in columns] for r in rows])
+
+
+def test_everything_is_there(scene, tmp_path):
+    path = tmp_path / "page.html"
+    write_page(scene[0].transpose("gate", "column", "row"), path, scene[1].transpose("time", ...))
+    metadata, arrays, _ = embedded(path)
+    assert set(arrays) == {"gate_energy", "gate_energy_stderr", "waveform", "waveform_stderr"}
+    for name, values in arrays.items():
+        data = scene[0] if "gate" in name else scene[1]
+        order = ("gate", "row", "column") if "gate" in name else ("row", "column", "time")
+        assert (values == data[name].transpose(*order).values.ravel().astype(np.float32)).all()
+    assert (metadata["rows"], metadata["columns"], metadata["notes"]) == (ROWS, COLUMNS, [])
+    assert ["note", "</script><!--<script>"] in metadata["attributes"]
+    # The centre of pixel (0, 0) is at angle_x = 3, angle_y = -2; depth = 0.22 (t - 1402) / 2 - 0.5.
+    axes = metadata["axes"]
+    assert axes["top"] - axes["along"] / 2 == pytest.approx(3)
+    assert axes["left"] + axes["across"] / 2 == pytest.approx(-2)
+    assert (axes["along"], axes["across"]) == pytest.approx((6 / 29, 4 / 20))
+    assert metadata["depth_of_time"] == pytest.approx([-0.5 - 0.11 * 1402, 0.11])
+
+
+def test_large_pages_show_means(scene, tmp_path, caplog):
+    stack, result = scene
+    path = tmp_path / "page.html"
+    write_page(stack, path, result)
+    letters = embedded(path)[2]
+    gates, waveforms = (sum(letters[name] for name in (kind, f"{kind}_stderr")) for kind in ("gate_energy", "waveform"))
+    rest = path.stat().st_size - gates - waveforms
+    # The bound on the metadata is a few kB too large. Shares of blocks: 1/4, 1/13, 1/52.
+    cases = [
+        (gates + 1.10 * waveforms, 1, 1),
+        (gates + 0.50 * waveforms, 1, 2),
+        (gates + 0.20 * waveforms, 1, 4),
+        (0.80 * gates, 2, 4),
+        (0.18 * gates, 4, 8),
+    ]
+    for room, block, waveform_block in cases:
+        limit = (rest + room + 8000) / 1e6
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            write_page(stack, path, result, limit)
+        assert path.stat().st_size <= 1e6 * limit
+        metadata, arrays, _ = embedded(path)
+        assert (metadata["block"], metadata["waveform"]["block"] * metadata["block"]) == (block, waveform_block)
+        for name in ("gate_energy", "gate_energy_stderr"):
+            np.testing.assert_allclose(arrays[name], np.moveaxis(means(stack[name], block), -1, 0).ravel(), rtol=1e-6)
+        for name in ("waveform", "waveform_stderr"):
+            np.testing.assert_allclose(arrays[name], means(result[name], waveform_block).ravel(), rtol=1e-6)
+        assert (metadata["rows"], metadata["columns"]) == (-(-ROWS // block), -(-COLUMNS // block))
+        assert metadata["axes"]["along"] == pytest.approx(block * 6 / 29)
+        notes = metadata["notes"]
+        assert len(notes) == (block > 1) + (waveform_block > 1)
+        assert all(f"{limit:g} MB" in note for note in notes)
+        assert [record.getMessage() for record in caplog.records] == [f"{path}: {note}" for note in notes]
+
+
+def test_waveforms_are_left_out_where_pixels_form_no_image(scene, tmp_path):
+    stack, result = (data.isel(row=0).rename(column="pixel").drop_vars("row", errors="ignore") for data in scene)
+    names = [f"pixel {i}" for i in range(COLUMNS)]
+    stack, result = (data.assign_coords(pixel=names) for data in (stack, result))
+    path = tmp_path / "page.html"
+    write_page(stack, path, result)
+    whole, letters = path.stat().st_size, embedded(path)[2]
+    write_page(stack, path, result, (whole - letters["waveform"] + 8000) / 1e6)
+    metadata, arrays, _ = embedded(path)
+    assert metadata["names"] == names
+    assert set(arrays) == {"gate_energy", "gate_energy_stderr"}
+    assert len(metadata["notes"]) == 1
+    assert metadata["notes"][0].startswith("The waveforms were left out, because the page would have exceeded")
+    with pytest.raises(UserError, match="is too small for this stack"):
+        write_page(stack, path, result, (whole - sum(letters.values())) / 1e6)
+
+
+def test_a_stack_may_hold_its_waveforms(scene, tmp_path):
+    both = scene[0].merge(scene[1])
+    write_page(both, tmp_path / "page.html")
+    assert (embedded(tmp_path / "page.html")[1]["waveform"] == scene[1]["waveform"].values.ravel().astype("f4")).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda stack, result: (stack, "page.htm"), "the file name must end in .html"),
+        (lambda stack, result: (stack, "no/page.html"), "No such file"),
+        (lambda stack, result: (result, "page.html"), "the dataset is no gate stack: it has no variable gate_energy."),
+        (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform."),
+        (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
+        (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),
+        (lambda stack, result: (stack, "page.html", None, 0), "limit_mb = 0 must be a finite number above 0."),
+        (lambda stack, result: (stack, "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
+    ],
+)
+def test_mistakes_end_with_one_sentence(scene, tmp_path, change, message):
+    stack, name, *rest = change(*(data.isel(row=slice(0, 4), column=slice(0, 4)) for data in scene))
+    with pytest.raises(UserError, match=re.escape(message)) as caught:
+        write_page(stack, tmp_path / name, *rest)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_page_is_one_file_of_its_own(scene, tmp_path):
+    write_page(scene[0], tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    # Metadata, two arrays and the script: no text ends or begins an element.
+    assert page.count("<script") == page.count("</script>") == 4
+    assert page.count("<!--") == 0
+    assert "<title>a &amp; b · gate stack</title>" in page
+    assert set(re.findall(r"(?:https?:)?//[\w.-]+\.\w+[^\s\"']*", page)) == {"http://www.w3.org/2000/svg"}
+    assert "default-src 'none'" in page
+    assert not re.search(r"\b(eval|innerHTML|import|fetch)\b", page)
+    assert '<script>\n"use strict";' in page

@@ -1,0 +1,142 @@
+"""Figure of a layout: places on the sea, colours and labels."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from command_line import run
+from matplotlib.collections import PathCollection, QuadMesh
+from matplotlib.colors import to_rgb
+from matplotlib.patches import PathPatch
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.plots.layout import plot_layout
+from mitransient_lidar.rendering.describe import describe_layout
+from mitransient_lidar.transport.scene import LidarScene
+
+HALF = 15.0  # mrad
+
+
+def described(scene):
+    return describe_layout(LidarScene.from_scene(scene, scene.sensors()[0]))
+
+
+def result(attributes, pixels=4, grid=None, energy=None):
+    values = np.full((pixels, 3), 1e-15) if energy is None else np.outer(energy, [0, 1, 0])
+    return results.build(
+        values,
+        values,
+        values,
+        values,
+        time=TimeAxis(0, 1, values.shape[1]),
+        pixel_names=[f"p{index}" for index in range(pixels)],
+        pixel_centres_mrad=[(index, -index) for index in range(pixels)],
+        grid=grid,
+        attributes={"altitude": 200.0, "off_nadir_deg": 20.0, **attributes},
+    )
+
+
+def on_sea(angle_x_mrad):
+    """Distance along the azimuth [m] of a ray in the plane of incidence, from the angle it makes with the vertical."""
+    return 200 * (np.tan(np.radians(20) + np.arctan(1e-3 * angle_x_mrad)) - np.tan(np.radians(20)))
+
+
+def patches(figure):
+    """Return the filled shapes of the pixels."""
+    return [patch for patch in figure.axes[0].patches if isinstance(patch, PathPatch)]
+
+
+def test_pixels_are_drawn_on_the_sea_in_their_colours(lidar_scene):
+    """Far is up and +y to the right; far and near edges lie 3.41 and 3.38 m from the shot, the sides 3.19 m."""
+    figure = plot_layout(result(described(lidar_scene())))
+    shapes = patches(figure)
+    assert [int(np.argmax(to_rgb(shape.get_edgecolor()))) for shape in shapes[:3]] == [0, 1, 2]
+    vertices = [shape.get_path().vertices for shape in shapes]
+    for index, (sign_y, edge) in enumerate([(-1, HALF), (1, HALF), (-1, -HALF), (1, -HALF)]):
+        y, x = vertices[index].T
+        assert x[np.argmax(np.abs(x))] == pytest.approx(on_sea(edge), rel=3e-3)
+        assert y[np.argmax(np.abs(y))] == pytest.approx(sign_y * 0.015 * 200 / np.cos(np.radians(20)), rel=3e-3)
+    assert on_sea(HALF) == pytest.approx(3.416, abs=1e-3)
+    ax = figure.axes[0]
+    assert ax.get_aspect() == 1
+    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert texts == ["p0", "p1", "p2", "p3", "beam, e$^{-1/2}$", "beam, e$^{-2}$"]
+
+
+def test_azimuth_is_up_wherever_the_lidar_stands(lidar_scene):
+    """From a laser that looks towards -y the far edge is at negative y, and is still drawn on top."""
+    pose = {"to_world": mi.ScalarTransform4f().look_at([0, 72.794, 200], [0, 0, 0], [0, 0, 1])}
+    figure = plot_layout(result(described(lidar_scene(tx=pose, rx=pose))))
+    top = max(shape.get_path().vertices[:, 1].max() for shape in patches(figure))
+    assert top == pytest.approx(on_sea(HALF), rel=3e-3)
+    assert patches(figure)[0].get_path().vertices[:, 1].min() > -0.02
+    assert figure.axes[0].get_ylabel() == "along (m), away from the lidar"
+
+
+def test_imager_cells_lie_on_the_sea_with_their_energy(lidar_scene):
+    attributes = {"field_of_view_mrad": 30.0, "field_of_view_shape": "circle"}
+    attributes |= described(lidar_scene(rx={"layout": "6x6"}))
+    assert "pixel_outlines" not in attributes
+    figure = plot_layout(result(attributes, 6, (2, 3), 1e-15 * np.arange(6)))
+    (mesh,) = (item for item in figure.axes[0].collections if isinstance(item, QuadMesh))
+    corners = mesh.get_coordinates()
+    assert corners.shape == (3, 4, 2)
+    # Corner (0, 0) is far at -angle_y, and the middle row of corners passes through the shot.
+    assert corners[0, 0, 0] < 0 < corners[0, 0, 1]
+    np.testing.assert_allclose(corners[1, :, 1], 0, atol=1e-9)
+    np.testing.assert_allclose(mesh.get_array().ravel(), np.arange(6), atol=1e-12)
+    assert figure.axes[1].get_xlabel() == "received energy (fJ)"
+
+
+def test_grazing_views_are_not_to_scale():
+    attributes = {"altitude": 15.0, "off_nadir_deg": 84.6, "field_of_view_mrad": 20.0, "field_of_view_shape": "circle"}
+    ax = plot_layout(result(attributes)).axes[0]
+    assert ax.get_aspect() == "auto"
+    assert ax.get_xlabel() == "y (m), not to scale"
+
+
+def test_results_without_outlines_are_dots_and_the_field_of_view():
+    """As from earlier versions: dots at the centres, and the field of view if it is known."""
+    figure = plot_layout(result({}))
+    (dots,) = (item for item in figure.axes[0].collections if isinstance(item, PathCollection))
+    y, x = dots.get_offsets().T
+    np.testing.assert_allclose(x, on_sea(np.arange(4)), rtol=1e-3, atol=1e-9)
+    assert np.all(np.diff(y) < 0)
+    figure = plot_layout(result({"field_of_view_mrad": 30.0, "field_of_view_shape": "square"}))
+    assert figure.axes[0].lines[0].get_xdata().max() == pytest.approx(3.2, abs=0.05)
+
+
+def test_files_hold_all_that_is_drawn(lidar_scene, tmp_path):
+    attributes = described(lidar_scene(extra={"ball": {"type": "sphere", "center": [0, 0, -6], "radius": 0.5}}))
+    drawn = []
+    for suffix in (".nc", ".exr"):
+        results.save(result(attributes), tmp_path / f"a{suffix}")
+        done = run("plot", tmp_path / f"a{suffix}", "--layout")
+        assert (done.exit_code, done.stdout) == (0, f"{tmp_path / 'a_layout.png'}\n")
+        drawn.append((tmp_path / "a_layout.png").read_bytes())
+    assert drawn[0] == drawn[1]
+
+
+def test_long_texts_are_left_out(lidar_scene, tmp_path):
+    """256 pixels of a circle have outlines that NetCDF could not keep together with other attributes."""
+    attributes = described(lidar_scene(rx={"layout": "16x16", "imager": False}))
+    assert all(len(value) <= 60_000 for value in attributes.values())
+    results.save(result(attributes, 256), tmp_path / "a.nc")
+    plot_layout(results.open(tmp_path / "a.nc"))
+    assert "pixel_outlines" not in described(lidar_scene(rx={"layout": "20x20", "imager": False}))
+
+
+def test_refusals(tmp_path):
+    nowhere = result({})
+    del nowhere.attrs["altitude"]
+    with pytest.raises(UserError, match="no altitude and off_nadir_deg among its attributes"):
+        plot_layout(nowhere)
+    with pytest.raises(UserError, match="no pixels that look at the sea"):
+        plot_layout(result({"off_nadir_deg": 100.0, "field_of_view_mrad": 30.0}))
+    with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
+        plot_layout(result({}), tmp_path / "a.txt")
+    results.save(result({}), tmp_path / "a.nc")
+    done = run("plot", tmp_path / "a.nc", "--layout", "--log")
+    assert done.exit_code == 2
+    assert "--layout does not go with --log or --linear" in done.output

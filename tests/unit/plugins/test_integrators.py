@@ -1,0 +1,68 @@
+"""What all integrators have in common: scenes as they are now, no derivatives, nothing kept."""
+
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.scene import LidarScene
+
+FEW = {"paths_per_pass": 1024}
+INTEGRATORS = {
+    "lidar_volpath": FEW,
+    "lidar_merging": {**FEW, "photons_per_pass": 1024},
+}
+
+
+def scene_with(lidar_scene, name, depth=8.0):
+    return lidar_scene(integrator={"type": name, **INTEGRATORS[name]}, bottom=depth)
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
+    """A bottom moved from 8 m to 6 m gives the energies of a scene that was built with it at 6 m, in every bit."""
+    scene = scene_with(lidar_scene, name)
+    before = np.array(mi.render(scene, seed=1))
+    parameters = mi.traverse(scene)
+    parameters["bottom.to_world"] = mi.ScalarTransform4f().translate([0, 0, -6]).scale(500)
+    parameters.update()
+    after = np.array(mi.render(scene, seed=1))
+    np.testing.assert_array_equal(after, mi.render(scene_with(lidar_scene, name, 6.0), seed=1))
+    assert not np.array_equal(after, before)
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_derivatives_are_refused(lidar_scene, name):
+    scene = scene_with(lidar_scene, name)
+    with pytest.raises(UserError, match=f"{name} has no derivatives"):
+        scene.integrator().render_forward(scene, None)
+    parameters = mi.traverse(scene)
+    key = "bottom.bsdf.reflectance.value"
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    energy = dr.sum(mi.render(scene, parameters, seed=1), axis=None)
+    with pytest.raises(UserError, match=f"{name} has no derivatives"):
+        dr.backward(energy)
+
+
+def living():
+    """Return the number of laid-out scenes in memory."""
+    gc.collect()
+    return sum(isinstance(one, LidarScene | DaylightScene) for one in gc.get_objects())
+
+
+def test_refused_and_finished_renders_keep_no_scene():
+    """Scenes that stay in memory are part of every later kernel."""
+    before = living()
+    options = {"integrator": {"type": "lidar_merging", **INTEGRATORS["lidar_merging"]}, "passes": 2}
+    for params in ({}, {"bin_count": 1}, {"time_start_ns": 100.0}, {"bottom_depth": 0.1}):
+        try:
+            mitransient_lidar.render("table1", params=params, **options)
+        except UserError:
+            assert params
+    assert living() == before

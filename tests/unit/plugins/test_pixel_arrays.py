@@ -1,0 +1,199 @@
+"""Hexagons, pixel maps, gaps and nested pixels in a receiver: what they sum to, and what one has to do with another."""
+
+import dataclasses
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from mitransient_lidar.transport.sensor.hex_pixels import hexagon_count
+
+BRIGHT = {"sea": {"slope_variance": "0.02"}, "film": {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 7}}
+MERGING = {"integrator": {"type": "lidar_merging"}, **BRIGHT}
+SQUARE = {"field_of_view_mrad": 20.0, "field_of_view_shape": "square"}
+
+
+def polygon(corners, **more):
+    vertices = ", ".join(f"{angle_x:.9g} {angle_y:.9g}" for angle_x, angle_y in corners)
+    return {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": vertices, **more}
+
+
+def assert_alike(first, second):
+    """Means over independent passes agree within their errors, of all bins together (Sidak), and are known well."""
+    (a, b), count = (first, second), len(first)
+    error = np.hypot(a.std(axis=0, ddof=1), b.std(axis=0, ddof=1)) / np.sqrt(count)
+    total = np.abs(a.mean(axis=0).sum())
+    assert np.sqrt((error**2).sum()) < 0.03 * total
+    used = error > 0
+    z = (a.mean(axis=0) - b.mean(axis=0))[used] / error[used]
+    # Errors of few passes are themselves uncertain: a third wider than the normal distribution.
+    assert np.abs(z).max() < 1.33 * norm.isf(0.5e-5 / used.sum())
+
+
+@pytest.fixture
+def png(tmp_path):
+    """Function that writes an image and returns its path."""
+
+    def write(values, name="map.png"):
+        path = tmp_path / name
+        if name.endswith(".npy"):
+            np.save(path, values)
+        else:
+            mi.Bitmap(np.ascontiguousarray(values)[..., None]).write(str(path))
+        return str(path)
+
+    return write
+
+
+class OnePixel:
+    """The pixels of an array taken for one."""
+
+    def __init__(self, pixels):
+        self._pixels, self.names, self.grid = pixels, ["single"], None
+        self.count, self.area, self.sample = 1, pixels.area, pixels.sample
+        self.field_of_view = pixels.field_of_view
+
+    def pixel_at(self, angle_x, angle_y, u):
+        return mi.UInt32(0), self._pixels.pixel_at(angle_x, angle_y, u)[1]
+
+
+@pytest.mark.parametrize(
+    "receiver", [{"layout": "hex37"}, {"layout": "hex7", "fill_factor": 0.5}, {"layout": "3x5", "fill_factor": 0.5}]
+)
+def test_pixels_of_a_layout_share_its_light_without_loss(receiver, lidar_scene, passes):
+    """The same paths, told apart or not: the same sum to the last bit."""
+    scene = lidar_scene(rx={**receiver, "blur_mrad": 1.0}, **BRIGHT)
+    apart = passes(scene, 2)
+    sensor = scene.sensors()[0]
+    sensor.receiver = dataclasses.replace(sensor.receiver, pixels=OnePixel(sensor.receiver.pixels))
+    together = passes(scene, 2)
+    assert apart.shape[1] > 1
+    assert together.shape[1] == 1
+    np.testing.assert_allclose(apart.sum(axis=1), together[:, 0], rtol=1e-12)
+    assert np.count_nonzero(together) == together.size
+
+
+@pytest.mark.parametrize("layout", ["2x2", "4x1", "8x8"])
+def test_cells_sum_to_the_whole_square(layout, lidar_scene, passes):
+    whole = passes(lidar_scene(rx={**SQUARE, "layout": "1x1"}, **BRIGHT), 2)
+    parts = passes(lidar_scene(rx={**SQUARE, "layout": layout, "imager": False}, **BRIGHT), 2)
+    np.testing.assert_allclose(parts.sum(axis=1), whole[:, 0], rtol=1e-12)
+
+
+def test_labels_sum_to_the_map_with_one_label(png, lidar_scene, passes):
+    labels = np.random.default_rng(2).integers(0, 6, (9, 12)).astype(np.uint8)
+    maps = [png(labels, "parts.png"), png((labels > 0).astype(np.uint8), "whole.png")]
+    parts, whole = (passes(lidar_scene(rx={"pixel_map": path}, **BRIGHT), 2) for path in maps)
+    assert parts.shape[1] == 5
+    np.testing.assert_allclose(parts.sum(axis=1), whole[:, 0], rtol=1e-12)
+
+
+def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
+    """Seven hexagons of side s: 18 corners."""
+    side = 10.0 / np.sqrt(7)
+    angles = np.radians(60 * np.arange(6))
+    corners = []
+    for a in angles + np.radians(30):
+        # The outer hexagon in this direction has its corners 3 to 5 away from the middle, one of them shared.
+        centre = np.sqrt(3) * side * np.array([np.cos(a), np.sin(a)])
+        for turn in (-90, -30, 30):
+            corners.append(centre + side * np.array([np.cos(a + np.radians(turn)), np.sin(a + np.radians(turn))]))
+    hexagons = lidar_scene(rx={"layout": "hex7", "field_of_view_mrad": 20.0}, **MERGING)
+    outline = lidar_scene(rx={"a": polygon(corners)}, **MERGING)
+    pixels = [scene.sensors()[0].receiver.pixels for scene in (hexagons, outline)]
+    assert pixels[0].area == pytest.approx(pixels[1].area, rel=1e-6)
+    assert_alike(passes(hexagons, 12).sum(axis=1), passes(outline, 12, 50).sum(axis=1))
+
+
+def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
+    """With gaps, out of the middle: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
+    layout = lidar_scene(rx={**SQUARE, "layout": "4x3", "fill_factor": 0.64}, **MERGING)
+    centre, half = (2.5, 20 / 3), (2.0, 0.4 * 20 / 3)
+    corners = [(centre[0] + i * half[0], centre[1] + j * half[1]) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    alone = lidar_scene(rx={"a": polygon(corners)}, **MERGING)
+    pixels = layout.sensors()[0].receiver.pixels
+    np.testing.assert_allclose(1e3 * pixels.centres()[5], centre, atol=1e-9)
+    assert_alike(passes(layout, 12)[:, 5], passes(alone, 12, 50)[:, 0])
+
+
+def test_a_nested_pixel_sees_the_same_alone_and_among_others(lidar_scene, passes):
+    """Others overlap it, hold it, or lie far away."""
+    ring = {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 16.0, "inner_mrad": 8.0, "pixel_name": "ring"}
+    others = {
+        "a": {"type": "pixel_fov", "field_of_view_mrad": 30.0, "pixel_name": "all"},
+        "b": {"type": "pixel_fov", "shape": "rectangle", "angle_x_mrad": 5.0, "pixel_name": "box"},
+        "d": polygon([(-14, -14), (-10, -14), (-14, -10)], pixel_name="corner"),
+    }
+    alone = lidar_scene(rx={"c": ring}, **MERGING)
+    among = lidar_scene(rx={"c": ring, **others}, **MERGING)
+    names = among.sensors()[0].receiver.pixels.names
+    assert sorted(names) == ["all", "box", "corner", "ring"]
+    assert_alike(passes(among, 12)[:, names.index("ring")], passes(alone, 12, 50)[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("map.png", np.uint8), ("map.png", np.uint16), ("map.npy", np.int64), ("map.npy", np.float64), ("map.exr", "f4")],
+)
+def test_labels_are_read_as_they_are_written(png, name, kind):
+    labels = np.array([[0, 1], [200, 7], [7, 1]], dtype=kind)
+    pixels = mi.load_dict({"type": "multipixel_receiver", "pixel_map": png(labels, name)}).receiver.pixels
+    assert pixels.names == ["label1", "label7", "label200"]
+    np.testing.assert_allclose(pixels.centres()[2] * 1e3, [0, -7.5], atol=1e-9)
+    assert (pixels.layout, pixels.field_of_view_shape, pixels.grid) == ("map", "square", None)
+
+
+def refused(plugin):
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({"type": "multipixel_receiver", **plugin})
+    return str(caught.value)
+
+
+MAPS = [
+    (np.zeros((4, 4), np.uint8), "map.png", "must have a label other than 0"),
+    (np.array([[0.5, 1]]), "map.npy", "must hold labels that are whole numbers from 0 to 16777216"),
+    (np.array([[-1, 1]]), "map.npy", "must hold labels that are whole numbers"),
+    (np.array([[1, 2**25]]), "map.npy", "must hold labels that are whole numbers"),
+    (np.array([[np.nan, 1]]), "map.npy", "must hold finite numbers"),
+    (np.ones((2, 3, 4)), "map.npy", "has the shape (2, 3, 4): it must have rows and columns"),
+    (np.ones(3), "map.npy", "has the shape (3,)"),
+    (np.array([["a"]]), "map.npy", "must hold real numbers"),
+    (np.arange(1, 2**20 + 3).reshape(2, -1), "map.npy", "has 1048578 labels; allowed are at most 1048576"),
+]
+
+
+@pytest.mark.parametrize(("values", "name", "message"), MAPS)
+def test_images_that_are_no_maps_are_refused(png, values, name, message):
+    assert message in refused({"pixel_map": png(values, name)})
+
+
+def test_files_that_are_no_images_are_refused(tmp_path):
+    for name in ("bad.png", "bad.npy", "bad.exr"):
+        (tmp_path / name).write_text("nothing")
+        assert re.search(
+            rf"pixel_map = '.*{name}' cannot be read: it is damaged", refused({"pixel_map": str(tmp_path / name)})
+        )
+    assert "'none.png' cannot be read: No such file" in refused({"pixel_map": "none.png"})
+    assert "'map.jpg' must be a .png, .npy or .exr file" in refused({"pixel_map": "map.jpg"})
+    mi.Bitmap(np.ones((2, 2, 3), np.uint8)).write(str(tmp_path / "colour.png"))
+    assert "one (grey) channel" in refused({"pixel_map": str(tmp_path / "colour.png")})
+
+
+def test_images_that_are_no_point_spread_functions_are_refused(png):
+    for values in (np.zeros((3, 3)), np.array([[1.0, -0.1]])):
+        message = refused({"blur_file": png(values, "psf.npy"), "blur_file_mrad": 3.0})
+        assert "must hold values that are not negative and not all 0" in message
+
+
+@pytest.mark.parametrize("rings", range(6))
+def test_numbers_of_hexagons(rings):
+    assert hexagon_count(f"hex{1 + 3 * rings * (rings + 1)}") == 1 + sum(6 * ring for ring in range(rings + 1))
+
+
+def test_the_largest_arrays_load():
+    """590 rings; the next one would be above 2^20 pixels."""
+    pixels = mi.load_dict({"type": "multipixel_receiver", "layout": "hex1046071"}).receiver.pixels
+    assert pixels.count == len(pixels.centres()) == 1046071
+    assert "hex1049617" in refused({"layout": "hex1049617"})

@@ -1,0 +1,312 @@
+"""Plugins: what their constructors refuse, what their manuals promise, and how they work with Mitsuba's own parts."""
+
+import ast
+import importlib
+import logging
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import scenes, variants
+from mitransient_lidar.transport.scene import LidarScene
+
+SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10], [0, 0, 0, 1]])
+CIRCLE = {"type": "pixel_fov", "field_of_view_mrad": 10.0}
+
+REFUSED = [
+    ({"type": "lidar_transmitter", "altitude": -1.0}, "altitude = -1 must be greater than 0"),
+    ({"type": "lidar_transmitter", "off_nadir_deg": 95.0}, "off_nadir_deg = 95 must lie between 0 and 89.9"),
+    ({"type": "lidar_transmitter", "pulse_energy_mj": 0.0}, "pulse_energy_mj = 0 must be greater than 0"),
+    ({"type": "lidar_transmitter", "optical_efficiency": 1.1}, "optical_efficiency = 1.1 must lie between"),
+    ({"type": "lidar_transmitter", "beam_profile": "donut"}, "beam_profile = 'donut'"),
+    ({"type": "lidar_transmitter", "divergence_mrad": 0.0}, "divergence_mrad = 0 must be greater than 0"),
+    ({"type": "lidar_transmitter", "divergence_mrad": 1.0, "divergence_1e2_mrad": 2.0}, "give one of"),
+    ({"type": "lidar_transmitter", "beam_profile": "top_hat", "divergence_fwhm_mrad": 2.0}, "divergence_fwhm_mrad"),
+    ({"type": "lidar_transmitter", "divergence_across_mrad": 0.0}, "divergence_across_mrad = 0 must be greater than 0"),
+    ({"type": "lidar_transmitter", "divergence_across_mrad": 2e3}, "divergence_across_mrad = 2000 must lie between"),
+    ({"type": "lidar_transmitter", "ellipse_deg": 20.0}, "ellipse_deg needs divergence_across_mrad"),
+    (
+        {"type": "lidar_transmitter", "divergence_across_mrad": 2.0, "ellipse_deg": float("inf")},
+        "ellipse_deg = inf must be finite",
+    ),
+    (
+        {"type": "lidar_transmitter", "divergence_fwhm_mrad": 2.0, "divergence_across_mrad": 2.0},
+        "divergence_across_mrad goes with divergence_mrad",
+    ),
+    ({"type": "lidar_transmitter", "profile_mrad": 2.0}, "profile_mrad does not go with beam_profile = 'gaussian'"),
+    ({"type": "lidar_transmitter", "beam_profile": "image"}, "profile_file is missing"),
+    (
+        {"type": "lidar_transmitter", "beam_profile": "image", "profile_file": "nowhere.npy"},
+        "profile_mrad is missing: beam_profile = 'image' needs it",
+    ),
+    (
+        {"type": "lidar_transmitter", "beam_profile": "image", "divergence_mrad": 5.0},
+        "divergence_mrad does not go with beam_profile = 'image'",
+    ),
+    (
+        {"type": "lidar_transmitter", "beam_profile": "image", "profile_file": "nowhere.npy", "profile_mrad": 5.0},
+        "profile_file = 'nowhere.npy' cannot be read: No such file or directory",
+    ),
+    (
+        {"type": "lidar_transmitter", "beam_profile": "image", "profile_file": "beam.jpg", "profile_mrad": 5.0},
+        "profile_file = 'beam.jpg' must be a .png, .npy or .exr file",
+    ),
+    ({"type": "lidar_transmitter", "pulse_file": "nowhere.txt"}, "cannot read nowhere.txt: No such file or directory"),
+    ({"type": "lidar_transmitter", "pulse_fwhm_ns": float("nan")}, "pulse_fwhm_ns = nan"),
+    ({"type": "lidar_transmitter", "to_world": SHEAR}, "to_world must be a rotation"),
+    ({"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f(), "altitude": 3.0}, "not both"),
+    ({"type": "lidar_transmitter", "wavelength_nm": 5.0}, "wavelength_nm = 5 must lie between 300 and 1100"),
+    ({"type": "lidar_transmitter", "power": 5.0}, "power"),
+    ({"type": "pixel_fov", "field_of_view_mrad": 0.0}, "field_of_view_mrad = 0 must be greater than 0"),
+    ({"type": "pixel_fov", "shape": "blob"}, "shape = 'blob' must be one of circle"),
+    ({"type": "pixel_fov", "shape": "ring", "inner_mrad": 40.0}, "inner_mrad = 40 must lie between 0 and 30"),
+    ({"type": "pixel_fov", "shape": "sector", "extent_deg": 0.0}, "extent_deg = 0 must lie between"),
+    ({"type": "pixel_fov", "shape": "strip", "angle_x_min_mrad": 20.0}, "angle_x_min_mrad = 20 must lie between"),
+    ({"type": "pixel_fov", "shape": "rectangle", "width_mrad": 0.0}, "width_mrad = 0"),
+    ({"type": "pixel_fov", "shape": "polygon"}, "at least three corners"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 1 1, 2 2"}, "lie on one line"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 3, 4 0, 0 2"}, "must not cross each other"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 4, 4 0, 0 4"}, "must not cross each other"),
+    # A tooth that runs back, a spike, a repeated corner, corners on an edge and at a corner, and an edge along another.
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 6 2, 3 1, 0 4"}, "nor touch or overlap"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 3 1, 6 2, 3 1, 0 4"}, "nor touch or overlap"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 0, 4 0, 0 4"}, "nor touch or overlap"),
+    ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 6 0, 6 6, 3 0, 0 6"}, "nor touch or overlap"),
+    (
+        {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 2 2, 4 0, 4 4, 2 2, 0 4"},
+        "nor touch or overlap",
+    ),
+    (
+        {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 6 0, 6 4, 4 4, 4 0, 2 0, 2 4, 0 4"},
+        "nor touch or overlap",
+    ),
+    (
+        {"type": "pixel_fov", "shape": "strip", "angle_x_min_mrad": 5.0, "angle_x_max_mrad": 4.0},
+        "angle_x_max_mrad = 4 must lie",
+    ),
+    ({"type": "time_gated_film", "bin_count": 10.5}, "bin_count = 10.5 must be an integer"),
+    ({"type": "ocean_surface", "surface_seed": "x"}, "surface_seed = 'x' must be a number"),
+    ({"type": "fournier_forand", "junge_slope": 6.0, "refractive_index": 1.1}, "junge_slope = 6 must lie between"),
+    ({"type": "multipixel_receiver", "layout": "2by2"}, "layout = '2by2' must be rows x columns"),
+    ({"type": "multipixel_receiver", "layout": "0x2"}, "layout = '0x2'"),
+    ({"type": "multipixel_receiver", "layout": "9999x9999"}, "at most 1048576"),
+    ({"type": "multipixel_receiver", "field_of_view_shape": "oval"}, "field_of_view_shape = 'oval'"),
+    ({"type": "multipixel_receiver", "aperture_area": 0.0}, "aperture_area = 0"),
+    ({"type": "multipixel_receiver", "obscuration": 1.0}, "obscuration = 1 must lie between 0 and 0.999"),
+    ({"type": "pixel_fov", "obscuration": -0.1}, "obscuration = -0.1 must lie between 0 and 0.999"),
+    ({"type": "multipixel_receiver", "response_time_ns": -1.0}, "response_time_ns = -1 must not be negative"),
+    ({"type": "multipixel_receiver", "layout": "2x2", "a": CIRCLE}, "nested pixel_fov sensors or layout"),
+    ({"type": "multipixel_receiver", "a": {"type": "perspective"}}, "nested sensors must be pixel_fov"),
+    ({"type": "multipixel_receiver", "fill_factor": 0.5, "a": CIRCLE}, "nested pixel_fov sensors or fill_factor"),
+    ({"type": "multipixel_receiver", "layout": "hex8"}, "layout = 'hex8' must have 1, 7, 19, 37, 61, ... hexagons"),
+    ({"type": "multipixel_receiver", "layout": "hex0"}, "layout = 'hex0' must have"),
+    ({"type": "multipixel_receiver", "layout": "hex1049617"}, "has 1049617 pixels; allowed are at most 1048576"),
+    ({"type": "multipixel_receiver", "layout": "hex7", "imager": True}, "imager = True is for layouts of rows x col"),
+    (
+        {"type": "multipixel_receiver", "layout": "hex7", "field_of_view_shape": "square"},
+        "field_of_view_shape = 'square' is for layouts of rows x columns: leave it out",
+    ),
+    ({"type": "multipixel_receiver", "fill_factor": 0.0}, "fill_factor = 0 must lie between 0.01 and 1"),
+    ({"type": "multipixel_receiver", "layout": "hex7", "fill_factor": 1.5}, "fill_factor = 1.5 must lie between"),
+    ({"type": "multipixel_receiver", "pixel_map": "a.png", "layout": "2x2"}, "layout = '2x2' is for receivers without"),
+    ({"type": "multipixel_receiver", "pixel_map": "a.png", "fill_factor": 0.5}, "fill_factor = 0.5 is for receivers"),
+    ({"type": "multipixel_receiver", "blur_mrad": -1.0}, "blur_mrad = -1 must lie between 0 and 1000"),
+    ({"type": "pixel_fov", "blur_mrad": float("nan")}, "blur_mrad = nan must be finite"),
+    ({"type": "multipixel_receiver", "blur_mrad": 1.0, "blur_file": "a.npy"}, "blur_mrad and blur_file: give one"),
+    ({"type": "multipixel_receiver", "blur_file": "a.npy"}, "blur_file_mrad is missing"),
+    (
+        {"type": "multipixel_receiver", "blur_file_mrad": 2.0},
+        "blur_file_mrad is the size of blur_file, which is missing",
+    ),
+    (
+        {"type": "multipixel_receiver", "blur_file": "none.npy", "blur_file_mrad": 2.0},
+        "blur_file = 'none.npy' cannot be read: No such file or directory",
+    ),
+    ({"type": "time_gated_film", "bin_width_ns": 0.0}, "bin_width_ns = 0 must be greater than 0"),
+    ({"type": "time_gated_film", "bin_count": 0}, "bin_count = 0 must lie between 1"),
+    ({"type": "time_gated_film", "time_start_ns": float("inf")}, "time_start_ns = inf must be finite"),
+    ({"type": "layered_water", "attenuation": -0.1}, "attenuation = -0.1 must not be negative"),
+    ({"type": "layered_water", "scattering": float("nan")}, "scattering"),
+    ({"type": "layered_water", "scattering": 0.4}, "scattering = 0.4 must not exceed attenuation = 0.3"),
+    ({"type": "layered_water", "backscattering": 0.2}, "backscattering = 0.2 must not exceed scattering = 0.15"),
+    ({"type": "layered_water", "layer_tops": "0, 4, 3"}, "layers out of order"),
+    ({"type": "layered_water", "layer_tops": "1, 2"}, "first layer must start at 0"),
+    ({"type": "layered_water", "attenuation": "0.3, 0.4, 0.5", "layer_tops": "0, 1"}, "attenuation has 3 values"),
+    ({"type": "layered_water", "phase_function": "mie"}, "phase_function = 'mie'"),
+    ({"type": "layered_water", "phase_g": 1.0}, "phase_g = 1 must lie between"),
+    ({"type": "layered_water", "refractive_index": 0.9}, "refractive_index = 0.9"),
+    ({"type": "layered_water", "a": {"type": "petzold"}, "b": {"type": "petzold"}}, "nested phase functions"),
+    ({"type": "fournier_forand", "backscatter_ratio": 0.6}, "backscatter_ratio = 0.6 must lie between"),
+    ({"type": "fournier_forand", "junge_slope": 3.5}, "both refractive_index and junge_slope"),
+    ({"type": "two_term_henyey_greenstein", "weight": 1.5}, "weight = 1.5 must lie between 0 and 1"),
+    ({"type": "ocean_surface", "wind_speed": -1.0}, "wind_speed = -1 must lie between 0 and 30"),
+    ({"type": "ocean_surface", "wind_speed": 31.0}, "wind_speed = 31 must lie between 0 and 30"),
+    ({"type": "ocean_surface", "spectrum": "swell"}, "spectrum = 'swell' must be one of"),
+    ({"type": "ocean_surface", "slope_variance": "some"}, "slope_variance = 'some' must be"),
+    ({"type": "ocean_surface", "slope_variance": "2"}, "slope_variance = 2 must lie between"),
+    ({"type": "ocean_surface", "cell_size": "fine"}, "cell_size = 'fine' must be a number"),
+    ({"type": "ocean_surface", "cell_size": 0.001}, "cell_size = 0.001 with period = 32 needs 32000 cells per side"),
+    (
+        {"type": "ocean_surface", "refined_size": 2000.0},
+        "refined_size = 2000 with cell_size = 0.25 needs 8000 cells per side",
+    ),
+    ({"type": "ocean_surface", "size": -1.0}, "size = -1 must be greater than 0"),
+    ({"type": "ocean_surface", "spectrum": "jonswap"}, "fetch is missing: the spectrum 'jonswap' needs it"),
+    ({"type": "ocean_surface", "fetch": 1e4, "inverse_wave_age": 2.0}, "are alternatives: give one of them"),
+    ({"type": "ocean_surface", "inverse_wave_age": 9.0}, "inverse_wave_age = 9 must lie between"),
+    ({"type": "ocean_surface", "spectrum": "flat", "swell_height": 1.0}, "needs a spectrum of waves, not 'flat'"),
+    ({"type": "ocean_surface", "spectrum": "height_map"}, "filename is missing"),
+    (
+        {"type": "ocean_surface", "spectrum": "table", "filename": "none.npz"},
+        "cannot read none.npz: No such file or directory",
+    ),
+    ({"type": "ocean_surface", "water_depth": 0.0}, "water_depth = 0 must be greater than 0"),
+    ({"type": "ocean_surface", "current_speed": 11.0}, "current_speed = 11 must lie between 0 and 10"),
+    ({"type": "ocean_surface", "wake_speed": -2.0}, "wake_speed = -2 must lie between 0 and 40"),
+    ({"type": "ocean_surface", "time": float("nan")}, "time = nan must be finite"),
+    ({"type": "ocean_surface", "refined_size": 0.0}, "refined_size = 0 must be greater than 0"),
+    ({"type": "lidar_volpath", "connection": "best"}, "connection = 'best' must be one of"),
+    ({"type": "lidar_volpath", "paths_per_pass": 3}, "paths_per_pass = 3 must lie between 1024"),
+    ({"type": "lidar_volpath", "guiding_probability": 1.0}, "guiding_probability = 1 must lie between"),
+    ({"type": "lidar_volpat"}, "lidar_volpat"),
+]
+
+
+@pytest.mark.parametrize(("plugin", "message"), REFUSED)
+def test_what_plugins_refuse_is_told_in_one_sentence(plugin, message):
+    with pytest.raises(UserError, match=re.escape(message)) as caught, scenes.as_user_error():
+        mi.load_dict(plugin)
+    assert "\n" not in str(caught.value)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_overlapping_pixels_are_warned_of_and_names_must_differ(caplog):
+    with caplog.at_level(logging.WARNING):
+        mi.load_dict({"type": "multipixel_receiver", "a": CIRCLE, "b": {**CIRCLE, "angle_x_mrad": 4.0}})
+    assert "'pixel0' and 'pixel1' overlap" in caplog.text
+    with pytest.raises(RuntimeError, match="names must differ"):
+        mi.load_dict({"type": "multipixel_receiver", "a": {**CIRCLE, "pixel_name": "x"},
+                      "b": {**CIRCLE, "angle_x_mrad": 20.0, "pixel_name": "x"}})  # fmt: skip
+
+
+def test_defaults_are_the_published_system():
+    transmitter = mi.load_dict({"type": "lidar_transmitter"})
+    receiver = mi.load_dict({"type": "multipixel_receiver"}).receiver
+    water = mi.load_dict({"type": "layered_water"})
+    assert (transmitter.pulse_energy, transmitter.divergence, transmitter.pulse.fwhm_ns) == (5e-3, 10e-3, 5.0)
+    assert transmitter.optical_efficiency == 0.9
+    optics = receiver.optics
+    assert (optics.aperture_area, optics.optical_efficiency) == (0.025, 0.9)
+    assert optics.two_way_atmospheric_transmittance == 0.9
+    assert receiver.pixels.layout == "2x2"
+    np.testing.assert_allclose(transmitter.pose.origin, [-200 * np.tan(np.radians(20)), 0, 200])
+    column = water.column
+    assert (column.attenuation[0], column.scattering[0], column.backscattering[0]) == (0.3, 0.15, 0.006)
+
+
+def test_look_at_agrees_with_altitude_and_angle():
+    """Local x of Mitsuba's look_at is +angle_y, local y is +angle_x: mixed up, far and left pixels would be swapped."""
+    place = [-200 * np.tan(np.radians(20)), 0, 200]
+    to_world = mi.ScalarTransform4f().look_at(origin=place, target=[0, 0, 0], up=[0, 0, 1])
+    poses = [mi.load_dict({"type": "lidar_transmitter", **p}).pose for p in ({}, {"to_world": to_world})]
+    for name in ("origin", "axis", "far", "left"):
+        np.testing.assert_allclose(getattr(poses[0], name), getattr(poses[1], name), atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "module", [name for name in variants._PLUGIN_MODULES if name not in ("phase.tabulated", "lidar_integrator")]
+)
+def test_examples_in_the_manual_load(module, tmp_path, monkeypatch):
+    # The file that an example reads: an isotropic phase function.
+    (tmp_path / "harbour.csv").write_text("".join(f"{angle}, 0.0796\n" for angle in range(0, 181, 10)))
+    monkeypatch.chdir(tmp_path)
+    classes = vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
+    (manual,) = (c.__doc__ for c in classes if isinstance(c, type) and "code-block:: xml" in (c.__doc__ or ""))
+    name = module.removeprefix("phase.")
+    assert f"(``{name}``)" in manual
+    xml, python = re.search(r"code-block:: xml\n(.*?)\.\. code-block:: python\n(.*)", manual, re.DOTALL).groups()
+    load = ast.literal_eval(python.strip())
+    assert load["type"] == name
+    mi.load_dict(load)
+    if "<film" in xml and "<sensor" not in xml:
+        return  # a film loads inside a sensor only, and the sensors' examples hold one
+    if "<phase" in xml:
+        xml = f'<medium type="layered_water" name="interior">{xml}</medium>'
+    if "<medium" in xml and "<shape" not in xml:
+        xml = f'<shape type="ocean_surface">{xml}</shape>'
+    mi.load_string(f'<scene version="3.0.0">{xml}</scene>')
+
+
+def scene(**parts):
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "tx": {"type": "lidar_transmitter"},
+            "rx": {"type": "multipixel_receiver", "film": {"type": "time_gated_film"}},
+            "sea": {"type": "ocean_surface", "interior": {"type": "layered_water"}},
+            **parts,
+        }
+    )
+
+
+WRONG_SCENES = [
+    ({"rx": {"type": "perspective"}}, "multipixel_receiver or pixel_fov"),
+    ({"rx": {"type": "multipixel_receiver"}}, "time_gated_film"),
+    ({"tx": {"type": "constant"}}, "exactly one lidar_transmitter"),
+    ({"tx2": {"type": "lidar_transmitter"}}, "has 2 of which 2"),
+    ({"sea": {"type": "ocean_surface"}}, "needs a layered_water"),
+    ({"sea": {"type": "ocean_surface", "interior": {"type": "homogeneous"}}}, "must be layered_water"),
+    ({"sea": {"type": "ocean_surface", "exterior": {"type": "layered_water"}}}, "interior medium"),
+    ({"more": {"type": "sphere", "interior": {"type": "layered_water", "attenuation": 1.0}}}, "allowed is one"),
+    ({"tx": {"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}}, "altitude"),
+]
+
+
+@pytest.mark.parametrize(("parts", "message"), WRONG_SCENES)
+def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
+    loaded = scene(**parts)
+    with pytest.raises(ValueError, match=message):
+        LidarScene.from_scene(loaded, loaded.sensors()[0])
+
+
+def test_users_bsdf_wins_and_ripples_take_the_waters_index():
+    own = scene(sea={"type": "ocean_surface", "bsdf": {"type": "dielectric"}, "interior": {"type": "layered_water"}})
+    (surface,) = (s for s in own.shapes() if hasattr(s, "ripple_variance"))
+    assert not surface.has_ripples
+    water = {"type": "layered_water", "refractive_index": 1.25}
+    loaded = scene(sea={"type": "ocean_surface", "interior": water})
+    indices = [float(value[0]) if hasattr(value, "__len__") else float(value)
+               for key, value in mi.traverse(loaded) if key.endswith(".eta")]  # fmt: skip
+    assert indices == [pytest.approx(1.25)]
+
+
+def test_no_wind_is_a_flat_sea():
+    (surface,) = (s for s in scene(sea={"type": "ocean_surface", "wind_speed": 0.0,
+                  "interior": {"type": "layered_water"}}).shapes() if hasattr(s, "ripple_variance"))  # fmt: skip
+    assert surface.bbox().max.z == surface.bbox().min.z == 0
+    assert surface.sea.spectrum == "flat"
+
+
+def test_other_integrators_see_the_layers():
+    """Mitsuba's volumetric path tracers ask for coefficients with a null part up to the largest attenuation."""
+    water = mi.load_dict(
+        {"type": "layered_water", "layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.6, 0.2"}
+    )
+    mei = mi.MediumInteraction3f()
+    mei.p = mi.Point3f(0, 0, mi.Float([-1.0, -4.0]))
+    scattering, null, total = (np.array(c).ravel() for c in water.get_scattering_coefficients(mei))
+    np.testing.assert_allclose(scattering, [0.6, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(total, [0.9, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
+
+
+def test_a_pixel_alone_is_a_receiver():
+    alone = scene(rx={**CIRCLE, "film": {"type": "time_gated_film"}}, integrator={"type": "lidar_volpath"})
+    energy = np.array(mi.render(alone, seed=1, spp=2**14))
+    assert energy.shape == (1, 320)
+    assert energy.sum() > 0
+    assert mitransient_lidar.render(alone, passes=2).pixel.values.tolist() == ["pixel"]

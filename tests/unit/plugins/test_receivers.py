@@ -1,0 +1,204 @@
+"""Poses, views, film and transmitter as Mitsuba plugins: axes, solid angles, and who owns an edge."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import pass_streams, stratified_point
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+COUNT = 2**20
+COLLECTION = 0.025 * 0.9 * 0.9
+
+
+def uniform_pair(count=COUNT, seed=1):
+    rng = mi.PCG32(count, initstate=seed)
+    return mi.Point2f(rng.next_float32(), rng.next_float32())
+
+
+@pytest.mark.parametrize("angle", [0.0, 20.0, 75.0])
+def test_gx_points_away_from_nadir_and_gy_along_y(angle):
+    """With angle_x towards nadir the far pixels would hear the echo first."""
+    pose = Pose.from_angles(200.0, angle, 3.0, -2.0)
+    frame = np.stack([pose.left, pose.far, pose.axis])
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(pose.ground_point(), [3.0, -2.0, 0.0], atol=1e-9)
+    far, left, axis = (np.array(pose.direction(*g)).ravel() for g in ((0.01, 0.0), (0.0, 0.01), (0.0, 0.0)))
+    assert np.arctan2(np.hypot(*far[:2]), -far[2]) - np.radians(angle) == pytest.approx(np.arctan(0.01), abs=1e-6)
+    assert far[0] > axis[0]
+    assert left[1] == pytest.approx(0.01 / np.hypot(1, 0.01), rel=1e-6)
+    np.testing.assert_allclose(axis, [np.sin(np.radians(angle)), 0, -np.cos(np.radians(angle))], atol=1e-7)
+
+
+def test_direction_and_tangent_are_inverse():
+    pose = Pose.from_angles(200.0, 35.0)
+    rng = np.random.default_rng(2)
+    angle_x, angle_y = 0.6 * rng.standard_normal((2, 1000))
+    x, y, cosine = pose.tangent(pose.direction(mi.Float(angle_x), mi.Float(angle_y)))
+    np.testing.assert_allclose(np.array(x), angle_x, atol=2e-6)
+    np.testing.assert_allclose(np.array(y), angle_y, atol=2e-6)
+    np.testing.assert_allclose(np.array(cosine), 1 / np.sqrt(1 + angle_x**2 + angle_y**2), rtol=1e-6)
+    # Behind the tangent plane the cosine tells, though the projected point looks like any other.
+    assert float(pose.tangent(mi.Vector3f((-pose.axis).tolist()))[2][0]) == pytest.approx(-1)
+
+
+def test_tangent_of_a_point_is_that_of_its_direction():
+    pose = Pose.from_angles(200.0, 20.0)
+    point = pose.origin + 50 * (pose.axis + 0.02 * pose.far - 0.03 * pose.left)
+    assert pose.tangent_of_point(point) == pytest.approx((0.02, -0.03))
+
+
+def test_look_at_gives_the_axes_of_the_angles():
+    """Position and target alone; scaling the transform changes nothing."""
+    wanted = Pose.from_angles(120.0, 25.0, 2.0, 1.0)
+    look = mi.ScalarTransform4f().look_at(origin=wanted.origin.tolist(), target=[2.0, 1.0, 0.0], up=[0, 0, 1])
+    for to_world in (look, look @ mi.ScalarTransform4f().scale(3.0)):
+        pose = mi.load_dict({"type": "multipixel_receiver", "to_world": to_world}).receiver.pose
+        for name in ("origin", "axis", "far", "left"):
+            np.testing.assert_allclose(getattr(pose, name), getattr(wanted, name), atol=2e-5, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "solid_angle"),
+    [
+        # 0.8 rad across: the tangent-plane area alone would be 12 % and 15 % too large.
+        ({"type": "multipixel_receiver", "field_of_view_mrad": 800.0}, 2 * np.pi * (1 - 1 / np.hypot(1, 0.4))),
+        (
+            {"type": "multipixel_receiver", "field_of_view_mrad": 800.0, "field_of_view_shape": "square"},
+            4 * np.arcsin(0.4**2 / (1 + 0.4**2)),
+        ),
+        (
+            {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 800.0, "inner_mrad": 400.0},
+            2 * np.pi * (1 / np.hypot(1, 0.2) - 1 / np.hypot(1, 0.4)),
+        ),
+    ],
+)
+def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, solid_angle):
+    plugin = mi.load_dict(sensor)
+    ray, weight = plugin.sample_ray(0.0, mi.Float(0.5), uniform_pair(), mi.Point2f(0.5))
+    weight = np.array(weight).ravel().astype(np.float64)
+    assert abs(weight.mean() - COLLECTION * solid_angle) < 4 * weight.std() / np.sqrt(COUNT)
+    assert weight.std() / np.sqrt(COUNT) < 1e-3 * weight.mean()
+    np.testing.assert_allclose(np.array(ray.o)[:, 0], plugin.receiver.pose.origin, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
+
+
+def test_view_counts_every_overlapping_pixel_in_full():
+    """Two concentric circles: were the light shared between them, the small one would get half."""
+    fields = {"wide": 30.0, "narrow": 10.0}
+    nested = {
+        name: {"type": "pixel_fov", "field_of_view_mrad": width, "pixel_name": name} for name, width in fields.items()
+    }
+    receiver = mi.load_dict({"type": "multipixel_receiver", **nested}).receiver
+    view = SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter"}))
+    assert view.use_footprint
+    start = view.sample(dr.arange(mi.UInt32, COUNT), COUNT, pass_streams(9, 0, COUNT))
+    weight, pixel = np.array(start.weight, dtype=np.float64), np.array(start.pixel)
+    for index, name in enumerate(receiver.pixels.names):
+        samples = COUNT * weight * (pixel == index)
+        expected = COLLECTION * 2 * np.pi * (1 - 1 / np.hypot(1, 0.5e-3 * fields[name]))
+        error = samples.std() / np.sqrt(COUNT)
+        assert error < 5e-3 * expected
+        assert abs(samples.mean() - expected) < 4 * error
+
+
+def test_view_leaves_a_footprint_alone_that_it_does_not_see():
+    receiver = mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 10.0}).receiver
+    uses = [
+        SensorSampler(receiver, mi.load_dict({"type": "lidar_transmitter", "aim_y": y})).use_footprint for y in (0, 30)
+    ]
+    assert uses == [True, False]
+
+
+@pytest.mark.parametrize("count", [4096, 5000])
+def test_stratified_points_cover_the_square_evenly(count):
+    """In 16 x 16 cells 4096 points fall 16 into each, and of 5000 nearly as many: random ones would spread by 4."""
+    points = np.array(stratified_point(dr.arange(mi.UInt32, count), count, pass_streams(1, 0, count)))
+    assert points.min() >= 0
+    assert points.max() < 1
+    counts = np.histogram2d(*points, bins=(16, 16), range=((0, 1), (0, 1)))[0]
+    assert np.abs(counts - count / 256).max() < 2 if count == 5000 else counts.std() == 0
+
+
+def test_stratified_points_are_uniform_in_their_strata():
+    """A thousand passes of four points, one in each quarter: uniform there along both axes (Kolmogorov-Smirnov)."""
+    passes = [stratified_point(dr.arange(mi.UInt32, 4), 4, pass_streams(seed, 0, 4)) for seed in range(1000)]
+    points = np.array([np.array(points) for points in passes])
+    corner = np.floor(2 * points[0])
+    assert np.array_equal(np.floor(2 * points), np.broadcast_to(corner, points.shape))
+    for coordinate in (2 * points - corner).transpose(1, 2, 0).reshape(8, -1):
+        assert kstest(coordinate, "uniform").pvalue > 1e-3
+
+
+def test_imager_rows_go_from_far_to_near_and_columns_from_right_to_left(lidar_scene, passes):
+    """A beam aimed 1.5 m towards +y, as seen 200 m away, lights the columns of +angle_y; near rows hear it first."""
+    scene = lidar_scene(
+        tx={"aim_y": 1.5},
+        rx={"layout": "4x6", "field_of_view_shape": "square"},
+        sea={"slope_variance": "0.02"},
+        water={"attenuation": 50.0, "scattering": 0.0, "backscattering": 0.0},
+        film={"bin_width_ns": 0.5, "bin_count": 120},
+        bottom=None,
+    )
+    energy = passes(scene, 4).mean(axis=0)
+    assert energy.shape == (4, 6, 120)
+    assert np.array(mi.render(scene)).shape == (4, 6, 120)
+    columns = energy.sum(axis=(0, 2))
+    # 1.5 m at a range of 212.8 m are 7 mrad: in the fifth of the six columns of 5 mrad.
+    assert np.argmax(columns) == 4
+    ticks = np.arange(120)
+    arrival = [(energy[row].sum(axis=0) * ticks).sum() / energy[row].sum() for row in range(4)]
+    # 7.5 mrad a row are 3.9 ns, 7.7 bins.
+    assert np.all(np.diff(arrival) < -4)
+
+
+def test_film_keeps_the_last_pass(lidar_scene):
+    scene = lidar_scene(rx={"layout": "5x5"}, film={"bin_count": 40, "time_start_ns": 1410.0})
+    energy = np.array(mi.render(scene, seed=3))
+    film = scene.sensors()[0].film()
+    assert energy.shape == (5, 5, 40)
+    np.testing.assert_array_equal(np.array(film.develop()), energy)
+    np.testing.assert_allclose(film.energy(), energy, rtol=1e-6)
+    np.testing.assert_array_equal(np.array(film.bitmap()), energy.reshape(25, 40))
+    film.clear()
+    assert not film.energy().any()
+
+
+def test_foreign_integrators_are_refused():
+    with pytest.raises(UserError, match="use the integrator lidar_merging or lidar_volpath"):
+        mi.load_dict({"type": "time_gated_film"}).create_block()
+
+
+@pytest.mark.parametrize("profile", ["gaussian", "top_hat"])
+def test_light_on_a_plane_across_the_beam_is_the_pulse(profile):
+    """Energy per area over a plate at 200 m adds up to 5 mJ x 0.9: a wrong inverse square or cosine would not."""
+    laser = mi.load_dict({"type": "lidar_transmitter", "beam_profile": profile, "divergence_mrad": 10.0})
+    pose = laser.pose
+    ticks = (np.arange(800) + 0.5) / 800 * 14 - 7
+    x, y = (g.ravel() for g in np.meshgrid(ticks, ticks))
+    points = pose.origin[:, None] + 200 * pose.axis[:, None] + np.outer(pose.far, x) + np.outer(pose.left, y)
+    it = dr.zeros(mi.SurfaceInteraction3f, x.size)
+    it.p = mi.Point3f(points)
+    ds, weight = laser.sample_direction(it, mi.Point2f(0.5))
+    np.testing.assert_array_equal(np.array(weight).ravel(), np.array(laser.eval_direction(it, ds)).ravel())
+    cosine = -np.array(dr.dot(ds.d, mi.Vector3f(pose.axis.tolist())))
+    np.testing.assert_allclose(cosine, 200 / np.sqrt(200**2 + x**2 + y**2), rtol=1e-5)
+    energy = np.sum(np.array(weight).ravel().astype(np.float64) * cosine) * (ticks[1] - ticks[0]) ** 2
+    assert energy == pytest.approx(4.5e-3, rel=2e-3 if profile == "top_hat" else 1e-4)
+
+
+def test_rays_of_the_laser_leave_its_point_with_all_its_energy():
+    laser = mi.load_dict({"type": "lidar_transmitter", "aim_x": 4.0})
+    ray, weight = laser.sample_ray(0.0, mi.Float(0.5), mi.Point2f(0.5), uniform_pair(4096))
+    assert np.all(np.array(weight) == np.float32(4.5e-3))
+    np.testing.assert_allclose(np.array(ray.o)[:, 0], laser.pose.origin, atol=1e-4)
+    # Rays are where the intensity is: 5 mrad standard deviation along each axis.
+    angle_x, angle_y, cosine = laser.pose.tangent(ray.d)
+    for g in (np.array(angle_x), np.array(angle_y)):
+        assert abs(np.mean(g**2) / 25e-6 - 1) < 4 * np.sqrt(2 / 4096)
+    assert np.all(np.array(cosine) > 0.99)
+    assert float(laser.intensity(mi.Vector3f((-laser.pose.axis).tolist()))[0]) == 0

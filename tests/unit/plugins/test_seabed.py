@@ -1,0 +1,152 @@
+"""The bottom: heights, patches, cells, and what it refuses."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+
+
+def load(**parameters):
+    return mi.load_dict({"type": "seabed", **parameters})
+
+
+def look_down(shape, x, y):
+    """Return heights [m], reflectances and normals under points (x, y), as rays find them."""
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    x, y = (mi.Float(np.atleast_1d(values).astype(np.float32)) for values in (x, y))
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 50.0), mi.Vector3f(0, 0, -1)))
+    reflectance = si.bsdf().eval_diffuse_reflectance(si)
+    return np.array(si.p)[2], np.array(reflectance)[0], np.array(si.n).T
+
+
+def test_plain_bottom_is_two_triangles_that_face_up():
+    shape = load(depth=6.5, reflectance=0.25)
+    assert shape.face_count() == 2
+    z, reflectance, normal = look_down(shape, [0.0, 300.0, -499.0], [0.0, -40.0, 499.0])
+    np.testing.assert_allclose(z, -6.5)
+    np.testing.assert_allclose(reflectance, 0.25, rtol=1e-6)
+    np.testing.assert_allclose(normal, np.tile([0, 0, 1], (3, 1)), atol=1e-6)
+
+
+def test_slopes_rise_towards_positive_x_and_y():
+    z, _, normal = look_down(load(slope_x_deg=10.0, slope_y_deg=-5.0), [3.0, 0.0], [0.0, 4.0])
+    np.testing.assert_allclose(z, [-8 + 3 * np.tan(np.radians(10)), -8 - 4 * np.tan(np.radians(5))], rtol=1e-5)
+    # A slope that rises towards +x faces -x.
+    assert normal[0, 0] < 0 < normal[0, 1]
+
+
+def test_depth_is_that_at_the_origin_wherever_the_middle_lies():
+    z, _, _ = look_down(load(slope_x_deg=10.0, centre_x=20.0, size=100.0), [20.0, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(z, [-8 + 20 * np.tan(np.radians(10)), -8], rtol=1e-5)
+
+
+def test_bowl_rises_with_the_square_of_the_distance_and_ends_with_the_fine_square():
+    shape = load(curvature=0.04, centre_x=1.0, refined_size=20.0)
+    z, _, _ = look_down(shape, [1.0, 4.0, 1.0, 101.0], [0.0, 0.0, 5.0, 0.0])
+    np.testing.assert_allclose(z, [-8, -8 + 0.02 * 9, -8 + 0.02 * 25, -8 + 0.02 * 100], atol=1e-3)
+    mound, _, _ = look_down(load(curvature=-0.04), [3.0], [0.0])
+    np.testing.assert_allclose(mound, -8 - 0.02 * 9, atol=1e-3)
+
+
+def test_ripples_have_their_height_length_and_bearing():
+    shape = load(ripple_height=0.1, ripple_length=0.5, ripple_bearing_deg=90.0)
+    y = np.arange(-2, 2, 0.0625)
+    z, _, _ = look_down(shape, np.full_like(y, 0.31), y)
+    np.testing.assert_allclose(z, -8 + 0.05 * np.cos(2 * np.pi * y / 0.5), atol=1e-4)
+    along, _, _ = look_down(shape, np.arange(-2, 2, 0.1), np.full(40, 0.25))
+    assert np.ptp(along) < 1e-4
+
+
+def test_height_map_is_added(tmp_path):
+    x, y = np.linspace(-3, 4, 29), np.linspace(10, 13, 13)
+    heights = 0.5 * x - 0.25 * y[:, None]
+    np.savez(tmp_path / "map.npz", heights=heights, x=x, y=y)
+    z, _, _ = look_down(load(filename=str(tmp_path / "map.npz"), depth=4.0), [0.2, 3.9, 60.0], [11.1, 12.8, 11.5])
+    # Beyond the map its edge goes on.
+    expected = [-4 + 0.1 - 2.775, -4 + 1.95 - 3.2, -4 + 2 - 2.875]
+    np.testing.assert_allclose(z, expected, atol=1e-3)
+
+
+def test_height_map_about_the_sea_level(tmp_path):
+    np.save(tmp_path / "map.npy", np.full((5, 9), -7.25))
+    shape = load(filename=str(tmp_path / "map.npy"), map_size=16.0, depth=0.0)
+    assert shape.bottom.refined_size == 16
+    np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 2.0])[0], -7.25)
+
+
+def test_patches_have_their_reflectance_and_area():
+    shape = load(patches="0 0 1 0.4; 3, -1, 0.5, 0; 0.5 0 0.3 0.9", reflectance=0.2)
+    _, reflectance, _ = look_down(shape, [-0.5, 0.5, 3.0, 5.0, 0.0], [0.0, 0.0, -1.0, 5.0, 1.2])
+    np.testing.assert_allclose(reflectance, [0.4, 0.9, 0, 0.2, 0.2], atol=1e-6)
+    # Mean over a square of 4 m around one disc of radius 1 m.
+    side = np.linspace(-1.995, 1.995, 400)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    _, reflectance, _ = look_down(load(patches="0 0 1 0.4", reflectance=0.2), x, y)
+    assert reflectance.mean() == pytest.approx(0.2 + 0.2 * np.pi / 16, rel=2e-3)
+
+
+def test_fine_square_grows_to_hold_the_patches():
+    assert load(patches="30 0 2 0.4").bottom.refined_size == 64
+    assert load(patches="1 0 2 0.4").bottom.refined_size == 20
+
+
+def test_users_own_bsdf_wins_and_may_read_the_patches():
+    plastic = load(patches="0 0 1 0.4", bsdf={"type": "roughplastic"})
+    assert not mi.has_flag(plastic.bsdf().flags(), mi.BSDFFlags.DiffuseTransmission)
+    assert mi.has_flag(plastic.bsdf().flags(), mi.BSDFFlags.GlossyReflection)
+    texture = {"type": "mesh_attribute", "name": "vertex_reflectance", "scale": 0.5}
+    shape = load(patches="0 0 1 0.4", bsdf={"type": "diffuse", "reflectance": texture})
+    np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 0.0])[1], [0.2, 0.05], rtol=1e-5)
+
+
+def test_reads_from_xml():
+    text = """<scene version="3.0.0"><shape type="seabed" id="bottom"><float name="depth" value="5"/>
+    <string name="cell_size" value="auto"/><string name="patches" value="0 0 1 0.4"/></shape></scene>"""
+    (shape,) = mi.load_string(text).shapes()
+    assert shape.bottom.depth == 5
+    assert "depth=5 m" in str(shape)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"depth": 0.0}, "depth = 0 must be greater than 0"),
+        ({"depth": -3.0}, "depth = -3 must be greater than 0"),
+        ({"slope_x_deg": 50.0}, "slope_x_deg = 50 must lie between -45 and 45"),
+        ({"curvature": 2.0}, "curvature = 2 must lie between -1 and 1"),
+        ({"reflectance": 1.5}, "reflectance = 1.5 must lie between 0 and 1"),
+        ({"ripple_height": 0.1}, "ripple_height = 0.1 must be at most 0.3 of ripple_length = 0.2"),
+        ({"ripple_height": 0.01, "cell_size": 0.1}, "cell_size = 0.1 must be at most a quarter of ripple_length"),
+        ({"cell_size": 0.001}, "size = 20 with cell_size = 0.001 needs 20000 cells a side: allowed are 2048"),
+        ({"cell_size": 0.0}, "cell_size = 0 must be greater than 0"),
+        ({"size": 0.0}, "size = 0 must be greater than 0"),
+        ({"map_size": 4.0}, "map_size = 4.0 needs a height map"),
+        ({"filename": "nowhere.npy", "map_size": 4.0}, "cannot read nowhere.npy: No such file"),
+        ({"patches": "0 0 1 1.3"}, "patches: reflectance of number 1 = 1.3 must lie between 0 and 1"),
+        ({"patches": "0 0 1 0.3; 2 2 0 0.1"}, "patches: radius of number 2 = 0 must be greater than 0"),
+        ({"patches": "0 0 1"}, "patches: '0 0 1' must be four numbers, x y radius reflectance"),
+        ({"patches": "0 0 a 0.1"}, "patches: radius of number 1 = 'a' must be a number"),
+        (
+            {"patches": "9 0 2 0.1", "refined_size": 20.0},
+            r"patches: number 1 reaches 11 m from \(0, 0\), but must lie within",
+        ),
+        ({"slope_x_deg": 20.0, "centre_x": 30.0}, "puts the bottom at z = 2.92 m in its middle, .* below the sea"),
+    ],
+)
+def test_mistakes_are_told(parameters, message):
+    with pytest.raises(RuntimeError, match=message):
+        load(**parameters)
+
+
+def test_bottom_that_rises_through_the_sea_is_refused_only_where_the_receiver_looks(lidar_scene):
+    def render(depth):
+        seabed = {"type": "seabed", "id": "bottom", "depth": depth, "slope_x_deg": 15.0}
+        scene = lidar_scene(bottom=None, extra={"bottom": seabed})
+        return mitransient_lidar.render(scene, passes=2)
+
+    # On the mean sea level at x = 29.9 m, where nothing looks; then at x = 1.1 m.
+    assert float(render(8.0).impulse_response.sum()) > 0
+    with pytest.raises(UserError, match="rises through the sea surface where the receiver looks: a bottom must lie"):
+        render(0.3)

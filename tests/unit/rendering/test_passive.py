@@ -1,0 +1,250 @@
+"""Pictures by daylight as their user makes them: what is returned, files, frames, the command, and mistakes."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+from PIL import Image
+from significance import largest_z
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.rendering import passive
+from mitransient_lidar.results.radiance import save_radiance
+from mitransient_lidar.transport.daylight.renderer import DaylightLight
+from mitransient_lidar.transport.daylight.sampling import pixel_solid_angles
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
+from mitransient_lidar.transport.sensor.pixels import LayoutPixels
+
+PASSIVE = {"type": "passive_volpath", "paths_per_pass": 4096}
+
+
+def scene(layout="4x4", **parts):
+    return {
+        "integrator": PASSIVE,
+        "rx": {
+            "type": "multipixel_receiver",
+            "layout": layout,
+            "imager": True if layout == "4x4" else None,
+            "film": {"type": "time_gated_film"},
+        },
+        "sea": {"type": "ocean_surface", "wind_speed": 4.0, "refined_size": 12.0, "cell_size": 0.5,
+                "interior": {"type": "layered_water"}},
+        "bottom": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).scale(500),
+            "bsdf": {"type": "diffuse"},
+        },
+        "sun": {"type": "sun", "zenith_deg": 50.0, "azimuth_deg": 90.0},
+        "sky": {"type": "sky", "sun_zenith_deg": 50.0, "sun_azimuth_deg": 90.0},
+        **parts,
+    }  # fmt: skip
+
+
+def no_none(parts):
+    return {
+        key: no_none(value) if isinstance(value, dict) else value for key, value in parts.items() if value is not None
+    }
+
+
+def render(parts=None, **options):
+    options.setdefault("passes", 2)
+    return passive.render_passive(no_none(parts or scene()), **options)
+
+
+def test_ratio_statistics():
+    """Against the spread of many repeats: ratios of sums of correlated numbers."""
+    rng = np.random.default_rng(3)
+    ratios, errors = [], []
+    for _ in range(400):
+        statistics = passive.RatioStatistics(1)
+        for _ in range(24):
+            sampled = rng.uniform(0.5, 1.5, 1)
+            statistics.add(sampled * 3 + rng.normal(0, 0.4, 1), sampled)
+        ratios.append(statistics.ratio[0])
+        errors.append(statistics.stderr[0])
+    assert abs(np.mean(ratios) - 3) < largest_z(400) * np.std(ratios) / 20
+    assert np.mean(errors) == pytest.approx(np.std(ratios), rel=0.2)
+    nothing = passive.RatioStatistics(2)
+    for _ in range(2):
+        nothing.add(np.array([1.0, 0.0]), np.array([1.0, 0.0]))
+    assert np.isnan(nothing.ratio[1])
+    assert nothing.relative_errors() == pytest.approx([0.0])
+
+
+def test_non_finite_radiance_is_kept_and_reported(monkeypatch, caplog):
+    """One pixel of sixteen receives a value that is not finite."""
+    original = DaylightLight._add
+
+    def add(self, pixel, found, active):
+        original(self, pixel, dr.select(pixel == 5, dr.nan, found), active)
+
+    monkeypatch.setattr(DaylightLight, "_add", add)
+    picture = render()
+    assert np.flatnonzero(~np.isfinite(picture["radiance"].values)).tolist() == [5]
+    assert "1 of 16 pixels have non-finite radiance" in caplog.text
+
+
+def test_solid_angles():
+    """Of layouts exactly: (1 + g^2)^(-3/2) over the cells; hexagons fill 82.7 % of the circle."""
+    square = pixel_solid_angles(LayoutPixels("3x5", 0.6, "square"))
+    inside = 4 * np.arcsin(np.sin(np.arctan(0.3)) ** 2)
+    assert square.sum() == pytest.approx(inside, rel=1e-5)
+    assert square[0] == pytest.approx(square[-1], rel=1e-5)
+    circle = pixel_solid_angles(LayoutPixels("2x2", 0.03, "circle"))
+    np.testing.assert_allclose(circle, np.pi * 0.015**2 / 4, rtol=1e-3)
+    pixels = HexPixels("hex7", 0.03, 1.0)
+    np.testing.assert_allclose(pixel_solid_angles(pixels), pixels.area / 7, rtol=2e-3)
+
+
+def test_a_still_picture():
+    picture = render(filter_width_nm=2.0, passes=4)
+    assert picture["radiance"].dims == ("row", "column")
+    assert picture["radiance"].attrs["units"] == "W m-2 sr-1 nm-1"
+    assert float(picture["radiance"].min()) > 0
+    # 0.025 m^2 of aperture, optics 0.9, air 0.9 both ways; the circle cuts the corners' cells.
+    etendue = 0.025 * 0.9 * np.sqrt(0.9) * np.pi * 0.015**2
+    assert float(picture["etendue"].sum()) == pytest.approx(etendue, rel=1e-3)
+    power = picture["radiance"] * picture["etendue"] * 2.0
+    np.testing.assert_allclose(picture["background_power"], power)
+    mean = float((picture["radiance"] * picture["etendue"]).sum() / picture["etendue"].sum())
+    assert picture.attrs["background_radiance"] == pytest.approx(mean)
+    assert {"sun_zenith_deg", "sky_irradiance", "passes", "seed", "integrator", "title"} <= set(picture.attrs)
+
+
+def test_same_seed_same_picture_other_seed_another_one():
+    first, again, other = (render(seed=seed)["radiance"].values for seed in (5, 5, 6))
+    # Sums of 64 bits, in any order.
+    np.testing.assert_allclose(first, again, rtol=1e-10)
+    assert np.all(first != other)
+
+
+def test_standard_errors_and_connections():
+    """Both samplings and their combination have one mean, within the stated errors."""
+    found = {}
+    for connection in ("mis", "emitter", "phase"):
+        engine = {**PASSIVE, "connection": connection, "paths_per_pass": 2**15}
+        found[connection] = render(scene("1x1"), integrator=engine, passes=12, seed=len(found))
+    mean = {name: float(picture["radiance"][0]) for name, picture in found.items()}
+    error = {name: float(picture["radiance_stderr"][0]) for name, picture in found.items()}
+    for other in ("emitter", "phase"):
+        assert abs(mean[other] - mean["mis"]) < largest_z(12, 2) * np.hypot(error[other], error["mis"])
+    assert error["mis"] < 0.02 * mean["mis"]
+
+
+def test_blur_leaves_the_mean_and_evens_the_edges():
+    """A bright plate in the air on half of the view: blurred, its neighbours get light."""
+    half = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 50, 1]).scale([50, 50, 1]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.9}}}  # fmt: skip
+    pictures = []
+    for blur in (None, 4.0):
+        parts = no_none(scene(plate=half))
+        parts["rx"] |= {"off_nadir_deg": 0.0, "field_of_view_shape": "square"} | ({"blur_mrad": blur} if blur else {})
+        pictures.append(render(parts, passes=8)["radiance"].mean("row").values)
+    sharp, blurred = pictures
+    assert sharp[3] > 5 * sharp[1]
+    assert blurred[1] > 1.5 * sharp[1]
+    assert blurred[2] < 0.95 * sharp[2]
+
+
+def test_frames_move_the_sea():
+    pictures = render(frames=2, frame_step_s=0.5)
+    assert pictures["radiance"].dims == ("frame", "row", "column")
+    assert pictures["time_s"].values.tolist() == [0.0, 0.5]
+    assert np.any(pictures["radiance"][0] != pictures["radiance"][1])
+    # A flat sea has nothing that moves: frames differ by noise only.
+    flat = no_none(scene())
+    flat["sea"]["spectrum"] = "flat"
+    still = render(flat, frames=2, passes=16)
+    z = (still["radiance"][0] - still["radiance"][1]) / np.hypot(*still["radiance_stderr"].values)
+    assert np.abs(z).max() < largest_z(16, 16)
+
+
+def test_files(tmp_path):
+    picture = render(filter_width_nm=1.0, frames=2)
+    for suffix in (".nc", ".exr"):
+        save_radiance(picture, tmp_path / f"a{suffix}")
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as again:
+        np.testing.assert_array_equal(again["radiance"], picture["radiance"])
+        np.testing.assert_array_equal(again["background_power"], picture["background_power"])
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert [part.header["name"] for part in file.parts] == ["frame0000", "frame0001"]
+        assert set(file.parts[1].channels) == {"Y", "Y.stderr"}
+        np.testing.assert_array_equal(file.parts[1].channels["Y"].pixels, picture["radiance"][1].astype(np.float32))
+    save_radiance(picture.isel(frame=0), tmp_path / "b.exr")
+    with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
+        assert len(file.parts) == 1
+    with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
+        save_radiance(picture, tmp_path / "a.txt")
+
+
+def test_daylight_does_not_touch_the_laser():
+    """The lidar integrators render a scene with sun and sky as they do without."""
+    laser = {"tx": {"type": "lidar_transmitter"}, "integrator": {"type": "lidar_volpath", "paths_per_pass": 4096}}
+    day = scene("2x2", **laser)
+    night = {name: part for name, part in day.items() if name not in ("sun", "sky")}
+    first, second = (mitransient_lidar.render(no_none(parts), passes=2)["impulse_response"] for parts in (day, night))
+    np.testing.assert_allclose(first, second, rtol=1e-5)
+    loaded = mi.load_dict({"type": "scene", **no_none(day)})
+    assert LidarScene.from_scene(loaded, loaded.sensors()[0]).transmitter.pulse_energy > 0
+    # And the laser does not light a picture.
+    dark = render({**day, "integrator": PASSIVE})
+    np.testing.assert_allclose(dark["radiance"], render(scene("2x2"))["radiance"], rtol=1e-10)
+
+
+def test_the_shipped_scene_by_the_command(tmp_path):
+    assert "passive_sea" in catalogue.scene_names()
+    small = ["-D", "layout=8x8", "-D", "surface_refined_size=8", "-D", "surface_cell_size=0.5"]
+    options = ["--passes", "2", "--frames", "2", "--filter-width-nm", "1", "-o", str(tmp_path / "new")]
+    done = run("passive", "passive_sea", *small, *options)
+    assert done.exit_code == 0, done.output
+    written = [tmp_path / "new" / f"passive_sea_passive{suffix}" for suffix in (".nc", ".exr", ".png", ".gif")]
+    assert done.stdout.splitlines()[:4] == [str(path) for path in written]
+    with Image.open(written[2]) as picture, Image.open(written[3]) as movie:
+        assert (picture.format, movie.format, movie.n_frames, movie.size) == ("PNG", "GIF", 2, (384, 384))
+    assert "mean power of a pixel" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fig09_1x1", "-q"], "emitters: passive imaging needs a sun or a sky"),
+        (["passive_sea", "--frames", "0"], "frames = 0 must lie between 1 and 10000"),
+        (["passive_sea", "--frame-step", "0"], "frame_step_s = 0 must be greater than 0"),
+        (["passive_sea", "--filter-width-nm", "-1"], "filter_width_nm = -1 must be greater than 0"),
+        (["passive_sea", "--passes", "1"], "passes = 1 must be at least 2"),
+        (["passive_sea", "-q", "-D", "sun=3"], "parameter 'sun' is not one of scene passive_sea"),
+    ],
+)
+def test_mistakes_end_with_one_sentence(arguments, message):
+    assert_refused(run("passive", *arguments), message)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"sun": None, "sky": None}, "needs a sun or a sky"),
+        ({"sun2": {"type": "sun"}}, "more than one sun"),
+        ({"lamp": {"type": "point"}}, "allows sun, sky and lidar_transmitter"),
+        ({"sun": {"type": "sun", "zenith_deg": 20.0}}, "degrees from where it is"),
+    ],
+)
+def test_scenes_that_are_refused(parts, message):
+    with pytest.raises(UserError, match=message):
+        render(scene(**parts))
+
+
+def test_options_that_are_refused():
+    with pytest.raises(UserError, match="frames = 0 must lie between 1"):
+        render(frames=0)
+    with pytest.raises(UserError, match="renders no images by daylight"):
+        render(integrator="lidar_volpath")
+    with pytest.raises(UserError, match="the time of a loaded one cannot be changed"):
+        passive.render_passive(mi.load_dict({"type": "scene", **no_none(scene())}), passes=2, frames=2)
+    with pytest.raises(UserError, match="passive_volpath has no laser"):
+        mitransient_lidar.render(no_none({**scene(), "tx": {"type": "lidar_transmitter"}}), passes=2)

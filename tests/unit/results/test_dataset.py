@@ -1,0 +1,315 @@
+"""Datasets: labels, attributes, and round trips through both file formats."""
+
+import logging
+import os
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+ATTRIBUTES = {
+    "scene": "fig09",
+    "seed": 2**40 + 1,
+    "scene.wind_speed": 3.0,
+    "error_median": 0.1,  # not representable in 32 bits
+    "layout": "2x2",
+    "notes": "Östersjön, 深さ",
+    "empty": "",
+    "nothing": [],
+    "one_int": [7],
+    "one_text": ["å"],
+    "floats": [0.1, 1e-300],
+    "channels": "a name that OpenEXR reserves",
+    "unknown": float("nan"),
+}
+
+
+def make(pixels=4, bins=6, grid=None, names=None, attributes=ATTRIBUTES):
+    rng = np.random.default_rng(3)
+    values = [1e-15 * rng.random((pixels, bins)) for _ in range(2)] + [1e-6 * rng.random((pixels, bins)) for _ in "ab"]
+    return results.build(
+        *values,
+        time=TimeAxis(1400.1, 0.3, bins),
+        pixel_names=names or [f"p{i}" for i in range(pixels)],
+        pixel_centres_mrad=rng.normal(size=(pixels, 2)),
+        grid=grid,
+        attributes=attributes,
+    )
+
+
+def assert_same_kinds(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert type(other[name]) is type(value), name
+        if isinstance(value, list):
+            assert [type(item) for item in other[name]] == [type(item) for item in value], name
+
+
+def test_build_labels_time_at_bin_centres():
+    dataset = make()
+    # Left edges would give 1400.1 and 1400.4.
+    np.testing.assert_allclose(dataset["time"].values[:2], [1400.25, 1400.55], rtol=0, atol=1e-9)
+    assert dataset["time"].attrs["units"] == "ns"
+    assert dataset["waveform"].dims == ("pixel", "time")
+    assert dataset["waveform"].attrs["units"] == "W"
+    assert dataset["impulse_response"].attrs["units"] == "J"
+    assert dataset["waveform"].attrs["ancillary_variables"] == "waveform_stderr"
+    assert dataset.attrs["Conventions"] == "CF-1.11"
+    assert dataset.attrs["scene.wind_speed"] == 3.0
+
+
+def test_build_orders_an_imager_row_by_row():
+    energy = np.arange(12.0).reshape(6, 2)
+    centres = [(angle_x, angle_y) for angle_x in (5.0, -5.0) for angle_y in (-9.0, 0.0, 9.0)]
+    dataset = results.build(
+        energy,
+        energy,
+        energy,
+        energy,
+        time=TimeAxis(0.0, 1.0, energy.shape[1]),
+        pixel_names=[],
+        pixel_centres_mrad=centres,
+        grid=(2, 3),
+        attributes={},
+    )
+    assert dataset["impulse_response"].dims == ("row", "column", "time")
+    assert dataset["impulse_response"].values[1, 0].tolist() == [6.0, 7.0]
+    assert dataset["angle_x"].values[0].tolist() == [5.0, 5.0, 5.0]
+    assert dataset["angle_y"].values[1].tolist() == [-9.0, 0.0, 9.0]
+    assert "pixel" not in dataset.coords
+
+
+def test_build_does_not_share_memory_with_its_input():
+    waveform = np.ones((1, 3))
+    dataset = results.build(
+        waveform,
+        waveform,
+        waveform,
+        waveform,
+        time=TimeAxis(0, 1, waveform.shape[1]),
+        pixel_names=["a"],
+        pixel_centres_mrad=[(0, 0)],
+        attributes={},
+    )
+    waveform[:] = 9
+    assert dataset["waveform"].values.max() == 1
+
+
+def test_build_turns_numpy_attributes_into_python_ones():
+    attributes = {"a": np.float32(0.5), "b": np.int64(3), "c": (1, 2.5), "d": np.arange(2), "e": True}
+    attrs = make(attributes=attributes).attrs
+    assert [attrs[name] for name in "abcde"] == [0.5, 3, [1.0, 2.5], [0, 1], 1]
+    assert [type(attrs[name]) for name in "abe"] == [float, int, int]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"time": TimeAxis(0.0, 0.0, 3)}, "bin_width_ns = 0.0 must be a finite number above 0"),
+        ({"time": TimeAxis(0.0, float("nan"), 3)}, "bin_width_ns = nan"),
+        ({"time": TimeAxis(float("inf"), 1.0, 3)}, "time_start_ns = inf must be finite"),
+        ({"time": TimeAxis(0.0, 1.0, 4)}, "time has 4 bins; it must have those of impulse_response, 3"),
+        ({"pixel_names": ["a"]}, "must be 2 different names"),
+        ({"pixel_names": ["a", "a"]}, "must be 2 different names"),
+        ({"pixel_centres_mrad": [(0, 0)]}, "pixel_centres_mrad must be 2 finite pairs"),
+        ({"pixel_centres_mrad": [(0, 0), (0, np.nan)]}, "pixel_centres_mrad must be 2 finite pairs"),
+        ({"grid": (2, 2)}, r"grid = \(2, 2\)"),
+        ({"attributes": {"bad": None}}, "attribute bad = None"),
+        ({"attributes": {"bad": ["a", 1]}}, "attribute bad"),
+        ({"attributes": {"bad": 2**63}}, "attribute bad"),
+        ({"waveform": np.ones((2, 4))}, r"waveform has shape \(2, 4\)"),
+        ({"impulse_response": np.ones(3)}, r"impulse_response has shape \(3,\)"),
+    ],
+)
+def test_build_rejects(change, sentence):
+    arguments = dict.fromkeys(
+        ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr"), np.ones((2, 3))
+    )
+    arguments |= {"time": TimeAxis(0.0, 1.0, 3), "pixel_names": ["a", "b"]}
+    arguments |= {"pixel_centres_mrad": np.zeros((2, 2)), "attributes": {}} | change
+    with pytest.raises(ValueError, match=sentence):
+        results.build(**arguments)
+
+
+def test_build_warns_of_non_finite_values_and_keeps_them(caplog):
+    waveform = np.ones((3, 4))
+    waveform[1, :2] = np.nan
+    waveform[2, 3] = np.inf
+    clean = np.ones((3, 4))
+    with caplog.at_level(logging.WARNING):
+        dataset = results.build(
+            clean,
+            clean,
+            waveform,
+            clean,
+            time=TimeAxis(0, 1, waveform.shape[1]),
+            pixel_names=["red", "green", "blue"],
+            pixel_centres_mrad=np.zeros((3, 2)),
+            attributes={},
+        )
+    assert caplog.messages == ["waveform has non-finite values in pixel green: 2, blue: 1"]
+    assert np.isnan(dataset["waveform"].values[1, 0])
+
+
+CASES = {
+    "four pixels": {},
+    "one pixel, one bin": {"pixels": 1, "bins": 1},
+    "odd names": {"names": ["", "a.b/c", 'ö "x" \n', "日本"]},
+    "imager": {"pixels": 6, "grid": (2, 3)},
+    "imager of one pixel": {"pixels": 1, "grid": (1, 1)},
+    "one column": {"pixels": 3, "grid": (3, 1)},
+}
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+@pytest.mark.parametrize("case", CASES)
+def test_round_trip(tmp_path, case, suffix):
+    dataset = make(**CASES[case])
+    kept = dataset.copy(deep=True)
+    path = tmp_path / f"result{suffix}"
+    results.save(dataset, path)
+    xr.testing.assert_identical(dataset, kept)  # saving leaves the dataset alone
+    back = results.open(path)
+    if suffix == ".nc":
+        xr.testing.assert_identical(back, dataset)
+    else:
+        for name in dataset.data_vars:
+            assert back[name].dtype == np.float64
+            np.testing.assert_array_equal(back[name].values, dataset[name].values.astype(np.float32))
+        nothing = [str(name) for name in dataset.data_vars]
+        xr.testing.assert_identical(back.drop_vars(nothing), dataset.drop_vars(nothing))
+        assert {name: back[name].attrs for name in nothing} == {name: dataset[name].attrs for name in nothing}
+    assert_same_kinds(dataset.attrs, back.attrs)
+    for name in dataset.coords:
+        assert back[name].dtype.kind == dataset[name].dtype.kind
+        assert_same_kinds(dataset[name].attrs, back[name].attrs)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_round_trip_keeps_non_finite_values(tmp_path, suffix):
+    dataset = make()
+    dataset["waveform"][0, 0] = np.nan
+    dataset["waveform"][1, 1] = -np.inf
+    results.save(dataset, tmp_path / f"a{suffix}")
+    back = results.open(tmp_path / f"a{suffix}")["waveform"].values
+    assert np.isnan(back[0, 0])
+    assert back[1, 1] == -np.inf
+
+
+def test_result_read_back_can_be_saved_in_the_other_format(tmp_path):
+    dataset = make()
+    results.save(dataset, tmp_path / "a.nc")
+    results.save(results.open(tmp_path / "a.nc"), tmp_path / "b.exr")
+    results.save(results.open(tmp_path / "b.exr"), tmp_path / "c.nc")
+    back = results.open(tmp_path / "c.nc")
+    xr.testing.assert_allclose(back, dataset, rtol=1e-7)
+    assert_same_kinds(dataset.attrs, back.attrs)
+
+
+def test_netcdf_is_plain_for_others(tmp_path):
+    dataset = make()
+    results.save(dataset, tmp_path / "a.nc")
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as other:
+        # Decoded as a time span, ns would become integers.
+        assert other["time"].dtype == np.float64
+        np.testing.assert_array_equal(other["time"].values, dataset["time"].values)
+        assert "_FillValue" not in other["time"].encoding
+        assert other.attrs["scene.wind_speed"] == 3.0
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_content_counts_not_the_suffix(tmp_path, suffix):
+    results.save(make(), tmp_path / f"a{suffix}")
+    os.rename(tmp_path / f"a{suffix}", tmp_path / "a.dat")
+    assert results.open(tmp_path / "a.dat").attrs["scene"] == "fig09"
+
+
+def test_open_rejects_missing_and_foreign_files(tmp_path):
+    with pytest.raises(UserError, match=r"cannot read .*missing\.nc: No such file"):
+        results.open(tmp_path / "missing.nc")
+    (tmp_path / "text.exr").write_text("not an image")
+    with pytest.raises(UserError, match=r"text\.exr is neither an EXR nor a NetCDF-4 file"):
+        results.open(tmp_path / "text.exr")
+    (tmp_path / "empty.nc").write_bytes(b"")
+    with pytest.raises(UserError, match=r"empty\.nc is neither"):
+        results.open(tmp_path / "empty.nc")
+    with pytest.raises(UserError, match="Is a directory"):
+        results.open(tmp_path)
+    xr.Dataset({"a": 1}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    with pytest.raises(UserError, match=r"other\.nc is a NetCDF file, but not a result of mitransient-lidar"):
+        results.open(tmp_path / "other.nc")
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_open_rejects_truncated_files(tmp_path, suffix, capfd):
+    whole = tmp_path / f"whole{suffix}"
+    results.save(make(bins=50), whole)
+    data = whole.read_bytes()
+    for length in [1, 4, 8, 9, 100, len(data) // 3, len(data) // 2, len(data) - 1]:
+        part = tmp_path / f"part{length}{suffix}"
+        part.write_bytes(data[:length])
+        with pytest.raises(UserError, match=part.name):
+            results.open(part)
+    assert capfd.readouterr() == ("", "")  # the libraries' own messages are kept from the user
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_failed_save_leaves_no_file(tmp_path, suffix):
+    (tmp_path / "file").write_text("regular")
+    with pytest.raises(UserError, match=rf"cannot write .*file/a{suffix}: .*Not a directory"):
+        results.save(make(), tmp_path / "file" / f"a{suffix}")
+    with pytest.raises(UserError, match=r"cannot write .*missing/a"):
+        results.save(make(), tmp_path / "missing" / f"a{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(UserError, match=r"cannot write .*: Is a directory"):
+        results.save(make(), tmp_path / f"folder{suffix}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", f"folder{suffix}"]
+
+
+def test_save_rejects_other_suffixes_and_datasets(tmp_path):
+    with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
+        results.save(make(), tmp_path / "a.png")
+    with pytest.raises(UserError, match="no variable waveform"):
+        results.save(make().drop_vars("waveform"), tmp_path / "a.nc")
+    with pytest.raises(UserError, match="cannot store the variable depth"):
+        results.save(make().assign(depth=1.0), tmp_path / "a.exr")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("blow", [KeyboardInterrupt, RuntimeError])
+def test_interrupted_save_keeps_the_old_file(tmp_path, blow):
+    path = tmp_path / "a.nc"
+    path.write_text("old")
+
+    def write():
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise blow
+
+    with pytest.raises(blow):
+        write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_time_axis_from_attributes_or_from_the_coordinate():
+    dataset = make(bins=6)
+    assert results.time_axis(dataset) == TimeAxis(1400.1, 0.3, 6)
+    # After a selection the attributes belong to other bins.
+    later = results.time_axis(dataset.isel(time=slice(2, 5)))
+    assert (later.start_ns, later.bin_width_ns, later.bin_count) == (pytest.approx(1400.7), pytest.approx(0.3), 3)
+    coarse = results.time_axis(dataset.coarsen(time=2).mean())
+    assert (coarse.start_ns, coarse.bin_width_ns, coarse.bin_count) == (pytest.approx(1400.1), pytest.approx(0.6), 3)
+    one = dataset.isel(time=[3])
+    assert results.time_axis(one).start_ns == pytest.approx(1401.0)
+    for invalid in (one.assign_attrs(bin_width_ns="wide"), dataset.assign_coords(time=dataset["time"][::-1].values)):
+        with pytest.raises(UserError, match=r"no attribute bin_width_ns|no two increasing times"):
+            results.time_axis(invalid)
+    with pytest.raises(UserError, match="no coordinate time"):
+        results.time_axis(dataset.drop_vars("time"))

@@ -1,0 +1,99 @@
+"""EXR stacks: channels, header attributes, damage."""
+
+import time
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.results import exr
+
+
+def header_and_channels(path):
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return dict(file.header()), {name: channel.pixels.copy() for name, channel in file.channels().items()}
+
+
+def test_layers_are_bins(tmp_path):
+    values = np.arange(2 * 3 * 4, dtype=float).reshape(2, 3, 4)
+    exr.write(tmp_path / "a.exr", {"bin": {"Y": values, "stderr": -values}}, {}, {})
+    header, channels = header_and_channels(tmp_path / "a.exr")
+    assert sorted(channels) == sorted(f"bin000{k}.{part}" for k in range(4) for part in ("Y", "stderr"))
+    # Row 1, column 0 of bin 2 is 1*12 + 0*4 + 2.
+    assert channels["bin0002.Y"][1, 0] == 14
+    assert channels["bin0002.stderr"][1, 0] == -14
+    assert channels["bin0000.Y"].dtype == np.float32
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+    assert header["type"] == OpenEXR.scanlineimage
+
+
+def test_more_than_ten_thousand_bins_have_five_digits(tmp_path):
+    values = np.arange(10001, dtype=float).reshape(1, 1, -1)
+    exr.write(tmp_path / "a.exr", {"bin": {"Y": values}}, {}, {})
+    _, channels = header_and_channels(tmp_path / "a.exr")
+    assert "bin00000.Y" in channels
+    stacks, _ = exr.read(tmp_path / "a.exr")
+    np.testing.assert_array_equal(stacks["bin"]["Y"], values)
+
+
+def test_600_bins_of_four_pixels_take_less_than_a_second(tmp_path):
+    values = np.random.default_rng(0).random((1, 4, 600))
+    start = time.perf_counter()
+    pair = {"Y": values, "stderr": values}
+    exr.write(tmp_path / "a.exr", {"bin": pair, "wave": pair}, {}, {})
+    assert time.perf_counter() - start < 1.0
+
+
+def test_plain_attributes_are_readable_and_never_wrong(tmp_path):
+    readable = {
+        "seed": 2**40,
+        "small": -3,
+        "width": 0.1,
+        "huge": 1e300,
+        "nothing": [],
+        "names": ["rød", ""],
+        "mixed": [1, 2**40],
+        "floats": [0.5, 2.0],
+        "x" * 300: 1,
+    }
+    exact = {"seed": 2**40, "width": 0.1, "nothing": [], "inf": float("inf")}
+    exr.write(tmp_path / "a.exr", {"bin": {"Y": np.zeros((1, 1, 1))}}, exact, readable)
+    header, _ = header_and_channels(tmp_path / "a.exr")
+    assert header["seed"] == "1099511627776"  # stored as a number it would come back as 0
+    assert header["small"] == -3
+    assert header["width"] == pytest.approx(0.1, rel=1e-7)
+    assert header["huge"] == "1e+300"
+    assert header["names"] == ["rød", ""]
+    assert header["mixed"] == ["1", "1099511627776"]
+    assert header["floats"] == [0.5, 2.0]
+    assert "nothing" not in header
+    _, back = exr.read(tmp_path / "a.exr")
+    assert back == exact
+
+
+def test_foreign_file(tmp_path):
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.zeros((2, 2), np.float32)}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(UserError, match=r"a\.exr is an OpenEXR file, but not a result of mitransient-lidar"):
+        exr.read(tmp_path / "a.exr")
+
+
+def test_every_truncation_and_a_flipped_byte_are_noticed(tmp_path, capfd):
+    values = np.broadcast_to(np.arange(20.0)[:, np.newaxis, np.newaxis], (20, 8, 2))  # two ZIP blocks of 16 lines
+    whole, part = tmp_path / "whole.exr", tmp_path / "part.exr"
+    exr.write(whole, {"bin": {"Y": values}}, {"a": 1}, {})
+    data = whole.read_bytes()
+    for length in range(len(data)):
+        part.write_bytes(data[:length])
+        with pytest.raises(UserError, match=r"part\.exr is damaged or truncated"):
+            exr.read(part)
+    part.write_bytes(data[:-20] + bytes([data[-20] ^ 255]) + data[-19:])
+    with pytest.raises(UserError, match="damaged"):
+        exr.read(part)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_unwritable_place_is_an_os_error(tmp_path):
+    with pytest.raises(OSError, match="No such file"):
+        exr.write(tmp_path / "missing" / "a.exr", {"bin": {"Y": np.zeros((1, 1, 1))}}, {}, {})

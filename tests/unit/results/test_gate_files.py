@@ -1,0 +1,286 @@
+"""Files of gate stacks: content for other programs, exact round trips, damage."""
+
+import json
+import time
+
+import numpy as np
+import OpenEXR
+import OpenImageIO
+import pytest
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results import gate_files
+
+ATTRIBUTES = {
+    "scene": "mine field",
+    "seed": 2**40,
+    "gate_rise_ns": 0.1,
+    "gate_step_ns": 5.0,
+    "pulses": 100,
+    "nothing": [],
+    "one": [1.5],
+    "names": ["rød", ""],
+    "surface_time_ns": 1420.0625,
+}
+
+
+def make(rows=4, columns=5, gates=3, attributes=ATTRIBUTES, seed=7):
+    """Return a stack of random energies, exact in 32 bits; `rows` 0 gives `columns` pixels."""
+    rng = np.random.default_rng(seed)
+    shape = (rows, columns) if rows else (columns,)
+    dims = ("row", "column") if rows else ("pixel",)
+    energy = rng.gamma(3.0, 1e-17, (*shape, gates)).astype(np.float32).astype(np.float64)
+    stderr = (0.1 * energy).astype(np.float32).astype(np.float64)
+    start = 1418.1 + 5.0 * np.arange(gates)
+    coords = {
+        "gate": np.arange(gates),
+        "gate_start": ("gate", start, {"units": "ns"}),
+        "gate_width": ("gate", np.full(gates, 10.1), {"units": "ns"}),
+        "gate_depth": ("gate", (start + 5.05 - 1420.0625) / 9.4, {"units": "m"}),
+        "angle_x": (dims, rng.normal(size=shape), {"units": "mrad"}),
+        "angle_y": (dims, rng.normal(size=shape), {"units": "mrad"}),
+    }
+    coords |= {"row": np.arange(rows), "column": np.arange(columns)} if rows else {"pixel": list("abcdefgh"[:columns])}
+    variables = {
+        "gate_energy": ((*dims, "gate"), energy, {"units": "J", "long_name": "energy"}),
+        "gate_energy_stderr": ((*dims, "gate"), stderr, {"units": "J"}),
+    }
+    return xr.Dataset(variables, coords, attributes)
+
+
+def parts_by_other_reader(path):
+    """Read all parts with OpenImageIO: name, channel names, header attributes, values (row, column, channel)."""
+    image = OpenImageIO.ImageInput.open(str(path))
+    assert image is not None, OpenImageIO.geterror()
+    parts = []
+    index = 0
+    while image.seek_subimage(index, 0):
+        spec = image.spec()
+        header = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+        values = image.read_image(index, 0, 0, spec.nchannels, OpenImageIO.FLOAT)
+        kinds = {str(spec.channelformat(channel)) for channel in range(spec.nchannels)}
+        parts.append((header, list(spec.channelnames), kinds, values))
+        index += 1
+    image.close()
+    return parts
+
+
+def assert_parts_show(parts, stack):
+    energy, stderr = (stack[name].transpose(..., "gate").values for name in ("gate_energy", "gate_energy_stderr"))
+    assert len(parts) == stack.sizes["gate"]
+    for k, (header, channels, kinds, values) in enumerate(parts):
+        assert header["oiio:subimagename"] == f"gate{k:03d}"
+        assert channels == ["Y", "Y.stderr"]
+        assert kinds == {"float"}
+        np.testing.assert_array_equal(values[..., 0], np.atleast_2d(energy[..., k]))
+        np.testing.assert_array_equal(values[..., 1], np.atleast_2d(stderr[..., k]))
+        assert header["gateStartNs"] == pytest.approx(1418.1 + 5.0 * k, rel=1e-7)
+        assert header["gateWidthNs"] == pytest.approx(10.1, rel=1e-7)
+        assert header["gateDepthM"] == pytest.approx((1418.1 + 5.0 * k + 5.05 - 1420.0625) / 9.4, rel=1e-6)
+
+
+@pytest.mark.parametrize("rows", [4, 0])
+def test_another_reader_finds_one_part_a_gate(tmp_path, rows):
+    stack = make(rows=rows)
+    gate_files.save_stack(stack, tmp_path / "a.exr")
+    parts = parts_by_other_reader(tmp_path / "a.exr")
+    assert_parts_show(parts, stack)
+    assert parts[0][3].shape == (rows or 1, 5, 2)
+    header = parts[0][0]
+    assert header["compression"] == "zip"
+    assert header["lidar.scene"] == "mine field"
+    assert header["lidar.seed"] == "1099511627776"  # 32-bit integers are all that a header holds
+    assert header["lidar.pulses"] == 100
+    assert json.loads(header["mitransientLidar"])["attributes"] == ATTRIBUTES
+    assert "lidar.scene" not in parts[1][0]
+
+
+def test_another_reader_finds_every_file_of_a_sequence(tmp_path):
+    stack = make()
+    paths = gate_files.save_sequence(stack, tmp_path / "new" / "folder", "sand")
+    assert [path.name for path in paths] == ["sand_gate000.exr", "sand_gate001.exr", "sand_gate002.exr"]
+    assert sorted((tmp_path / "new" / "folder").iterdir()) == paths
+    parts = [part for path in paths for part in parts_by_other_reader(path)]
+    assert_parts_show(parts, stack)
+    # A single file of a sequence has the metadata of its origin.
+    assert [part[0]["lidar.scene"] for part in parts] == ["mine field"] * 3
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc", ".EXR"])
+@pytest.mark.parametrize("rows", [4, 0])
+def test_stacks_come_back(tmp_path, rows, suffix):
+    stack = make(rows=rows)
+    gate_files.save_stack(stack, tmp_path / f"a{suffix}")
+    back = gate_files.open_stack(tmp_path / f"a{suffix}")
+    xr.testing.assert_identical(back, stack)
+    assert {type(value) for value in back.attrs.values()} == {str, int, float, list}
+    assert back["gate"].dtype == stack["gate"].dtype
+
+
+def test_values_beyond_32_bits_are_rounded_in_exr_only(tmp_path):
+    stack = make()
+    stack["gate_energy"] *= 1 / 3
+    for suffix in (".exr", ".nc"):
+        gate_files.save_stack(stack, tmp_path / f"a{suffix}")
+    rounded = gate_files.open_stack(tmp_path / "a.exr")["gate_energy"]
+    np.testing.assert_array_equal(rounded, stack["gate_energy"].astype(np.float32))
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.nc"), stack)
+
+
+def test_a_sequence_comes_back_from_its_folder_and_its_first_file(tmp_path):
+    stack = make()
+    paths = gate_files.save_sequence(stack, tmp_path, "a_gate001.exr")  # a stem that looks like a number
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
+    xr.testing.assert_identical(gate_files.open_stack(paths[0]), stack)
+    for path in paths:  # the user may rename all files alike
+        path.rename(path.with_name(path.name.replace("a_gate001.exr", "b")))
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
+
+
+def test_a_thousand_gates_have_four_digits(tmp_path):
+    stack = make(rows=0, columns=2, gates=1000)
+    gate_files.save_stack(stack, tmp_path / "a.exr")
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert [file.parts[k].header["name"] for k in (0, 999)] == ["gate0000", "gate0999"]
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), stack)
+
+
+def test_one_gate_and_unknown_depth(tmp_path):
+    stack = make(gates=1).drop_vars("gate_depth")
+    gate_files.save_stack(stack, tmp_path / "a.exr")
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), stack)
+    assert "gateDepthM" not in parts_by_other_reader(tmp_path / "a.exr")[0][0]
+    xr.testing.assert_identical(gate_files.open_stack(gate_files.save_sequence(stack, tmp_path, "s")[0]), stack)
+
+
+def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
+    stack = make()
+    both = stack.transpose("gate", "column", "row").assign(
+        waveform=(("row", "column", "time"), np.ones((4, 5, 7))), time=("time", np.arange(7.0))
+    )
+    gate_files.save_stack(both, tmp_path / "a.exr")
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), stack)
+    more = stack.assign(contrast=("gate", [1.0, 2.0, 3.0]))
+    with pytest.raises(UserError, match=r"cannot store the variable contrast; use a \.nc file"):
+        gate_files.save_stack(more, tmp_path / "b.exr")
+    assert not (tmp_path / "b.exr").exists()
+    gate_files.save_stack(more, tmp_path / "b.nc")
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "b.nc"), more)
+
+
+def test_imager_of_256_squared_and_64_gates_is_written_in_seconds(tmp_path):
+    stack = make(256, 256, 64)
+    start = time.perf_counter()
+    gate_files.save_stack(stack, tmp_path / "a.exr")
+    assert time.perf_counter() - start < 5.0  # about 1 s on one idle core
+    assert gate_files.open_stack(tmp_path / "a.exr").equals(stack)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda stack: stack.drop_vars("gate_energy_stderr"), "no variable gate_energy_stderr"),
+        (lambda stack: stack.rename(row="line"), r"must have the dimensions \(row, column, gate\)"),
+        (lambda stack: stack.isel(gate=slice(0)), "must not be empty"),
+        (lambda stack: stack.drop_vars("gate_width"), r"no coordinate gate_width over \(gate\)"),
+    ],
+)
+def test_what_is_no_stack_is_not_written(tmp_path, change, message):
+    for write in (
+        lambda stack: gate_files.save_stack(stack, tmp_path / "a.exr"),
+        lambda stack: gate_files.save_sequence(stack, tmp_path, "a"),
+    ):
+        with pytest.raises(UserError, match=message):
+            write(change(make()))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_names(tmp_path):
+    with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
+        gate_files.save_stack(make(), tmp_path / "a.tif")
+    with pytest.raises(UserError, match="without folders"):
+        gate_files.save_sequence(make(), tmp_path, "a/b")
+    with pytest.raises(UserError, match="No such file"):
+        gate_files.save_stack(make(), tmp_path / "missing" / "a.exr")
+    with pytest.raises(UserError, match="No such file"):
+        gate_files.open_stack(tmp_path / "a.exr")
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(UserError, match="neither an EXR nor a NetCDF-4 file"):
+        gate_files.open_stack(tmp_path / "file")
+    with pytest.raises(UserError, match="cannot write"):
+        gate_files.save_sequence(make(), tmp_path / "file", "a")
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_damaged_files_are_rejected(tmp_path, suffix, capfd):
+    whole, part = tmp_path / f"whole{suffix}", tmp_path / f"part{suffix}"
+    gate_files.save_stack(make(), whole)
+    data = whole.read_bytes()
+    for length in {*range(8, len(data), 61), len(data) - 1}:
+        part.write_bytes(data[:length])
+        with pytest.raises(UserError, match=r"part\.\w+ is damaged or truncated"):
+            gate_files.open_stack(part)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_files_with_other_content(tmp_path):
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.zeros((2, 2), np.float32)}) as file:
+        file.write(str(tmp_path / "foreign.exr"))
+    with pytest.raises(UserError, match="not a result of mitransient-lidar"):
+        gate_files.open_stack(tmp_path / "foreign.exr")
+    xr.Dataset({"depth": ("x", [1.0])}).to_netcdf(tmp_path / "foreign.nc", engine="h5netcdf")
+    with pytest.raises(UserError, match="holds no gate stack"):
+        gate_files.open_stack(tmp_path / "foreign.nc")
+
+    values = np.ones((1, 4))
+    options = {"pixel_names": ["a"], "pixel_centres_mrad": [(0.0, 0.0)], "attributes": {}}
+    waveforms = results.build(values, values, values, values, time=TimeAxis(0, 1, 4), **options)
+    results.save(waveforms, tmp_path / "wave.exr")
+    with pytest.raises(UserError, match="holds no gates, but a result with time bins"):
+        gate_files.open_stack(tmp_path / "wave.exr")
+    for gates in (1, 3):
+        gate_files.save_stack(make(gates=gates), tmp_path / "gates.exr")
+        with pytest.raises(UserError, match="no time bins"):
+            results.open(tmp_path / "gates.exr")
+
+
+def test_sequences_that_are_not_whole(tmp_path, caplog):
+    old = gate_files.save_sequence(make(seed=1, gates=4), tmp_path, "a")
+    with pytest.raises(UserError, match=r"is gate 2 of a sequence: open the folder or the first file, a_gate000\.exr"):
+        gate_files.open_stack(old[2])
+    of_old = old[1].read_bytes()
+    new = gate_files.save_sequence(make(seed=2), tmp_path, "a")
+    assert "a_gate003.exr does not belong to this sequence of 3 gates" in caplog.text
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path), make(seed=2))
+    new[1].write_bytes(of_old)
+    with pytest.raises(UserError, match="its 3 gates belong to different stacks"):
+        gate_files.open_stack(tmp_path)
+    new[1].unlink()
+    with pytest.raises(UserError, match=r"a_gate001\.exr: gate 1 of the 3 gates of the sequence is missing"):
+        gate_files.open_stack(tmp_path)
+    new[0].rename(tmp_path / "first.exr")
+    with pytest.raises(UserError, match=r"its name must end in _gate000\.exr"):
+        gate_files.open_stack(tmp_path / "first.exr")
+    with pytest.raises(UserError, match="holds no sequence of gates"):
+        gate_files.open_stack(tmp_path)
+    for stem in ("b", "c"):
+        gate_files.save_sequence(make(), tmp_path, stem)
+    with pytest.raises(UserError, match=r"2 sequences of gates: open the first file of one \(b_gate000\.exr, c_"):
+        gate_files.open_stack(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    gate_files.save_stack(make(seed=1), tmp_path / "a.exr")
+
+    def fail(path, parts):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(gate_files.exr, "write_parts", fail)
+    with pytest.raises(UserError, match="No space left on device"):
+        gate_files.save_stack(make(seed=2), tmp_path / "a.exr")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.exr"), make(seed=1))

@@ -1,0 +1,315 @@
+"""Performance of detection: needed signals, drawn shots, depths, tables, drawings and the command, without renders."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+from PIL import Image
+from scipy.stats import norm, t
+from significance import largest_z
+
+from mitransient_lidar.analysis.detection import trials
+from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment, Level
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.plots.detection import plot_detection
+from mitransient_lidar.studies import detection
+
+NAMES = ["red", "green", "blue", "black"]
+T = np.arange(40)
+PULSE_NS = 5.0
+ECHO = np.exp(-4 * np.log(2) * ((T - 20) / PULSE_NS) ** 2)
+PHOTON = 6.62607015e-34 * 299792458 / 532e-9 / 1e-9  # power of a photon in a bin of 1 ns [W]
+
+COUNTER = ReceiverChain(LinearDetector(1.0))
+NOISY = ReceiverChain(LinearDetector(1.0), Amplifier(1e4, 100.0))
+
+
+def experiment(
+    levels=(1, 1, 1, 1), echoes=(0, 0, 1, 0), chain=COUNTER, renders=4, seas=False, scatter=0.01, photons=1e6
+):
+    """Return four pixels with steady backscatter and a target's echo."""
+    random = np.random.default_rng(1)
+    bare = photons * PHOTON * np.multiply.outer(np.ones(renders), np.multiply.outer(levels, np.ones(len(T))))
+    own = 0.3 * photons * PHOTON * np.multiply.outer(np.ones(renders), np.multiply.outer(echoes, ECHO))
+    own *= 1 + scatter * random.normal(size=(renders, 1, 1))
+    return Experiment(bare, own, seas, chain, 1.0, 0.0, slice(12, 29), int(np.argmax(echoes)))
+
+
+def test_one_pixel_of_four_holds_the_target():
+    """Shot noise of 4 B against that of B: the pixel alone needs half, and the sum is as bad as one detector."""
+    found = trials.needs(experiment(), 1e-3, 0.9)
+    gains = dict(zip(COMBINATIONS, found["gain_target"][1], strict=True))
+    # Not exactly 2: the echo's own shot noise adds up to 0.3 % of the variance at this level.
+    assert gains["best"] == pytest.approx(2, rel=0.005)
+    assert gains["brightest"] == pytest.approx(gains["best"], rel=1e-3)
+    assert gains["sum"] == pytest.approx(1, rel=1e-6)
+
+
+def test_needed_share_in_closed_form():
+    """Backscatter's shot noise: a share f of s photons in B has a deflection of f sqrt(sum(s^2/B)), wanted is 4.372."""
+    level = experiment(scatter=0.0).needed("best", "target", 1e-3, 0.9)
+    sharpness = np.sqrt(np.sum((0.3e6 * ECHO[12:29]) ** 2 / 1e6))
+    assert np.exp(level.log) == pytest.approx(4.3718 / sharpness, rel=0.01)
+
+
+def test_needed_energy_in_closed_form():
+    """Shot noise falls with the root of the energy, so that the share of it is the square of the deflections'."""
+    light = experiment(scatter=0.0)
+    level = light.needed("best", "energy", 1e-3, 0.9)
+    photons, rise = np.exp(level.log) * 1e6, np.exp(level.log) * 0.3e6 * ECHO[12:29]
+    weights = rise / (photons + rise / 2)
+    lifted = weights @ rise - norm.isf(1e-3) * np.sqrt(photons * np.sum(weights**2))
+    assert lifted / np.sqrt(weights**2 @ (photons + rise)) == pytest.approx(norm.ppf(0.9), abs=0.002)
+
+
+def test_electronics_of_four_detectors_add_up():
+    """Where amplifiers make the noise, four of them have twice that of one for the same light."""
+    found = trials.needs(experiment(echoes=(1, 1, 1, 1), chain=NOISY, photons=1e3), 1e-3, 0.9)
+    gains = dict(zip(COMBINATIONS, found["gain_target"][1], strict=True))
+    assert gains["sum"] == pytest.approx(0.5, rel=0.01)
+    assert gains["best"] == pytest.approx(0.5, rel=0.01)
+    assert gains["brightest"] == pytest.approx(0.25, rel=0.01)
+
+
+def test_intervals_hold_the_scatter_of_renders():
+    """Renders whose echoes differ by factors: the needed share has Student's interval of their mean."""
+    light = experiment(renders=6, scatter=0.05)
+    level = light.needed("best", "target", 1e-3, 0.9)
+    factors = light.difference[:, 2, 20] / light.difference[:, 2, 20].mean()
+    reach = t.ppf(0.975, 5) * factors.std(ddof=1) / np.sqrt(6)
+    value, low, high = level.limits()
+    assert np.log(high / value) == pytest.approx(reach, rel=0.03)
+    assert np.log(value / low) == pytest.approx(reach, rel=0.03)
+    # All pixels share these factors: the gain does not know them.
+    _, low, high = level.limits(light.needed("single", "target", 1e-3, 0.9))
+    assert high / low < 1.001
+
+
+def test_hopeless_and_trivial_levels():
+    nothing = experiment(echoes=(0, 0, 1e-12, 0)).needed("best", "target", 1e-3, 0.9)
+    assert nothing.limits() == (np.inf, np.inf, np.inf)
+    assert experiment(photons=1e30).needed("best", "target", 1e-3, 0.9).log == -np.inf
+
+
+def test_drawn_shots_have_the_expected_rates():
+    light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 0.2, 1, 0.5))
+    share = np.exp(light.needed("best", "target", 0.05, 0.9).log)
+    shots = 4000
+    found = trials.drawn(light, share, 0.05, shots, 3)
+    at = int(np.flatnonzero(found["false_alarm"][1] == 0.05)[0])
+    for row in range(len(COMBINATIONS)):
+        for name, expected in (
+            ("drawn_false_alarm", 0.05),
+            ("drawn_detection", found["expected_detection"][1][row][at]),
+        ):
+            error = np.sqrt(expected * (1 - expected) / shots)
+            assert abs(found[name][1][row, at] - expected) < largest_z(shots, 8) * error
+    assert found["expected_detection"][1][-1][at] == pytest.approx(0.9, abs=1e-3)
+    # Rates and area tell the same: the best weighting beats one pixel far beyond the intervals.
+    assert found["area_low"][1][3] > found["area_high"][1][0]
+    assert np.all(np.abs(found["area"][1] - found["expected_area"][1]) < 0.03)
+
+
+def test_clutter_that_all_pixels_share_is_weighted_away():
+    """Backscatter that differs by 20 % from sea to sea, alike in all pixels, hides the target from one pixel alone."""
+    random = np.random.default_rng(2)
+    light = experiment(renders=16, seas=True)
+    light.background[:] *= 1 + 0.2 * random.normal(size=(16, 1, 1))
+    found = trials.needs(light, 1e-2, 0.9)
+    gains = dict(zip(COMBINATIONS, found["gain_target"][1], strict=True))
+    assert gains["best"] > 1.5
+
+
+def test_depth_errors_reach_the_bound():
+    found = trials.depth_errors(experiment(scatter=0.0, photons=1e5), 4000, 5, PULSE_NS, 0.11)
+    spread, bound = found["depth_spread"][1], np.array(found["depth_bound"][1])
+    # 4000 shots know a spread to 1.1 %; 1 % for what noise does not do to a linear estimate.
+    np.testing.assert_allclose(spread, bound, rtol=4.5 * 0.0112 + 0.01)
+    assert np.all(np.abs(found["depth_bias"][1]) < largest_z(4000, 4) * bound / np.sqrt(4000))
+    assert 1.7 < found["depth_gain_low"][1][3] < found["depth_gain"][1][3] < 2.0
+
+
+def test_detectable_depth_is_where_the_whole_signal_suffices(monkeypatch):
+    """Needed shares of e^-1 at 4 m and e^3 at 8 m cross 1 at 5 m; renders of e^-1.1 and e^-0.9 shift that."""
+    changes = np.array([-0.1, 0.1, 0.0])
+    levels = iter([Level(-1.0, changes), Level(3.0, 0 * changes)] * 3 + [Level(1.0, changes), Level(3.0, changes)])
+    monkeypatch.setattr(Experiment, "needed", lambda *_: next(levels))
+    found = trials.by_depth([experiment(), experiment()], [4.0, 8.0], 1e-3, 0.9)
+    reached, low = found["detectable_depth"][1], found["detectable_depth_low"][1]
+    assert reached[0] == pytest.approx(5)
+    moved = [4 + 4 * (1 - c) / (4 - c) for c in changes]
+    error = np.sqrt(2 / 3 * np.sum((np.array(moved) - np.mean(moved)) ** 2))
+    assert 5 - low[0] == pytest.approx(t.ppf(0.975, 2) * error)
+    assert np.isnan(reached[3])
+    assert found["needed_at_depth"][1][0, 1] == pytest.approx(np.exp(3))
+
+
+def made_up(depths=True):
+    """Return a result as of `detect`, from synthetic light."""
+    light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 0.2, 1, 0.5))
+    data = trials.needs(light, 1e-3, 0.9)
+    data |= trials.drawn(light, float(data["needed_target"][1][-1]), 1e-3, 200, 1)
+    data |= trials.depth_errors(light, 200, 1, PULSE_NS, 0.11)
+    if depths:
+        data |= trials.by_depth([light, experiment(photons=1.0)], [4.0, 8.0], 1e-3, 0.9)
+    for name, values in (("background", light.background), ("difference", light.difference)):
+        data[name] = (("pixel", "time"), values.mean(axis=0), {"units": "W"})
+    coords = {"combination": list(COMBINATIONS), "pixel": NAMES, "time": 0.5 + T}
+    attributes = {"scene": "made_up", "receiver": "apd", "pfa": 1e-3, "pd": 0.9, "shots": 200, "clutter": 0}
+    attributes |= {"drawn_share": float(data["needed_target"][1][-1]), "confidence": 0.95, "brightest": "blue"}
+    return xr.Dataset(data, coords, {**attributes, "pulse_fwhm_ns": PULSE_NS})
+
+
+@pytest.fixture(scope="module")
+def result():
+    return made_up()
+
+
+def test_table_tells_all(result):
+    lines = detection.describe_detection(result)
+    rows = [line.split()[0] for line in lines]
+    assert [rows.count(name) for name in COMBINATIONS] == [3, 3, 3, 3]
+    best = next(line for line in lines if line.startswith("best"))
+    assert f"{100 * float(result['needed_target'][3]):.3g} (" in best
+
+
+def test_command_writes_and_prints(result, tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(detection, "detect", lambda scene, params, **options: asked.update(options) or result)
+    plot = tmp_path / "new" / "detection.png"
+    done = run("detect", "fig13_2x2", "--depths", "4,8", "--pfa", 0.01, "-o", plot, "-q")
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.splitlines()[:2] == [str(plot), str(plot.with_suffix(".nc"))]
+    assert (asked["depths"], asked["pfa"], asked["receiver"]) == ([4, 8], 0.01, "apd")
+    with Image.open(plot) as picture:
+        assert picture.format == "PNG"
+    with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as kept:
+        np.testing.assert_array_equal(kept["needed_target"], result["needed_target"])
+
+
+def test_figure_shows_the_numbers_of_the_result(result):
+    figure = plot_detection(result)
+    light, characteristic, required, gains, errors, depths = figure.axes
+    np.testing.assert_allclose(light.lines[4].get_ydata().max(), 1e6 * result["difference"][2].max())
+    assert [text.get_text() for text in light.get_legend().get_texts()] == [*NAMES, "without the target"]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[:4] == ["one pixel for all light", "sum of the pixels", "brightest pixel alone", "best weighting"]
+    assert labels[4] == "200 simulated shots"
+    for i, name in enumerate(COMBINATIONS):
+        np.testing.assert_allclose(characteristic.lines[2 * i].get_ydata(), result["expected_detection"][i])
+        np.testing.assert_allclose(
+            depths.lines[2 * i].get_ydata(), 100 * result["needed_at_depth"].sel(combination=name)
+        )
+    assert characteristic.get_title().endswith("% of the target's signal")
+    assert required.get_title() == "required for $P_d$ = 0.9 at $P_{fa}$ = 0.001"
+    # Points of each combination: the share of the target's signal at 0, that of the pulse energy at 1.
+    points = [container.lines[0].get_data() for container in required.containers]
+    shares = [float(value) for x, (value,) in points if x[0] < 0.5]
+    np.testing.assert_allclose(shares, 100 * result["needed_target"])
+    heights = {round(bar.get_x() + bar.get_width() / 2, 6): bar.get_height() for bar in gains.patches}
+    for i in range(4):
+        assert heights[round(0.2 * (i - 1.5), 6)] == pytest.approx(float(result["gain_target"][i]))
+    spreads = {round(bar.get_x() + bar.get_width() / 2, 6): bar.get_height() for bar in errors.patches}
+    assert spreads[0.3] == pytest.approx(1e3 * float(result["depth_spread"][3]))
+    assert figure.get_suptitle() == "made_up, receiver apd: detection in noise, 95 % confidence intervals"
+
+
+def test_figure_without_depths_and_with_infinite_values(result):
+    hopeless = result.drop_dims("depth").copy(deep=True)
+    hopeless["needed_energy"][:] = np.inf
+    *_, required, _, _, depths = plot_detection(hopeless).axes
+    assert not depths.axison
+    assert len(depths.get_legend().get_texts()) == 5
+    assert {round(container.lines[0].get_xdata()[0]) for container in required.containers} == {0}
+
+
+def test_seas_and_depths_are_asked_for(monkeypatch):
+    """Four other seas than the scene's, surface_seed 8, at its own depth of 8 m and at the one asked for."""
+    asked = []
+    random = np.random.default_rng(3)
+
+    def signal(scene, params, **options):
+        asked.append((params["surface_seed"], params.get("target_depth"), options["seed"]))
+        light = experiment(levels=random.uniform(0.9, 1.1, 4), photons=1e5 if "target_depth" in params else 1e6)
+        data = {"background": light.background[0], "difference": light.difference[0]}
+        coords = {"pixel": ["red", "green", "blue", "black"], "time": 0.5 + T}
+        return xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, coords)
+
+    monkeypatch.setattr(detection, "target_signal", signal)
+    done = []
+    count = {"clutter": 4, "shots": 200}
+    found = detection.detect(
+        "fig13_2x2", depths=(7,), progress=lambda state: done.append((state.done, state.planned)), **count
+    )
+    assert [(seed, depth) for seed, depth, _ in asked] == [(9 + i, d) for d in (None, 7) for i in range(4)]
+    # The same random numbers at each depth, others for each sea.
+    assert len({seed for *_, seed in asked}) == 4
+    assert done == [(i + 1, 8) for i in range(8)]
+    assert found["needed_at_depth"].sizes == {"combination": 4, "depth": 1}
+    assert found.attrs["renders"] == found.attrs["clutter"] == 4
+    assert found.attrs["scene.surface_seed"] == "8"
+    assert np.all(found["needed_at_depth"] > found["needed_target"])
+    assert "noise and 4 seas" in detection.describe_detection(found)[0]
+
+
+def test_blind_receiver_is_told(monkeypatch):
+    """A counter with a dead time of 30 ns, which the first of a million photons starts, counts no echo at 20 ns."""
+    light = experiment()
+    data = {"background": light.background[0], "difference": light.difference[0]}
+    record = xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, {"time": 0.5 + T})
+    monkeypatch.setattr(detection, "target_signal", lambda *_, **__: record)
+    with pytest.raises(UserError, match="receiver spad does not see the target"):
+        detection.detect("fig13_2x2", renders=3, receiver="spad")
+
+
+def test_echo_outside_the_record_is_told(monkeypatch):
+    light = experiment()
+    data = {"background": light.background[0], "difference": np.roll(light.difference[0], 15, axis=-1)}
+    late = xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, {"time": 0.5 + T})
+    monkeypatch.setattr(detection, "target_signal", lambda *_, **__: late)
+    with pytest.raises(UserError, match=r"the record must hold 1\.5 pulse widths about the target's echo at 35\.5 ns"):
+        detection.detect("fig13_2x2", renders=3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fig13_2x2", "--pfa", 0.7), "pfa = 0.7 must lie between 1e-12 and 0.5"),
+        (("fig13_2x2", "--pfa", 0.1, "--pd", 0.1), "pd = 0.1 must lie between"),
+        (("fig13_2x2", "--clutter", 2), "clutter = 2 must be 0 or lie between 4 and 1000"),
+        (("fig13_2x2", "--renders", 2), "renders = 2 must lie between 3 and 1000"),
+        (("fig13_2x2", "--shots", 10), "shots = 10 must lie between 100 and 100000"),
+        (("fig13_2x2", "--depths", "4;8"), "--depths 4;8 is not of the form"),
+        (("fig13_2x2", "-o", "a.txt"), "must end in .png"),
+        (
+            ("fig13_2x2", "-q", "--receiver", "eye"),
+            "receiver = 'eye' must be a ReceiverChain or one of ideal, photodiode",
+        ),
+    ],
+)
+def test_mistakes_end_with_one_sentence(arguments, message):
+    assert_refused(run("detect", *arguments), message)
+
+
+@pytest.mark.parametrize(
+    ("scene", "params", "options", "message"),
+    [
+        ("fig13_2x2", {}, {"depths": (8, 14), "progress": pytest.fail}, r"below the bottom, up to z = -14 m"),
+        ("fig13_2x2", {}, {"depths": (8, 4)}, r"depths = \[8, 4\] must be above 0 m and increase"),
+        ("fig09_2x2", {}, {"depths": (4, 8)}, "scene fig09_2x2 has no parameter target_depth, which depths needs"),
+        ("fig13_2x2", {"spectrum": "flat"}, {"clutter": 4}, "clutter needs waves"),
+        ({}, None, {"clutter": 4}, "depths and clutter need an XML scene"),
+    ],
+)
+def test_mistakes_are_told_before_rendering(scene, params, options, message):
+    with pytest.raises(UserError, match=message):
+        detection.detect(scene, params, **options)
+
+
+@pytest.mark.parametrize("options", [{"pfa": 0}, {"pfa": 0.1, "pd": 0.1}, {"clutter": 3}, {"shots": 1}, {"seed": -1}])
+def test_numbers_out_of_range_are_told(options):
+    with pytest.raises(ValueError, match=f"{list(options)[-1]} = "):
+        detection.detect("fig13_2x2", **options)

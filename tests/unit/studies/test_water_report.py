@@ -1,0 +1,209 @@
+"""The command that tells what a way of knowing a water stands for."""
+
+import re
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+from scipy.integrate import trapezoid
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.water import water_types
+from mitransient_lidar.physics.water.profiles import read_profile
+from mitransient_lidar.plots.water import plot_water
+from mitransient_lidar.studies.water_report import water_of
+
+STATION = """depth, a, b, bb_ratio
+1, 0.1, 0.2, 0.01
+4, 0.3, 0.6, 0.04
+6, 0.05, 0.1, 0.02
+10, 0.05, 0.1, 0.02
+"""
+
+
+@pytest.fixture
+def station(tmp_path):
+    path = tmp_path / "a station & more.csv"
+    path.write_text(STATION)
+    return path
+
+
+def figures(output):
+    """Return the printed numbers by name, and those of the -D options."""
+    lines = output.splitlines()
+    named = {line[:30].strip(): float(line[30:]) for line in lines[:-1] if re.match(r".{30}[0-9.]", line)}
+    options = dict(part.split("=") for part in lines[-1].split(" -D ")[1:])
+    return named, {name: float(value) for name, value in options.items()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["jerlov", "II"], water_types.jerlov("II")),
+        (["chlorophyll", "1"], water_types.chlorophyll(1.0)),
+        (["kd", "0.1"], water_types.from_kd(0.1)),
+        (["secchi", "6"], water_types.from_secchi(6.0)),
+        (["pure"], water_types.pure_seawater()),
+    ],
+)
+def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
+    done = run("water", *arguments)
+    assert done.exit_code == 0, done.output
+    named, options = figures(done.stdout)
+    assert named["absorption a (1/m)"] == pytest.approx(wanted.absorption, rel=1e-4)
+    assert named["diffuse attenuation Kd (1/m)"] == pytest.approx(wanted.kd, rel=1e-4)
+    assert options["attenuation"] == pytest.approx(wanted.absorption + wanted.scattering, rel=1e-5)
+    assert options["scattering"] == pytest.approx(wanted.scattering, rel=1e-5)
+    assert options["backscattering"] == pytest.approx(wanted.backscattering, rel=1e-5)
+    # Quan and Fry at 532 nm, 20 deg C and 35 per mille.
+    assert options["refractive_index"] == pytest.approx(1.341510, abs=1e-5)
+    assert options["group_index"] == pytest.approx(1.363796, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["mud", "3"], "kind = 'mud' must be one of jerlov"),
+        (["jerlov"], "value is missing: jerlov needs one"),
+        (["pure", "3"], "value = '3' must be left out"),
+        (["kd", "clear"], "value = 'clear' must be a number for kd"),
+        (["kd", "0.1", "--wavelength", "500"], "wavelength = 500 must be 532 nm for kd"),
+        (["jerlov", "IV"], "IV"),
+        (["petzold"], "value is missing: petzold needs one"),
+        (["petzold", "muddy"], "value = 'muddy' must be one of clear, coastal, turbid for petzold"),
+        (["petzold", "clear", "--wavelength", "600"], "wavelength = 600 must lie between 514 and 533 nm for petzold"),
+        (["profile"], "value is missing: profile needs one"),
+        (["profile", "missing.csv"], "cannot read missing.csv: No such file"),
+        (["jerlov", "II", "-o", "a.txt"], "cannot write a.txt: the file name must end in .png, .pdf or .svg"),
+        (["pure", "-o", "missing/a.png"], "cannot write missing/a.png: No such file"),
+        (["secchi", "100"], "100"),
+        (["pure", "--temperature", "80"], "temperature = 80"),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, message):
+    done = run("water", *arguments)
+    assert_refused(done, message)
+
+
+@pytest.mark.parametrize(
+    ("name", "a", "b", "ratio"),
+    # a and b of his table at 530 nm, and bb/b to its two digits (Petzold 1972).
+    [("clear", 0.114, 0.037, 0.044), ("coastal", 0.179, 0.219, 0.013), ("turbid", 0.366, 1.824, 0.020)],
+)
+def test_petzold_waters(name, a, b, ratio):
+    done = run("water", "petzold", name)
+    assert done.exit_code == 0, done.output
+    assert "measured at 514 to 530 nm" in done.stdout
+    named, options = figures(done.stdout)
+    assert named["absorption a (1/m)"] == a
+    assert named["bb/b"] == pytest.approx(ratio, abs=5.5e-4)
+    assert options["attenuation"] == pytest.approx(a + b, rel=1e-6)
+    assert options["backscattering"] == pytest.approx(named["bb/b"] * b, rel=1e-4)
+
+
+def test_profile_is_described(station):
+    done = run("water", "profile", str(station), "--tolerance", "0.05")
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    named = {line[:30].strip(): line[30:] for line in lines if re.match(r".{30}[0-9]", line)}
+    assert named["depth (m)"] == "1 to 10"
+    assert named["absorption a (1/m)"] == "0.05 to 0.3"
+    assert named["scattering b (1/m)"] == "0.1 to 0.6"
+    assert named["attenuation c (1/m)"] == "0.15 to 0.9"
+    assert named["bb/b"] == "0.01 to 0.04"
+    # 0.3 * 1 above the first node, then trapezia: 0.6 * 3 + 0.525 * 2 + 0.15 * 4.
+    assert named["optical depth to 10 m"] == "3.75"
+    count = int(named["layers within 5 %"])
+    # A ratio of 1.1 a layer: c alone has ln 3 and ln 6, bb ln 12 and ln 12 to go through; the last has no end.
+    assert count == pytest.approx(2 * np.log(12) / np.log(1.1) + 1, abs=4)
+    assert count == read_profile(station).layers(0.05).count
+
+
+def test_profile_line_is_xml_for_a_medium(station):
+    """The path stands in the XML whole, with its spaces and signs, and is good from every folder."""
+    done = run("water", "profile", str(station), "--tolerance", "0.05")
+    medium = ElementTree.fromstring(f"<medium>{done.stdout.splitlines()[-1]}</medium>")
+    given = {child.get("name"): child.get("value") for child in medium}
+    assert given == {"profile": str(station), "profile_tolerance": "0.05"}
+    usual = run("water", "profile", str(station)).stdout.splitlines()[-1]
+    assert "profile_tolerance" not in usual
+    for element, tolerance in ((done.stdout.splitlines()[-1], 0.05), (usual, 0.01)):
+        loaded = mi.load_string(f'<medium version="3.0.0" type="layered_water">{element}</medium>')
+        assert loaded.column.count == read_profile(station).layers(tolerance).count
+
+
+def test_tolerance_out_of_range(station):
+    done = run("water", "profile", str(station), "--tolerance", "2")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == "tolerance = 2 must lie between 1e-05 and 0.5\n"
+
+
+def test_profile_without_scattering(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("depth, a, b\n0, 0.1, 0\n5, 0.1, 0\n")
+    done = run("water", "profile", str(path), "-o", str(tmp_path / "a.png"))
+    assert done.exit_code == 0, done.output
+    assert f"{'bb/b':<30}none, nothing scatters" in done.stdout
+    assert f"{'layers within 1 %':<30}1\n" in done.stdout
+
+
+def test_profile_that_no_fournier_forand_function_fits_is_not_drawn(tmp_path):
+    path, plot = tmp_path / "a.csv", tmp_path / "a.png"
+    path.write_text("depth, a, b, bb_ratio\n0, 0.1, 0.1, 0.7\n5, 0.1, 0.1, 0.7\n")
+    done = run("water", "profile", str(path), "-o", str(plot))
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert "backscatter_ratio = 0.7 must lie between" in done.stderr
+    assert not plot.exists()
+
+
+def test_pure_sea_water_renders():
+    """No Fournier-Forand function has bb/b = 0.5: without its own scattering the medium would be refused."""
+    done = run("water", "pure")
+    _, options = figures(done.stdout)
+    names = ("attenuation", "scattering", "backscattering")
+    values = {name: options[name] for name in names}
+    water = mi.load_dict({"type": "layered_water", **values, "water_scattering": options["water_scattering"]})
+    assert water.phases.phases[0].backscatter_ratio == pytest.approx(0.5, rel=1e-4)
+    with pytest.raises(RuntimeError, match="backscatter_ratio"):
+        mi.load_dict({"type": "layered_water", **values})
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "label", "share", "at_1_degree", "tolerance"),
+    [
+        # Zhang, Hu and He (2009): 2.2975e-4 / 0.001962 forwards as backwards.
+        ("pure", None, "pure sea water, bb/b = 0.5", 0.5, 0.1171, 1e-3),
+        # Petzold's 16.623 over his 0.219 at 1 degree.
+        ("petzold", "coastal", "measured, bb/b = 0.0134", 0.0134, 75.9, 0.02),
+        # Mobley, Sundman and Boss (2002): n = 1.10 and mu = 3.5835 for this bb/b, whose function is 72.78 at 1 degree.
+        ("secchi", "6", "Fournier-Forand, bb/b = 0.0183", 0.0183, 72.78, 2e-3),
+    ],
+)
+def test_every_kind_draws_its_function(monkeypatch, kind, value, label, share, at_1_degree, tolerance):
+    drawn = []
+    monkeypatch.setattr("mitransient_lidar.plots.water.plot_phase_function", lambda *arguments: drawn.append(arguments))
+    plot_water(kind, value, 532.0, 20.0, 35.0, 0.01, "a.png")
+    ((phase, name, title, path),) = drawn
+    assert (name, path) == (label, "a.png")
+    assert f"a = {water_of(kind, value, 532.0, 20.0, 35.0).absorption:.3g}, " in title
+    theta = np.linspace(np.pi / 2, np.pi, 20_001)
+    assert 2 * np.pi * trapezoid(phase(theta) * np.sin(theta), theta) == pytest.approx(share, rel=5e-3)
+    assert phase(np.radians(1.0)) == pytest.approx(at_1_degree, rel=tolerance)
+
+
+@pytest.mark.parametrize("arguments", [["jerlov", "II"], ["petzold", "turbid"], ["pure"], ["profile"]])
+def test_plots_are_written_and_their_paths_come_last(station, tmp_path, arguments):
+    path = tmp_path / "a.png"
+    words = [*arguments, str(station)] if arguments == ["profile"] else arguments
+    plain = run("water", *words)
+    done = run("water", *words, "-o", str(path))
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"{plain.stdout}{path}\n"
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plot_water_knows_the_kinds():
+    with pytest.raises(UserError, match="kind = 'mud' must be one of jerlov"):
+        plot_water("mud", "3", 532.0, 20.0, 35.0, 0.01, "a.png")

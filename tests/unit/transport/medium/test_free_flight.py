@@ -1,0 +1,133 @@
+"""Free flight and optical depth through layers against float64 arithmetic and exact transmittance."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.transport.medium.free_flight import LayeredFlight
+
+#: Edges are float32 numbers, so that NumPy and Dr.Jit agree on which side of them a depth lies.
+COLUMNS = {
+    "one": WaterColumn.from_text("0", "0.3", "0.15", "0.006"),
+    "two": WaterColumn.from_text("0, 3", "0.9, 0.5", "0.7, 0.35", "0.014, 0.007"),
+    "five": WaterColumn.from_text("0, 1, 2.5, 4, 7", "0.2, 1.5, 0.1, 0.8, 0.4", "0.1", "0.002"),
+    "clear_between": WaterColumn.from_text("0, 2, 5", "0.3, 0, 0.6", "0", "0"),
+    "thousand": WaterColumn.from_text(
+        np.arange(1000) / 64, 0.3 + 0.2 * np.sin(np.arange(1000) * 0.05), np.full(1000, 0.05), np.full(1000, 0.001)
+    ),
+}
+#: Vertical components of directions, positive downwards: steep, slanted, nearly and exactly horizontal.
+DIRECTIONS = [1.0, 0.6, 0.05, 1e-3, 1e-6, 0.0, -1e-6, -1e-3, -0.05, -0.6, -1.0]
+#: Depths of starts: a wave crest, the mean surface, inside layers, on an edge, in the last layer.
+DEPTHS = [-0.5, 0.0, 0.7, 2.0, 3.0, 4.9, 12.0]
+
+
+def rounding(column, depth, downward, length):
+    """Return the optical depth that float32 depths may miss: their rounding over the slope, by the range of c."""
+    reach = np.abs(depth) + np.abs(downward) * length + column.layer_tops.max()
+    blur = np.finfo(np.float32).eps * reach / np.maximum(np.abs(downward), np.finfo(np.float32).eps)
+    # A level ray cannot gain or lose more than its whole length in the wrong layer.
+    return 4 * np.minimum(blur, length) * np.ptp(column.attenuation) * (downward != 0)
+
+
+def exact(column, depth, downward, length):
+    return column.optical_depth(depth, np.asarray(depth) + downward * np.asarray(length), length)
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.parametrize("downward", DIRECTIONS)
+def test_optical_depth_is_the_sum_over_the_layers(name, downward):
+    """A difference of cumulative depths over the slope would be 0/0 level, and noise below a slope of 1e-3."""
+    column = COLUMNS[name]
+    depth, length = (g.ravel() for g in np.meshgrid(DEPTHS, [0.01, 0.5, 3.0, 9.0]))
+    depth = depth.astype(np.float32).astype(np.float64)
+    downward = float(np.float32(downward))
+    got = LayeredFlight(column).optical_depth(mi.Float(depth), mi.Float(downward), mi.Float(length))
+    expected = exact(column, depth, downward, length)
+    tolerance = 2e-5 * (expected + 0.1) + rounding(column, depth, downward, length)
+    assert np.all(np.abs(np.array(got) - expected) <= tolerance)
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.parametrize("downward", DIRECTIONS)
+def test_distance_inverts_the_optical_depth(name, downward):
+    column = COLUMNS[name]
+    flight = LayeredFlight(column)
+    depth, wanted = (g.ravel() for g in np.meshgrid(DEPTHS, [1e-3, 0.1, 1.0, 4.0]))
+    downward = float(np.float32(downward))
+    distance = np.array(flight.distance(mi.Float(depth), mi.Float(downward), mi.Float(wanted)), dtype=np.float64)
+    reached = np.isfinite(distance)
+    assert not np.any(np.isnan(distance))
+    assert np.all(distance > 0)
+    depth32 = depth.astype(np.float32).astype(np.float64)
+    got = exact(column, depth32[reached], downward, distance[reached])
+    tolerance = 1e-4 * wanted[reached] + 2e-6 + rounding(column, depth32[reached], downward, distance[reached])
+    assert np.all(np.abs(got - wanted[reached]) <= tolerance)
+    # What is never reached: level rays in clear water only.
+    never = (column.attenuation[column.layer_at(depth32)] == 0) & (downward == 0)
+    np.testing.assert_array_equal(~reached, never)
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.parametrize(("depth", "downward"), [(0.0, 0.95), (6.0, -0.8), (-0.4, 0.3), (2.5, 1e-3), (1.7, 0.0)])
+def test_flights_follow_the_transmittance(name, depth, downward):
+    """1 - transmittance of the sampled distance is uniform; a sampler that ignores one edge fails by far."""
+    column = COLUMNS[name]
+    drawn = -np.log(1 - np.random.default_rng(11).random(20_000 if name == "thousand" else 200_000))
+    distance = LayeredFlight(column).distance(mi.Float(depth), mi.Float(downward), mi.Float(drawn))
+    distance = np.array(distance, dtype=np.float64)
+    if name == "clear_between" and depth == 2.5 and downward <= 1e-3:
+        # Nearly level in the clear layer, 2.5 m above its lower edge: far, but not without end.
+        assert distance.min() >= 2.5 / downward * (1 - 1e-6)
+    uniform = -np.expm1(-exact(column, float(np.float32(depth)), float(np.float32(downward)), distance))
+    assert kstest(uniform, "uniform").pvalue > 1e-4
+
+
+def test_the_test_of_flights_sees_a_wrong_layer():
+    """Negative control: distances of the first layer's attenuation alone."""
+    drawn = -np.log(1 - np.random.default_rng(11).random(200_000))
+    uniform = -np.expm1(-exact(COLUMNS["two"], 0.0, 0.95, drawn / 0.9))
+    assert kstest(uniform, "uniform").pvalue < 1e-10
+
+
+def test_light_that_ends_in_clear_water_goes_on_for_ever():
+    column = WaterColumn.from_text("0, 2", "0.5, 0", "0", "0")
+    flight = LayeredFlight(column)
+    # 0.5 per metre over 2 m straight down is an optical depth of 1 and never more.
+    distance = np.array(flight.distance(mi.Float(0, 0, 3), mi.Float(1, 1, 1), mi.Float(0.9, 1.1, 0.1)))
+    np.testing.assert_allclose(distance, [1.8, np.inf, np.inf], rtol=1e-6)
+    clear = LayeredFlight(WaterColumn.from_text("0", "0", "0", "0"))
+    assert float(clear.distance(mi.Float(1), mi.Float(0.5), mi.Float(0.1))[0]) == np.inf
+    assert float(clear.optical_depth(mi.Float(1), mi.Float(0.5), mi.Float(100))[0]) == 0
+
+
+def test_clear_water_above_the_light_lets_it_out():
+    flight = LayeredFlight(WaterColumn.from_text("0, 2", "0, 0.5", "0", "0"))
+    distance = np.array(flight.distance(mi.Float(4, 4), mi.Float(-1, -1), mi.Float(0.9, 1.1)))
+    np.testing.assert_allclose(distance, [1.8, np.inf], rtol=1e-6)
+
+
+def test_equal_layers_are_one():
+    one = LayeredFlight(WaterColumn.from_text("0", "0.4", "0.2", "0.01"))
+    many = LayeredFlight(WaterColumn.from_text("0, 1, 1.5, 4", "0.4", "0.2", "0.01"))
+    rng = np.random.default_rng(3)
+    depth, downward, drawn = (mi.Float(v) for v in (6 * rng.random(1000), 2 * rng.random(1000) - 1, rng.random(1000)))
+    first, second = (np.array(flight.distance(depth, downward, drawn)) for flight in (one, many))
+    # Slopes down to 1e-3 in float32 depths of some metres.
+    np.testing.assert_allclose(first, second, rtol=2e-3)
+    assert np.median(np.abs(second / first - 1)) < 1e-6
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_a_layer_owns_its_upper_edge_and_the_first_one_the_crests(name):
+    column = COLUMNS[name]
+    flight = LayeredFlight(column)
+    layer_tops = column.layer_tops.astype(np.float32)
+    depths = np.concatenate([layer_tops, np.nextafter(layer_tops[1:], np.float32(-1)), [-1.0, 1e4]]).astype(np.float32)
+    expected = np.concatenate([np.arange(column.count), np.arange(column.count - 1), [0, column.count - 1]])
+    layer = flight.layer_at(mi.Float(depths))
+    np.testing.assert_array_equal(np.broadcast_to(np.array(layer), expected.shape), expected)
+    np.testing.assert_allclose(np.array(flight.attenuation(layer)), column.attenuation[expected[: len(layer)]])
+    np.testing.assert_allclose(np.array(flight.albedo(layer)), column.albedo[expected[: len(layer)]], rtol=1e-6)

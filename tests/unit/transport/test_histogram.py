@@ -1,0 +1,88 @@
+"""Histogram of a pass: bins, exact sums, values that are not finite, and its largest size."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.transport.histogram import TransientHistogram
+
+#: Path length of light that arrives in the first bin [m].
+FIRST = mi.Float(1390.1e-9 * C0)
+
+
+def histogram(bins, shape=(1,), emitted=2.0**26):
+    return TransientHistogram(TimeAxis(1390.0, 0.5, bins), shape, emitted)
+
+
+def test_bins_are_half_open():
+    """Bins of 2 m of path from 0, so that edges are exact: an edge belongs to the later bin."""
+    axis = TimeAxis(0.0, 2e9 / C0, 4)
+    sums = TransientHistogram(axis, (2,), 2.0**26)
+    below = np.nextafter(np.float32([2, 8]), np.float32(0))
+    lengths = mi.Float([0, 2, 4, below[0], below[1], 8, -1e-3, np.nan, np.inf])
+    energies = mi.Float([1, 10, 100, 1000, 1e4, 1e5, 1e5, 1e5, 1e5])
+    sums.add(mi.UInt32(1), lengths, energies, mi.Bool(True))
+    np.testing.assert_array_equal(sums.energy(), [[0, 0, 0, 0], [1001, 10, 100, 1e4]])
+    assert axis.path_end == pytest.approx(8)
+    sums.clear()
+    assert not sums.energy().any()
+
+
+def test_inactive_paths_leave_no_trace():
+    sums = histogram(3)
+    sums.add(mi.UInt32(0), FIRST, mi.Float(1.0, 2.0), mi.Bool(False, True))
+    np.testing.assert_array_equal(sums.energy(), [[2, 0, 0]])
+
+
+def test_sums_are_exact():
+    """2^25 ones: a float32 sum stops at 2^24."""
+    sums, count = histogram(2), 2**25
+    sums.add(mi.UInt32(0), FIRST, dr.ones(mi.Float, count), mi.Bool(True))
+    assert sums.energy()[0, 0] == count
+
+
+def test_sums_do_not_depend_on_their_order():
+    """A million energies over 14 decades, in two orders: the same bits, and right to single precision."""
+    energies = np.float32(10.0 ** np.random.default_rng(3).uniform(-14, 0, 2**20))
+    found = []
+    for order in (energies, energies[::-1]):
+        sums = histogram(2, emitted=1e6)
+        sums.add(mi.UInt32(0), FIRST, mi.Float(order), mi.Bool(True))
+        found.append(sums.energy()[0, 0])
+    assert found[0] == found[1]
+    assert found[0] == pytest.approx(energies.astype(np.float64).sum(), rel=1e-6)
+
+
+def test_small_and_large_energies_are_summed_without_bias():
+    """Energies far below the coarse unit would vanish in it, and a shift by half a unit would show."""
+    for emitted, energy in ((1.0, 1e-26), (1.0, 3e-19), (1.0, 1e-17), (1.0, 1e-6), (4.5e-3, 1e-22)):
+        sums = histogram(1, emitted=emitted)
+        spread = np.float32(energy * np.random.default_rng(1).uniform(0.5, 1.5, 2**16))
+        sums.add(mi.UInt32(0), FIRST, mi.Float(spread), mi.Bool(True))
+        assert sums.energy()[0, 0] == pytest.approx(spread.astype(np.float64).sum(), rel=1e-5)
+        assert sums.rounded_energy()[0, 0] == pytest.approx(sums.energy()[0, 0], rel=1e-6)
+
+
+def test_energy_that_is_not_finite_marks_its_bin():
+    sums = histogram(3, (2,), 1.0)
+    times = mi.Float(1390.1e-9 * C0, 1390.1e-9 * C0, 1391.1e-9 * C0)
+    sums.add(mi.UInt32(1), times, mi.Float(np.nan, 0.5, np.inf), mi.Bool(True))
+    for energy in (sums.energy(), sums.rounded_energy()):
+        np.testing.assert_array_equal(energy, [[0, 0, 0], [np.nan, 0, np.nan]])
+
+
+def test_images_have_rows_and_columns():
+    sums = histogram(5, (2, 3))
+    sums.add(mi.UInt32(4), mi.Float(1391.1e-9 * C0), mi.Float(3.0), mi.Bool(True))
+    energy = sums.energy()
+    assert energy.shape == (2, 3, 5)
+    assert energy[1, 1, 2] == energy.sum() == 3
+
+
+def test_histogram_that_would_not_fit_is_refused():
+    with pytest.raises(UserError, match=r"bin_count = 1000000 times 300 pixels must not exceed 268435456"):
+        histogram(1_000_000, (300,))
