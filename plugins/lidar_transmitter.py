@@ -14,11 +14,7 @@ from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
 #: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian.
-_WIDTHS = {
-    "divergence_mrad": 1.0,
-    "divergence_fwhm_mrad": float(np.sqrt(2 * np.log(2))),
-    "divergence_1e2_mrad": 2.0,
-}
+_WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": float(np.sqrt(2 * np.log(2))), "divergence_1e2_mrad": 2.0}
 
 _PROFILES = ("gaussian", "top_hat", "image")
 

@@ -64,10 +64,7 @@ class Retroreflector(mi.BSDF):
         self._concentration = 0.25 / math.sin(0.25 * self.width) ** 2
         self._mass = -math.expm1(-2 * self._concentration)
         front = mi.BSDFFlags.FrontSide.value
-        self.m_components = [
-            mi.BSDFFlags.GlossyReflection.value | front,
-            mi.BSDFFlags.DiffuseReflection.value | front,
-        ]
+        self.m_components = [mi.BSDFFlags.GlossyReflection.value | front, mi.BSDFFlags.DiffuseReflection.value | front]
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def sample(

@@ -220,10 +220,7 @@ def _quantile(values: FloatArray, weight: FloatArray, share: float) -> float:
 def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict[str, FloatArray]) -> dict[str, Any]:
     """Return what one pass tells of one plane, by the names of the result."""
     weight, energy = light.weight, system.transmitter.energy
-    shares = {
-        "transmitted": weight.sum() / energy,
-        "unscattered": weight[light.scatterings == 0].sum() / energy,
-    }
+    shares = {"transmitted": weight.sum() / energy, "unscattered": weight[light.scatterings == 0].sum() / energy}
     if len(weight) == 0:
         unknown = {name: np.full(len(axes[_CURVES[name]]), np.nan) if name in _CURVES else np.nan for name in _MEANING}
         return {**unknown, **shares}

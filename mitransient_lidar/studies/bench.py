@@ -40,10 +40,7 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
             "field_of_view_mrad": "35",
         },
     ),
-    "target": (
-        "fig09_2x2",
-        {"field_of_view_mrad": "35", "bottom_depth": "12", "bin_count": "190"},
-    ),
+    "target": ("fig09_2x2", {"field_of_view_mrad": "35", "bottom_depth": "12", "bin_count": "190"}),
     "imager": ("fig09_2x2", {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}),
 }
 

@@ -64,12 +64,7 @@ def shot_statistics(
     rows: list[dict[str, Any]] = []
     drawn = random_shots(scene, params, sea, count=count, passes=_PASSES, seed=seed, progress=progress)
     for shot, result in drawn:
-        row: dict[str, Any] = {
-            "aim_x": shot.x,
-            "aim_y": shot.y,
-            "slope_along": shot.along,
-            "slope_across": shot.across,
-        }
+        row: dict[str, Any] = {"aim_x": shot.x, "aim_y": shot.y, "slope_along": shot.along, "slope_across": shot.across}
         for name, middle, half in _gates(result):
             row[f"{name}_peak"], row[f"{name}_time"] = highest_points(result, middle - half, middle + half)
         rows.append(row)

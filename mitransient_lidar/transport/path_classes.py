@@ -49,11 +49,7 @@ class PathClasses:
         """Return a packed label, and the numbers of scattering events and reversals (0 where nothing is separated)."""
         if not self.separate:
             return label, mi.UInt32(0), mi.UInt32(0)
-        return (
-            label & ((1 << _PIXEL_BITS) - 1),
-            (label >> _PIXEL_BITS) & _MOST,
-            label >> (_PIXEL_BITS + _ORDER_BITS),
-        )
+        return (label & ((1 << _PIXEL_BITS) - 1), (label >> _PIXEL_BITS) & _MOST, label >> (_PIXEL_BITS + _ORDER_BITS))
 
     def index(self, pixel: mi.UInt32, order: mi.UInt32, reversals: mi.UInt32) -> mi.UInt32:
         """Return the index of a pixel's class."""

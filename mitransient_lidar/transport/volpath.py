@@ -297,12 +297,7 @@ class PathTracer:
         return dr.select(active, self.scene.water.optical_depth(point, direction, length), 0)
 
     def _evaluate(
-        self,
-        emitter: EmitterDirection,
-        vertex: Vertex,
-        event: ScatteringEvent,
-        active: mi.Bool,
-        direction: mi.Vector3f,
+        self, emitter: EmitterDirection, vertex: Vertex, event: ScatteringEvent, active: mi.Bool, direction: mi.Vector3f
     ) -> ScatterEvaluation:
         """Return value and density of a direction at scattering events and solids."""
         value, pdf = mi.Float(0), mi.Float(0)

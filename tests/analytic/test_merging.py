@@ -13,12 +13,7 @@ from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
-from mitransient_lidar.transport.merging.cells import (
-    Region,
-    SurfaceHeights,
-    WaterCells,
-    WaterGrid,
-)
+from mitransient_lidar.transport.merging.cells import Region, SurfaceHeights, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene

@@ -110,11 +110,7 @@ def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind(wind, d
 
 @pytest.mark.parametrize(
     ("asked", "total"),
-    [
-        ("cox_munk", sum(cox_munk(6.0))),
-        ("spectrum", sum(ElfouhailySpectrum(6.0).slope_variance())),
-        ("0.1", 0.1),
-    ],
+    [("cox_munk", sum(cox_munk(6.0))), ("spectrum", sum(ElfouhailySpectrum(6.0).slope_variance())), ("0.1", 0.1)],
 )
 def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, total):
     _, shape = surface(wind_speed=6.0, slope_variance=asked, **PATCH)

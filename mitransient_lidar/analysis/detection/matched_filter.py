@@ -10,10 +10,7 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, positive
 
 
 def delays(
-    samples: npt.ArrayLike,
-    templates: npt.ArrayLike,
-    delays_ns: npt.ArrayLike,
-    covariance: npt.ArrayLike,
+    samples: npt.ArrayLike, templates: npt.ArrayLike, delays_ns: npt.ArrayLike, covariance: npt.ArrayLike
 ) -> FloatArray:
     """Return the delays [ns] of echoes of unknown height, from the matched filter that fits best, shape (shots,).
 

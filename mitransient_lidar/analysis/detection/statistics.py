@@ -29,11 +29,7 @@ class SampleMoments(NamedTuple):
 
 
 def sample_moments(
-    chain: ReceiverChain,
-    power: npt.ArrayLike,
-    bin_width_ns: float,
-    samples: slice,
-    background: npt.ArrayLike = 0.0,
+    chain: ReceiverChain, power: npt.ArrayLike, bin_width_ns: float, samples: slice, background: npt.ArrayLike = 0.0
 ) -> SampleMoments:
     """Return mean and covariance of some samples of a shot in closed form, in `chain.units` and their square.
 

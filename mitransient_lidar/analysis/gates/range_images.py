@@ -42,11 +42,7 @@ class RangeImage(NamedTuple):
 
 
 def contrast(
-    a: npt.ArrayLike,
-    b: npt.ArrayLike,
-    a_stderr: npt.ArrayLike,
-    b_stderr: npt.ArrayLike,
-    correlation: float = 0.0,
+    a: npt.ArrayLike, b: npt.ArrayLike, a_stderr: npt.ArrayLike, b_stderr: npt.ArrayLike, correlation: float = 0.0
 ) -> Contrast:
     """Return Michelson's contrast (a - b) / (a + b) and Weber's (a - b) / b, with errors to first order.
 

@@ -28,11 +28,7 @@ _REACH = 0.75  # half the window of an echo in a deconvolved record, in echo wid
 
 
 def richardson_lucy(
-    waveforms: npt.ArrayLike,
-    kernel: tuple[int, npt.ArrayLike],
-    *,
-    offset: npt.ArrayLike = 0.0,
-    iterations: int = 50,
+    waveforms: npt.ArrayLike, kernel: tuple[int, npt.ArrayLike], *, offset: npt.ArrayLike = 0.0, iterations: int = 50
 ) -> FloatArray:
     """Deconvolve waveforms by the iteration of Richardson (1972) and Lucy (1974).
 
@@ -124,12 +120,7 @@ def deconvolution_offset(
 
 
 def deconvolved_echo(
-    records: Records,
-    sharp: FloatArray,
-    bins: IntArray,
-    template: Template,
-    flags: IntArray,
-    echo_fwhm_ns: float,
+    records: Records, sharp: FloatArray, bins: IntArray, template: Template, flags: IntArray, echo_fwhm_ns: float
 ) -> Echoes:
     """Measure an echo in records deconvolved by `richardson_lucy`, shape (n, time).
 

@@ -8,14 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.analysis.waveforms.echo_detection import (
-    BoolArray,
-    Echoes,
-    EchoFlag,
-    IntArray,
-    Records,
-    has_echo,
-)
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, Echoes, EchoFlag, IntArray, Records, has_echo
 from mitransient_lidar.core.validation import FloatArray, finite_array, positive
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 
@@ -197,12 +190,7 @@ def _mean(tried: list[_Fit]) -> _Fit:
 
 
 def _fit(
-    model: Model,
-    start: FloatArray,
-    data: _Data,
-    scale: FloatArray,
-    wanted: BoolArray,
-    held: FloatArray | None = None,
+    model: Model, start: FloatArray, data: _Data, scale: FloatArray, wanted: BoolArray, held: FloatArray | None = None
 ) -> _Fit:
     """Fit a model to many windows at once by damped least squares (Levenberg and Marquardt).
 

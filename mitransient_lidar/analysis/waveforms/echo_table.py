@@ -154,11 +154,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     records, geometry = waveforms.records(rows), waveforms.geometry
     width = waveforms.echo_fwhm_ns
     found = find_echoes(
-        records,
-        width,
-        threshold=settings.threshold,
-        contrast=settings.contrast,
-        earliest_ns=waveforms.quiet_until_ns,
+        records, width, threshold=settings.threshold, contrast=settings.contrast, earliest_ns=waveforms.quiet_until_ns
     )
     time = records.time_ns
     surface, target, bottom = found.bins

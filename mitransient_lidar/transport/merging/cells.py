@@ -148,13 +148,7 @@ class WaterGrid:
     """
 
     def __init__(
-        self,
-        scene: LidarScene,
-        heights: SurfaceHeights,
-        width: float,
-        growth: float,
-        thickness: float,
-        depth: float,
+        self, scene: LidarScene, heights: SurfaceHeights, width: float, growth: float, thickness: float, depth: float
     ) -> None:
         self.heights = heights
         self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)

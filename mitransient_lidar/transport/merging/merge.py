@@ -34,12 +34,7 @@ def store_points(segments: SegmentBuffer, count: int, cells: WaterCells, classes
 
 
 def merge_in_water(
-    scene: LidarScene,
-    record: PassRecord,
-    points: SegmentPoints,
-    cells: WaterCells,
-    photons: PhotonMap,
-    u: mi.Float,
+    scene: LidarScene, record: PassRecord, points: SegmentPoints, cells: WaterCells, photons: PhotonMap, u: mi.Float
 ) -> None:
     """Merge points of the receiver's paths with the light in their cells.
 

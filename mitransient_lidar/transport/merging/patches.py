@@ -92,12 +92,7 @@ class SolidPatches:
     buckets = 1 << (2 * _BUCKET_BITS)
 
     def __init__(
-        self,
-        scene: LidarScene,
-        region: Region,
-        width: float,
-        shift: mi.Point2f,
-        uneven: Sequence[mi.Shape] = (),
+        self, scene: LidarScene, region: Region, width: float, shift: mi.Point2f, uneven: Sequence[mi.Shape] = ()
     ) -> None:
         self.scene = scene
         self.width = opaque(width)

@@ -153,10 +153,7 @@ def changed(value):
         (lambda: detect_waveforms(make().transpose("time", "pixel"), CHAIN), r"dimensions \('time', 'pixel'\)"),
         (lambda: detect_waveforms(make().drop_vars("time"), CHAIN), "no coordinate time"),
         (lambda: detect_waveforms(make().drop_vars("pixel"), CHAIN), "no coordinate pixel"),
-        (
-            lambda: detect_waveforms(without(make(bins=1), attribute="bin_width_ns"), CHAIN),
-            "no attribute bin_width_ns",
-        ),
+        (lambda: detect_waveforms(without(make(bins=1), attribute="bin_width_ns"), CHAIN), "no attribute bin_width_ns"),
         (lambda: detect_waveforms(changed(np.nan), CHAIN), "waveform has 1 values that are not finite"),
         (lambda: detect_waveforms(changed(-1e-9), CHAIN), "waveform holds -1e-09 W"),
         (lambda: detect_waveforms(make(), CHAIN, shots=0), "shots = 0"),

@@ -13,10 +13,7 @@ from mitransient_lidar.transport.daylight.scene import DaylightScene
 from mitransient_lidar.transport.scene import LidarScene
 
 FEW = {"paths_per_pass": 1024}
-INTEGRATORS = {
-    "lidar_volpath": FEW,
-    "lidar_merging": {**FEW, "photons_per_pass": 1024},
-}
+INTEGRATORS = {"lidar_volpath": FEW, "lidar_merging": {**FEW, "photons_per_pass": 1024}}
 
 
 def scene_with(lidar_scene, name, depth=8.0):

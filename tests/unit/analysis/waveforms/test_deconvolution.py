@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.analysis.waveforms.deconvolution import (
-    deconvolution_offset,
-    deconvolved_echo,
-    richardson_lucy,
-)
+from mitransient_lidar.analysis.waveforms.deconvolution import deconvolution_offset, deconvolved_echo, richardson_lucy
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 

@@ -69,11 +69,7 @@ def elfouhaily_written_out(wind):
 
 @pytest.mark.parametrize(
     ("wind", "height", "wavelength", "up", "cross"),
-    [
-        (3, 0.232, 8.2, 0.01545, 0.00998),
-        (6, 0.937, 32.7, 0.02170, 0.01478),
-        (10, 2.633, 90.8, 0.03551, 0.02480),
-    ],
+    [(3, 0.232, 8.2, 0.01545, 0.00998), (6, 0.937, 32.7, 0.02170, 0.01478), (10, 2.633, 90.8, 0.03551, 0.02480)],
 )
 def test_elfouhaily_totals(wind, height, wavelength, up, cross):
     spectrum = ElfouhailySpectrum(wind)
