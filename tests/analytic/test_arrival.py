@@ -12,6 +12,8 @@ from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.transport.histogram import TransientHistogram
 
 BIN_NS = 0.25
 #: A pencil beam from 200 m: across 0.1 mrad the arrival at 20 degrees changes by 0.05 ns, evenly about the mean.
@@ -147,12 +149,11 @@ def test_plate_in_the_air_without_any_water(lidar_scene, passes):
 
 
 def test_bins_are_half_open_and_their_sum_is_the_energy():
-    film = mi.load_dict({"type": "time_gated_film", "time_start_ns": 0.0, "bin_width_ns": 1.0, "bin_count": 4})
-    film.prepare_pixels(2, 128.0)
+    histogram = TransientHistogram(TimeAxis(0.0, 1.0, 4), (2,), emitted=128.0)
     metre = 299792458e-9  # optical length of 1 ns
     times = np.array([-0.001, 0.0, 0.999, 1.001, 2.5, 3.999, 4.001, np.nan])
-    film.add_transient(mi.UInt32(1), mi.Float(times * metre), mi.Float(np.arange(1.0, 9.0)), mi.Bool(True))
-    assert film.energy().tolist() == [[0, 0, 0, 0], [2 + 3, 4, 5, 6]]
+    histogram.add(mi.UInt32(1), mi.Float(times * metre), mi.Float(np.arange(1.0, 9.0)), mi.Bool(True))
+    assert histogram.energy().tolist() == [[0, 0, 0, 0], [2 + 3, 4, 5, 6]]
 
 
 def test_bins_sum_to_a_film_of_one_bin(lidar_scene, passes):

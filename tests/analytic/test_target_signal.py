@@ -42,7 +42,7 @@ def test_near_pixels_hold_the_published_target(published):
 
 def test_best_weights_are_no_worse_than_the_sum_or_any_pixel(published):
     snr = published["combined_detectability"].sel(combination="best")
-    assert snr >= published["combined_detectability"].sel(combination="whole")
+    assert snr >= published["combined_detectability"].sel(combination="sum")
     assert snr >= published["detectability"].max()
 
 
@@ -65,17 +65,17 @@ def test_target_shades_the_bottom_behind_it(published):
 
 def test_map_moves_the_target():
     maps = target_map("fig13_2x2", NEAR, x=(0.0, 2.0), y=(-1.0, 1.0), passes=16, integrator=SMALL)
-    far = maps["echo"].sel(pixel=["red", "green"]).sum("pixel") / maps["combined_echo"].sel(combination="whole")
+    far = maps["echo"].sel(pixel=["red", "green"]).sum("pixel") / maps["combined_echo"].sel(combination="sum")
     # Farther away it is seen by the far pixels, and to one side by the pixels of that side.
     assert np.all(far.sel(target_x=2.0) > far.sel(target_x=0.0) + 0.2)
-    left = maps["echo"].sel(pixel=["red", "blue"]).sum("pixel") / maps["combined_echo"].sel(combination="whole")
+    left = maps["echo"].sel(pixel=["red", "blue"]).sum("pixel") / maps["combined_echo"].sel(combination="sum")
     assert np.all(left.sel(target_y=-1.0) > left.sel(target_y=1.0) + 0.3)
     assert len(describe_map(maps)) == 5
 
 
-def test_table_tells_pixels_and_combinations(published):
+def test_table_lists_pixels_and_combinations(published):
     lines = describe_target(published)
-    assert [line.split()[0] for line in lines[2:]] == ["red", "green", "blue", "black", "whole", "best"]
+    assert [line.split()[0] for line in lines[2:]] == ["red", "green", "blue", "black", "sum", "best"]
     assert lines[-2].split()[4] == "100.0"
 
 
@@ -89,7 +89,7 @@ def test_table_tells_pixels_and_combinations(published):
         ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
     ],
 )
-def test_mistakes_are_told(scene, params, options, message):
+def test_invalid_input_is_refused(scene, params, options, message):
     with pytest.raises(UserError, match=message):
         target_signal(scene, {**NEAR, **params}, passes=16, integrator=SMALL, **options)
 

@@ -9,6 +9,7 @@ import time
 import mitsuba as mi
 import numpy as np
 import pytest
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -238,22 +239,31 @@ def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite()
     assert errors.tolist() == [1, 0.5, 0.25, 1, np.inf, 1]
 
 
-@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
-def test_twice_the_paths_half_the_variance(integrator):
-    """Over three doublings the variance of the total falls as 1/n: 8 times less, limits from the F distribution."""
-    totals = []
-    for paths in (2**12, 2**15):
+@pytest.mark.slow
+@pytest.mark.parametrize(("integrator", "fastest"), [("lidar_volpath", 8), ("lidar_merging", 64)])
+def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, fastest):
+    """Logarithm of the ratio of variances, averaged over gates of late light, with its jackknife error.
+
+    Merging counts pairs of a photon and a point, of which there are 64 times as many: where pairs are rare, its
+    variance falls faster than that of paths.
+    """
+    groups, variances = 32, []
+    for paths in (2**11, 2**14):
         photons = {"photons_per_pass": paths} if integrator == "lidar_merging" else {}
         engine = mi.load_dict({"type": integrator, "paths_per_pass": paths, **photons})
         scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
         renderer = engine.prepare(scene, scene.sensors()[0])
         # Late light only: surface echo and early column are stratified and fall faster.
-        total = [renderer.render_pass(seed).histogram.energy()[:, 60:].sum() for seed in range(64)]
-        totals.append(np.var(total, ddof=1))
-    from scipy.stats import f
-
-    low, high = f.interval(0.9999, 63, 63)
-    assert 8 * low < totals[0] / totals[1] < 8 * high * 2
+        energy = np.array([renderer.render_pass(seed).histogram.energy()[:, 60:140] for seed in range(8 * groups)])
+        gates = energy.reshape(groups, 8, 32, 10).sum(axis=-1)
+        left_out = [np.delete(gates, group, axis=0).reshape(-1, 32) for group in range(groups)]
+        variances.append([sample.var(axis=0, ddof=1) for sample in left_out])
+    ratios = np.log(np.divide(*variances)).mean(axis=1)
+    error = np.sqrt((groups - 1) * ratios.var())
+    print("RATIO", np.exp(ratios.mean()), error)
+    assert error < 0.06
+    limit = largest_z(groups) * error
+    assert np.log(8) - limit < ratios.mean() < np.log(fastest) + limit
 
 
 MISTAKES = [
