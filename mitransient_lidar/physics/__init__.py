@@ -1,1 +1,4 @@
-"""Physics of depth-sounding lidar in NumPy."""
+"""Formulas and tables in NumPy.
+
+Arguments outside the ranges in their descriptions raise `core.errors.UserError`; sections Raises list other causes.
+"""

@@ -74,11 +74,6 @@ def clear_sky_irradiance(
     pressure_hpa : float
         Pressure at sea level [hPa], 0 (no Rayleigh scattering) to 1100.
 
-    Raises
-    ------
-    UserError
-        If a parameter is out of range.
-
     Notes
     -----
     Model of Gregg and Carder (1990, doi:10.4319/lo.1990.35.8.1657) for cloudless maritime atmospheres, at one
@@ -131,11 +126,6 @@ def background_power(radiance: npt.ArrayLike, etendue: npt.ArrayLike, filter_wid
     -------
     ndarray
         Power [W].
-
-    Raises
-    ------
-    UserError
-        If the width is not positive or a value not finite.
     """
     width = positive("filter_width_nm", filter_width_nm)
     return np.asarray(finite_array("radiance", radiance) * finite_array("etendue", etendue) * width)

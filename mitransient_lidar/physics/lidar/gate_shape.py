@@ -60,11 +60,6 @@ class GateShape:
         rise_ns, fall_ns : float
             10-90 % times of the edges [ns], at least 0; the gate must reach 1 between them:
             rise_ns + fall_ns at most 1.18 width_ns.
-
-        Raises
-        ------
-        UserError
-            If a time is out of range.
         """
         width = positive("width_ns", width_ns)
         rise, fall = non_negative("rise_ns", rise_ns), non_negative("fall_ns", fall_ns)
@@ -87,11 +82,6 @@ class GateShape:
             maximum at 0.
         transmission : array_like, shape (S,)
             Transmission, 0 to 1, not all 0.
-
-        Raises
-        ------
-        UserError
-            If the samples do not have this form.
         """
         t, g = time_samples(times_ns, "transmission", transmission)
         if g.min() < 0 or g.max() > 1:

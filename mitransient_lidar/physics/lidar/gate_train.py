@@ -81,11 +81,6 @@ class GateTrain:
         Pulses that each gate accumulates, 1 to 10^9.
     profile : GateShape, optional
         Measured gate instead of raised-cosine edges; `width_ns`, `rise_ns` and `fall_ns` must equal its own values.
-
-    Raises
-    ------
-    UserError
-        If a value is out of range.
     """
 
     start_ns: float
@@ -159,11 +154,6 @@ class GateTrain:
             First bin that the gate overlaps.
         weights : ndarray, shape (M,)
             Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the record.
-
-        Raises
-        ------
-        UserError
-            If an argument is out of range.
         """
         start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
         bins = integer("bin_count", bin_count, 1, _MOST_BINS)
@@ -242,11 +232,6 @@ def time_of_depth(depth_m: npt.ArrayLike, surface_time_ns: float, group_index: f
     -------
     ndarray
         Time [ns], surface_time + 2 n_g depth / (c0 cos_water).
-
-    Raises
-    ------
-    UserError
-        If an argument is out of range.
     """
     delay = finite_array("depth_m", depth_m) / _speed(group_index, cos_water)
     return np.asarray(finite("surface_time_ns", surface_time_ns) + delay)

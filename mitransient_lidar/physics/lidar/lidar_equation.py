@@ -30,11 +30,6 @@ class LidarSystem:
         Refractive index of the water, which determines the directions of rays, at least 1.
     group_index : float
         Group index of the water, which determines travel times, at least 1.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
     """
 
     height: float

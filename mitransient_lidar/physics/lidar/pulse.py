@@ -56,11 +56,6 @@ class Pulse:
             Strictly increasing times [ns], at least 2. They are shifted so that the (first) largest sample is at 0.
         power : array_like, shape (S,)
             Power in any unit, not negative, not all 0. It is scaled to unit area.
-
-        Raises
-        ------
-        UserError
-            If the samples do not have this form.
         """
         t, p = time_samples(times_ns, "power", power)
         if np.any(p < 0):
@@ -109,11 +104,6 @@ class Pulse:
         weights : ndarray, shape (M,)
             weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m: exact
             integrals over the bins, truncated where less than 1e-10 lies outside, with the sum 1.
-
-        Raises
-        ------
-        UserError
-            If the bin width is not positive or the response time negative.
         """
         dt = positive("bin_width_ns", bin_width_ns)
         tau = non_negative("response_time_ns", response_time_ns)

@@ -64,11 +64,6 @@ def refracted_path(
     -------
     theta, phi : ndarray
         Angles from the vertical [rad] in air and water that solve H tan(theta) + D tan(phi) = rho.
-
-    Raises
-    ------
-    UserError
-        If a height is not positive, a depth negative, or n below 1.
     """
     in_range("n", n, 1, np.inf)
     rho, h, d = np.broadcast_arrays(

@@ -36,11 +36,6 @@ class BeamSpread:
         Mean fourth power <Theta^4> of the scattering angle [rad^4], at least 0. It adds the spread of single
         scatterings to the variance of the delays; the default, 0, is the limit of many weak ones, in which k = 1.5.
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
-
     Notes
     -----
     McLean, Freeman and Walker (1998), Appl. Opt. 37, 4701, doi:10.1364/AO.37.004701: the irradiance is
@@ -129,11 +124,6 @@ class BeamSpread:
         ndarray
             T (1 - 2 (x/2)^k K_k(x)/Gamma(k)), from 0 to T, without the unscattered light. T is the transmittance,
             x = R sqrt(3 (beta + a v)/(v z)), K a modified Bessel function.
-
-        Raises
-        ------
-        UserError
-            If a radius is negative.
         """
         from scipy.special import gamma, kv
 

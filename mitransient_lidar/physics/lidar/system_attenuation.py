@@ -30,11 +30,6 @@ def system_attenuation(attenuation: npt.ArrayLike, kd: npt.ArrayLike, spot_diame
         K = Kd + (c - Kd) exp(-0.85 c D) [1/m], of the broadcast shape of the parameters. Without its geometric
         factors the signal is proportional to exp(-2 K s) with the distance s in the water.
 
-    Raises
-    ------
-    UserError
-        If a value is negative or not finite, or kd exceeds attenuation.
-
     Notes
     -----
     Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996, solved the transfer by Monte Carlo for a level sea.

@@ -35,11 +35,6 @@ def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
         Dead time [ns], at least the width of a bin. One that is longer than the record leaves only the first count.
     bin_width_ns : float
         Width of the bins [ns], positive.
-
-    Raises
-    ------
-    UserError
-        If a time is not positive or the dead time is shorter than a bin.
     """
     tau, width = positive("dead_time_ns", dead_time_ns), positive("bin_width_ns", bin_width_ns)
     if tau < width:

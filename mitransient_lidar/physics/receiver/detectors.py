@@ -56,11 +56,6 @@ def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
     float
         F = k M + (1 - k) (2 - 1/M).
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
-
     Notes
     -----
     R. J. McIntyre, IEEE Trans. Electron Devices 13, 164 (1966), doi:10.1109/T-ED.1966.15651.
@@ -113,11 +108,6 @@ class LinearDetector:
         Multiplied dark current, before the multiplication [nA]: the anode's dark current over the gain.
     leakage_current_na : float
         Unmultiplied dark current [nA], such as the surface current of an avalanche photodiode.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
 
     Notes
     -----
@@ -197,11 +187,6 @@ class SiliconPhotomultiplier:
         Mean charge of an avalanche in electrons, at least 1.
     gain_spread : float
         Standard deviation of the charge over its mean, at least 0.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
 
     Notes
     -----
@@ -285,11 +270,6 @@ class SinglePhotonDetector:
         Dark counts [1/s], at least 0.
     paralyzable : bool
         Whether an event in the dead time prolongs it.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
 
     Notes
     -----

@@ -49,11 +49,6 @@ class Amplifier:
     limit_v : float or None
         Largest output of either sign [V], positive; None for no limit.
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
-
     Notes
     -----
     Thermal noise: J. B. Johnson and H. Nyquist, Phys. Rev. 32, 97 and 110 (1928), doi:10.1103/PhysRev.32.110.
@@ -111,11 +106,6 @@ class LogAmplifier:
     knee_v : float
         Input below which the output is linear [V], positive.
 
-    Raises
-    ------
-    UserError
-        If a parameter is not positive.
-
     Notes
     -----
     The output is volts_per_decade asinh(v/(2 knee_v))/ln 10: volts_per_decade log10(v/knee_v) for v well above the
@@ -160,11 +150,6 @@ class Digitiser:
     sampling_ghz : float or None
         Samples per ns, positive. The time between them must be an integer number of the record's bins; None for one
         sample per bin.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
 
     Notes
     -----

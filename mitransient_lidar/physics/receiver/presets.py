@@ -123,11 +123,6 @@ class ReceiverChain:
         -------
         Record
             Signal in `units`, and whether amplifier or digitiser are saturated.
-
-        Raises
-        ------
-        UserError
-            If an argument lies outside its range.
         """
         events = self._events(power, bin_width_ns, background)
         number, start = integer("shots", shots, 1, 10**9), integer("seed", seed, 0, 2**63 - 1)
@@ -162,11 +157,6 @@ class ReceiverChain:
         -------
         Expected
             Moments in `units` and their square.
-
-        Raises
-        ------
-        UserError
-            As for `apply`.
         """
         events = self._events(power, bin_width_ns, background)
         if self.amplifier is None:
@@ -199,11 +189,6 @@ class ReceiverChain:
             Mean above that without signal, over the standard deviation with signal; 0 without signal, infinite
             without noise, and NaN where most samples are saturated. For the mean of n shots it is sqrt(n) times
             larger.
-
-        Raises
-        ------
-        UserError
-            As for `apply`.
         """
         lit = self.expected(power, bin_width_ns, background)
         dark = self.expected(np.zeros(np.shape(power)), bin_width_ns, background)

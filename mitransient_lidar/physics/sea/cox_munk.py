@@ -22,11 +22,6 @@ def cox_munk(wind_speed: float) -> tuple[float, float]:
     upwind, crosswind : float
         Slope variances [1]. At zero wind the regression gives 0.003 crosswind.
 
-    Raises
-    ------
-    UserError
-        If the wind speed lies outside its range.
-
     Notes
     -----
     Cox and Munk (1954), J. Opt. Soc. Am. 44, 838, doi:10.1364/JOSA.44.000838: 3.16e-3 W and 0.003 + 1.92e-3 W.

@@ -27,11 +27,6 @@ def angular_frequency(k: npt.ArrayLike, depth: float = math.inf) -> FloatArray:
     ndarray
         omega [rad/s], of the shape of `k`.
 
-    Raises
-    ------
-    UserError
-        If the depth is not greater than 0.
-
     Notes
     -----
     Linear waves (Lamb 1932, Hydrodynamics, sections 229 and 267): omega^2 = (g k + (T/rho) k^3) tanh(k depth) with

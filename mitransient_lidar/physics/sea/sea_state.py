@@ -100,11 +100,6 @@ class MatchedSpectrum(CosineSpectrum):
     scales : tuple of float
         Factors along and across the direction [1].
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
-
     Notes
     -----
     With the fractions 1/2 +- Delta/4 of the slope variance k^2 S, factors s_u and s_c give

@@ -115,11 +115,6 @@ class SeaSurface:
         ----------
         get
             Function (name, default) -> value.
-
-        Raises
-        ------
-        UserError
-            If a parameter is out of range, or parameters contradict each other.
         """
         spectrum = get("spectrum", "elfouhaily")
         if spectrum not in _SPECTRA:

@@ -32,11 +32,6 @@ class SwellSpectrum(AxialSpectrum):
         Standard deviation of the wavenumber over its mean [1], above 0 up to 0.3.
     directional_spread : float
         Standard deviation of the direction [rad], above 0 up to 0.6.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
     """
 
     height: float

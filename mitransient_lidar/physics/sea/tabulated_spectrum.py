@@ -28,11 +28,6 @@ class TabulatedSpectrum(WaveSpectrum):
     one_sided : bool
         True: `density` is that of waves that travel along (kx, ky). False: it is that of a frozen surface, and all
         waves travel towards the half plane of `direction`.
-
-    Raises
-    ------
-    UserError
-        If the table does not have this form.
     """
 
     kx: FloatArray

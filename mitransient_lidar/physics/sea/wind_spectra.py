@@ -91,11 +91,6 @@ class ElfouhailySpectrum(WindSpectrum):
     direction : float
         Direction the wind blows towards [rad], counter-clockwise from +x.
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
-
     Notes
     -----
     Elfouhaily, Chapron, Katsaros and Vandemark (1997), J. Geophys. Res. 102, 15781, doi:10.1029/97JC00467, with the
@@ -190,11 +185,6 @@ class PiersonMoskowitzSpectrum(SaturatedSpectrum):
     wind_speed, direction : float
         As for `ElfouhailySpectrum`. Below 0.14 m/s there are no gravity waves and the sea is flat.
 
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
-
     Notes
     -----
     Pierson and Moskowitz (1964), J. Geophys. Res. 69, 5181, doi:10.1029/JZ069i024p05181: alpha = 8.1e-3, beta = 0.74
@@ -229,11 +219,6 @@ class JonswapSpectrum(SaturatedSpectrum):
         peak reaches that of the fully developed sea and the growth ends.
     peak_enhancement : float
         gamma, 1 to 7; the mean over the measurements is 3.3.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
 
     Notes
     -----

@@ -34,11 +34,6 @@ def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
     ndarray
         Phase function [1/sr], of the shape of `theta`; infinite at theta = 0.
 
-    Raises
-    ------
-    UserError
-        If n or mu lies outside its range.
-
     Notes
     -----
     Fournier and Forand (1994), Ocean Optics XII, Proc. SPIE 2258, 194, in the form of Fournier and Jonasz (1999),
@@ -152,11 +147,6 @@ def two_term_henyey_greenstein(theta: npt.ArrayLike, weight: float, g_forward: f
         Weight of the forward lobe, 0 to 1.
     g_forward, g_backward : float
         Asymmetry of the lobes, 0 <= g < 1 each; the backward lobe has mean cosine -g_backward.
-
-    Raises
-    ------
-    UserError
-        If a parameter lies outside its range.
     """
     w = in_range("weight", weight, 0, 1)
     for name, g in (("g_forward", g_forward), ("g_backward", g_backward)):

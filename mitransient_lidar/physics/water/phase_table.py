@@ -130,11 +130,6 @@ class PowerLawTable:
             The functions; the result has the nodes of the finest.
         weights : array_like
             Weights, such as scattering coefficients, at least 0 and not all 0.
-
-        Raises
-        ------
-        UserError
-            If a weight is negative, all are 0, or their number differs from that of the tables.
         """
         factors = finite_array("weights", weights)
         if factors.shape != (len(tables),):

@@ -60,11 +60,6 @@ class Profile:
         Absorption a and scattering b at the nodes [1/m], at least 0.
     backscattering : array_like, shape (N,)
         Backscattering bb at the nodes [1/m], from 0 to `scattering`.
-
-    Raises
-    ------
-    UserError
-        If the arrays do not have this form.
     """
 
     depth: FloatArray
@@ -113,11 +108,6 @@ class Profile:
             is larger, except in layers of the least thickness `THINNEST_LAYER`. Vertical optical depths from z = 0 are
             exact at the edges; within a layer they deviate by at most `tolerance`/2 of that layer's own optical depth.
             The last layer, which has no lower edge, begins where the profile becomes constant.
-
-        Raises
-        ------
-        UserError
-            If `tolerance` lies outside its range.
         """
         tolerance = in_range("tolerance", tolerance, 1e-5, 0.5)
         z, (a, b, bb) = self._varying_part()

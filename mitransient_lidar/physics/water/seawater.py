@@ -43,11 +43,6 @@ def refractive_index(
     ndarray
         Index [1], of the broadcast shape.
 
-    Raises
-    ------
-    UserError
-        If a value lies outside its range.
-
     Notes
     -----
     Quan and Fry (1995), Appl. Opt. 34, 3477, doi:10.1364/AO.34.003477. The index relative to air determines refraction
@@ -74,11 +69,6 @@ def group_index(
     ndarray
         n - wavelength dn/dwavelength [1], of the broadcast shape, with the derivative of the same formula. Travel times
         are too short by 0.03 % in all media alike, since air has the index 1 here.
-
-    Raises
-    ------
-    UserError
-        If a value lies outside its range.
     """
     lam, t, s = _state(wavelength_nm, temperature, salinity)
     slope = -(15.868 + 0.01155 * s - 0.00423 * t) / lam**2 + 2 * 4382 / lam**3 - 3 * 1.1455e6 / lam**4
@@ -98,11 +88,6 @@ def water_absorption(wavelength_nm: npt.ArrayLike) -> FloatArray:
     ndarray
         Absorption [1/m], linear between tabulated values 2.5 nm apart. The effects of salt and temperature, which
         matter in the red, are neglected. A later compilation (WOPP v3 of 2016) gives 2 % more at 532 nm.
-
-    Raises
-    ------
-    UserError
-        If a wavelength lies outside its range.
 
     Notes
     -----
@@ -133,11 +118,6 @@ def water_scattering(
     -------
     ndarray
         Scattering [1/m], of the broadcast shape; its authors report agreement with Morel's measurements within 2 %.
-
-    Raises
-    ------
-    UserError
-        If a value lies outside its range.
 
     Notes
     -----
@@ -173,11 +153,6 @@ def water_phase_function(theta: npt.ArrayLike, depolarisation: float = DEPOLARIS
     -------
     ndarray
         Phase function [1/sr], of the shape of `theta`.
-
-    Raises
-    ------
-    UserError
-        If the ratio lies outside its range.
     """
     delta = in_range("depolarisation", depolarisation, 0, 0.2)
     p = (1 - delta) / (1 + delta)

@@ -52,11 +52,6 @@ class InherentProperties:
         Scattering coefficient b [1/m], at least `backscattering`.
     backscattering : float
         Backscattering coefficient bb [1/m], the part of b into the backward hemisphere, at least 0.
-
-    Raises
-    ------
-    UserError
-        If a value is negative or not finite, or bb exceeds b.
     """
 
     absorption: float
@@ -105,11 +100,6 @@ def pure_seawater(
     ----------
     wavelength_nm, temperature, salinity : float
         As in `seawater.water_scattering`: [nm], [degrees C], [per mille].
-
-    Raises
-    ------
-    UserError
-        If a value lies outside its range.
     """
     b = float(water_scattering(wavelength_nm, temperature, salinity))
     return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2)
@@ -163,11 +153,6 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
         Chlorophyll concentration C [mg/m^3], 0.01 to 30.
     wavelength_nm : float
         Wavelength [nm], 400 to 700.
-
-    Raises
-    ------
-    UserError
-        If a value lies outside its range.
 
     Notes
     -----
