@@ -5,7 +5,7 @@ Irradiances and radiances are spectral, per nanometre; zenith angles are degrees
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,6 @@ SUN_RADIUS_DEG = 0.2666
 #: Largest zenith angle of the sun [deg].
 LARGEST_SUN_ZENITH_DEG = 89.0
 
-_WAVELENGTH_UM = 1e-3 * 532.0
-
 #: Extraterrestrial irradiance [W m^-2 nm^-1]: mean over 527 to 537 nm of the table of Gregg and Carder. Fraunhofer
 #: lines make it 4 % more or less within a nanometre.
 _SOLAR_CONSTANT = 1.90
@@ -27,28 +25,19 @@ _SOLAR_CONSTANT = 1.90
 #: Absorption of ozone [1/cm], same table, at 532 nm.
 _OZONE_ABSORPTION = 0.0662
 
-#: Single-scattering albedo of maritime aerosol at a relative humidity of 80 % (their equation 36, air mass type 1).
+#: Single-scattering albedo of maritime aerosol at a relative humidity of 80 % (equation 36, air mass type 1).
 _AEROSOL_ALBEDO = 0.993
 
-#: Pressure [hPa] to which their Rayleigh optical depth belongs.
+#: Pressure [hPa] of the Rayleigh optical depth.
 _SEA_LEVEL_PRESSURE = 1013.25
 
 
-@dataclass(frozen=True)
-class ClearSkyIrradiance:
-    """Irradiance at the sea under a clear sky [W m^-2 nm^-1].
+class ClearSkyIrradiance(NamedTuple):
+    """Irradiance at the sea under a clear sky [W m^-2 nm^-1]."""
 
-    Attributes
-    ----------
-    direct_normal
-        Irradiance of the sun on a plane normal to its rays.
-    direct, diffuse
-        Irradiances of the sun and of the sky on a horizontal plane.
-    """
-
-    direct_normal: float
-    direct: float
-    diffuse: float
+    direct_normal: float  #: Of the sun, on a plane normal to its rays.
+    direct: float  #: Of the sun, on a horizontal plane.
+    diffuse: float  #: Of the sky, on a horizontal plane.
 
 
 def clear_sky_irradiance(
@@ -89,7 +78,7 @@ def clear_sky_irradiance(
     cosine = float(np.cos(np.radians(zenith)))
     air_mass = 1 / (cosine + 0.50572 * (96.07995 - zenith) ** -1.6364)
     ozone_mass = 1.0035 / np.sqrt(cosine**2 + 0.007)
-    lam = _WAVELENGTH_UM
+    lam = 1e-3 * 532.0  # micrometres
     rayleigh = np.exp(-air_mass * pressure / _SEA_LEVEL_PRESSURE / (115.6406 * lam**4 - 1.335 * lam**2))
     aerosol = depth * (lam / 0.55) ** -exponent * air_mass
     absorbed, scattered = np.exp(-(1 - _AEROSOL_ALBEDO) * aerosol), np.exp(-_AEROSOL_ALBEDO * aerosol)
@@ -111,21 +100,16 @@ def _forward_fraction(cosine: float, exponent: float) -> float:
 
 
 def background_power(radiance: npt.ArrayLike, etendue: npt.ArrayLike, filter_width_nm: float) -> FloatArray:
-    """Power of daylight on a detector: P = L (A Omega eta) dlambda.
+    """Power [W] of daylight on a detector, the product of the arguments.
 
     Parameters
     ----------
     radiance : array_like
-        Radiance L [W m^-2 sr^-1 nm^-1].
+        Radiance [W m^-2 sr^-1 nm^-1].
     etendue : array_like
         Open area of the aperture times solid angle of the pixel times transmittance of optics and air [m^2 sr].
     filter_width_nm : float
-        Width dlambda [nm] of the filter, positive: its integral over its peak, which is part of the transmittance.
-
-    Returns
-    -------
-    ndarray
-        Power [W].
+        Width of the filter [nm], positive: its integral over its peak, which is part of the transmittance.
     """
     width = positive("filter_width_nm", filter_width_nm)
     return np.asarray(finite_array("radiance", radiance) * finite_array("etendue", etendue) * width)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.text_tables import read_two_columns
-from mitransient_lidar.core.validation import FloatArray, non_negative, positive, time_samples
+from mitransient_lidar.core.validation import FloatArray, in_range, non_negative, positive, time_samples
 from mitransient_lidar.physics.piecewise_linear import integral
 
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
@@ -84,9 +84,8 @@ class GateShape:
             Transmission, 0 to 1, not all 0.
         """
         t, g = time_samples(times_ns, "transmission", transmission)
-        if g.min() < 0 or g.max() > 1:
-            bad = g.min() if g.min() < 0 else g.max()
-            raise UserError(f"transmission = {bad:g} must lie between 0 and 1")
+        for extreme in (g.min(), g.max()):
+            in_range("transmission", extreme, 0, 1)
         if g.max() == 0:
             raise UserError("transmission must be greater than 0 somewhere")
         half = g.max() / 2
@@ -99,15 +98,9 @@ class GateShape:
 
     @classmethod
     def from_file(cls, path: str | PathLike[str]) -> GateShape:
-        """Read a measured gate from a text file of two columns, time [ns] and transmission 0 to 1; # starts a comment.
-
-        Raises
-        ------
-        UserError
-            If the file does not hold two columns of numbers, or as for `sampled`.
-        """
+        """Read a measured gate from two columns of a text file, times and transmissions as for `sampled`."""
         table, _ = read_two_columns(path, "time in ns and transmission")
-        return cls.sampled(table[:, 0], table[:, 1])
+        return cls.sampled(*table.T)
 
     @property
     def span_ns(self) -> tuple[float, float]:

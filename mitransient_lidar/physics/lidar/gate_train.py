@@ -29,23 +29,13 @@ from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 #: Points of a table of weights per shortest time scale, and largest number of points.
 _POINTS, _LONGEST_TABLE = 128, 2**18
 
-_MOST_BINS = 10**9
-
 
 class ResponseTable(NamedTuple):
-    """Weight of an ideal echo in the first gate against its arrival time.
+    """Weight of an ideal echo in the first gate against its arrival time."""
 
-    Attributes
-    ----------
-    start_ns, step_ns : float
-        Arrival time of the first value and time between values [ns].
-    values : ndarray, shape (N,)
-        Weights, 0 to 1; 0 at both ends.
-    """
-
-    start_ns: float
-    step_ns: float
-    values: FloatArray
+    start_ns: float  #: Arrival time of the first value [ns].
+    step_ns: float  #: Time between values [ns].
+    values: FloatArray  #: Weights, shape (N,), 0 to 1; 0 at both ends.
 
     @property
     def end_ns(self) -> float:
@@ -156,7 +146,7 @@ class GateTrain:
             Exact means of the transmission over bins first to first + M - 1; M is 0 for a gate outside the record.
         """
         start, width = finite("time_start_ns", time_start_ns), positive("bin_width_ns", bin_width_ns)
-        bins = integer("bin_count", bin_count, 1, _MOST_BINS)
+        bins = integer("bin_count", bin_count, 1, 10**9)
         opens = self.start_ns + self.step_ns * integer("gate", gate, 0, self.count - 1)
         first, last = (opens + np.array(self.shape.span_ns) - start) / width
         low, high = int(np.clip(np.floor(first), 0, bins)), int(np.clip(np.ceil(last), 0, bins))
@@ -184,7 +174,7 @@ class GateTrain:
         Raises
         ------
         UserError
-            If a time is out of range, or the step would need more than 2^18 values.
+            If the step needs more than 2^18 values.
         """
         from scipy.signal import fftconvolve
 
@@ -215,7 +205,7 @@ class GateTrain:
 
 
 def time_of_depth(depth_m: npt.ArrayLike, surface_time_ns: float, group_index: float, cos_water: float) -> FloatArray:
-    """Arrival time of an echo on the depth axis.
+    """Arrival time [ns] of an echo on the depth axis, surface_time + 2 n_g depth / (c0 cos_water).
 
     Parameters
     ----------
@@ -227,11 +217,6 @@ def time_of_depth(depth_m: npt.ArrayLike, surface_time_ns: float, group_index: f
         Group index of the water, 1 to 2.
     cos_water : float
         Cosine of the refracted angle of the receiver's axis from the vertical, greater than 0 and at most 1.
-
-    Returns
-    -------
-    ndarray
-        Time [ns], surface_time + 2 n_g depth / (c0 cos_water).
     """
     delay = finite_array("depth_m", depth_m) / _speed(group_index, cos_water)
     return np.asarray(finite("surface_time_ns", surface_time_ns) + delay)
@@ -251,21 +236,11 @@ def _speed(group_index: float, cos_water: float) -> float:
 
 @dataclass(frozen=True)
 class GatePlan:
-    """Gates of a scene: a train without its start, which is given in time or in depth.
-
-    Parameters
-    ----------
-    train
-        Shape, step and number of the gates and pulses; its start does not count.
-    start_ns
-        Half height of the first gate's rising edge [ns], or None.
-    start_depth
-        Depth of the echoes that arrive at that time [m], or None.
-    """
+    """Gates of a scene: a train whose start is replaced by one given in time or in depth."""
 
     train: GateTrain
-    start_ns: float | None = None
-    start_depth: float | None = None
+    start_ns: float | None = None  #: Time of the half height of the first gate's rising edge [ns].
+    start_depth: float | None = None  #: Depth of the echoes that arrive at that time [m], without `start_ns`.
 
     def placed(self, surface_time_ns: float, group_index: float, cos_water: float) -> GateTrain:
         """Return the train with its start; the arguments are those of `time_of_depth`."""

@@ -14,30 +14,14 @@ from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_
 
 @dataclass(frozen=True)
 class LidarSystem:
-    """Co-located transmitter and receiver.
+    """Co-located transmitter and receiver."""
 
-    Parameters
-    ----------
-    height : float
-        Height above the mean sea level [m].
-    off_nadir : float
-        Angle of the axis from the vertical [rad], 0 to below pi/2.
-    energy : float
-        Pulse energy times the efficiencies of both optics and the two-way transmission of the atmosphere [J].
-    aperture_area : float
-        Area of the receiver normal to the ray [m^2].
-    refractive_index : float
-        Refractive index of the water, which determines the directions of rays, at least 1.
-    group_index : float
-        Group index of the water, which determines travel times, at least 1.
-    """
-
-    height: float
-    off_nadir: float
-    energy: float
-    aperture_area: float
-    refractive_index: float = 1.34
-    group_index: float = 1.34
+    height: float  #: Height above the mean sea level [m], positive.
+    off_nadir: float  #: Angle of the axis from the vertical [rad], 0 to below pi/2.
+    energy: float  #: Pulse energy [J], positive, times efficiencies of both optics and two-way transmission of the air.
+    aperture_area: float  #: Area of the receiver normal to the ray [m^2], positive.
+    refractive_index: float = 1.34  #: Refractive index of the water, at least 1, which refracts rays.
+    group_index: float = 1.34  #: Group index of the water, at least 1, which determines travel times.
 
     def __post_init__(self) -> None:
         for name in ("height", "energy", "aperture_area"):
@@ -48,19 +32,12 @@ class LidarSystem:
             in_range(name, getattr(self, name), 1, np.inf)
 
     def water_gain(self, depth: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
-        """Received energy per unit of backscatter at a depth, without attenuation in the water.
+        """Received energy per unit of backscatter [J sr], without attenuation in the water.
 
         Parameters
         ----------
-        depth : array_like
-            Depth [m], at least 0.
-        theta : array_like
-            Angle of the ray in air [rad]; it broadcasts with `depth`.
-
-        Returns
-        -------
-        ndarray
-            Energy over backscatter [J sr].
+        depth, theta : array_like
+            Depth [m], at least 0, and angle of the ray in air [rad], which broadcast.
         """
         _, transmittance = fresnel(theta, self.refractive_index)
         solid_angle = solid_angle_per_area(self.height, depth, theta, self.refractive_index)

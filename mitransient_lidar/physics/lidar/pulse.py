@@ -58,8 +58,7 @@ class Pulse:
             Power in any unit, not negative, not all 0. It is scaled to unit area.
         """
         t, p = time_samples(times_ns, "power", power)
-        if np.any(p < 0):
-            raise UserError(f"power = {p.min():g} must not be negative")
+        non_negative("power", p.min())
         area = np.sum(np.diff(t) * (p[1:] + p[:-1]) / 2)
         if area <= 0:
             raise UserError("power must be greater than 0 somewhere")
@@ -68,15 +67,9 @@ class Pulse:
 
     @classmethod
     def from_file(cls, path: str | PathLike[str]) -> Pulse:
-        """Read a sampled pulse from a text file of two columns, time [ns] and power; # starts a comment.
-
-        Raises
-        ------
-        UserError
-            If the file does not hold two columns of numbers, or as for `sampled`.
-        """
+        """Read a sampled pulse from two columns of a text file, times and powers as for `sampled`."""
         table, _ = read_two_columns(path, "time in ns and power")
-        return cls.sampled(table[:, 0], table[:, 1])
+        return cls.sampled(*table.T)
 
     def cumulative(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Fraction of the energy that has left the transmitter by the times `t_ns` [ns]."""
@@ -146,9 +139,9 @@ def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, Floa
     Parameters
     ----------
     energy : array_like, shape (..., time)
-        Energy per bin [J].
+        Energy per bin [J]; at least one bin.
     bin_width_ns : float
-        Width of the bins [ns], that of the kernel.
+        Width of the bins [ns], positive, that of the kernel.
     kernel : (int, ndarray)
         First lag and weights, from `Pulse.kernel`.
 
@@ -156,11 +149,6 @@ def waveform(energy: npt.ArrayLike, bin_width_ns: float, kernel: tuple[int, Floa
     -------
     ndarray, shape (..., time)
         Mean power in each bin [W]. Energy that the kernel moves past either end of the record is lost.
-
-    Raises
-    ------
-    UserError
-        If the bin width is not positive or `energy` has no time axis.
     """
     from scipy.ndimage import convolve1d
 

@@ -15,7 +15,7 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 
 def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
     """Angle of refraction [rad] in water of relative index `n` >= 1 for angles `theta` [rad] in air."""
-    return np.asarray(np.arcsin(np.sin(_angles(theta)) / in_range("n", n, 1, np.inf)))
+    return np.asarray(np.arcsin(np.sin(finite_array("theta", theta)) / in_range("n", n, 1, np.inf)))
 
 
 def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
@@ -33,7 +33,7 @@ def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
     reflectance, transmittance : ndarray
         They add up to 1; the reflectance is 1 beyond the critical angle.
     """
-    angle = _angles(theta)
+    angle = finite_array("theta", theta)
     cos_i = np.cos(angle)
     sin_t = np.sin(angle) / positive("n", n)
     cos_t = np.sqrt(np.maximum(1 - sin_t**2, 0))
@@ -91,10 +91,8 @@ def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt
     ----------
     height, depth : array_like
         Height of the receiver and depth of the point [m].
-    theta : array_like
-        Angle of the ray in air [rad].
-    n : float
-        Refractive index of the water.
+    theta, n
+        Angle of the ray in air [rad], and refractive index of the water.
 
     Returns
     -------
@@ -103,7 +101,7 @@ def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt
         S_s = n H/cos(theta) + D/cos(phi) and S_t = n H cos(phi)/cos^2(theta) + D cos(theta)/cos^2(phi).
     """
     h, d = np.asarray(height, dtype=np.float64), np.asarray(depth, dtype=np.float64)
-    air, water = np.cos(_angles(theta)), np.cos(snell(theta, n))
+    air, water = np.cos(finite_array("theta", theta)), np.cos(snell(theta, n))
     sagittal = n * h / air + d / water
     tangential = n * h * water / air**2 + d * air / water**2
     return np.asarray(1 / (sagittal * tangential))
@@ -111,9 +109,4 @@ def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt
 
 def surface_time_ns(height: npt.ArrayLike, theta: npt.ArrayLike) -> FloatArray:
     """Two-way time [ns] to the level surface from `height` [m] at the angle `theta` [rad]."""
-    return np.asarray(2e9 * np.asarray(height, dtype=np.float64) / (C0 * np.cos(_angles(theta))))
-
-
-def _angles(theta: npt.ArrayLike) -> FloatArray:
-    """Return finite angles."""
-    return finite_array("theta", theta)
+    return np.asarray(2e9 * np.asarray(height, dtype=np.float64) / (C0 * np.cos(finite_array("theta", theta))))

@@ -12,21 +12,11 @@ from mitransient_lidar.core.validation import FloatArray
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Equal, half-open time bins [start, start + width); time is 0 when the pulse's peak leaves the transmitter.
+    """Equal, half-open time bins [start, start + width); time is 0 when the pulse's peak leaves the transmitter."""
 
-    Parameters
-    ----------
-    start_ns
-        Start of the first bin [ns].
-    bin_width_ns
-        Width of a bin [ns], positive.
-    bin_count
-        Number of bins, at least 1.
-    """
-
-    start_ns: float
-    bin_width_ns: float
-    bin_count: int
+    start_ns: float  #: Start of the first bin [ns].
+    bin_width_ns: float  #: Width of a bin [ns], positive.
+    bin_count: int  #: Number of bins, at least 1.
 
     @property
     def centres_ns(self) -> FloatArray:
