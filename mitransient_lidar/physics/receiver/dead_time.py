@@ -5,8 +5,8 @@ makes tau/dt + 1/2 bins, the firing bin included: the event lies anywhere in its
 fractional part of this number is the probability of one more dead bin. This is the model of Coates (1968) with a dead
 time shorter than the record; the count rate of steady light is correct to second order in the events per bin.
 
-Arrays hold the mean number of events per bin that a live cell would detect, over (..., time). All cells are live at the
-first bin.
+Arrays `events` hold the mean number of events per bin that a live cell would detect, shape (..., time), and
+probabilities have the same shape. All cells are live at the first bin.
 """
 
 from __future__ import annotations
@@ -46,17 +46,7 @@ def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
 def firing_probability(events: FloatArray, dead: DeadBins) -> tuple[FloatArray, FloatArray]:
     """Probabilities that a cell fires and that it is live in each bin, with a non-paralyzable dead time.
 
-    Parameters
-    ----------
-    events : ndarray, shape (..., time)
-        Mean number of events in a live cell.
-    dead : DeadBins
-        From `dead_bins`.
-
-    Returns
-    -------
-    fired, live : ndarray, shape (..., time)
-        fired = live (1 - exp(-events)), and live is 1 minus the probability of firing in the dead bins before.
+    fired = live (1 - exp(-events)), and live is 1 minus the probability of firing in the dead bins before.
 
     Notes
     -----
@@ -75,10 +65,9 @@ def firing_probability(events: FloatArray, dead: DeadBins) -> tuple[FloatArray, 
 
 
 def firing_probability_paralyzable(events: FloatArray, dead: DeadBins) -> FloatArray:
-    """Probability of a count in each bin when every event restarts the dead time, shape (..., time).
+    """Probability of a count in each bin when every event restarts the dead time.
 
-    (1 - exp(-events)) times the probability of no event in the dead bins before; parameters as for
-    `firing_probability`.
+    (1 - exp(-events)) times the probability of no event in the dead bins before.
     """
     mean = np.moveaxis(events, -1, 0)
     total = np.concatenate((np.zeros((1, *mean.shape[1:])), np.cumsum(mean, axis=0)))
@@ -95,10 +84,8 @@ def pair_covariances(
 
     Parameters
     ----------
-    events, dead
-        As for `firing_probability`.
-    fired : ndarray, shape (..., time)
-        Probabilities from `firing_probability` or `firing_probability_paralyzable`.
+    events, dead, fired
+        Arguments and result of `firing_probability`, or of `firing_probability_paralyzable`.
     lags : int
         Number of lags, at least 1.
     paralyzable : bool
@@ -138,10 +125,7 @@ def pair_covariances(
 
 
 def sample_cells(events: FloatArray, cells: int, dead: DeadBins, shots: int, random: np.random.Generator) -> IntArray:
-    """Draw the number of firing cells in each bin of `shots` realisations, shape (shots, ..., time).
-
-    Each of the `cells` has the mean number `events`; `events` and `dead` are as for `firing_probability`.
-    """
+    """Draw the number of firing `cells`, each with the mean `events`, in `shots` records, shape (shots, ..., time)."""
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     fired = np.zeros((len(hit), shots, *hit.shape[1:]), dtype=np.int64)
     live = np.full(fired.shape[1:], cells, dtype=np.int64)
@@ -160,10 +144,7 @@ def sample_cells(events: FloatArray, cells: int, dead: DeadBins, shots: int, ran
 def sample_counter(
     events: FloatArray, dead: DeadBins, paralyzable: bool, shots: int, random: np.random.Generator
 ) -> IntArray:
-    """Draw the counts of a single cell, 0 or 1 in each bin, shape (shots, ..., time).
-
-    Parameters as for `sample_cells`; with `paralyzable` every event restarts the dead time.
-    """
+    """Draw the counts of a single cell, 0 or 1 in each bin, in `shots` records, shape (shots, ..., time)."""
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     fired = np.zeros((len(hit), shots, *hit.shape[1:]), dtype=np.int64)
     free_from = np.zeros(fired.shape[1:], dtype=np.int64)

@@ -41,7 +41,7 @@ def photons_per_joule(wavelength_nm: float) -> float:
 
 
 def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
-    """Excess noise factor of an avalanche photodiode.
+    """Excess noise factor of an avalanche photodiode, F = k M + (1 - k) (2 - 1/M).
 
     Parameters
     ----------
@@ -50,11 +50,6 @@ def avalanche_excess_noise(gain: float, ionisation_ratio: float) -> float:
     ionisation_ratio : float
         Effective ratio k of the ionisation coefficients, that of holes over that of electrons where electrons begin
         the avalanche, 0 to 1.
-
-    Returns
-    -------
-    float
-        F = k M + (1 - k) (2 - 1/M).
 
     Notes
     -----
@@ -70,21 +65,12 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
     Parameters
     ----------
     dynode_gains : sequence of float
-        Mean secondary electrons per electron of each dynode, above 1.
-
-    Returns
-    -------
-    float
-        F = 1 + 1/d_1 + 1/(d_1 d_2) + ...; d/(d - 1) for many equal dynodes.
-
-    Raises
-    ------
-    UserError
-        If there is no dynode or a gain is not above 1.
+        Mean secondary electrons d per electron of each dynode, above 1; at least one dynode.
 
     Notes
     -----
-    Variances of a cascade: W. Shockley and J. R. Pierce, Proc. IRE 26, 321 (1938).
+    F = 1 + 1/d_1 + 1/(d_1 d_2) + ...; d/(d - 1) for many equal dynodes. Variances of a cascade: W. Shockley and J. R.
+    Pierce, Proc. IRE 26, 321 (1938).
     """
     gains = finite_array("dynode_gains", dynode_gains)
     if gains.ndim != 1 or gains.size == 0 or np.any(gains <= 1):

@@ -1,8 +1,4 @@
-"""Receiver electronics: amplifier with noise and bandwidth, logarithmic compression, and digitiser.
-
-`Readout` combines the stages behind the low-pass: it clips, compresses and rounds voltages, and gives the resulting
-mean and variance for a normal distribution. `presets.ReceiverChain` joins detector and electronics.
-"""
+"""Receiver electronics: amplifier with noise and bandwidth, logarithmic compression, and digitiser."""
 
 from __future__ import annotations
 
@@ -99,21 +95,12 @@ class Amplifier:
 class LogAmplifier:
     """Logarithmic compression of voltages of either sign.
 
-    Parameters
-    ----------
-    volts_per_decade : float
-        Increase of the output per decade of the input [V], positive.
-    knee_v : float
-        Input below which the output is linear [V], positive.
-
-    Notes
-    -----
     The output is volts_per_decade asinh(v/(2 knee_v))/ln 10: volts_per_decade log10(v/knee_v) for v well above the
     knee, and smooth at 0, where noise makes the input negative.
     """
 
-    volts_per_decade: float
-    knee_v: float
+    volts_per_decade: float  #: Increase of the output per decade of the input [V], positive.
+    knee_v: float  #: Input below which the output is linear [V], positive.
 
     def __post_init__(self) -> None:
         positive("volts_per_decade", self.volts_per_decade)
@@ -194,19 +181,9 @@ class Digitiser:
 
 @dataclass(frozen=True)
 class Readout:
-    """Stages behind the low-pass of an amplifier: its limits, the logarithm and the digitiser.
+    """Stages behind the low-pass of an amplifier, which clip, compress and round voltages; None leaves one out."""
 
-    Parameters
-    ----------
-    limit_v : float or None
-        Largest voltage of either sign [V]; None for no limit.
-    logarithm : LogAmplifier or None
-        Compression.
-    digitiser : Digitiser or None
-        Rounding and the range of codes.
-    """
-
-    limit_v: float | None = None
+    limit_v: float | None = None  #: Largest voltage of either sign [V].
     logarithm: LogAmplifier | None = None
     digitiser: Digitiser | None = None
 

@@ -1,8 +1,7 @@
 """Receiver chains, from the optical power on a detector to recorded samples with noise, and presets of them.
 
-A `ReceiverChain` has a detector (`detectors`) and electronics (`electronics`). It draws random shots (`apply`) and
-gives their mean and variance in closed form (`expected`, `snr`). Powers are means over time bins; before and after a
-record there is only the background, such as that of `clear_sky.background_power`. `RECEIVERS` holds typical chains.
+Powers are means over time bins; before and after a record there is only the background, such as that of
+`clear_sky.background_power`.
 """
 
 from __future__ import annotations
@@ -49,25 +48,10 @@ class Record(NamedTuple):
 class ReceiverChain:
     """Stages of a receiver, in the order of the signal.
 
-    Parameters
-    ----------
-    detector : LinearDetector, SiliconPhotomultiplier or SinglePhotonDetector
-        The detector; a `SinglePhotonDetector` outputs counts and takes no further stages.
-    amplifier : Amplifier or None
-        Amplifier; None for an output of charge in electrons per bin.
-    logarithm : LogAmplifier or None
-        Logarithmic compression; it requires an amplifier.
-    digitiser : Digitiser or None
-        Digitiser; it requires an amplifier.
-    wavelength_nm : float
-        Vacuum wavelength of the light [nm], positive.
-    source : str
-        Source of the numbers.
-
     Raises
     ------
     UserError
-        If the stages do not fit together or the wavelength is not positive.
+        If the stages do not fit together.
 
     Notes
     -----
@@ -77,12 +61,12 @@ class ReceiverChain:
     third in the variance were found; the shots themselves (`apply`) make no such assumption.
     """
 
-    detector: Detector
-    amplifier: Amplifier | None = None
-    logarithm: LogAmplifier | None = None
-    digitiser: Digitiser | None = None
-    wavelength_nm: float = 532.0
-    source: str = ""
+    detector: Detector  #: A `SinglePhotonDetector` outputs counts and takes no further stages.
+    amplifier: Amplifier | None = None  #: None for an output of charge in electrons per bin.
+    logarithm: LogAmplifier | None = None  #: It requires an amplifier.
+    digitiser: Digitiser | None = None  #: It requires an amplifier.
+    wavelength_nm: float = 532.0  #: Vacuum wavelength of the light [nm], positive.
+    source: str = ""  #: Source of the numbers.
 
     def __post_init__(self) -> None:
         positive("wavelength_nm", self.wavelength_nm)
@@ -146,17 +130,9 @@ class ReceiverChain:
         return record
 
     def expected(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> Expected:
-        """Return mean, variance and probability of saturation of the samples in closed form.
+        """Return mean, variance and probability of saturation of the samples in closed form, in `units`.
 
-        Parameters
-        ----------
-        power, bin_width_ns, background
-            As for `apply`.
-
-        Returns
-        -------
-        Expected
-            Moments in `units` and their square.
+        The arguments are those of `apply`.
         """
         events = self._events(power, bin_width_ns, background)
         if self.amplifier is None:
@@ -176,19 +152,11 @@ class ReceiverChain:
         return self._readout().expected(mean, variance)
 
     def snr(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
-        """Return the signal-to-noise ratio of the samples of one shot.
+        """Return the signal-to-noise ratio of the samples of one shot, shape (..., sample).
 
-        Parameters
-        ----------
-        power, bin_width_ns, background
-            As for `apply`.
-
-        Returns
-        -------
-        ndarray, shape (..., sample)
-            Mean above that without signal, over the standard deviation with signal; 0 without signal, infinite
-            without noise, and NaN where most samples are saturated. For the mean of n shots it is sqrt(n) times
-            larger.
+        The mean above that without signal is divided by the standard deviation with signal: 0 without signal, infinite
+        without noise, and NaN where most samples are saturated. For the mean of n shots the ratio is sqrt(n) times
+        larger. The arguments are those of `apply`.
         """
         lit = self.expected(power, bin_width_ns, background)
         dark = self.expected(np.zeros(np.shape(power)), bin_width_ns, background)

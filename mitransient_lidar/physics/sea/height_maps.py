@@ -1,4 +1,4 @@
-"""Height maps: the elevation of a surface on a rectangular grid, read from a file."""
+"""Height maps: elevations of a surface, read from a file."""
 
 from __future__ import annotations
 
@@ -17,28 +17,17 @@ from mitransient_lidar.physics.piecewise_linear import locate
 #: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
 _UNEVENNESS = 1e-3
 
-_NETCDF_NAMES = ("height", "elevation")
-_EXR_CHANNELS = ("Y", "R", "Z")
-
 _Contents = tuple[Array, dict[str, Array]]
 """Heights, and positions by the names x and y as far as the file has them."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeightMap:
-    """Elevation of a surface on a rectangular grid.
+    """Elevation of a surface on a rectangular grid, evenly spaced along each axis."""
 
-    Attributes
-    ----------
-    heights : ndarray, shape (rows, columns)
-        Elevation [m]; row 0 has the smallest y, column 0 the smallest x.
-    x, y : ndarray, shapes (columns,) and (rows,)
-        Positions of columns and rows [m], evenly spaced, increasing, at least 2 each.
-    """
-
-    heights: FloatArray
-    x: FloatArray
-    y: FloatArray
+    heights: FloatArray  #: Elevation [m], shape (rows, columns); row 0 has the smallest y, column 0 the smallest x.
+    x: FloatArray  #: Positions of the columns [m], increasing, at least 2.
+    y: FloatArray  #: Positions of the rows [m], increasing, at least 2.
 
     def sample(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return the elevation on grid lines by bilinear interpolation.
@@ -163,7 +152,7 @@ def _read_npz(path: Path) -> _Contents:
 
 def _read_exr(path: Path) -> _Contents:
     images = read_exr(path)
-    names = list(images) if len(images) == 1 else [name for name in _EXR_CHANNELS if name in images]
+    names = list(images) if len(images) == 1 else [name for name in "YRZ" if name in images]
     if not names:
         channels = ", ".join(sorted(images))
         raise UserError(f"{path} has the channels {channels}: it must have only one, or one called Y, R or Z.")
@@ -174,7 +163,7 @@ def _read_netcdf(path: Path) -> _Contents:
     variables = read_netcdf(path)
     data = {name: variable for name, variable in variables.items() if not variable.is_coordinate}
     flat = [name for name, variable in data.items() if variable.values.ndim == 2]
-    names = [name for name in _NETCDF_NAMES if name in data] or flat
+    names = [name for name in ("height", "elevation") if name in data] or flat
     if len(names) != 1:
         raise UserError(
             f"{path} has {len(names)} variables that may be the heights: it must have one called height or elevation,"

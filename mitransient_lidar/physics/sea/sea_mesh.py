@@ -15,21 +15,11 @@ _GROWTH = 1.3
 
 @dataclass(frozen=True)
 class SeaMesh:
-    """Triangle mesh of a height field.
+    """Triangle mesh of a height field."""
 
-    Attributes
-    ----------
-    vertices
-        Positions [m], shape (vertices, 3).
-    faces
-        Indices of the corners, counter-clockwise seen from the air, shape (faces, 3).
-    texcoords
-        Coordinates along and across the wind [m], the axes of the ripples, shape (vertices, 2).
-    """
-
-    vertices: FloatArray
-    faces: npt.NDArray[np.uint32]
-    texcoords: FloatArray
+    vertices: FloatArray  #: Positions [m], shape (vertices, 3).
+    faces: npt.NDArray[np.uint32]  #: Indices of the corners, counter-clockwise seen from the air, shape (faces, 3).
+    texcoords: FloatArray  #: Coordinates along and across the wind [m], axes of the ripples, shape (vertices, 2).
 
 
 def grid_indices(cells: int, extent: int) -> IntArray:
@@ -60,6 +50,8 @@ def grid_indices(cells: int, extent: int) -> IntArray:
 def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_direction: float) -> SeaMesh:
     """Return the triangle mesh of heights on grid lines.
 
+    Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.mesh_slope_variance` assumes.
+
     Parameters
     ----------
     heights
@@ -68,11 +60,6 @@ def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_directio
         Positions of the grid lines [m], increasing.
     wind_direction
         Direction of the first texture coordinate [rad], counter-clockwise from +x.
-
-    Returns
-    -------
-    SeaMesh
-        Cells are split along the diagonal from (i+1, j) to (i, j+1), as `realization.mesh_slope_variance` assumes.
     """
     east, north = np.meshgrid(x, y)
     vertices = np.stack([east, north, heights], axis=-1).reshape(-1, 3)

@@ -55,6 +55,7 @@ _SIZE_PER_FOOTPRINT, _SIZE_MARGIN = 1.25, 8.0
 _SPECTRA = ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat")
 
 Get = Callable[[str, Any], Any]
+Wake = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -73,49 +74,23 @@ class PeriodicHeights:
 
 @dataclass(frozen=True)
 class SeaSurface:
-    """A sea surface, ready to be triangulated.
+    """A sea surface with its resolution. Pairs of slope variances are along and across the wind [1]."""
 
-    Attributes
-    ----------
-    spectrum
-        Name of the source of the waves.
-    wind_speed, wind_direction
-        Wind at 10 m [m/s], and direction that it blows towards [rad], counter-clockwise from +x.
-    waves
-        Elevations, None for a flat sea.
-    cell_size
-        Side of the cells of the fine patch [m], infinite for a flat sea.
-    centre
-        Position of the patch [m].
-    refined_size, size
-        Sides of the patch and of the whole surface [m].
-    resolved_variance, ripple_variance
-        Slope variances of the facets and of the ripples, along and across the wind [1].
-    wake
-        Function from grid lines x and y [m] to the heights of a ship's wake [m], None without a ship.
-    """
-
-    spectrum: str
-    wind_speed: float
-    wind_direction: float
-    waves: PeriodicHeights | HeightMap | None
-    cell_size: float
-    centre: tuple[float, float]
-    refined_size: float
-    size: float
-    resolved_variance: tuple[float, float]
-    ripple_variance: tuple[float, float]
-    wake: Callable[[FloatArray, FloatArray], FloatArray] | None
+    spectrum: str  #: Name of the source of the waves.
+    wind_speed: float  #: Wind at 10 m [m/s].
+    wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
+    waves: PeriodicHeights | HeightMap | None  #: Elevations, None for a flat sea.
+    cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
+    centre: tuple[float, float]  #: Position of the patch [m].
+    refined_size: float  #: Side of the patch [m].
+    size: float  #: Side of the whole surface [m].
+    resolved_variance: tuple[float, float]  #: Slope variances of the facets.
+    ripple_variance: tuple[float, float]  #: Slope variances of the ripples.
+    wake: Wake | None  #: Heights of a ship's wake [m] on grid lines x and y [m], None without a ship.
 
     @classmethod
     def read(cls, get: Get) -> SeaSurface:
-        """Build a sea from parameters with the names and meanings of the plugin ``ocean_surface``.
-
-        Parameters
-        ----------
-        get
-            Function (name, default) -> value.
-        """
+        """Build a sea from parameters of the plugin ``ocean_surface``; `get` is a function (name, default) -> value."""
         spectrum = get("spectrum", "elfouhaily")
         if spectrum not in _SPECTRA:
             raise UserError(f"spectrum = {spectrum!r} must be one of {', '.join(_SPECTRA)}")
@@ -161,19 +136,9 @@ class SeaSurface:
                 f"refined_size = {refined_size:g} with cell_size = {cell:g} needs {refined_size / cell:.0f} cells per "
                 f"side but at most {_MOST_CELLS} are allowed"
             )
-        return cls(
-            spectrum if waves is not None else "flat",
-            wind_speed,
-            wind_direction,
-            waves,
-            cell,
-            centre,
-            min(refined_size, size),
-            size,
-            resolved,
-            (along, across),
-            wake,
-        )
+        kind = spectrum if waves is not None else "flat"
+        patch = min(refined_size, size)
+        return cls(kind, wind_speed, wind_direction, waves, cell, centre, patch, size, resolved, (along, across), wake)
 
     @property
     def slope_variance(self) -> float:
@@ -263,10 +228,7 @@ def _with_total_variance(
 def _matched(
     state: WaveSpectrum | None, wind_direction: float, along: float, across: float
 ) -> tuple[WaveSpectrum | None, tuple[float, float]]:
-    """Return a sea state whose wind waves have the given slope variances, and the total with swell.
-
-    Swell adds to the measured variances of the wind; a table is not changed.
-    """
+    """Return a sea state whose wind waves have the slope variances, and the total with swell; a table is unchanged."""
     if state is None:
         return None, (along, across)
     components = _components(state)
@@ -310,7 +272,7 @@ def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, f
     return along, across
 
 
-def _read_wake(get: Get) -> Callable[[FloatArray, FloatArray], FloatArray] | None:
+def _read_wake(get: Get) -> Wake | None:
     """Return the wake of a ship as a function of grid lines, None without a ship."""
     speed = in_range("wake_speed", get("wake_speed", 0.0), 0.0, 40.0)
     bearing = _read_angle(get, "wake_bearing_deg")

@@ -21,18 +21,10 @@ _SMALLEST_LAST_DEG = 170.0
 
 
 class MeasuredPhase(NamedTuple):
-    """A phase function from a table.
+    """A phase function from a table."""
 
-    Attributes
-    ----------
-    table : PowerLawTable
-        The phase function, normalised to 1 over the sphere.
-    integral : float
-        Integral of the given values over the sphere; 1 if they were normalised in 1/sr.
-    """
-
-    table: PowerLawTable
-    integral: float
+    table: PowerLawTable  #: The phase function, normalised to 1 over the sphere.
+    integral: float  #: Integral of the given values over the sphere; 1 if they were normalised in 1/sr.
 
 
 def read_phase_table(path: str | PathLike[str]) -> MeasuredPhase:

@@ -42,21 +42,11 @@ _JERLOV: dict[str, tuple[float, tuple[float, float] | None]] = {
 
 @dataclass(frozen=True)
 class InherentProperties:
-    """Inherent optical properties of water at one wavelength.
+    """Inherent optical properties of water at one wavelength."""
 
-    Parameters
-    ----------
-    absorption : float
-        Absorption coefficient a [1/m], at least 0.
-    scattering : float
-        Scattering coefficient b [1/m], at least `backscattering`.
-    backscattering : float
-        Backscattering coefficient bb [1/m], the part of b into the backward hemisphere, at least 0.
-    """
-
-    absorption: float
-    scattering: float
-    backscattering: float
+    absorption: float  #: Absorption coefficient a [1/m], at least 0.
+    scattering: float  #: Scattering coefficient b [1/m], at least `backscattering`.
+    backscattering: float  #: Backscattering coefficient bb [1/m], the part into the backward hemisphere, at least 0.
 
     def __post_init__(self) -> None:
         for name in ("absorption", "scattering", "backscattering"):
