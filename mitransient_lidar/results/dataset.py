@@ -11,7 +11,6 @@ EXR files round the values to 32 bits and store everything else exactly; NetCDF 
 from __future__ import annotations
 
 import logging
-import math
 import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
@@ -25,6 +24,7 @@ import xarray as xr
 from mitransient_lidar._version import __version__
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.validation import finite, positive
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format, text
@@ -64,22 +64,22 @@ def build(
     grid: tuple[int, int] | None = None,
     attributes: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Label the arrays of a render as a result, see the module's documentation.
+    """Label the arrays of a render as a result.
 
     Non-finite values are kept; a warning lists their pixels.
 
     Parameters
     ----------
     impulse_response, impulse_response_stderr : array-like of shape (pixel, time)
-        Received energy and its standard error. [J per bin]
+        Received energy and its standard error [J per bin].
     waveform, waveform_stderr : array-like of shape (pixel, time)
-        Received power after the pulse and the receiver's response, and its standard error. [W]
+        Received power after the pulse and the receiver's response, and its standard error [W].
     time : TimeAxis
         The time bins.
     pixel_names : sequence of str
         Unique names of the pixels; unused with `grid`.
     pixel_centres_mrad : array-like of shape (pixel, 2)
-        Tangent-plane angles (angle_x, angle_y) of the centres of the pixels. [mrad]
+        Tangent-plane angles (angle_x, angle_y) of the centres of the pixels [mrad].
     grid : tuple of int, optional
         Rows and columns of an imager, with pixels in row-major order.
     attributes : mapping of str to int, float, str or a list of those
@@ -90,12 +90,8 @@ def build(
     ValueError
         If shapes disagree, names repeat, a number is out of range or an attribute has an unsupported type.
     """
-    values = {
-        name: np.array(array, dtype=np.float64)
-        for name, array in zip(
-            _VARIABLES, (impulse_response, impulse_response_stderr, waveform, waveform_stderr), strict=True
-        )
-    }
+    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
+    values = {name: np.array(array, dtype=np.float64) for name, array in zip(_VARIABLES, arrays, strict=True)}
     shape = values["impulse_response"].shape
     if len(shape) != 2 or 0 in shape:
         raise ValueError(f"impulse_response has shape {shape}; it must be (pixel, time) with at least one of each.")
@@ -109,24 +105,17 @@ def build(
         raise ValueError(
             f"pixel_centres_mrad must be {shape[0]} finite pairs (angle_x, angle_y), but has shape {centres.shape}."
         )
-    if not math.isfinite(time.start_ns):
-        raise ValueError(f"time_start_ns = {time.start_ns} must be finite.")
-    if not (math.isfinite(time.bin_width_ns) and time.bin_width_ns > 0):
-        raise ValueError(f"bin_width_ns = {time.bin_width_ns} must be a finite number above 0.")
+    bins = {"time_start_ns": finite("time_start_ns", time.start_ns)}
+    bins["bin_width_ns"] = positive("bin_width_ns", time.bin_width_ns)
 
     coords = pixel_coordinates(pixel_names, centres, grid)
-    dims = coords["angle_x"][0]
-    layout = coords["angle_x"][1].shape
+    dims, layout = coords["angle_x"][0], coords["angle_x"][1].shape
     time_name = "time at the centre of the bin since the pulse's peak left the transmitter"
     coords["time"] = ("time", time.centres_ns, {"units": "ns", "long_name": time_name})
-    bins = {"time_start_ns": float(time.start_ns), "bin_width_ns": float(time.bin_width_ns)}
-
-    _warn_of_non_finite(
-        values,
-        coords["pixel"][1].tolist() if grid is None else [f"({i // grid[1]}, {i % grid[1]})" for i in range(shape[0])],
-    )
+    names = coords["pixel"][1].tolist() if grid is None else [str(divmod(i, grid[1])) for i in range(shape[0])]
+    _warn_of_non_finite(values, names)
     return xr.Dataset(
-        {name: ((*dims, "time"), values[name].reshape(*layout, -1), dict(_VARIABLES[name])) for name in _VARIABLES},
+        {name: ((*dims, "time"), values[name].reshape(*layout, -1), about) for name, about in _VARIABLES.items()},
         coords,
         provenance({**bins, **attributes}),
     )
@@ -192,24 +181,21 @@ def pixel_coordinates(
     """
     centres = np.asarray(pixel_centres_mrad, dtype=np.float64)
     count = len(centres)
-    dims: tuple[str, ...]
-    layout: tuple[int, ...]
     coords: dict[str, Any]
     if grid is None:
         names = [text(name) for name in pixel_names]
         if len(names) != count or len(set(names)) != len(names):
             raise ValueError(f"pixel_names = {names} must be {count} different names, one a pixel.")
-        dims, layout = ("pixel",), (count,)
         coords = {"pixel": ("pixel", np.array(names, dtype=str), {"long_name": "pixel name"})}
     else:
         rows, columns = grid
         if rows < 1 or columns < 1 or rows * columns != count:
             raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
-        dims, layout = ("row", "column"), (rows, columns)
         coords = {
             "row": ("row", np.arange(rows), {"long_name": "row of the image, 0 farthest from nadir"}),
             "column": ("column", np.arange(columns), {"long_name": "column of the image, 0 at the -angle_y edge"}),
         }
+    dims, layout = tuple(coords), grid or (count,)
     where = {"angle_x": "in the plane of incidence, away from nadir", "angle_y": "across the plane of incidence"}
     for axis, (name, direction) in enumerate(where.items()):
         described = {"units": "mrad", "long_name": f"angle of the pixel's centre {direction}"}
@@ -235,14 +221,9 @@ def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a result to an EXR or NetCDF file atomically.
+    """Write a result to an EXR (``.exr``) or NetCDF file (``.nc``) atomically; an existing file is replaced.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result of `build` or `open`; coordinates and, for NetCDF, variables may have been added.
-    path : path
-        File name ending in ``.exr`` or ``.nc``. An existing file is replaced.
+    Coordinates and, for NetCDF, variables may have been added to the result of `build` or `open`.
 
     Raises
     ------

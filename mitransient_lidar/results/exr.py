@@ -21,10 +21,8 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from mitransient_lidar.core.array_files import EXR_SIGNATURE, silence_openexr
+from mitransient_lidar.core.array_files import silence_openexr
 from mitransient_lidar.core.errors import UserError
-
-SIGNATURE = EXR_SIGNATURE
 
 _EXACT = "mitransientLidar"
 _LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
@@ -81,14 +79,7 @@ def write(
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
-    """Read a file of `write`.
-
-    Returns
-    -------
-    stacks : dict of str to dict of str to float32 array
-        Stack name to component name to values of shape (row, column, time).
-    exact : dict
-        The exact metadata.
+    """Read the stacks and the exact metadata from a file of `write`.
 
     Raises
     ------
@@ -115,12 +106,12 @@ def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
 
 
 def header(readable: Mapping[str, Any], exact: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the header attributes of a part.
-
-    They are readable attributes for other programs, as for `write`, and optionally metadata of JSON types that
-    `exact_metadata` returns unchanged.
-    """
-    attributes = {name: _plain(value) for name, value in readable.items() if _is_storable(name, value)}
+    """Return the header attributes of a part from metadata as for `write`; `exact_metadata` returns `exact`."""
+    attributes = {
+        name: _plain(value)
+        for name, value in readable.items()
+        if value != [] and 0 < len(name.encode()) <= _LONGEST_NAME
+    }
     if exact is not None:
         attributes[_EXACT] = json.dumps(exact)
     return attributes
@@ -196,11 +187,6 @@ def _damaged(path: str | os.PathLike[str]) -> str:
     return f"{path} is damaged or truncated: its OpenEXR data cannot be read."
 
 
-def _is_storable(name: str, value: Any) -> bool:
-    """Return whether an OpenEXR header can store the attribute."""
-    return value != [] and 0 < len(name.encode()) <= _LONGEST_NAME
-
-
 def _plain(value: Any) -> Any:
     """Replace numbers beyond 32 bits by text: OpenEXR would store 0 or infinity."""
     if isinstance(value, list):
@@ -208,6 +194,6 @@ def _plain(value: Any) -> Any:
         return [str(item) for item in value] if any(isinstance(item, str) for item in plain) else plain
     if isinstance(value, int):
         return value if _INT32.min <= value <= _INT32.max else str(value)
-    if isinstance(value, float) and _FLOAT32_MAX < abs(value) < float("inf"):
+    if isinstance(value, float) and _FLOAT32_MAX < abs(value) < np.inf:
         return str(value)
     return value

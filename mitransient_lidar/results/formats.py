@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.core.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.results import exr
 
 Format = Literal["exr", "netcdf"]
 
@@ -46,7 +46,7 @@ def input_format(path: str | os.PathLike[str]) -> Format:
             signature = file.read(len(_HDF5_SIGNATURE))
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}.") from error
-    if signature.startswith(exr.SIGNATURE):
+    if signature.startswith(EXR_SIGNATURE):
         return "exr"
     if signature == _HDF5_SIGNATURE:
         return "netcdf"

@@ -5,7 +5,7 @@ channels ``Y`` and ``Y.stderr``. Pixels without a grid form an image one row hig
 ``gateStartNs``, ``gateWidthNs`` and, if known, ``gateDepthM``; the first part also has all other metadata of the stack.
 A sequence is a folder of files with one part each, numbered like the parts.
 
-EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.
+Precision is that of the files of `results.dataset`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _NUMBERED = re.compile(r"(.+)_gate(\d{3,})\.exr", re.IGNORECASE | re.DOTALL)
 
 
 def check_stack(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the gates of a dataset, without a histogram beside them, the dimension ``gate`` last.
+    """Return the gates of a dataset without its time bins, the dimension ``gate`` last.
 
     Raises
     ------
@@ -63,14 +63,9 @@ def check_stack(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def save_stack(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a gate stack to an EXR file, one part per gate, or to a NetCDF file, atomically.
+    """Write a gate stack to an EXR (``.exr``) or NetCDF file (``.nc``) atomically; an existing file is replaced.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A gate stack. A histogram beside the gates is not written; use `results.save` for it.
-    path : path
-        File name ending in ``.exr`` or ``.nc``. An existing file is replaced.
+    Time bins are not written; use `results.save` for them.
 
     Raises
     ------
@@ -95,7 +90,7 @@ def save_sequence(dataset: xr.Dataset, folder: str | os.PathLike[str], stem: str
     Parameters
     ----------
     dataset : xarray.Dataset
-        A gate stack. A histogram beside the gates is not written.
+        A gate stack. Time bins are not written.
     folder : path
         Output folder, created if missing. Existing files of the same names are replaced.
     stem : str
@@ -119,7 +114,8 @@ def save_sequence(dataset: xr.Dataset, folder: str | os.PathLike[str], stem: str
     for path, part in reversed(list(zip(paths, parts, strict=True))):
         with replacing(path) as temporary:
             exr.write_parts(temporary, [part])
-    if stale := sorted({path for path in _numbered(folder) if _stem(path) == stem} - set(paths)):
+    similar = {path for path in folder.iterdir() if (number := _NUMBERED.fullmatch(path.name)) and number[1] == stem}
+    if stale := sorted(similar - set(paths)):
         _LOG.warning("%s does not belong to this sequence of %d gates, but has a similar name", stale[0], len(paths))
     return paths
 
@@ -232,20 +228,12 @@ def _later_files(first: Path, count: int) -> list[exr.Part]:
     return parts
 
 
-def _numbered(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if _NUMBERED.fullmatch(path.name)]
-
-
-def _stem(path: Path) -> str:
-    number = _NUMBERED.fullmatch(path.name)
-    return number[1] if number else ""
-
-
 def _first_of_folder(folder: Path) -> Path:
     try:
-        firsts = sorted(path for path in _numbered(folder) if re.search(r"_gate0+\.exr$", path.name, re.IGNORECASE))
+        numbers = {path: _NUMBERED.fullmatch(path.name) for path in sorted(folder.iterdir())}
     except OSError as error:
         raise UserError(f"cannot read {folder}: {error.strerror}.") from error
+    firsts = [path for path, number in numbers.items() if number and int(number[2]) == 0]
     if len(firsts) == 1:
         return firsts[0]
     if firsts:

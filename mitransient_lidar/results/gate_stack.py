@@ -42,7 +42,7 @@ def train_from_options(
     profile_file: str | PathLike[str] | None = None,
     pulses: int = 1,
 ) -> GateTrain:
-    """Build a gate train from user options.
+    """Build a gate train from command line options.
 
     Parameters
     ----------
@@ -72,21 +72,18 @@ def train_from_options(
         raise UserError(
             f"rise_ns = {rise_ns:g} and fall_ns = {fall_ns:g} must be 0 with a profile, which includes its edges"
         )
-    try:
-        if start_ns is not None and start_depth_m is None:
-            start = start_ns
-        elif start_depth_m is not None and start_ns is None:
-            start = float(LidarGeometry.from_attributes(attributes, surface="measured").time_of_depth(start_depth_m))
-        else:
-            raise UserError("a gate train needs one start: either start_ns or start_depth_m")
-        if profile_file is not None and width_ns is None:
-            profile = GateShape.from_file(profile_file)
-            return GateTrain.measured(profile, start, profile.width_ns if step_ns is None else step_ns, count, pulses)
-        if width_ns is not None and profile_file is None:
-            return GateTrain(start, width_ns, width_ns if step_ns is None else step_ns, count, rise_ns, fall_ns, pulses)
-        raise UserError("a gate train needs one shape: either width_ns or a profile file")
-    except OSError as error:
-        raise UserError(f"cannot read {profile_file}: {error.strerror}") from error
+    if start_ns is not None and start_depth_m is None:
+        start = start_ns
+    elif start_depth_m is not None and start_ns is None:
+        start = float(LidarGeometry.from_attributes(attributes, surface="measured").time_of_depth(start_depth_m))
+    else:
+        raise UserError("a gate train needs one start: either start_ns or start_depth_m")
+    if profile_file is not None and width_ns is None:
+        profile = GateShape.from_file(profile_file)
+        return GateTrain.measured(profile, start, profile.width_ns if step_ns is None else step_ns, count, pulses)
+    if width_ns is not None and profile_file is None:
+        return GateTrain(start, width_ns, width_ns if step_ns is None else step_ns, count, rise_ns, fall_ns, pulses)
+    raise UserError("a gate train needs one shape: either width_ns or a profile file")
 
 
 def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
@@ -105,7 +102,7 @@ def build_gates(
     coords: Mapping[Any, Any],
     attributes: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Label the energies in gates as a gate stack, see the module's documentation.
+    """Label the energies in gates as a gate stack.
 
     Parameters
     ----------
@@ -114,11 +111,8 @@ def build_gates(
         axis, in row-major order.
     train : GateTrain
         The gates.
-    coords : mapping
-        Coordinates of the pixels of a result: ``row``, ``column`` or ``pixel``, and ``angle_x``, ``angle_y``.
-        ``time`` is ignored.
-    attributes : mapping of str to int, float, str or a list of those
-        Attributes of the result.
+    coords, attributes : mapping
+        Coordinates and attributes of a result; the coordinate ``time`` is ignored.
 
     Raises
     ------
@@ -128,18 +122,14 @@ def build_gates(
     pixels = xr.Dataset(coords={name: value for name, value in coords.items() if name != "time"})
     dims = ("row", "column") if "row" in pixels.sizes else ("pixel",)
     shape = tuple(pixels.sizes[dim] for dim in dims)
-    values = {"gate_energy": np.asarray(energy, np.float64), "gate_energy_stderr": np.asarray(stderr, np.float64)}
-    for name, array in values.items():
+    collected = {"long_name": "energy collected while the gate is open", "ancillary_variables": "gate_energy_stderr"}
+    error = {"long_name": "standard error of the energy collected in the gate"}
+    variables = {}
+    for name, values, about in (("gate_energy", energy, collected), ("gate_energy_stderr", stderr, error)):
+        array = np.asarray(values, np.float64)
         if array.shape not in ((*shape, train.count), (math.prod(shape), train.count)):
             raise UserError(f"{name} has shape {array.shape}; it must be {(*shape, train.count)}.")
-    described = {
-        "gate_energy": {
-            "units": "J",
-            "long_name": "energy collected while the gate is open",
-            "ancillary_variables": "gate_energy_stderr",
-        },
-        "gate_energy_stderr": {"units": "J", "long_name": "standard error of the energy collected in the gate"},
-    }
+        variables[name] = ((*dims, "gate"), array.reshape(*shape, train.count), {"units": "J", **about})
     axis = {
         "gate": (np.arange(train.count), {"long_name": "number of the gate"}),
         "gate_start": (train.starts_ns, {"units": "ns", "long_name": "half height of the gate's rising edge"}),
@@ -152,9 +142,7 @@ def build_gates(
             {"units": "m", "long_name": "depth of the middle of the gate", "positive": "down"},
         ),
     }
-    stack = pixels.assign(
-        {name: ((*dims, "gate"), array.reshape(*shape, train.count), described[name]) for name, array in values.items()}
-    ).assign_coords({name: ("gate", array, about) for name, (array, about) in axis.items()})
+    stack = pixels.assign(variables).assign_coords({name: ("gate", *item) for name, item in axis.items()})
     history = str(attributes.get("history", ""))
     stack.attrs = {
         **attributes,

@@ -21,25 +21,13 @@ Attributes = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class LidarGeometry:
-    """Co-located lidar over a level sea.
+    """Co-located lidar over a level sea."""
 
-    Attributes
-    ----------
-    height
-        Height above the mean sea level [m].
-    off_nadir
-        Angle of the axis from the vertical [rad].
-    refractive_index, group_index
-        Indices of the water.
-    surface_time_ns
-        Arrival time of the surface echo [ns], the zero of the depth axis.
-    """
-
-    height: float
-    off_nadir: float
+    height: float  #: Height above the mean sea level [m].
+    off_nadir: float  #: Angle of the axis from the vertical [rad].
     refractive_index: float
     group_index: float
-    surface_time_ns: float
+    surface_time_ns: float  #: Arrival time of the surface echo [ns], the zero of the depth axis.
 
     @classmethod
     def level(cls, height: float, off_nadir: float, refractive_index: float, group_index: float) -> LidarGeometry:
@@ -128,13 +116,8 @@ class LidarGeometry:
     def lidar_system(self, attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
         """Return the system of the lidar equation, with the pulse energy inside the receiver's field of view.
 
-        Parameters
-        ----------
-        attributes
-            Attributes of the result.
-        efficiency
-            Efficiencies of transmitter and receiver times the two-way transmittance of the atmosphere, 0 to 1. By
-            default, from the scene's parameters ``optical_efficiency`` and ``two_way_atmospheric_transmittance``.
+        The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default
+        it follows from the scene's parameters ``optical_efficiency`` and ``two_way_atmospheric_transmittance``.
 
         Raises
         ------

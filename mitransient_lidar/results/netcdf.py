@@ -17,16 +17,9 @@ _LISTS = "mitransient_lidar_lists"  # NetCDF attribute with the names of the att
 
 
 def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], compressed: Collection[str]) -> None:
-    """Write a dataset to a NetCDF-4 file.
+    """Write a dataset, with the large variables `compressed`, to a NetCDF-4 file; an existing one is overwritten.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Its attributes have the types that `formats.attribute` returns.
-    path : path
-        File to write; an existing one is overwritten.
-    compressed : collection of str
-        Names of the large variables.
+    Attributes have the types that `formats.attribute` returns.
 
     Raises
     ------

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.clear_sky import background_power
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.dataset import provenance
+from mitransient_lidar.results.formats import output_format
 
 _UNIT = "W m-2 sr-1 nm-1"
 
@@ -45,10 +45,8 @@ def build_radiance(
         Times of the frames [s], shape (frames,); None for a single image.
     etendue
         Open area times solid angle times transmittance of optics and air of each pixel [m^2 sr], shape (pixels,).
-    coords
-        Coordinates of the pixels, from `dataset.pixel_coordinates`.
-    grid
-        (rows, columns) of an imager, or None.
+    coords, grid
+        Coordinates of the pixels, from `dataset.pixel_coordinates`, and (rows, columns) of an imager, or None.
     filter_width_nm
         Width of the receiver's filter [nm], or None.
     attributes
@@ -83,27 +81,19 @@ def build_radiance(
 
 
 def save_radiance(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write images to a NetCDF file, or to an EXR file with the channels Y and Y.stderr and a part for each frame.
+    """Write images to a NetCDF file (``.nc``), or to an EXR file (``.exr``); an existing file is replaced.
 
-    Parameters
-    ----------
-    dataset
-        A result of `build_radiance`.
-    path
-        File name that ends in ``.nc`` or ``.exr``. An existing file is replaced. Pixels that form no grid are an image
-        one row high.
+    An EXR file has the channels Y and Y.stderr and a part for each frame. Pixels without a grid are an image one row
+    high.
 
     Raises
     ------
     UserError
         If the suffix is another one, or the file cannot be written.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".exr", ".nc"):
-        raise UserError(f"cannot write {path}: the file name must end in .exr or .nc.")
+    file_format = output_format(Path(path))
     with replacing(path) as temporary:
-        if suffix == ".nc":
+        if file_format == "netcdf":
             netcdf.write_netcdf(dataset, temporary, ("radiance", "radiance_stderr"))
         else:
             exr.write_parts(temporary, _parts(dataset))

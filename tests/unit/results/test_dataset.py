@@ -110,7 +110,7 @@ def test_build_turns_numpy_attributes_into_python_ones():
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"time": TimeAxis(0.0, 0.0, 3)}, "bin_width_ns = 0.0 must be a finite number above 0"),
+        ({"time": TimeAxis(0.0, 0.0, 3)}, "bin_width_ns = 0 must be greater than 0"),
         ({"time": TimeAxis(0.0, float("nan"), 3)}, "bin_width_ns = nan"),
         ({"time": TimeAxis(float("inf"), 1.0, 3)}, "time_start_ns = inf must be finite"),
         ({"time": TimeAxis(0.0, 1.0, 4)}, "time has 4 bins; it must have those of impulse_response, 3"),

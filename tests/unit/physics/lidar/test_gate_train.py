@@ -1,14 +1,10 @@
-"""Gates: shapes, trains, weights of echoes, contrast and range images."""
-
-import time
+"""Gates: shapes, trains and weights of echoes."""
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.special import ndtr
-from scipy.stats import binom, chi2, exponnorm, norm
+from scipy.stats import exponnorm, norm
 
-from mitransient_lidar.analysis.gates.range_images import contrast, range_from_gates
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GateTrain, depth_of_time, time_of_depth
 from mitransient_lidar.physics.lidar.pulse import Pulse
@@ -211,128 +207,3 @@ def test_depth_and_time():
         time_of_depth(1.0, 1420, 1.34, 0.0)
     with pytest.raises(ValueError, match=r"group_index = 0\.9 must lie between 1 and 2"):
         time_of_depth(1.0, 1420, 0.9, 1.0)
-
-
-def test_contrast_and_its_error():
-    found = contrast([3.0, 1.0], [1.0, 0.0], [0.2, 0.1], [0.1, 0.1])
-    np.testing.assert_allclose(found.michelson, [0.5, 1.0])
-    np.testing.assert_allclose(found.weber, [2.0, np.nan])
-    # 2/(a+b)^2 sqrt(b^2 0.2^2 + a^2 0.1^2) and sqrt(0.2^2 + (a/b)^2 0.1^2)/b
-    assert found.michelson_stderr[0] == pytest.approx(np.sqrt(0.04 + 0.09) / 8)
-    assert found.weber_stderr[0] == pytest.approx(np.sqrt(0.04 + 0.09))
-    with pytest.raises(ValueError, match="a_stderr = -1 must not be negative"):
-        contrast(1.0, 1.0, -1.0, 1.0)
-
-
-@pytest.mark.parametrize("correlation", [-0.6, 0.0, 0.8])
-def test_contrast_error_is_the_spread(correlation):
-    draws, a, b, sa, sb = 20_000, 5.0, 2.0, 0.05, 0.04
-    covariance = correlation * sa * sb
-    sample = np.random.default_rng(5).multivariate_normal([a, b], [[sa**2, covariance], [covariance, sb**2]], draws)
-    seen, stated = contrast(*sample.T, sa, sb, correlation), contrast(a, b, sa, sb, correlation)
-    # The spread of 20 000 draws is known to 0.5 %; six comparisons at 5 standard errors, and second order below 0.1 %.
-    for name in ("michelson", "weber"):
-        ratio = np.std(getattr(seen, name), ddof=1) / float(getattr(stated, f"{name}_stderr"))
-        assert abs(ratio - 1) < 5 / np.sqrt(2 * draws) + 1e-3
-
-
-MID = 0.5 + 0.25 * np.arange(64)
-
-
-def echoes(depth, decay=0.6, amplitude=6.0, width=0.35):
-    """Energies of an exponential column that ends at an echo, both spread as a Gaussian."""
-    depth = np.asarray(depth)[..., None]
-    column = np.exp(-decay * MID) * ndtr((depth - MID) / width)
-    return column + amplitude * np.exp(-decay * depth) * np.exp(-0.5 * ((MID - depth) / width) ** 2)
-
-
-def test_range_of_a_noiseless_echo():
-    depth = np.random.default_rng(2).uniform(4, 12, 500)
-    energy = echoes(depth)
-    found = range_from_gates(energy, 1e-4 * energy + 1e-9, MID, reach=4)
-    # The column is 8000 times as bright at the top as at the deepest echo. A gate is 0.25 m: taken with the column,
-    # the centroid would lie more than 0.1 m too shallow, and the middle of the strongest gate off by up to 0.125 m.
-    assert np.abs(found.depth - depth).max() < 0.03
-    assert found.confidence.min() > 1 - 1e-9
-
-
-def test_range_is_not_drawn_by_a_column_alone():
-    energy = np.exp(-0.6 * MID)[None]
-    found = range_from_gates(energy, 1e-3 * energy, MID)
-    assert found.confidence[0] < 1e-3
-    # The echo alone
-    found = range_from_gates(energy * 0 + np.exp(-0.5 * ((MID - 9.1) / 0.3) ** 2), 1e-3 * energy, MID, reach=4)
-    assert found.depth[0] == pytest.approx(9.1, abs=1e-3)
-
-
-def test_range_error_is_the_spread():
-    """Over 3000 noise realisations, centroids spread as the stated error says: without a column, where it is exact."""
-    draws, rng = 3000, np.random.default_rng(3)
-    energy = 1000 * np.exp(-0.5 * ((MID - 8.03) / 0.35) ** 2)
-    error = np.full(MID.size, 3.0)
-    found = range_from_gates(energy + error * rng.standard_normal((draws, MID.size)), np.tile(error, (draws, 1)), MID)
-    z = (found.depth - 8.03) / found.sigma
-    # Five gates cut the tails of the echo off, which moves the centroid: compare the spread, not the mean.
-    low, high = chi2.ppf([5e-6, 1 - 5e-6], draws - 1) / (draws - 1)
-    # The floor of the column is the error of the gates: clipped weights shrink the spread by some per cent.
-    assert np.sqrt(low) - 0.1 < np.std(z, ddof=1) < np.sqrt(high)
-    assert abs(np.median(found.depth) - 8.03) < 0.02
-
-
-def test_range_with_a_noisy_column():
-    depth = np.random.default_rng(8).uniform(4, 12, 2000)
-    truth = echoes(depth, amplitude=10.0)
-    error = 0.05 * truth + 1e-5
-    seen = truth + error * np.random.default_rng(9).standard_normal(truth.shape)
-    found = range_from_gates(seen, error, MID, reach=4)
-    off = found.depth - depth
-    assert np.mean(np.abs(off) < 0.3) > 0.995
-    assert 0.5 < np.std((off / found.sigma)[np.abs(off) < 0.3]) < 1.3
-
-
-def test_confidence_in_noise():
-    """Where there is only noise, a confidence above p comes in at most a fraction 1 - p of the pixels."""
-    pixels = 20_000
-    noise = np.random.default_rng(4).standard_normal((pixels, MID.size))
-    found = range_from_gates(noise, np.ones_like(noise), MID)
-    for level in (0.5, 0.9, 0.99):
-        allowed = binom.ppf(1 - 2e-6, pixels, 1 - level)
-        assert np.count_nonzero(found.confidence > level) <= allowed
-    # An echo of 8 standard errors is beyond doubt, one of 1 is not.
-    noise[:, 40] += np.where(np.arange(pixels) % 2 == 0, 12, 1)
-    found = range_from_gates(noise, np.ones_like(noise), MID)
-    assert np.median(found.confidence[::2]) > 0.999
-    assert np.median(found.confidence[1::2]) < 0.5
-
-
-def test_range_without_light_or_with_holes():
-    energy = np.stack([np.zeros(64), echoes(8.0), echoes(8.0)])
-    energy[2, 5] = np.nan
-    found = range_from_gates(energy, np.zeros_like(energy), MID, reach=4)
-    np.testing.assert_array_equal(np.isnan(found.depth), [True, False, True])
-    np.testing.assert_array_equal(found.confidence, [0, 1, 0])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "options", "message"),
-    [
-        ((np.ones((2, 4)), np.ones((2, 5)), np.arange(4)), {}, "must be equal, with the 4 gates"),
-        ((np.ones(2), np.ones(2), np.arange(2)), {}, "2 gates and must have at least 3"),
-        ((np.ones(3), np.ones(3), [0, 2, 1]), {}, "gate_mid must increase strictly"),
-        ((np.ones(3), -np.ones(3), [0, 1, 2]), {}, "stderr = -1 must not be negative"),
-        ((np.ones(9), np.ones(9), np.arange(9)), {"reach": 4}, "reach = 4 must lie between 0 and 3"),
-    ],
-)
-def test_range_refuses_bad_input(arguments, options, message):
-    with pytest.raises(ValueError, match=message):
-        range_from_gates(*arguments, **options)
-
-
-def test_range_of_a_large_image_is_fast():
-    depth = np.random.default_rng(6).uniform(4, 12, (256, 256))
-    energy = echoes(depth)
-    start = time.process_time()
-    found = range_from_gates(energy, 0.05 * energy + 1e-6, MID)
-    assert found.depth.shape == (256, 256)
-    # A loop over pixels would take minutes; this takes 0.3 to 0.7 s.
-    assert time.process_time() - start < 5
