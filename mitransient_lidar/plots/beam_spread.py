@@ -34,19 +34,8 @@ def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -
     """Draw the share of the light at each depth within a radius, a horizontal shift and a delay.
 
     Where the water above is uniform and scatters forwards, the closed form of McLean, Freeman and Walker (1998) is
-    drawn dashed, for the slant path to the depth. Dots are the radii that hold 50 and 90 % of the light.
-
-    Parameters
-    ----------
-    spread : xarray.Dataset
-        A result of `mitransient_lidar.studies.beam_spread.beam_spread`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
+    drawn dashed, for the slant path to the depth. Dots are the radii that hold 50 and 90 % of the light. `spread` is a
+    result of `studies.beam_spread.beam_spread`.
     """
     figure = drawing.new_figure(path, 12.4, 4.4)
     axes = figure.subplots(1, 3, sharey=True)

@@ -16,19 +16,7 @@ def plot_comparison(
 ) -> Figure:
     """Draw two results with bands of two standard errors, and below them their difference in standard errors.
 
-    Parameters
-    ----------
-    first, second
-        Results with the same pixels and time bins.
-    outcome
-        Their comparison, from `mitransient_lidar.analysis.comparison.compare`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
+    The results have the same pixels and time bins; `outcome` is that of `analysis.comparison.compare`.
     """
     figure = drawing.new_figure(path, 9.6, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))

@@ -22,20 +22,7 @@ _LABELS = {
 
 
 def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the signals, the operating characteristics, the signal required for detection, and the depth error.
-
-    Parameters
-    ----------
-    found
-        A result of `mitransient_lidar.studies.detection.detect`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
-    """
+    """Draw signals, operating characteristics, the signal required and the depth error of `studies.detection.detect`."""
     figure = drawing.new_figure(path, 12.5, 7.6)
     light, characteristic, required, gains, errors, depths = figure.subplots(2, 3).flat
     _draw_light(light, found)

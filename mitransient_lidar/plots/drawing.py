@@ -1,8 +1,4 @@
-"""Elements shared by all figures: file, colours, units, titles, axes and images.
-
-Every drawing returns a `matplotlib.figure.Figure` that is independent of pyplot and needs no closing. With a path it
-also writes a PNG, PDF or SVG file.
-"""
+"""Elements shared by all figures: file, colours, units, titles, axes and images."""
 
 from __future__ import annotations
 

@@ -11,20 +11,7 @@ from mitransient_lidar.plots import drawing
 
 
 def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw attenuation against the radius of the spot in the field of view.
-
-    Parameters
-    ----------
-    found
-        A result of `mitransient_lidar.studies.fov_sweep.fov_sweep`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
-    """
+    """Draw the attenuations of `studies.fov_sweep.fov_sweep` against the radius of the spot in the field of view."""
     figure = drawing.new_figure(path, 7.2, 4.8)
     attributes = found.attrs
     names = ("attenuation", "kd", "a_plus_bb", "absorption", "beam_radius")

@@ -39,20 +39,13 @@ _HALO = [withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
 def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the pixels, the beam and the targets of a result on the mean sea level, away from the lidar upwards.
 
-    Targets are drawn at their true place, without refraction. The cells of an imager show the received energy.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result of `mitransient_lidar.results.dataset`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
+    Targets are drawn at their true positions, without refraction. The cells of an imager show the received energy.
 
     Raises
     ------
     UserError
-        If the attributes of the result hold no pose of the lidar or no field of view, the receiver looks above the
-        horizon, the file has another suffix, or it cannot be written.
+        If the attributes of the result hold no pose of the lidar or no field of view, or the receiver looks above the
+        horizon.
     """
     figure = drawing.new_figure(path, 6.8, 6.4)
     attributes = dataset.attrs

@@ -21,21 +21,16 @@ _ANIMATION_WIDTH = 384
 
 
 def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, frame: int = 0) -> Figure:
-    """Draw a picture in grey, with the far edge on top; pixels that form no grid as bars of their radiance.
+    """Draw an image in grey, with the far edge on top; pixels that form no grid as bars of their radiance.
 
     Parameters
     ----------
     dataset
         A result of `mitransient_lidar.rendering.passive.render_passive`.
     path : path, optional
-        PNG, PDF or SVG file to write.
+        File to write.
     frame
         Index of the frame, if there are several.
-
-    Raises
-    ------
-    UserError
-        If the frame does not exist, the file has another suffix, or it cannot be written.
     """
     figure = drawing.new_figure(path, 6.4, 5.6)
     picture = dataset
@@ -59,19 +54,12 @@ def plot_passive(dataset: xr.Dataset, path: drawing.FilePath | None = None, fram
 
 
 def animate_passive(dataset: xr.Dataset, path: drawing.FilePath) -> None:
-    """Write the frames of an imager as an endless GIF animation in real time.
-
-    Parameters
-    ----------
-    dataset
-        A result of `mitransient_lidar.rendering.passive.render_passive` with several frames.
-    path
-        GIF file to write.
+    """Write the frames of an imager, from `rendering.passive.render_passive`, as an endless GIF animation in real time.
 
     Raises
     ------
     UserError
-        If the dataset has no frames or no image, the file has another suffix, or it cannot be written.
+        If the dataset has no frames or no image, or the name of the file does not end in ``.gif``.
     """
     from PIL import Image
 

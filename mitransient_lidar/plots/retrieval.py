@@ -20,18 +20,8 @@ _NAMES = {"along": "towards the lidar", "across": "to the left"}
 def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | None = None) -> Figure:
     """Draw retrieved slopes against true ones, one panel for each receiver; the legends give `slope_statistics`.
 
-    Parameters
-    ----------
-    receivers
-        By the name of the receiver: a result of `mitransient_lidar.analysis.retrieval.retrieve.surface_slopes`,
-        with ``true_slope_along`` and ``true_slope_across`` [1] over ``shot``.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If there is no receiver, the file has another suffix, or it cannot be written.
+    `receivers` holds, by the name of at least one receiver, results of `analysis.retrieval.retrieve.surface_slopes`
+    with ``true_slope_along`` and ``true_slope_across`` [1] over ``shot``.
 
     Examples
     --------

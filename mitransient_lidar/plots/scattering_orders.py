@@ -11,19 +11,9 @@ from mitransient_lidar.plots import drawing
 
 
 def plot_scattering_orders(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw power against time by order of scattering, and the share of light with several reversals, over all pixels.
+    """Draw power by order of scattering, and the share of light with several reversals, summed over the pixels.
 
-    Parameters
-    ----------
-    result
-        A result of `mitransient_lidar.studies.scattering_orders.scattering_orders`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
+    `result` is that of `studies.scattering_orders.scattering_orders`.
     """
     figure = drawing.new_figure(path, 9.0, 6.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))

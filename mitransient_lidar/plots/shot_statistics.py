@@ -22,17 +22,7 @@ _LABELS = {
 def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
     """Draw the strength, the times and the depths of echoes against the slopes that the beam meets.
 
-    Parameters
-    ----------
-    shots
-        A result of `mitransient_lidar.studies.shot_statistics.shot_statistics` of a receiver with 2x2 pixels.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the receiver has other pixels, the file has another suffix, or it cannot be written.
+    `shots` is a result of `studies.shot_statistics.shot_statistics`; a receiver without 2x2 pixels raises `UserError`.
     """
     figure = drawing.new_figure(path, 9.6, 7.0)
     effects, correlations = slope_effects(shots), slope_correlations(shots)

@@ -13,20 +13,7 @@ _DASHES = (0, (4, 2))
 
 
 def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the power in every pixel with and without the target, and the signal of the target alone.
-
-    Parameters
-    ----------
-    result
-        A result of `mitransient_lidar.studies.target_signal.target_signal`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
-    """
+    """Draw the power with and without the target in every pixel, and its signal, of `studies.target_signal.target_signal`."""
     figure = drawing.new_figure(path, 9.6, 7.0)
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = result["time"].values
@@ -59,19 +46,9 @@ def draw_against_background(ax: Axes, result: xr.Dataset, name: str) -> None:
 
 
 def plot_target_map(maps: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the share of the echo in each pixel, and the gain in SNR, against the place of the target.
+    """Draw the share of the echo in each pixel, and the gain in SNR, against the target's position.
 
-    Parameters
-    ----------
-    maps
-        A result of `mitransient_lidar.studies.target_signal.target_map`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
+    `maps` is a result of `studies.target_signal.target_map`.
     """
     names = [str(name) for name in maps["pixel"].values]
     figure = drawing.new_figure(path, 2.7 * (len(names) + 1), 3.0)

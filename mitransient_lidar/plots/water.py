@@ -42,17 +42,7 @@ def plot_water(
 ) -> Figure:
     """Draw the phase function of a water, or a profile with its layers.
 
-    Parameters
-    ----------
-    kind, value, wavelength_nm, temperature, salinity, tolerance
-        As for `mitransient_lidar.studies.water_report.describe_water`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        As for `describe_water`, or if the file has another suffix or cannot be written.
+    Arguments and errors are those of `studies.water_report.describe_water`.
     """
     if kind == "profile":
         profile = water_report.profile_of(value)
@@ -64,23 +54,11 @@ def plot_water(
 def plot_phase_function(
     phase_function: PhaseFunction, label: str, title: str, path: drawing.FilePath | None = None
 ) -> Figure:
-    """Draw a phase function beside those of pure sea water and of Petzold's average particle.
+    """Draw a phase function with those of pure sea water and of Petzold's average particle.
 
-    The left panel extends from 0.01 to 180 degrees, the right one over the backward hemisphere.
-
-    Parameters
-    ----------
-    phase_function : callable
-        Maps angles [rad] to p [1/sr]. If it is `water_phase_function` itself, pure sea water is drawn once.
-    label, title : str
-        Label in the legend, and title of the figure.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
-    Raises
-    ------
-    UserError
-        If the file has another suffix or cannot be written.
+    The left panel extends from 0.01 to 180 degrees, the right one over the backward hemisphere. The function maps
+    angles [rad] to p [1/sr]; if it is `water_phase_function` itself, pure sea water is drawn once. `label` is its name
+    in the legend.
     """
     figure = drawing.new_figure(path, 9.6, 4.6)
     full, backward = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
@@ -110,26 +88,15 @@ def plot_phase_function(
 
 
 def plot_profile(profile: Profile, layers: WaterColumn, title: str, path: drawing.FilePath | None = None) -> Figure:
-    """Draw a profile with the layers that approximate it, and the phase functions of these layers.
+    """Draw a profile with its layers, from `Profile.layers`, and the phase functions of these layers.
 
     The left panel has the coefficients against depth, lines for the profile and steps for the layers; the right panel
     has the Fournier-Forand functions of at most 8 layers that differ in bb/b.
 
-    Parameters
-    ----------
-    profile : Profile
-        Profile to draw.
-    layers : WaterColumn
-        Its layers, from `Profile.layers`.
-    title : str
-        Title of the figure.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-
     Raises
     ------
     UserError
-        If the file has another suffix or cannot be written, or no Fournier-Forand function has the bb/b of a layer.
+        If no Fournier-Forand function has the bb/b of a layer.
     """
     figure = drawing.new_figure(path, 10.4, 5.4)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))

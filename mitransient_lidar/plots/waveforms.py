@@ -24,7 +24,7 @@ _DECADES = 7  # at most, on a logarithmic axis
 def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
     """Draw the waveforms of a result; of an imager the total energy of each pixel and the summed waveform.
 
-    Bands are +-1 standard error. The depth axis holds along the axis of the receiver,
+    Bands are +-1 standard error. The depth axis is that of the receiver's axis,
     depth = (t - t_surface) c0 / (2 n_g) cos(theta_water). The depth axis and the layout of the pixels are left out if
     the result lacks their attributes.
 
@@ -33,14 +33,9 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     dataset : xarray.Dataset
         A result of `mitransient_lidar.results.dataset`.
     path : path, optional
-        PNG, PDF or SVG file to write.
+        File to write.
     scale : {'both', 'linear', 'log'}
         Scale of the power axis; 'both' draws two panels.
-
-    Raises
-    ------
-    UserError
-        If `scale` is unknown, the file has another suffix, or it cannot be written.
     """
     if scale not in get_args(Scale):
         raise UserError(f"scale = {scale!r} must be one of {', '.join(get_args(Scale))}.")

@@ -24,24 +24,21 @@ _CONTRAST_COLOUR = "#1f5fd6"
 
 
 def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_depth: float | None = None) -> Figure:
-    """Draw the depth of the strongest echo in every pixel, and its confidence.
-
-    The depths are those of `mitransient_lidar.analysis.gates.range_images.range_from_gates`.
+    """Draw the depth of the strongest echo in every pixel, and its confidence, from `range_images.range_from_gates`.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         A gate stack with the coordinate ``gate_depth``.
     path : path, optional
-        PNG, PDF or SVG file to write.
+        File to write.
     from_depth : float, optional
         Leave out gates whose middle is shallower [m]; by default those that open before the end of the surface echo.
 
     Raises
     ------
     UserError
-        If the dataset is no gate stack, has no depths, fewer than three gates are left, the file has another suffix, or
-        it cannot be written.
+        If the dataset is no gate stack, has no depths, or fewer than three gates are left.
     """
     figure = drawing.new_figure(path, 9.6, 4.3)
     stack = check_stack(dataset)
@@ -65,27 +62,18 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
 def plot_contrast(
     dataset: xr.Dataset, target: npt.ArrayLike, background: npt.ArrayLike, path: drawing.FilePath | None = None
 ) -> Figure:
-    """Draw the contrast of a target against its background, by the delay of the gate.
+    """Draw the contrast of a target against its background in a gate stack, against the start of the gate.
 
-    The contrast is Weber's (t - b) / b of the mean energies t and b of the two groups of pixels. Bars are one standard
-    error if the errors of the pixels are independent; the band is its bound, reached if those within a group are
-    fully correlated, as they partly are where pixels share photons. Gates whose background is below three standard
-    errors are left out.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A gate stack.
-    target, background : array_like of bool, shape (row, column) or (pixel,)
-        The pixels of either.
-    path : path, optional
-        PNG, PDF or SVG file to write.
+    The contrast is Weber's (t - b) / b of the mean energies t and b of two groups of pixels, selected by masks of shape
+    (row, column) or (pixel,). Bars are one standard error if the errors of the pixels are independent; the band is its
+    bound, reached if those within a group are fully correlated, as they partly are where pixels share photons. Gates
+    whose background is below three standard errors are left out.
 
     Raises
     ------
     UserError
-        If the dataset is no gate stack, a mask has another shape, is empty or shares pixels with the other one, no
-        gate has a background, the file has another suffix, or it cannot be written.
+        If the dataset is no gate stack, a mask has another shape, is empty or shares pixels with the other one, or no
+        gate has a background.
     """
     figure = drawing.new_figure(path, 9.6, 4.6)
     stack = check_stack(dataset)

@@ -53,7 +53,7 @@ class ColourScale(NamedTuple):
         return drawing.draw_image(ax, energy / self.factor, stack, label=label, norm=self.norm, cmap=colours)
 
     def add_bar(self, figure: Figure, image: AxesImage, axes: Any, label: str, **options: Any) -> Colorbar:
-        """Draw the colour bar beside some axes, with plain numbers on a logarithmic scale too."""
+        """Draw the colour bar of some axes, with plain numbers on a logarithmic scale too."""
         bar = figure.colorbar(image, ax=axes, extend=self.extend, label=label, **options)
         if isinstance(self.norm, LogNorm):
             bar.locator = LogLocator(subs=(1.0, 2.0, 5.0))
@@ -64,25 +64,16 @@ class ColourScale(NamedTuple):
 
 
 def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: bool = False) -> Figure:
-    """Draw a contact sheet of the gates on one common scale; of pixels without an image, their energy against depth.
+    """Draw a contact sheet of a gate stack on one common scale; of pixels without an image, their energy against depth.
 
     Of more than 36 gates every second, third, ... one is drawn. The colours end at the brightest gate below the surface
     (at its 99th percentile), so that the surface echo does not darken the rest; the label of the colour bar gives the
-    share of brighter values.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A gate stack, see `mitransient_lidar.results.gate_files`.
-    path : path, optional
-        PNG, PDF or SVG file to write.
-    log : bool
-        Logarithmic scale of the colours, or of the energy axis.
+    share of brighter values. With `log` the scale of the colours, or the energy axis, is logarithmic.
 
     Raises
     ------
     UserError
-        If the dataset is no gate stack, the file has another suffix, or it cannot be written.
+        If the dataset is no gate stack.
     """
     figure = drawing.new_figure(path, 9.6, 4.6)
     stack = check_stack(dataset)
@@ -102,18 +93,9 @@ def check_animation(stack: xr.Dataset, path: Path) -> None:
 
 
 def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False) -> None:
-    """Write an animation with one frame a gate, beside the mean energy against depth.
+    """Write an animation of a gate stack, one frame a gate, with the mean energy against depth and colours as `plot_gates`.
 
-    The colours are those of `plot_gates`.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A gate stack of an imager.
-    path : path
-        File to write, ending in ``.gif`` or, if the program ffmpeg is installed, ``.mp4``.
-    log : bool
-        Logarithmic scale of the colours.
+    The file name ends in ``.gif`` or, if the program ffmpeg is installed, ``.mp4``.
 
     Raises
     ------
