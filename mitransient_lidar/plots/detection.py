@@ -22,7 +22,10 @@ _LABELS = {
 
 
 def plot_detection(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw signals, operating characteristics, the signal required and the depth error of `studies.detection.detect`."""
+    """Draw the signals, the operating characteristics, the signal required for detection, and the depth error.
+
+    `found` is a result of `studies.detection.detect`.
+    """
     figure = drawing.new_figure(path, 12.5, 7.6)
     light, characteristic, required, gains, errors, depths = figure.subplots(2, 3).flat
     _draw_light(light, found)

@@ -86,7 +86,7 @@ def titled(attributes: Mapping[str, Any], text: str) -> str:
 
 
 def time_limits(dataset: xr.Dataset) -> tuple[float, float]:
-    """Return the echo window with a margin [ns], or the whole time axis if the window is unknown."""
+    """Return the echo window with a margin [ns], or the full time axis if the window is unknown."""
     time, attributes = dataset["time"].values, dataset.attrs
     half = 0.5 * (optional_number(attributes, "bin_width_ns") or 1.0)
     first, last = float(time[0]) - half, float(time[-1]) + half

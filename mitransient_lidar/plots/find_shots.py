@@ -15,7 +15,10 @@ from mitransient_lidar.studies.find_shots import RenderedShots, Shot
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the sea with the footprints of beam and pixels, and the waveforms, of `studies.find_shots.render_found_shots`."""
+    """Draw the sea with the footprints of beam and pixels at each shot, and the waveforms of the shots.
+
+    `rendered` is a result of `studies.find_shots.render_found_shots`.
+    """
     columns = min(2, len(rendered.results))
     rows = -(-len(rendered.results) // columns) if columns else 1
     figure = drawing.new_figure(path, 6.0 + 3.6 * columns, max(5.4, 2.7 * rows))

@@ -13,7 +13,10 @@ _DASHES = (0, (4, 2))
 
 
 def plot_target_signal(result: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the power with and without the target in every pixel, and its signal, of `studies.target_signal.target_signal`."""
+    """Draw the power in every pixel with and without the target, and the signal of the target alone.
+
+    `result` is that of `studies.target_signal.target_signal`.
+    """
     figure = drawing.new_figure(path, 9.6, 7.0)
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = result["time"].values

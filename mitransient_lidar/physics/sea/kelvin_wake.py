@@ -79,7 +79,7 @@ def kelvin_wake(
     j1 the spherical Bessel function; this is the form of Tuck, Scullen and Lazauskas (2002). The hull's wave
     resistance is (pi/2) rho U^2 integral |A|^2 cos(theta)^3 dtheta (Newman 1977), Michell's integral.
 
-    Only these free waves are included, not the local elevation about the hull, so that heights beside the hull are
+    Only these free waves are included, not the local elevation about the hull, so that heights next to the hull are
     rough. Ahead of the middle of the ship the integral yields mirrored, negated waves, which are removed; the others
     grow smoothly from 0 amidships to their full height at the stern. The theory exaggerates the short steep waves on
     the track, where a real ship leaves turbulent water.

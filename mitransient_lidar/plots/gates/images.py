@@ -93,9 +93,10 @@ def check_animation(stack: xr.Dataset, path: Path) -> None:
 
 
 def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False) -> None:
-    """Write an animation of a gate stack, one frame a gate, with the mean energy against depth and colours as `plot_gates`.
+    """Write an animation of a gate stack, one frame a gate, with the mean energy against depth.
 
-    The file name ends in ``.gif`` or, if the program ffmpeg is installed, ``.mp4``.
+    The colours are those of `plot_gates`. The file name ends in ``.gif`` or, if the program ffmpeg is installed,
+    ``.mp4``.
 
     Raises
     ------
