@@ -60,9 +60,9 @@ class SeaState(WaveSpectrum):
         """Variance of the elevation [m^2]."""
         return sum(component.elevation_variance() for component in self.components)
 
-    def slope_covariance(self, k_max: float = np.inf) -> FloatArray:
-        """Covariance matrix [1] of the slopes in x and y, shape (2, 2), of waves up to `k_max` [rad/m], above 0."""
-        return np.asarray(sum(component.slope_covariance(k_max) for component in self.components))
+    def slope_covariance(self) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
+        return np.asarray(sum(component.slope_covariance() for component in self.components))
 
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances [m^2]; see `WaveSpectrum.mode_variances`."""

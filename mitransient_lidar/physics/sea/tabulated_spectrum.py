@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, increasing_array, non_negative_array
-from mitransient_lidar.physics.sea.wave_spectrum import TravellingWaves, WaveSpectrum, check_k_max
+from mitransient_lidar.physics.sea.wave_spectrum import TravellingWaves, WaveSpectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,20 +21,16 @@ class TabulatedSpectrum(WaveSpectrum):
     kx, ky : array_like, shapes (I,) and (J,)
         Wavenumber components [rad/m], strictly increasing, at least 2 each.
     density : array_like, shape (J, I)
-        Variance density [m^4] at (kx[i], ky[j]), not negative. Its integral over the table is the elevation variance,
-        for a table of one half plane as well as of both.
+        Variance density [m^4] of waves that travel along (kx[i], ky[j]), not negative, greater than 0 somewhere. Its
+        integral over the table is the elevation variance.
     direction : float
         Direction [rad] of the axes of slope variances, counter-clockwise from +x.
-    one_sided : bool
-        True: `density` is that of waves that travel along (kx, ky). False: it is that of a frozen surface, and all
-        waves travel towards the half plane of `direction`.
     """
 
     kx: FloatArray
     ky: FloatArray
     density: FloatArray
     direction: float = 0.0
-    one_sided: bool = True
 
     def __post_init__(self) -> None:
         for name in ("kx", "ky"):
@@ -67,19 +63,14 @@ class TabulatedSpectrum(WaveSpectrum):
 
     def elevation_variance(self) -> float:
         """Variance of the elevation [m^2]."""
-        (x, x_weight), (y, y_weight) = _gauss_rule(self.kx, 1), _gauss_rule(self.ky, 1)
+        (x, x_weight), (y, y_weight) = _gauss_rule(self.kx), _gauss_rule(self.ky)
         return float(y_weight @ self._running(x, y[:, None]) @ x_weight)
 
-    def slope_covariance(self, k_max: float = np.inf) -> FloatArray:
-        """Covariance matrix [1] of the slopes in x and y, shape (2, 2), of waves up to `k_max` [rad/m], above 0."""
-        check_k_max(k_max)
-        farthest = np.hypot(np.abs(self.kx).max(), np.abs(self.ky).max())
-        # Two Gauss points per interval are exact for the full table; a circle that cuts it needs more.
-        points = 1 if k_max >= farthest else 500
-        x, x_weight = _gauss_rule(self.kx, points)
-        y, y_weight = _gauss_rule(self.ky, points)
+    def slope_covariance(self) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
+        (x, x_weight), (y, y_weight) = _gauss_rule(self.kx), _gauss_rule(self.ky)
         y, y_weight = y[:, None], y_weight[:, None]
-        variance = np.where(x**2 + y**2 <= k_max**2, self._running(x, y), 0) * x_weight * y_weight
+        variance = self._running(x, y) * x_weight * y_weight
         xx, xy, yy = np.sum(variance * x**2), np.sum(variance * x * y), np.sum(variance * y**2)
         return np.array([[xx, xy], [xy, yy]])
 
@@ -93,9 +84,7 @@ class TabulatedSpectrum(WaveSpectrum):
         return np.asarray(np.maximum(y_weight @ self.density @ x_weight.T, 0))
 
     def travelling_parts(self) -> tuple[TravellingWaves, ...]:
-        """Return the waves that travel with and those that travel against `direction`; one part if not one-sided."""
-        if not self.one_sided:
-            return (self,)
+        """Return the waves that travel with and those that travel against `direction`."""
         return _TableHalf(self, self.direction), _TableHalf(self, self.direction + np.pi)
 
     def _running(self, kx: FloatArray, ky: FloatArray) -> FloatArray:
@@ -110,7 +99,7 @@ class TabulatedSpectrum(WaveSpectrum):
 
 @dataclass(frozen=True, eq=False)
 class _TableHalf:
-    """Waves of a one-sided table that travel towards the half plane of one direction."""
+    """Waves of a table that travel towards the half plane of one direction."""
 
     table: TabulatedSpectrum
     direction: float
@@ -132,11 +121,9 @@ def _bracket(axis: FloatArray, k: FloatArray) -> tuple[npt.NDArray[np.intp], Flo
     return i, np.asarray((k - axis[i]) / (axis[i + 1] - axis[i]))
 
 
-def _gauss_rule(axis: FloatArray, points: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights [rad/m] of two-point Gauss rules over at least `points` equal parts of all intervals."""
-    parts = -(-points // (axis.size - 1))
-    edges = np.interp(np.arange(parts * (axis.size - 1) + 1) / parts, np.arange(axis.size), axis)
-    middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+def _gauss_rule(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights [rad/m] of the two-point Gauss rule in each interval, which is exact for cubic polynomials."""
+    middle, half = (axis[1:] + axis[:-1]) / 2, np.diff(axis) / 2
     nodes = middle[:, None] + half[:, None] * np.array([-1, 1]) / np.sqrt(3)
     return nodes.ravel(), np.repeat(half, 2)
 

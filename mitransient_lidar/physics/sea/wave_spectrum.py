@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 
 GRAVITY = 9.81
@@ -77,12 +76,12 @@ class WaveSpectrum(ABC):
         """Variance of the elevation [m^2]."""
 
     @abstractmethod
-    def slope_covariance(self, k_max: float = np.inf) -> FloatArray:
-        """Covariance matrix [1] of the slopes in x and y, shape (2, 2), of waves up to `k_max` [rad/m], above 0."""
+    def slope_covariance(self) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
 
-    def slope_variance(self, k_max: float = np.inf) -> tuple[float, float]:
-        """Slope variances [1] (along, across) the direction of all waves with wavenumbers up to `k_max` [rad/m]."""
-        return variances_along(self.slope_covariance(k_max), self.direction)
+    def slope_variance(self) -> tuple[float, float]:
+        """Slope variances [1] along and across the direction."""
+        return variances_along(self.slope_covariance(), self.direction)
 
     def mode_variances(self, ix: IntArray, iy: IntArray, dk: float) -> FloatArray:
         """Elevation variances of the waves of a periodic patch.
@@ -127,27 +126,25 @@ class AxialSpectrum(WaveSpectrum):
         k, weight = self.quadrature()
         return float(np.sum(self.omnidirectional(k) * weight))
 
-    def slope_covariance(self, k_max: float = np.inf) -> FloatArray:
-        """Covariance matrix [1] of the slopes in x and y, shape (2, 2), of waves up to `k_max` [rad/m], above 0."""
-        along, across = self.slope_variance(k_max)
+    def slope_covariance(self) -> FloatArray:
+        """Covariance matrix [1] of the slopes in x and y, shape (2, 2)."""
+        along, across = self.slope_variance()
         cos, sin = np.cos(self.direction), np.sin(self.direction)
         rotation = np.array([[cos, -sin], [sin, cos]])
         return np.asarray(rotation @ np.diag([along, across]) @ rotation.T)
 
-    def slope_variance(self, k_max: float = np.inf) -> tuple[float, float]:
-        """Slope variances [1] (along, across) the direction of all waves with wavenumbers up to `k_max` [rad/m]."""
-        check_k_max(k_max)
-        k, weight = self.quadrature(k_max)
+    def slope_variance(self) -> tuple[float, float]:
+        """Slope variances [1] along and across the direction."""
+        k, weight = self.quadrature()
         curvature = self.omnidirectional(k) * k**2 * weight
         spreading = self.spreading(k)
         return float(np.sum(curvature * (0.5 + spreading / 4))), float(np.sum(curvature * (0.5 - spreading / 4)))
 
-    def quadrature(self, k_max: float = np.inf) -> tuple[FloatArray, FloatArray]:
-        """Wavenumbers and weights [rad/m] of a midpoint rule in ln k over all waves up to `k_max` [rad/m]."""
+    def quadrature(self) -> tuple[FloatArray, FloatArray]:
+        """Wavenumbers and weights [rad/m] of a midpoint rule in ln k over all waves."""
         count = 4000
         nodes, weights = [np.ones(1)], [np.zeros(1)]
-        for low, end in pairwise(self.smooth_ranges):
-            high = min(end, k_max)
+        for low, high in pairwise(self.smooth_ranges):
             if low < high:
                 step = np.log(high / low) / count
                 k = low * np.exp(step * (np.arange(count) + 0.5))
@@ -185,9 +182,3 @@ class CosineSpectrum(AxialSpectrum):
         variances = mean[square] + modulation[square] * angle
         # Where Delta is 1, rounding may make the density across the direction negative.
         return np.asarray(np.maximum(variances, 0))
-
-
-def check_k_max(k_max: float) -> None:
-    """Reject an upper wavenumber that is not above 0; infinity is allowed."""
-    if not k_max > 0:
-        raise UserError(f"k_max = {k_max:g} must be greater than 0")

@@ -69,8 +69,11 @@ def test_sampled_kernel_with_response_matches_quadrature(response):
         lag = t - pulse.times_ns
         points = np.sort(lag[(lag > 0) & (lag < 30 * response)])
         parts = np.concatenate(([0], points, [30 * response]))
-        f = lambda u: pulse.cumulative(t - u) * np.exp(-u / response) / response  # noqa: E731
-        return sum(quad(f, a, b, epsabs=1e-13)[0] for a, b in pairwise(parts))
+
+        def delayed(u):
+            return pulse.cumulative(t - u) * np.exp(-u / response) / response
+
+        return sum(quad(delayed, a, b, epsabs=1e-13)[0] for a, b in pairwise(parts))
 
     for m in (0, 1, 3, 8):
         expected = arrived(first + m + 0.5) - arrived(first + m - 0.5)

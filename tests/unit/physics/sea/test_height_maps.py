@@ -5,6 +5,7 @@ import OpenEXR
 import pytest
 import xarray as xr
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 
 # Rows go up in y, columns in x: a map without symmetry under rotation or mirroring, not square.
@@ -123,7 +124,7 @@ def with_holes():
 )
 def test_invalid_maps_are_rejected(tmp_path, heights, size, message):
     path = write_npy(tmp_path / "map.npy", heights)
-    with pytest.raises(ValueError) as error:  # noqa: PT011, the message is compared
+    with pytest.raises(UserError) as error:
         read_height_map(path, size)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
@@ -152,7 +153,7 @@ def test_holes_of_an_image_are_counted_from_the_smallest_y(tmp_path):
 )
 def test_invalid_positions_are_rejected(tmp_path, positions, message):
     path = write_npz(tmp_path / "map.npz", heights=HEIGHTS, **positions)
-    with pytest.raises(ValueError) as error:  # noqa: PT011, the message is compared
+    with pytest.raises(UserError) as error:
         read_height_map(path)
     assert message in str(error.value)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 
 GRAVITY = 9.81
@@ -243,6 +244,6 @@ def test_300_by_300_points_take_less_than_half_a_second():
 )
 def test_errors(change, message):
     given = {"x": [0, 1], "y": [0, 1], "speed": 5, "bearing": 0, "length": 10, **change}
-    with pytest.raises(ValueError) as error:  # noqa: PT011, the full message is compared
+    with pytest.raises(UserError) as error:
         kelvin_wake(**given)
     assert str(error.value) == message

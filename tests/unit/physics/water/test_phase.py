@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.integrate import quad, simpson
@@ -90,8 +92,9 @@ def test_fournier_forand_is_smooth_and_normalised_through_delta_one(n, mu):
     log_p = np.log(fournier_forand(theta, n, mu))
     smooth = np.polynomial.Polynomial.fit(np.log(theta), log_p, 4)(np.log(theta))
     np.testing.assert_allclose(log_p, smooth, atol=2e-8)
-    p = lambda t: fournier_forand(t, n, mu)  # noqa: E731
-    assert integral(p, 1e-4) + fournier_forand_cdf(1e-4, n, mu) == pytest.approx(1, abs=1e-7)
+    assert integral(lambda t: fournier_forand(t, n, mu), 1e-4) + fournier_forand_cdf(1e-4, n, mu) == pytest.approx(
+        1, abs=1e-7
+    )
 
 
 def test_henyey_greenstein():
@@ -105,7 +108,7 @@ def test_henyey_greenstein():
 
 
 def test_two_term_henyey_greenstein():
-    p = lambda t: two_term_henyey_greenstein(t, 0.98, 0.9, 0.3)  # noqa: E731
+    p = partial(two_term_henyey_greenstein, weight=0.98, g_forward=0.9, g_backward=0.3)
     assert integral(p) == pytest.approx(1, abs=1e-8)
     assert integral(lambda t: p(t) * np.cos(t)) == pytest.approx(0.98 * 0.9 - 0.02 * 0.3, abs=1e-8)
 
@@ -177,7 +180,7 @@ def test_table_follows_closed_form_everywhere():
 
 @pytest.mark.parametrize(("g_backward", "count"), [(0.3, 2048), (0.7, 16384)])
 def test_table_follows_a_backward_lobe(g_backward, count):
-    p = lambda t: two_term_henyey_greenstein(t, 0.97, 0.95, g_backward)  # noqa: E731
+    p = partial(two_term_henyey_greenstein, weight=0.97, g_forward=0.95, g_backward=g_backward)
     theta = np.linspace(np.pi / 2, np.pi, 10_001)
     np.testing.assert_allclose(PowerLawTable.from_function(p, count).eval(theta), p(theta), rtol=1e-3)
 
