@@ -1,1 +1,1 @@
-"""Validation, errors and constants that every layer uses."""
+"""Validation, errors, constants and files, for every layer."""

@@ -30,21 +30,12 @@ class Variable(NamedTuple):
 
 
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
-    """Return the suffix of a file in lower case.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    suffixes : collection of str
-        Allowed suffixes.
-    kind : str
-        Kind of file, for the message.
+    """Return the suffix of a file in lower case; `kind` is the kind of file, for the message.
 
     Raises
     ------
     UserError
-        If the suffix is another one or the file cannot be opened.
+        If the suffix is not one of `suffixes`, or the file cannot be opened.
     """
     suffix = path.suffix.lower()
     if suffix not in suffixes:

@@ -122,7 +122,7 @@ def build(
 
 
 def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
-    """Return the dimensions of a variable, (pixel, time) or (row, column, time), optionally after ``shot``.
+    """Return the dimensions of a variable, (pixel, time) or (row, column, time), with `shots` also after ``shot``.
 
     Raises
     ------

@@ -74,7 +74,6 @@ def write(
             digits = max(4, len(str(len(images) - 1)))
             for index, image in enumerate(images):
                 channels[f"{stack}{index:0{digits}d}.{component}"] = image
-
     write_parts(path, [Part("", header(readable, exact), channels)])
 
 
@@ -90,7 +89,6 @@ def read(path: str | os.PathLike[str]) -> tuple[Stacks, dict[str, Any]]:
     exact = exact_metadata(path, parts[0].attributes)
     if len(parts) > 1:
         raise UserError(f"{path} holds {len(parts)} images and no time bins.")
-
     layers: dict[tuple[str, str], dict[int, npt.NDArray[np.float32]]] = {}
     for name, image in parts[0].channels.items():
         if match := _LAYER.fullmatch(name):

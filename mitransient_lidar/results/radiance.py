@@ -54,9 +54,8 @@ def build_radiance(
     """
     inner: tuple[str, ...] = ("pixel",) if grid is None else ("row", "column")
     shape = (len(etendue),) if grid is None else grid
-    dims = inner if times is None else ("frame", *inner)
-    outer = () if times is None else (len(frames),)
-    radiance, stderr = (np.reshape([frame[i] for frame in frames], (*outer, *shape)) for i in (0, 1))
+    dims, counts = (inner, shape) if times is None else (("frame", *inner), (len(frames), *shape))
+    radiance, stderr = (np.reshape([frame[i] for frame in frames], counts) for i in (0, 1))
     coords = dict(coords)
     if times is not None:
         coords |= {

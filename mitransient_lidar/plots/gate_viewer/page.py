@@ -11,7 +11,6 @@ import base64
 import html
 import json
 import logging
-import math
 import os
 import re
 import zlib
@@ -27,7 +26,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gates.images import known_depths
 from mitransient_lidar.results.gate_files import check_stack
@@ -88,8 +87,7 @@ def write_page(
     path = Path(path)
     if path.suffix.lower() != ".html":
         raise UserError(f"cannot write {path}: the file name must end in .html.")
-    if not (math.isfinite(limit_mb) and limit_mb > 0):
-        raise UserError(f"limit_mb = {limit_mb} must be a finite number above 0.")
+    positive("limit_mb", limit_mb)
     gated = check_stack(stack)
     record = _record(gated, stack if result is None and "waveform" in stack else result)
     frame = _frame()

@@ -142,7 +142,7 @@ def test_a_stack_may_hold_its_waveforms(scene, tmp_path):
         (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform."),
         (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
         (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),
-        (lambda stack, result: (stack, "page.html", None, 0), "limit_mb = 0 must be a finite number above 0."),
+        (lambda stack, result: (stack, "page.html", None, 0), "limit_mb = 0 must be greater than 0"),
         (lambda stack, result: (stack, "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
     ],
 )

@@ -1,3 +1,5 @@
+"""Phase functions of particles in closed form, and their tables."""
+
 from functools import partial
 
 import numpy as np
