@@ -116,7 +116,7 @@ def add_top_axis(ax: Axes, offset: float, slope: float, label: str) -> XAxis:
 def draw_band(
     ax: Axes, x: FloatArray, y: FloatArray, error: FloatArray, *, lowest: float = -np.inf, **style: Any
 ) -> None:
-    """Draw a curve with a band of +-`error`, cut off at `lowest`, since a logarithmic axis holds no values below 0."""
+    """Draw a curve with a band of +-`error`, cut off at `lowest`, since a logarithmic axis has no values below 0."""
     (line,) = ax.plot(x, y, **style)
     ax.fill_between(x, np.maximum(y - error, lowest), y + error, color=line.get_color(), alpha=0.22, linewidth=0)
 

@@ -32,7 +32,7 @@ _BEAM_COLOUR = "#e07b00"
 _TARGET_COLOUR = "#7a3fb0"
 _LEVELS = {0.6065: "e$^{-1/2}$", 0.1353: "e$^{-2}$", 1.0: "rim"}
 
-#: A light rim that sets lines off from pixels of any colour.
+#: White outline that separates lines from pixels of any colour.
 _HALO = [withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
 
 
@@ -68,19 +68,14 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
 
 @dataclass(frozen=True)
 class _Ground:
-    """Maps angles and places to distances across the lidar's azimuth and along it on the mean sea level [m].
+    """Map of angles and positions to distances across and along the lidar's azimuth on the mean sea level [m].
 
-    Attributes
-    ----------
-    receiver, transmitter
-        Origin, axis, far and left, shape (4, 3).
-    azimuth
-        Direction of the receiver's axis, from +x towards +y [rad].
+    A pose has origin, axis, far and left, shape (4, 3).
     """
 
     receiver: FloatArray
     transmitter: FloatArray
-    azimuth: float
+    azimuth: float  #: Direction of the receiver's axis, from +x towards +y [rad].
 
     @classmethod
     def of_result(cls, attributes: dict[str, Any]) -> _Ground:
@@ -90,7 +85,7 @@ class _Ground:
         return cls(receiver, transmitter, math.atan2(y, x))
 
     def place(self, points: FloatArray) -> FloatArray:
-        """Return (across, along) of places (x, y), shape (..., 2)."""
+        """Return (across, along) of positions (x, y), shape (..., 2)."""
         cos, sin = math.cos(self.azimuth), math.sin(self.azimuth)
         x, y = points[..., 0], points[..., 1]
         return np.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)

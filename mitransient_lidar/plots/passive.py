@@ -1,4 +1,4 @@
-"""Figures and animations of pictures by daylight."""
+"""Figures and animations of images by daylight."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _levels(values: FloatArray) -> tuple[float, float]:
     if finite.size == 0:
         return 0.0, 1.0
     low, high = np.quantile(finite, [_CLIPPED, 1 - _CLIPPED])
-    # Black lies below the darkest pixels, which keep their shades.
+    # Black is below the radiance of the darkest pixels, which thus keep their contrast.
     return float(max(0.0, low - 0.15 * (high - low))), float(high)
 
 

@@ -1,4 +1,4 @@
-"""Figures of the signal of a target, and of its change with the place of the target."""
+"""Figures of the signal of a target, and of its change with the position of the target."""
 
 from __future__ import annotations
 

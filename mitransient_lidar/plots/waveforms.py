@@ -24,9 +24,8 @@ _DECADES = 7  # at most, on a logarithmic axis
 def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
     """Draw the waveforms of a result; of an imager the total energy of each pixel and the summed waveform.
 
-    Bands are +-1 standard error. The depth axis is that of the receiver's axis,
-    depth = (t - t_surface) c0 / (2 n_g) cos(theta_water). The depth axis and the layout of the pixels are left out if
-    the result lacks their attributes.
+    Bands are +-1 standard error. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), on the axis of the receiver.
+    The depth axis and the layout of the pixels are left out if the result lacks their attributes.
 
     Parameters
     ----------
@@ -117,7 +116,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
             frameon=False,
             handlelength=1.0,
         )
-        legend.set_in_layout(False)  # it fits into the room below the square axes
+        legend.set_in_layout(False)  # it fits into the space below the square axes
     ax.set_anchor("N")
     angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
     width = optional_number(attributes, "field_of_view_mrad")
@@ -179,7 +178,7 @@ def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
     image = drawing.draw_image(ax, energy / factor, dataset, cmap="viridis")
     ax.set_anchor("N")
     scale = ax.inset_axes((0.0, -0.24, 1.0, 0.05))
-    scale.set_in_layout(False)  # it fits into the room below the square pixels
+    scale.set_in_layout(False)  # it fits into the space below the square pixels
     ax.figure.colorbar(image, cax=scale, orientation="horizontal", label=f"total energy ({prefix}J)")
 
 

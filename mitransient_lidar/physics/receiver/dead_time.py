@@ -1,9 +1,9 @@
 """Counting with dead time in time bins: probabilities of counts, their covariances, and random realisations.
 
 A cell that fires in a bin is dead for the rest of that bin and for the dead time tau after it. In bins of width dt this
-makes tau/dt + 1/2 bins, the firing bin included: the event lies anywhere in its bin, in the middle on average. The
-fractional part of this number is the probability of one more dead bin. This is the model of Coates (1968) with a dead
-time shorter than the record; the count rate of steady light is correct to second order in the events per bin.
+makes tau/dt + 1/2 bins, the firing bin included: on average the event is in the middle of its bin. The fractional part
+of this number is the probability of one more dead bin. This is the model of Coates (1968) with a dead time shorter than
+the record; the count rate of steady light is correct to second order in the events per bin.
 
 Arrays `events` hold the mean number of events per bin that a live cell would detect, shape (..., time), and
 probabilities have the same shape. All cells are live at the first bin.

@@ -164,7 +164,7 @@ class SeaSurface:
         return heights if self.wake is None else heights + self.wake(x, y)
 
 
-def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: float) -> WaveSpectrum | None:
+def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: float) -> SeaState | None:
     """Return the sea state of the parameters, None for a flat sea or a height map."""
     fetch = get("fetch", None)
     age = get("inverse_wave_age", None)
@@ -195,22 +195,12 @@ def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: floa
         if spectrum in ("flat", "height_map"):
             raise UserError(f"swell_height = {swell_height:g} needs a spectrum of waves, not {spectrum!r}")
         components.append(SwellSpectrum(swell_height, swell_wavelength, swell_direction))
-    return _combined(components)
-
-
-def _combined(components: list[WaveSpectrum]) -> WaveSpectrum | None:
-    """Return the sum of wave systems, None without any."""
-    return SeaState(tuple(components)) if len(components) > 1 else components[0] if components else None
-
-
-def _components(state: WaveSpectrum) -> list[WaveSpectrum]:
-    """Return the wave systems of a sea state."""
-    return list(state.components) if isinstance(state, SeaState) else [state]
+    return SeaState(tuple(components)) if components else None
 
 
 def _with_total_variance(
-    state: WaveSpectrum | None, slope_variance: Any, wind_speed: float, wind_direction: float
-) -> tuple[WaveSpectrum | None, tuple[float, float]]:
+    state: SeaState | None, slope_variance: Any, wind_speed: float, wind_direction: float
+) -> tuple[SeaState | None, tuple[float, float]]:
     """Return the sea state for a parameter ``slope_variance``, and its total slope variances along and across."""
     if slope_variance == "cox_munk":
         return _matched(state, wind_direction, *cox_munk(wind_speed))
@@ -226,24 +216,24 @@ def _with_total_variance(
 
 
 def _matched(
-    state: WaveSpectrum | None, wind_direction: float, along: float, across: float
-) -> tuple[WaveSpectrum | None, tuple[float, float]]:
+    state: SeaState | None, wind_direction: float, along: float, across: float
+) -> tuple[SeaState | None, tuple[float, float]]:
     """Return a sea state whose wind waves have the slope variances, and the total with swell; a table is unchanged."""
     if state is None:
         return None, (along, across)
-    components = _components(state)
+    components = list(state.components)
     if isinstance(components[0], CosineSpectrum):
         components[0] = MatchedSpectrum(components[0], along, across)
     for swell in components:
         if isinstance(swell, SwellSpectrum):
             more = variances_along(swell.slope_covariance(), wind_direction)
             along, across = along + more[0], across + more[1]
-    return _combined(components), (along, across)
+    return SeaState(tuple(components)), (along, across)
 
 
-def _period(state: WaveSpectrum) -> float:
+def _period(state: SeaState) -> float:
     """Return the default period of the sea [m]."""
-    longest = max(2 * math.pi / component.peak_wavenumber for component in _components(state))
+    longest = max(2 * math.pi / component.peak_wavenumber for component in state.components)
     return min(_LONGEST_PERIOD, _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP))
 
 

@@ -38,7 +38,7 @@ _Columns = dict[str, FloatArray]
 
 
 class _RowError(UserError):
-    """Invalid row of a profile; readers replace the row number by the place in the file."""
+    """Invalid row of a profile; readers replace the row number by the line or index in the file."""
 
     def __init__(self, row: int, text: str) -> None:
         super().__init__(f"{text}, in row {row} counted from 0.")
@@ -262,7 +262,7 @@ def read_profile(path: str | os.PathLike[str]) -> Profile:
 
 
 def _read_csv(path: Path) -> tuple[_Columns, list[str]]:
-    """Return the columns by name, and the place of each row."""
+    """Return the columns by name, and the line of each row."""
     cells = [(n, [cell.strip() for cell in line.split(",")]) for n, line in read_lines(path)]
     rows = [(n, row) for n, row in cells if any(row)]
     names = rows[0][1] if rows else []
@@ -281,7 +281,7 @@ def _read_csv(path: Path) -> tuple[_Columns, list[str]]:
 
 
 def _read_netcdf(path: Path) -> tuple[_Columns, list[str]]:
-    """Return the variables by name, and the place of each depth."""
+    """Return the variables by name, and the index of each depth."""
     columns = {name: item.values for name, item in read_netcdf(path).items() if item.dims == ("depth",)}
     _check_names(path, list(columns))
     for name, values in columns.items():

@@ -214,7 +214,7 @@ def _draw_sheet(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
 
 
 def _columns(count: int) -> int:
-    """Return the number of images in a row: at most 6, fewer if that leaves fewer gaps."""
+    """Return the number of images in a row: at most 6, fewer if the last row then has fewer gaps."""
     if count <= 3:
         return count
     return min(range(3, 7), key=lambda columns: -count % columns + 1.2 * abs(columns - min(6.0, 1.3 * count**0.5)))
@@ -246,7 +246,7 @@ def _animated_figure(stack: xr.Dataset, *, log: bool) -> tuple[Figure, Callable[
 
     def show(index: int) -> None:
         image.set_data(energy[..., index] / scale.factor)
-        # The marker of a mean below the logarithmic axis lies at its edge.
+        # The marker of a mean below the logarithmic axis is at its edge.
         marker.set_data([max(mean[index], right.get_xlim()[0])], [axis[index]])
         gate, time = _caption(stack, index)
         text = f"gate {gate.removeprefix('#').replace('  ', '  ·  ')}  ·  {time}"
