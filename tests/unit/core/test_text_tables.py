@@ -1,3 +1,5 @@
+"""Tables in text files, and line numbers of their errors."""
+
 import numpy as np
 import pytest
 

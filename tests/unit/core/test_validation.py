@@ -1,3 +1,5 @@
+"""Validators of numeric parameters."""
+
 import numpy as np
 import pytest
 

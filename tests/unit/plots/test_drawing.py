@@ -79,7 +79,7 @@ def test_top_axis_is_linear():
         ({}, (0.0, 100.0)),
     ],
 )
-def test_time_limits_hold_the_window_of_the_echoes(attributes, limits):
+def test_time_limits_contain_the_window_of_the_echoes(attributes, limits):
     record = xr.Dataset(coords={"time": 0.5 + np.arange(100)}, attrs={"bin_width_ns": 1.0, **attributes})
     assert drawing.time_limits(record) == pytest.approx(limits)
 

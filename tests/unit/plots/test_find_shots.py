@@ -53,7 +53,7 @@ def test_footprints_lie_at_the_shots():
     assert sea.get_xlabel() == "x (m)"  # the lidar looks in another direction
 
 
-def test_sea_repeats_itself_around_the_shots():
+def test_sea_is_periodic_around_the_shots():
     (image,) = plot_found_shots(rendered(waveforms=False)).axes[0].images
     left, right, near, far = image.get_extent()
     # A margin of six standard deviations of the beam, 7.2 m.
@@ -62,7 +62,7 @@ def test_sea_repeats_itself_around_the_shots():
     np.testing.assert_allclose(image.get_array()[0], np.sin(2 * np.pi * x / 10), atol=1e-9)
 
 
-def test_waveforms_stand_beside_the_sea_with_their_slopes():
+def test_waveforms_are_drawn_next_to_the_sea_with_their_slopes():
     figure = plot_found_shots(rendered())
     panels = [ax for ax in figure.axes if ax.get_ylabel() == "power (mW)"]
     assert [ax.get_title() for ax in panels] == ["towards (+5.7°, +0.0°)", "level (+0.0°, -2.9°)"]

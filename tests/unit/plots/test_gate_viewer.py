@@ -1,4 +1,4 @@
-"""File of the page of gate stacks: embedded data, size limit, and refused arguments."""
+"""File of the page of gate stacks: embedded data, size limit, and rejected arguments."""
 
 import base64
 import json
@@ -56,7 +56,7 @@ def means(variable, block):
     return np.array([[values[r : r + block, c : c + block].mean((0, 1)) for c in columns] for r in rows])
 
 
-def test_everything_is_there(scene, tmp_path):
+def test_page_contains_all_data(scene, tmp_path):
     path = tmp_path / "page.html"
     write_page(scene[0].transpose("gate", "column", "row"), path, scene[1].transpose("time", ...))
     metadata, arrays, _ = embedded(path)
@@ -146,7 +146,7 @@ def test_a_stack_may_hold_its_waveforms(scene, tmp_path):
         (lambda stack, result: (stack, "page.html", None, 0.01), "limit_mb = 0.01 is too small for this stack"),
     ],
 )
-def test_mistakes_end_with_one_sentence(scene, tmp_path, change, message):
+def test_invalid_input_is_rejected_in_one_sentence(scene, tmp_path, change, message):
     stack, name, *rest = change(*(data.isel(row=slice(0, 4), column=slice(0, 4)) for data in scene))
     with pytest.raises(UserError, match=re.escape(message)) as caught:
         write_page(stack, tmp_path / name, *rest)
@@ -154,7 +154,7 @@ def test_mistakes_end_with_one_sentence(scene, tmp_path, change, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_page_is_one_file_of_its_own(scene, tmp_path):
+def test_page_is_self_contained(scene, tmp_path):
     write_page(scene[0], tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     # Metadata, two arrays and the script: no text ends or begins an element.

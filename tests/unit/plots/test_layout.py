@@ -1,4 +1,4 @@
-"""Figure of a layout: places on the sea, colours and labels."""
+"""Figure of a layout: positions on the sea, colours and labels."""
 
 import mitsuba as mi
 import numpy as np
@@ -64,7 +64,7 @@ def test_pixels_are_drawn_on_the_sea_in_their_colours(lidar_scene):
     assert texts == ["p0", "p1", "p2", "p3", "beam, e$^{-1/2}$", "beam, e$^{-2}$"]
 
 
-def test_azimuth_is_up_wherever_the_lidar_stands(lidar_scene):
+def test_azimuth_points_up_for_every_direction_of_the_lidar(lidar_scene):
     """From a laser that looks towards -y the far edge is at negative y, and is still drawn on top."""
     pose = {"to_world": mi.ScalarTransform4f().look_at([0, 72.794, 200], [0, 0, 0], [0, 0, 1])}
     figure = plot_layout(result(described(lidar_scene(tx=pose, rx=pose))))
@@ -97,7 +97,7 @@ def test_grazing_views_are_not_to_scale():
 
 
 def test_results_without_outlines_are_dots_and_the_field_of_view():
-    """As from earlier versions: dots at the centres, and the field of view if it is known."""
+    """Results of earlier versions: dots at the centres, and the field of view if it is known."""
     figure = plot_layout(result({}))
     (dots,) = (item for item in figure.axes[0].collections if isinstance(item, PathCollection))
     y, x = dots.get_offsets().T
@@ -107,7 +107,7 @@ def test_results_without_outlines_are_dots_and_the_field_of_view():
     assert figure.axes[0].lines[0].get_xdata().max() == pytest.approx(3.2, abs=0.05)
 
 
-def test_files_hold_all_that_is_drawn(lidar_scene, tmp_path):
+def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     attributes = described(lidar_scene(extra={"ball": {"type": "sphere", "center": [0, 0, -6], "radius": 0.5}}))
     drawn = []
     for suffix in (".nc", ".exr"):
@@ -127,7 +127,7 @@ def test_long_texts_are_left_out(lidar_scene, tmp_path):
     assert "pixel_outlines" not in described(lidar_scene(rx={"layout": "20x20", "imager": False}))
 
 
-def test_refusals(tmp_path):
+def test_invalid_results_are_rejected(tmp_path):
     nowhere = result({})
     del nowhere.attrs["altitude"]
     with pytest.raises(UserError, match="no altitude and off_nadir_deg among its attributes"):

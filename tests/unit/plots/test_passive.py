@@ -1,4 +1,4 @@
-"""Figures and animations of pictures by daylight."""
+"""Figures and animations of images by daylight."""
 
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_animation_shows_the_frames_in_their_time(frames, tmp_path):
     assert np.corrcoef(shown[2].ravel(), frames["radiance"][2].values.ravel())[0, 1] > 0.99
 
 
-def test_missing_frames_are_refused(frames, tmp_path):
+def test_missing_frames_are_rejected(frames, tmp_path):
     with pytest.raises(UserError, match="needs frames of an imager"):
         animate_passive(few(), tmp_path / "a.gif")
     with pytest.raises(UserError, match=r"must end in \.gif"):

@@ -68,7 +68,7 @@ def test_correlations_are_those_of_the_panels(shots):
     np.testing.assert_allclose(list(found.values()), [1, -1, 1, 1])
 
 
-def test_other_pixels_are_refused(shots, tmp_path):
+def test_other_pixels_are_rejected(shots, tmp_path):
     with pytest.raises(UserError, match="must be the 2x2 of red, green, blue and black"):
         plot_shot_statistics(shots.assign_coords(pixel=["a", "b", "c", "d"]), tmp_path / "a.png")
     assert not list(tmp_path.iterdir())

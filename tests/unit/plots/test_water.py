@@ -20,7 +20,7 @@ def curve(ax, label):
     return line.get_xdata(), line.get_ydata()
 
 
-def test_phase_function_stands_beside_two_others():
+def test_phase_function_is_drawn_with_two_others():
     figure = plot_phase_function(fournier_forand_of(0.0183), "this", "water")
     whole, backward = figure.axes
     assert (whole.get_xscale(), whole.get_yscale(), backward.get_yscale()) == ("log", "log", "log")
@@ -34,7 +34,7 @@ def test_phase_function_stands_beside_two_others():
     assert curve(backward, "Petzold's average particle")[1][-1] == pytest.approx(3.154e-3 / 0.9929, rel=1e-3)
     # Zhang, Hu and He (2009): 2.2975e-4 / 0.001962 at 180 degrees.
     assert curve(whole, "pure sea water")[1][-1] == pytest.approx(0.1171, rel=1e-3)
-    # A Fournier-Forand function of Petzold's bb/b lies within a quarter of his from 0.1 to 1 degree.
+    # A Fournier-Forand function of Petzold's bb/b is within a quarter of his from 0.1 to 1 degree.
     angles, values = curve(whole, "this")
     assert np.interp(0.1, angles, values) == pytest.approx(1767, rel=0.25)
     assert np.interp(1.0, angles, values) == pytest.approx(71.6, rel=0.25)
@@ -45,7 +45,7 @@ def test_pure_sea_water_is_drawn_once():
     assert [line.get_label() for line in whole.lines] == ["Petzold's average particle", "this"]
 
 
-def test_a_backscatter_ratio_out_of_range_is_refused():
+def test_a_backscatter_ratio_out_of_range_is_rejected():
     with pytest.raises(UserError, match=r"backscatter_ratio = 0\.6 must lie between"):
         fournier_forand_of(0.6)
 
@@ -106,7 +106,7 @@ def test_water_without_scattering_is_drawn(tmp_path, b):
     assert [text.get_text() for text in right.texts] == ([] if any(b) else ["no backscattering"])
 
 
-def test_nothing_at_all_is_drawn(tmp_path):
+def test_vacuum_is_drawn(tmp_path):
     profile = Profile([0, 1], [0, 0], [0, 0], [0, 0])
     left, right = plot_profile(profile, profile.layers(), "vacuum", tmp_path / "a.svg").axes
     assert (left.get_ylim(), len(right.lines)) == ((1, 0), 0)
@@ -115,7 +115,7 @@ def test_nothing_at_all_is_drawn(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
-def test_files_are_whole_and_alone(tmp_path, suffix):
+def test_files_are_complete_and_no_others_are_left(tmp_path, suffix):
     path = tmp_path / f"a.{suffix}"
     figure = plot_phase_function(water_phase_function, "this", "$a$b$ {", path)
     assert isinstance(figure, Figure)
@@ -123,7 +123,7 @@ def test_files_are_whole_and_alone(tmp_path, suffix):
     assert [other.name for other in tmp_path.iterdir()] == [path.name]
 
 
-def test_wrong_files_are_told_and_nothing_is_left(tmp_path):
+def test_wrong_files_are_rejected_and_nothing_is_left(tmp_path):
     profile = Profile(DEPTH, A, B, 0.02 * B)
     with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
         plot_profile(profile, profile.layers(), "x", tmp_path / "a.txt")

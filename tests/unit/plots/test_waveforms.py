@@ -153,7 +153,7 @@ def test_odd_names_are_plain_text(tmp_path):
     assert figure.get_suptitle() == "a$b_{  ·  median standard error 0.98 %"
 
 
-def test_png_is_whole_or_absent(tmp_path):
+def test_png_is_complete_or_absent(tmp_path):
     waveforms.plot_waveforms(make(), tmp_path / "a.png")
     data = (tmp_path / "a.png").read_bytes()
     assert data.startswith(b"\x89PNG")

@@ -173,7 +173,7 @@ def test_round_trip(tmp_path, case, suffix):
     kept = dataset.copy(deep=True)
     path = tmp_path / f"result{suffix}"
     results.save(dataset, path)
-    xr.testing.assert_identical(dataset, kept)  # saving leaves the dataset alone
+    xr.testing.assert_identical(dataset, kept)  # saving does not change the dataset
     back = results.open(path)
     if suffix == ".nc":
         xr.testing.assert_identical(back, dataset)
@@ -212,7 +212,7 @@ def test_result_read_back_can_be_saved_in_the_other_format(tmp_path):
     assert_same_kinds(dataset.attrs, back.attrs)
 
 
-def test_netcdf_is_plain_for_others(tmp_path):
+def test_other_programs_read_netcdf(tmp_path):
     dataset = make()
     results.save(dataset, tmp_path / "a.nc")
     with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as other:
@@ -224,7 +224,7 @@ def test_netcdf_is_plain_for_others(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])
-def test_content_counts_not_the_suffix(tmp_path, suffix):
+def test_format_follows_the_content_not_the_suffix(tmp_path, suffix):
     results.save(make(), tmp_path / f"a{suffix}")
     os.rename(tmp_path / f"a{suffix}", tmp_path / "a.dat")
     assert results.open(tmp_path / "a.dat").attrs["scene"] == "fig09"
@@ -256,7 +256,7 @@ def test_open_rejects_truncated_files(tmp_path, suffix, capfd):
         part.write_bytes(data[:length])
         with pytest.raises(UserError, match=part.name):
             results.open(part)
-    assert capfd.readouterr() == ("", "")  # the libraries' own messages are kept from the user
+    assert capfd.readouterr() == ("", "")  # messages of the libraries are suppressed
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])

@@ -79,7 +79,7 @@ def test_foreign_file(tmp_path):
         exr.read(tmp_path / "a.exr")
 
 
-def test_every_truncation_and_a_flipped_byte_are_noticed(tmp_path, capfd):
+def test_every_truncation_and_a_flipped_byte_are_detected(tmp_path, capfd):
     values = np.broadcast_to(np.arange(20.0)[:, np.newaxis, np.newaxis], (20, 8, 2))  # two ZIP blocks of 16 lines
     whole, part = tmp_path / "whole.exr", tmp_path / "part.exr"
     exr.write(whole, {"bin": {"Y": values}}, {"a": 1}, {})
@@ -94,6 +94,6 @@ def test_every_truncation_and_a_flipped_byte_are_noticed(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_unwritable_place_is_an_os_error(tmp_path):
+def test_unwritable_path_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match="No such file"):
         exr.write(tmp_path / "missing" / "a.exr", {"bin": {"Y": np.zeros((1, 1, 1))}}, {}, {})

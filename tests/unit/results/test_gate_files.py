@@ -111,7 +111,7 @@ def test_another_reader_finds_every_file_of_a_sequence(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".exr", ".nc", ".EXR"])
 @pytest.mark.parametrize("rows", [4, 0])
-def test_stacks_come_back(tmp_path, rows, suffix):
+def test_stacks_are_read_back(tmp_path, rows, suffix):
     stack = make(rows=rows)
     gate_files.save_stack(stack, tmp_path / f"a{suffix}")
     back = gate_files.open_stack(tmp_path / f"a{suffix}")
@@ -130,12 +130,12 @@ def test_values_beyond_32_bits_are_rounded_in_exr_only(tmp_path):
     xr.testing.assert_identical(gate_files.open_stack(tmp_path / "a.nc"), stack)
 
 
-def test_a_sequence_comes_back_from_its_folder_and_its_first_file(tmp_path):
+def test_sequence_is_read_from_its_folder_and_its_first_file(tmp_path):
     stack = make()
     paths = gate_files.save_sequence(stack, tmp_path, "a_gate001.exr")  # a stem that looks like a number
     xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
     xr.testing.assert_identical(gate_files.open_stack(paths[0]), stack)
-    for path in paths:  # the user may rename all files alike
+    for path in paths:  # all files may be renamed in the same way
         path.rename(path.with_name(path.name.replace("a_gate001.exr", "b")))
     xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
 
@@ -188,7 +188,7 @@ def test_imager_of_256_squared_and_64_gates_is_written_in_seconds(tmp_path):
         (lambda stack: stack.drop_vars("gate_width"), r"no coordinate gate_width over \(gate\)"),
     ],
 )
-def test_what_is_no_stack_is_not_written(tmp_path, change, message):
+def test_other_datasets_are_not_written_as_stacks(tmp_path, change, message):
     for write in (
         lambda stack: gate_files.save_stack(stack, tmp_path / "a.exr"),
         lambda stack: gate_files.save_sequence(stack, tmp_path, "a"),
@@ -247,7 +247,7 @@ def test_files_with_other_content(tmp_path):
             results.open(tmp_path / "gates.exr")
 
 
-def test_sequences_that_are_not_whole(tmp_path, caplog):
+def test_incomplete_sequences_are_rejected(tmp_path, caplog):
     old = gate_files.save_sequence(make(seed=1, gates=4), tmp_path, "a")
     with pytest.raises(UserError, match=r"is gate 2 of a sequence: open the folder or the first file, a_gate000\.exr"):
         gate_files.open_stack(old[2])

@@ -138,7 +138,7 @@ def test_weights_of_sharp_gates_are_shares_of_bins():
     first, weights = GateTrain(1401.2, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)
     assert first == 2
     np.testing.assert_allclose(weights, [0.6, 1, 1, 1, 0.4])
-    # Only the part of a gate within the record counts, and none of a gate beside it.
+    # Only the part of a gate within the record counts, and none of a gate outside it.
     first, weights = GateTrain(1399.0, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)
     assert (first, weights.tolist()) == (0, [1, 1])
     assert GateTrain(900.0, 2.0, 1.0, 1).gate_bins(0, 1400.0, 0.5, 320)[1].size == 0

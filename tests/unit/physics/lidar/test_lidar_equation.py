@@ -1,3 +1,5 @@
+"""Gain of the lidar equation."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Pulses, their kernels with the response of the receiver, and waveforms."""
+
 from itertools import pairwise
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Refraction at a level sea: angles, transmittance, focusing and times."""
+
 import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns, layered_time_ns

@@ -164,7 +164,7 @@ def test_positions_may_be_rounded(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".nc"])
-def test_a_size_beside_positions_is_rejected(tmp_path, suffix):
+def test_a_size_with_positions_is_rejected(tmp_path, suffix):
     path = tmp_path / f"map{suffix}"
     if suffix == ".nc":
         write_netcdf(path, HEIGHTS, coords={"x": X, "y": Y})

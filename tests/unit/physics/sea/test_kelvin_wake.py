@@ -101,7 +101,7 @@ def test_energy_lies_within_kelvins_angle_and_is_densest_at_its_edge(side):
 def test_heights_agree_with_direct_quadrature():
     speed, length, beam, draught = 4.0, 12.0, 1.5, 0.6
     k0 = GRAVITY / speed**2
-    # The first is beside the hull, halfway from amidships to the stern.
+    # The first is next to the hull, halfway from amidships to the stern.
     x, y = np.array([-3.0, -9, -15, -30, -30, -47]), np.array([4, 3, -5, 7.5, -9.5, 16])
     share = np.array([0.5, 1, 1, 1, 1, 1])
     theta = (np.arange(20000) + 0.5) / 20000 * np.pi - np.pi / 2
@@ -137,8 +137,8 @@ def test_wave_resistance_is_michells(froude):
     assert resistance == pytest.approx(michell_resistance(density, speed, length, beam, draught), rel=0.01)
 
 
-def test_waves_stand_still_for_the_ship():
-    # Of waves that run with the ship, omega = U kx, so that kx^4 = k0^2 (kx^2 + ky^2): a differential equation.
+def test_waves_are_stationary_in_the_frame_of_the_ship():
+    # Of waves that are stationary for the ship, omega = U kx, so that kx^4 = k0^2 (kx^2 + ky^2): a differential equation.
     speed, step = 5.0, 0.25
     k0 = GRAVITY / speed**2
     x, y = np.arange(-60, -20, step), np.arange(-20, 20, step)
@@ -159,7 +159,7 @@ def test_wake_turns_and_moves_with_the_ship(bearing):
     east, north = x[pick[0]] - 5, y[pick[1]] + 7
     ahead = np.cos(bearing) * east + np.sin(bearing) * north
     port = np.cos(bearing) * north - np.sin(bearing) * east
-    # Seen by the ship. Only the images of the wake lie elsewhere.
+    # In the frame of the ship; only the periodic images of the wake differ.
     expected = at_points(ahead, port, 4.0, 0.0, **ship)
     assert np.abs(expected).max() > 0.05
     assert heights[pick[1], pick[0]] == pytest.approx(expected, abs=1e-5)
@@ -169,14 +169,14 @@ def test_waves_grow_from_amidships_to_the_stern():
     length, x, y = 20.0, np.linspace(-40, 40, 161), np.linspace(-10, 10, 41)
     heights = kelvin_wake(x, y, 6.0, 0.0, length)
     assert np.all(heights[:, x >= 0] == 0)
-    # Port and starboard are alike.
+    # The wake is symmetric about its track.
     assert heights == pytest.approx(heights[::-1], abs=1e-12)
     # A step in the heights amidships would be a wall of water; at a fifth of the way there are 6 % of them.
     assert np.abs(heights[:, (x < 0) & (x >= -2)]).max() < 0.06 * np.abs(heights).max()
 
 
 @pytest.mark.parametrize("speed", [3.0, 8.0, 25.0])
-def test_heights_do_not_depend_on_how_far_the_grid_goes(speed):
+def test_heights_do_not_depend_on_the_extent_of_the_grid(speed):
     # A larger grid has finer nodes of the integral: twice as many here.
     small = np.linspace(-40, 40, 81)
     large = np.linspace(-160, 160, 321)

@@ -60,7 +60,7 @@ def test_angular_frequency_in_its_limits():
     assert speeds[1] < min(speeds[0], speeds[2])
     # Ripples of 1 mm: surface tension of clean water, 0.0728 N/m
     assert angular_frequency(6283.0) ** 2 == pytest.approx(0.0728e-3 * 6283.0**3, rel=0.03)
-    # Shallow: all waves run at sqrt(g h)
+    # Shallow: all waves travel at sqrt(g h)
     assert angular_frequency(0.001, depth=2.0) / 0.001 == pytest.approx(np.sqrt(G * 2), rel=1e-5)
     assert angular_frequency(0.5, depth=2.0) ** 2 == pytest.approx(G * 0.5 * np.tanh(1.0), rel=1e-5)
     assert angular_frequency(0.0) == angular_frequency(0.0, 3.0) == 0
@@ -114,7 +114,7 @@ def test_realised_waves_have_the_variances_of_their_kind():
 
 @pytest.mark.parametrize("kind", ["elfouhaily", "single"])
 def test_slopes_are_gaussian(kind):
-    """One slope of each of 2000 seas. Waves of fixed amplitude would leave a single wave an arcsine law."""
+    """One slope of each of 2000 seas. With fixed amplitudes, a single wave would have an arcsine distribution."""
     if kind == "single":
         spectrum, period, cells = single_wave(16.0, 0.0), 64.0, 16
     else:
@@ -153,7 +153,7 @@ def test_seeds_differ_and_repeat():
     other = realise(spectrum, 40, 32, 2)
     assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.6
     assert np.isfinite(realise(spectrum, 40, 32, -5)).all()
-    # Values frozen on purpose: stored scenes must show the same sea in later versions.
+    # Fixed values: stored scenes must give the same sea in later versions.
     np.testing.assert_allclose(first[16, 15:18], [0.188771089, 0.184545047, 0.199352481], atol=1e-9)
 
 
@@ -180,7 +180,7 @@ def test_components_of_a_sea_have_independent_waves():
 @pytest.mark.parametrize(
     ("direction", "shift"), [(0.0, (0, 4)), (np.pi / 2, (4, 0)), (np.pi, (0, -4)), (-np.pi / 2, (-4, 0))]
 )
-def test_single_wave_runs_along_its_direction(direction, shift):
+def test_single_wave_travels_along_its_direction(direction, shift):
     wave, k = single_wave(16.0, direction), 2 * np.pi / 16
     period = 2 * np.pi / np.sqrt(G * k * (1 + (k / 370) ** 2))
     start = realise(wave, 64.0, 64, 5)
@@ -194,8 +194,8 @@ def test_single_wave_runs_along_its_direction(direction, shift):
     np.testing.assert_allclose(realise(wave, 64.0, 64, 5, slow, depth=2.0), start, atol=1e-13)
 
 
-def test_every_wave_runs_towards_the_half_plane_of_its_direction():
-    """The phase of each wave between two times, against k . direction; half turned the wrong way would be as likely."""
+def test_every_wave_travels_towards_the_half_plane_of_its_direction():
+    """The phase of each wave between two times, against k . direction; random phases would give the wrong sign for half."""
     direction = 2.2
     spectrum = ElfouhailySpectrum(6, direction=direction)
     before, after = (fourier(realise(spectrum, 40, 32, 4, time)) for time in (0.0, 0.1))

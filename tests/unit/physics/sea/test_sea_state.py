@@ -41,7 +41,7 @@ def partial_slopes(spectrum, k_max):
 
 
 def swell_table(**options):
-    """Return the table of waves that run along (0.5, 0.3) rad/m, and of as many that run along (-0.2, 0.6)."""
+    """Return the table of waves that travel along (0.5, 0.3) rad/m, and of equal ones along (-0.2, 0.6)."""
     kx, ky = np.linspace(-0.6, 0.9, 76), np.linspace(-0.1, 0.9, 51)
     x, y = kx, ky[:, None]
     humps = [np.exp(-(((x - a) / 0.08) ** 2) - ((y - b) / 0.06) ** 2) for a, b in ((0.5, 0.3), (-0.2, 0.6))]
@@ -61,7 +61,7 @@ SPECTRA = {
 
 
 def elfouhaily_written_out(wind):
-    """Return S(k) and Delta(k) of a fully developed sea, from PHYSICS.md with nothing shared with the package."""
+    """Return S(k) and Delta(k) of a fully developed sea, independently of the package."""
 
     def c(k):
         return np.sqrt(G / k * (1 + (k / 370.0) ** 2))
@@ -236,7 +236,7 @@ def test_jonswap_ends_where_the_sea_is_fully_developed():
     assert oldest.peak_wavenumber == pytest.approx(PiersonMoskowitzSpectrum(3).peak_wavenumber, rel=2e-3)
 
 
-def test_swell_has_the_height_and_the_length_asked_for():
+def test_swell_has_the_given_height_and_length():
     swell = SwellSpectrum(2.0, 80.0, 0.3, relative_bandwidth=0.05, directional_spread=0.1)
     assert significant_wave_height(swell) == pytest.approx(2.0, rel=1e-7)
     assert swell.peak_wavenumber == pytest.approx(2 * np.pi / 80)
@@ -248,14 +248,14 @@ def test_swell_has_the_height_and_the_length_asked_for():
 
 
 def test_swell_variance_is_conserved_in_a_short_period():
-    """Taken at the waves alone, swell of 60 m would be 0.2 m or 30 m high in periods of a few lengths."""
+    """Sampled at the waves of the period, swell of 60 m would be 0.2 m or 30 m high in periods of a few lengths."""
     swell = SwellSpectrum(1.0, 60.0, 0.4, relative_bandwidth=0.02, directional_spread=0.03)
     index = np.arange(-60, 61)
     for period in (61, 200, 256, 1100):
         variances = swell.mode_variances(index, index, 2 * np.pi / period)
         assert 4 * np.sqrt(variances.sum()) == pytest.approx(1.0, rel=1e-6)
         np.testing.assert_array_equal(variances, variances[::-1, ::-1])
-    # The wave that fits best holds most of it: 256/60 = 4.3 periods along 0.4 rad
+    # The nearest wave has most of the variance: 256/60 = 4.3 periods along 0.4 rad
     variances = swell.mode_variances(index, index, 2 * np.pi / 256)
     j, i = np.unravel_index(np.argmax(variances), variances.shape)
     assert (abs(index[i]), abs(index[j])) == (4, 2)
@@ -305,7 +305,7 @@ def test_directional_spectrum_integrates_to_elevation_and_slopes(kind):
 
 
 @pytest.mark.parametrize("kind", SPECTRA)
-def test_opposite_waves_count_alike(kind):
+def test_opposite_waves_have_equal_density(kind):
     kx, ky = np.random.default_rng(1).uniform(-1, 1, (2, 200))
     spectrum = SPECTRA[kind]
     there, back = spectrum.directional(kx, ky), spectrum.directional(-kx, -ky)
@@ -322,7 +322,7 @@ def test_mode_variances_are_the_directional_spectrum(kind):
     np.testing.assert_allclose(spectrum.mode_variances(ix, iy, dk), expected, rtol=1e-9, atol=1e-18)
 
 
-def test_table_is_bilinear_and_nothing_outside():
+def test_table_is_bilinear_and_zero_outside():
     table = TabulatedSpectrum([1, 2, 4], [-1, 1], [[1, 2, 0], [3, 4, 0]])
     # Half the value: the other half belongs to the opposite wave.
     assert table.directional(1.5, 0.0) == pytest.approx(0.5 * 2.5)
@@ -332,7 +332,7 @@ def test_table_is_bilinear_and_nothing_outside():
     # Mean of four corners times area, cell by cell
     assert table.elevation_variance() == pytest.approx(2 * 2.5 + 4 * 1.5)
     assert table.peak_wavenumber == pytest.approx(np.sqrt(5))
-    # The edges of the cells of the waves lie anywhere in the table's; together they hold it all.
+    # The cells of the waves do not coincide with those of the table, but cover all of it.
     index = np.arange(-30, 31)
     assert table.mode_variances(index, index, 0.19).sum() == pytest.approx(11.0, rel=1e-12)
 
@@ -376,7 +376,7 @@ def test_matched_totals(kind, wind):
     assert matched.slope_variance() == pytest.approx(cox_munk(wind), rel=1e-12)
     assert min(matched.scales) > 0
     assert matched.direction == 0.8
-    # Long waves, and with them the height, are left as they were.
+    # Long waves, and with them the height, are unchanged.
     assert matched.scaled_from == 2 * np.pi
     k = np.geomspace(0.01, 6.28, 30)
     np.testing.assert_array_equal(matched.omnidirectional(k), plain.omnidirectional(k))

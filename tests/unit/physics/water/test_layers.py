@@ -1,3 +1,5 @@
+"""Optical depths of layered water, and invalid layers."""
+
 import numpy as np
 import pytest
 

@@ -37,7 +37,7 @@ def fraction(p, low, high):
 def test_normalised_and_divided_as_the_report_says(name):
     p = petzold_water(name)
     _, ratio, median, below, _, _ = REPORT[name]
-    # The cone below 1e-12 rad still holds 8e-6 of the steepest.
+    # The cone below 1e-12 rad contains 8e-6 of the light of the steepest.
     assert fraction(p, 1e-12, np.pi) == pytest.approx(1, abs=1e-5)
     assert fraction(p, np.pi / 2, np.pi) == pytest.approx(ratio, abs=5e-4)
     assert fraction(p, 1e-12, np.radians(median)) == pytest.approx(0.5, abs=1e-3)

@@ -49,13 +49,13 @@ def test_factor_of_unnormalised_values(tmp_path, factor):
     np.testing.assert_allclose(read.table.value, expected.table.value, rtol=1e-12)
 
 
-def test_petzold_is_read_like_the_one_that_is_shipped():
+def test_petzold_file_equals_the_shipped_table():
     """The file integrates to 0.9929; its first two angles give the power -1.345, the paper's is -1.346."""
     path = resources.files("mitransient_lidar.physics.water").joinpath("petzold_average_particle.csv")
     table, integral = read_phase_table(path)
     assert integral == pytest.approx(0.9929, abs=1e-4)
     theta = np.radians(np.geomspace(0.001, 180, 500))
-    # Kinks at the rows: the fine table has its nodes beside them.
+    # Kinks at the rows: the nodes of the fine table do not coincide with them.
     np.testing.assert_allclose(table.eval(theta), petzold_average_particle()(theta), rtol=1e-2)
     shipped = PowerLawTable.from_function(petzold_average_particle(), table.count)
     assert table.mean_cosine == pytest.approx(shipped.mean_cosine, abs=1e-5)
@@ -76,7 +76,7 @@ def test_values_that_fall_towards_zero_end_flat(tmp_path):
     np.testing.assert_allclose(core / core[2], [1, 1, 1, 2**0.5], rtol=1e-3)
 
 
-def test_an_angle_of_zero_counts(tmp_path):
+def test_an_angle_of_zero_is_used(tmp_path):
     """Between 0 and the next angle ln p is linear in theta^2: half-way a quarter of the drop."""
     degrees = np.array([0.0, *np.linspace(5, 180, 36)])
     values = np.array([8.0, *np.geomspace(2, 0.01, 36)])
@@ -85,7 +85,7 @@ def test_an_angle_of_zero_counts(tmp_path):
     np.testing.assert_allclose(read, [8, 8 / 4**0.25, 2], rtol=1e-3)
 
 
-def test_last_value_holds_to_the_end(tmp_path):
+def test_last_value_is_continued_to_180_degrees(tmp_path):
     degrees = np.linspace(1, 170, 60)
     table, integral = read_phase_table(write(tmp_path / "short.txt", degrees, 2 - degrees / 180, " "))
     read = table.eval(np.radians([168.0, 171.0, 175.0, 180.0])) * integral

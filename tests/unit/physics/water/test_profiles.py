@@ -103,19 +103,19 @@ def test_clear_water_needs_the_floors():
 @pytest.mark.parametrize("nodes", [2, 50, 1000])
 @pytest.mark.parametrize("order", [1, -1])
 def test_fewest_layers_of_a_straight_profile(nodes, order):
-    """A layer may span a ratio of 1 + 2 tolerance; nodes in line change nothing. The last layer has no end."""
+    """A layer may span a ratio of 1 + 2 tolerance; collinear nodes change nothing. The last layer has no end."""
     z = np.linspace(0, 10, nodes)
     b = np.linspace(0.1, 0.8, nodes)[::order]
     count = Profile(z, b, b, 0.02 * b).layers(0.01).count
     assert count == np.ceil(np.log(8) / np.log(1.02)) + 1
 
 
-def test_number_of_layers_goes_with_the_inverse_tolerance(profile):
+def test_number_of_layers_is_proportional_to_the_inverse_tolerance(profile):
     coarse, fine = profile.layers(0.004).count, profile.layers(0.0004).count
     assert fine / coarse == pytest.approx(10, rel=0.03)
 
 
-def test_hardly_two_neighbours_could_be_one(noisy):
+def test_few_neighbouring_layers_could_be_merged(noisy):
     """Nodes that vary by less than the tolerance are joined in layers; 500 of them above 20 m need about 70."""
     tolerance = 0.01
     water = noisy.layers(tolerance)
@@ -138,13 +138,13 @@ def test_constant_parts_are_one_layer():
     np.testing.assert_allclose(water.attenuation[[0, -1]], [0.3, 0.2], rtol=2e-2)
 
 
-def test_a_cliff_has_layers_of_finite_thickness():
+def test_a_steep_profile_has_layers_of_finite_thickness():
     water = Profile([0, 3, 3 + 1e-9, 5], [0.4, 0.4, 0.1, 0.1], [0.5, 0.5, 0.4, 0.4], [0.01] * 4).layers()
     np.testing.assert_allclose(water.layer_tops, [0, 3, 3 + 1e-9], atol=2e-4)
     assert water.cumulative(5.0) == pytest.approx(0.9 * 3 + 0.5 * 2, rel=1e-6)
 
 
-def test_ten_thousand_layers_are_quick():
+def test_ten_thousand_layers_are_fast():
     z = np.linspace(0, 50, 1000)
     b = 0.3 + 0.2 * np.sin(z)
     profile = Profile(z, np.full(z.size, 0.05), b, 0.02 * b)
@@ -191,7 +191,7 @@ def test_csv_and_netcdf_give_the_same_layers(tmp_path, profile):
     csv = write_csv(tmp_path / "water.csv", {"depth": DEPTH, **columns})
     netcdf = tmp_path / "water.nc"
     variables = {name: ("depth", values) for name, values in columns.items()}
-    # What does not go with depth alone is none of the profile's.
+    # Variables over other dimensions than the depth are ignored.
     xr.Dataset({**variables, "station": 7}, {"depth": DEPTH}).to_netcdf(netcdf, engine="h5netcdf")
     expected = profile.layers()
     for path in (csv, str(netcdf)):

@@ -1,3 +1,5 @@
+"""Pure sea water against published formulas and measurements."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Waters by Jerlov type, chlorophyll, Kd and Secchi depth, against published values."""
+
 import numpy as np
 import pytest
 
@@ -123,7 +125,7 @@ def test_particle_scattering_in_the_blue():
 
 
 @pytest.mark.parametrize("wavelength", [400, 440, 532, 590, 700])
-def test_chlorophyll_never_clears_water(wavelength):
+def test_attenuation_increases_with_chlorophyll(wavelength):
     waters = [chlorophyll(c, wavelength) for c in np.geomspace(0.01, 30, 20)]
     assert waters[0].absorption >= water_absorption(wavelength)
     assert np.all(np.diff([w.absorption for w in waters]) >= 0)
@@ -153,7 +155,7 @@ def test_water_from_kd_with_albedo_and_backscatter_ratio():
 
 
 @pytest.mark.parametrize("depth", [0.5, 5, 25])
-def test_water_from_secchi_depth_keeps_both_rules(depth):
+def test_water_from_secchi_depth_satisfies_both_rules(depth):
     water = from_secchi(depth, 0.02)
     assert water.kd * depth == pytest.approx(1.7, rel=1e-9)
     assert (water.attenuation + water.kd) * depth == pytest.approx(8.7, rel=1e-9)

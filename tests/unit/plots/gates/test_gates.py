@@ -1,4 +1,4 @@
-"""Figures and animations of gate stacks: contents, places and colours."""
+"""Figures and animations of gate stacks: contents, positions and colours."""
 
 import math
 import stat
@@ -46,7 +46,7 @@ def images(figure):
 
 
 def colour_at(figure, ax, x, y):
-    """Return the colour (red, green, blue) that is seen at a place of the axes."""
+    """Return the colour (red, green, blue) at a position in the axes."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     picture = np.asarray(canvas.buffer_rgba())
@@ -54,7 +54,7 @@ def colour_at(figure, ax, x, y):
     return picture[picture.shape[0] - 1 - int(row), int(column), :3]
 
 
-def test_contact_sheet_shows_every_gate_at_its_place():
+def test_contact_sheet_shows_every_gate_at_its_position():
     stack = make()
     figure = plot_gates(stack)
     drawn = images(figure)
@@ -123,7 +123,7 @@ def test_logarithmic_colours():
     norm = drawn[0].norm
     assert isinstance(norm, LogNorm)
     assert norm.vmax / norm.vmin == pytest.approx(1000.0)
-    # Zero is dark, not missing; what is no number is grey.
+    # Zero is dark, not missing; NaN is grey.
     assert colour_at(figure, drawn[4].axes, 0.0, 2.0).sum() < 30
     np.testing.assert_allclose(colour_at(figure, drawn[5].axes, -6.0, 6.0), 153, atol=1)
 
@@ -166,7 +166,7 @@ def test_pixels_are_lines_over_depth():
 def test_gif_has_one_frame_a_gate(tmp_path):
     energy = np.full((ROWS, COLUMNS, 5), 1e-18)
     for k in range(5):
-        energy[:, k, k] = 1e-15  # a bright column that wanders to the right
+        energy[:, k, k] = 1e-15  # a bright column that moves to the right
     animate_gates(make(5, energy), tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as movie:
         assert movie.n_frames == 5
@@ -179,7 +179,7 @@ def test_gif_has_one_frame_a_gate(tmp_path):
     # The bright column moves by a fifth of the image's width (about 340 of the 840 points) a frame.
     bright = [np.flatnonzero(frame[210, 100:450].sum(axis=-1) > 600) for frame in frames]
     assert np.diff([columns.mean() for columns in bright[1:4]]) == pytest.approx([68, 68], abs=7)
-    # The text below the colour bar stands still.
+    # The text below the colour bar does not move.
     assert ((frames[1][500:] < 128) == (frames[3][500:] < 128)).all()
     assert (frames[1][500:] < 128).any()
 
@@ -193,7 +193,7 @@ exit {status}
 
 @pytest.fixture
 def fake_ffmpeg(tmp_path):
-    """Put a program in the place of ffmpeg that keeps the raw frames."""
+    """Replace ffmpeg by a program that stores the raw frames."""
 
     def install(status):
         program = tmp_path / "ffmpeg"
@@ -204,7 +204,7 @@ def fake_ffmpeg(tmp_path):
     return install
 
 
-def test_mp4_hands_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
+def test_mp4_passes_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
     with fake_ffmpeg(status=0):
         animate_gates(make(3), tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").stat().st_size == 3 * 840 * 540 * 4  # raw frames
