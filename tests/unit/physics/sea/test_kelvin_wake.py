@@ -138,7 +138,7 @@ def test_wave_resistance_is_michells(froude):
 
 
 def test_waves_are_stationary_in_the_frame_of_the_ship():
-    # Of waves that are stationary for the ship, omega = U kx, so that kx^4 = k0^2 (kx^2 + ky^2): a differential equation.
+    # Stationary waves have omega = U kx, so that kx^4 = k0^2 (kx^2 + ky^2): a differential equation.
     speed, step = 5.0, 0.25
     k0 = GRAVITY / speed**2
     x, y = np.arange(-60, -20, step), np.arange(-20, 20, step)

@@ -195,7 +195,7 @@ def test_single_wave_travels_along_its_direction(direction, shift):
 
 
 def test_every_wave_travels_towards_the_half_plane_of_its_direction():
-    """The phase of each wave between two times, against k . direction; random phases would give the wrong sign for half."""
+    """The sign of the phase change of each wave between two times is that of -k . direction."""
     direction = 2.2
     spectrum = ElfouhailySpectrum(6, direction=direction)
     before, after = (fourier(realise(spectrum, 40, 32, 4, time)) for time in (0.0, 0.1))
