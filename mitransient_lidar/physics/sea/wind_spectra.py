@@ -41,7 +41,7 @@ def inverse_wave_age(wind_speed: float, fetch: float) -> float:
     Raises
     ------
     UserError
-        If a parameter lies outside its range, or the fetch is so short that Omega exceeds 5.
+        If the fetch is so short that Omega exceeds 5.
 
     Notes
     -----

@@ -108,7 +108,7 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
     Raises
     ------
     UserError
-        If there is no such type or the wavelength lies outside its range.
+        If there is no such type.
 
     Notes
     -----
@@ -183,7 +183,7 @@ def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | N
     Raises
     ------
     UserError
-        If a value lies outside its range, or together they give less absorption than that of pure water.
+        If the values together give less absorption than that of pure water.
 
     Notes
     -----
@@ -223,7 +223,7 @@ def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RAT
     Raises
     ------
     UserError
-        If a value lies outside its range, or together they give less absorption than that of pure water.
+        If the values together give less absorption than that of pure water.
 
     Notes
     -----
