@@ -21,20 +21,15 @@ _LARGEST = 2**28
 _SMALLEST_WEIGHT = 1e-7
 
 #: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below
-#: which energies are summed finely. Coarse sums hold 64 times the emitted energy; fine ones 2^23 of the largest they
-#: take.
+#: which energies go to the fine sums. Coarse sums hold 64 times the emitted energy, fine ones 2^23 of their largest
+#: terms.
 _COARSE_BITS, _FINE_BITS, _COARSEST_FINE = 57, 32, 2.0**8
 
 
 class GateWeights:
-    """Weights with which an arrival counts in the gates that are open to a part of its pulse.
+    """Weights of an arrival in the gates that are open during its pulse.
 
-    Parameters
-    ----------
-    train
-        Gates.
-    table
-        Weight of an arrival in the first gate, from `GateTrain.response_weights`.
+    `table` holds the weight of an arrival in the first gate of `train`, from `GateTrain.response_weights`.
     """
 
     def __init__(self, train: GateTrain, table: ResponseTable) -> None:
@@ -79,8 +74,7 @@ class GateWeights:
 class TransientHistogram:
     """Energy of each pixel in each time bin, or in each gate.
 
-    Energies are summed as integers of two units, so that the sums do not depend on their order: the same seed gives the
-    same bits, and pixels sum exactly to the whole.
+    Energies are summed as integers of two units, so that the sums do not depend on their order.
 
     Parameters
     ----------
@@ -89,7 +83,7 @@ class TransientHistogram:
     shape
         Numbers of pixels, (pixels,) or (rows, columns).
     emitted
-        Energy that the laser emits [J]: no bin receives more.
+        Energy that the laser emits [J], the most that a bin receives.
     gates
         Gates that are summed instead of the time bins, or None.
 

@@ -1,8 +1,4 @@
-"""Numbers of a scene that a kernel reads instead of holding: the next shot or sea then needs no new kernel.
-
-Dr.Jit writes Python numbers into the kernels that it compiles. Where they differ from shot to shot, each shot would
-wait a second for the compiler.
-"""
+"""Scene constants kept opaque, so that kernels need not be recompiled for another shot or sea."""
 
 from __future__ import annotations
 
@@ -15,17 +11,17 @@ from numpy.typing import NDArray
 
 
 def opaque(value: float) -> mi.Float:
-    """Return a number."""
+    """Return a number that kernels read from memory."""
     return dr.opaque(mi.Float, float(value))
 
 
 def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
-    """Return a point, shape (3,)."""
+    """Return a point, of values of shape (3,), that kernels read from memory."""
     return mi.Point3f(*(opaque(value) for value in values))
 
 
 def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
-    """Return whether a pointer is that of one of some shapes."""
+    """Return whether a pointer refers to one of the shapes."""
     number = dr.reinterpret_array(mi.UInt32, pointer)
     found = mi.Bool(False)
     for shape in shapes:

@@ -1,4 +1,4 @@
-"""Independent passes over one scene: what prepares them, and what each of them records."""
+"""Independent passes over one scene, and their records."""
 
 from __future__ import annotations
 
@@ -14,14 +14,7 @@ from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 
 class PassRecord:
-    """Received light of one pass.
-
-    Parameters
-    ----------
-    histogram
-        Energy by pixel (or by class of a pixel) and time.
-    classes
-        Classes into which the light of a pixel is separated.
+    """Received light of one pass: a histogram by pixel, or by class of a pixel, and time.
 
     Attributes
     ----------
@@ -50,7 +43,7 @@ class PassRecord:
         energy: mi.Float,
         active: mi.Bool,
     ) -> None:
-        """Add the energy [J] of a path of an optical length [m], with its scattering events and vertical reversals."""
+        """Add the energy [J] of paths of an optical length [m], an order of scattering and a number of reversals."""
         self.histogram.add(self.classes.index(pixel, order, reversals), length, energy, active)
 
     def lose(self, energy: mi.Float, active: mi.Bool) -> None:
@@ -64,17 +57,7 @@ class PassRecord:
 
 
 class PassRenderer(ABC):
-    """Renders independent passes of one prepared scene.
-
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-    classes
-        Classes into which the received light is separated.
-    paths
-        Paths from the receiver in one pass.
-    """
+    """Renders independent passes of one prepared scene, by default with `paths` paths from the receiver each."""
 
     def __init__(self, scene: LidarScene, classes: PathClasses, paths: int) -> None:
         self.scene, self.classes, self.paths = scene, classes, paths
@@ -83,14 +66,7 @@ class PassRenderer(ABC):
     def render_pass(self, seed: int, *, paths: int | None = None, gates: GateWeights | None = None) -> PassRecord:
         """Render one pass.
 
-        Parameters
-        ----------
-        seed
-            Seed of the pass; passes of different seeds are independent.
-        paths
-            Number of paths, instead of the renderer's own.
-        gates
-            Gates that are summed instead of time bins, or None.
+        Passes of different seeds are independent. Energy is summed over `gates` instead of time bins if they are given.
 
         Raises
         ------

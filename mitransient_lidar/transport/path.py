@@ -84,18 +84,10 @@ class Path:
 
 
 def advance(path: Path, index_layers: IndexLayers | None, distance: mi.Float, point: mi.Point3f) -> None:
-    """Move a path along its direction to its next vertex; its point and its optical length change.
+    """Move paths over a distance [m] to their next vertices `point` [m]; their optical lengths grow.
 
-    Parameters
-    ----------
-    path
-        The path.
-    index_layers
-        Index layers of the water, or None in a scene without water.
-    distance
-        Length of the segment [m].
-    point
-        The vertex at its end [m]. On surfaces the intersection is more accurate than distance times direction.
+    On surfaces `point`, the intersection, is more accurate than distance times direction. Without water there are no
+    index layers.
     """
     group = mi.Float(1) if index_layers is None else index_layers.group(path.index_layer)
     length = distance * dr.select(path.in_water, group, 1)

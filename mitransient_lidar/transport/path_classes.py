@@ -20,11 +20,7 @@ MOST_ORDERS = _MOST - 1
 class PathClasses:
     """Classes into which the light of each pixel is separated.
 
-    Parameters
-    ----------
-    orders
-        Number of separate orders of scattering, 0 to `orders` - 1; the last class holds all higher ones. 0 separates
-        nothing: one class a pixel.
+    Orders of scattering below `orders`, and all higher ones together; with `orders` = 0 each pixel is one class.
     """
 
     orders: int = 0
@@ -46,7 +42,7 @@ class PathClasses:
         return label | _packed(scatterings, _PIXEL_BITS) | _packed(reversals, _PIXEL_BITS + _ORDER_BITS)
 
     def unpack(self, label: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return a packed label, and the numbers of scattering events and reversals (0 where nothing is separated)."""
+        """Return a label without the numbers of scattering events and reversals, and these (0 without classes)."""
         if not self.separate:
             return label, mi.UInt32(0), mi.UInt32(0)
         return (label & ((1 << _PIXEL_BITS) - 1), (label >> _PIXEL_BITS) & _MOST, label >> (_PIXEL_BITS + _ORDER_BITS))

@@ -1,8 +1,4 @@
-"""One step of a path: flight to the next vertex, and what happens there to its position, medium and direction.
-
-The reference integrator, merging and daylight share these steps. They differ in how they draw a new direction and in
-what they record at a vertex.
-"""
+"""One step of a path, shared by all integrators: flight to the next vertex, and change of medium and direction."""
 
 from __future__ import annotations
 
@@ -76,8 +72,6 @@ class PathStep:
 
     Parameters
     ----------
-    scene
-        The scene.
     flight
         Free flight from which the distances to scattering events are drawn; None without water.
     mode
@@ -109,7 +103,7 @@ class PathStep:
         return Vertex(si, reach, length, scattered, at_boundary & ~scattered, no, in_water, no, no)
 
     def arrive(self, path: Path, vertex: Vertex) -> None:
-        """Move paths to their next vertex and sort the vertices; paths that pass outside the surface mesh end."""
+        """Move paths to their next vertices and classify these; paths that pass outside the surface mesh end."""
         free = vertex.scattered | vertex.at_boundary | vertex.outside
         point = dr.select(free, path.point + path.direction * vertex.length, vertex.si.p)
         advance(path, self.scene.index_layers, vertex.length, point)
@@ -138,18 +132,8 @@ class PathStep:
     ) -> None:
         """Continue paths from a scattering event or a surface in a new direction.
 
-        Parameters
-        ----------
-        path, vertex
-            Paths at their vertices.
-        direction
-            New unit directions.
-        factor
-            Factor of the throughput; paths end where it is 0.
-        bs
-            Sample of the surface's BSDF, which decides on which side of the sea surface a path continues.
-        passes
-            Whether a path passes a solid as if it were not there (null interface).
+        Paths end where `factor` of the throughput is 0. The sample `bs` of the surface's BSDF decides on which side of
+        the sea surface a path continues; `passes` is whether a path crosses a solid unchanged (null interface).
         """
         path.throughput *= dr.select(path.active, factor, 1)
         path.active &= path.throughput > 0
@@ -162,10 +146,7 @@ class PathStep:
         path.reversals += dr.select(path.active & (before * path.direction.z < 0), mi.UInt32(1), 0)
 
     def cross_boundary(self, path: Path, at_boundary: mi.Bool) -> None:
-        """Refract paths at a boundary of index layers, or reflect them totally.
-
-        Radiance is multiplied by the square of the ratio of the refractive indices; energy is not.
-        """
+        """Refract paths at a boundary of index layers, or reflect them totally."""
         layers = self.scene.index_layers
         if layers is None or layers.count == 1:
             return
@@ -175,5 +156,6 @@ class PathStep:
         path.direction = dr.select(at_boundary, dr.select(passes, direction, mirrored), path.direction)
         path.reversals += dr.select(at_boundary & ~passes, mi.UInt32(1), 0)
         path.index_layer = dr.select(at_boundary & passes, beyond, path.index_layer)
+        # Radiance scales with the square of the refractive index; energy does not.
         if not self.adjoint:
             path.throughput *= dr.select(at_boundary & passes, ratio * ratio, 1)

@@ -19,10 +19,10 @@ from mitransient_lidar.transport.scene import LidarScene
 
 FloatArray = NDArray[np.float64]
 
-#: Paths end after this multiple of the way to the deepest plane, or where absorption has left this share of the light.
+#: Paths end after this multiple of the distance to the deepest plane, or when absorption leaves this share of light.
 _LONGEST_WAY, _SMALLEST_REST = 50.0, 1e-6
 
-#: Capacity for segments of each photon at first, and capacity over what the last pass needed.
+#: Initial capacity for segments of each photon, and capacity over the need of the last pass.
 _SEGMENTS, _CAPACITY_MARGIN = 2.5, 1.25
 
 
@@ -39,8 +39,7 @@ class CrossingPath(RandomWalkPath):
     submerged
         Whether its last segment lies in water.
     passed
-        Number of planes at or above it. It is part of the state: computed anew at each vertex, rounding could lose a
-        crossing or count it twice.
+        Number of planes at or above it, kept because rounding could lose or repeat a crossing if it were computed anew.
     """
 
     entry: mi.Point3f
@@ -100,25 +99,15 @@ class PlaneCrossings:
     delay: FloatArray
 
     def select(self, which: NDArray[np.bool_]) -> PlaneCrossings:
-        """Return some of the crossings."""
+        """Return the crossings where `which` is true."""
         return PlaneCrossings(**{name: values[which] for name, values in vars(self).items()})
 
 
 class Crossings:
-    """Segments that cross horizontal planes, instead of a `SegmentBuffer`, in a random walk of `CrossingPath`.
+    """Segments that cross horizontal planes, stored in place of a `SegmentBuffer` by random walks of `CrossingPath`.
 
-    Light counts before its first solid, and inside the surface mesh.
-
-    Parameters
-    ----------
-    water
-        The ``layered_water``.
-    depths
-        Depths of the planes below the mean sea level [m], increasing, shape (planes,).
-    capacity
-        Largest number of segments; more are counted, but not stored.
-    longest
-        Optical length in the water after which paths end [m].
+    Light counts before its first solid, and inside the surface mesh. At most `capacity` segments are stored, but all
+    are counted; `longest` is the optical length in the water after which paths end [m].
     """
 
     def __init__(self, water: Any, depths: FloatArray, capacity: int, longest: float = np.inf) -> None:
@@ -140,15 +129,7 @@ class Crossings:
     def add(self, path: CrossingPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
         """Store the next segment of each path that crosses a plane, and return the paths' offset unchanged.
 
-        Parameters
-        ----------
-        path
-            Paths at the start of the segment.
-        length
-            Length of the segment [m], infinite where it never ends.
-        label, active
-            As for `SegmentBuffer`, not used: light that leaves through clear water for ever is not active any more but
-            crosses planes, too. Every lane of the walk's loop has a segment.
+        Inactive lanes are stored, too: light that never ends its segment in clear water is inactive but crosses planes.
         """
         wet = path.in_water & path.before_first_solid & ~path.outside_surface
         enters = wet & ~path.entered
@@ -212,15 +193,13 @@ class Crossings:
     def _unscattered(
         self, entry: FloatArray, direction: FloatArray, depth: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return where rays that enter the water meet planes without scattering, and their optical lengths [m].
-
-        The horizontal part of index times direction is the same in all index layers.
-        """
+        """Return where rays that enter the water meet planes without scattering, and their optical lengths [m]."""
         layers = self._water.index_layers
         x, y, length = entry[:, 0], entry[:, 1], entry[:, 3]
         top = -entry[:, 2]
         edges = [*layers.boundaries, np.inf]
         for index, group, bottom in zip(layers.refractive_index, layers.group_index, edges, strict=True):
+            # The horizontal part of index times direction is the same in all index layers.
             ratio = layers.refractive_index[0] / index
             ux, uy = ratio * direction[:, 0], ratio * direction[:, 1]
             # The ray of the top index layer also reaches planes above the trough of a wave.
@@ -237,9 +216,9 @@ class CrossingTracer:
     Parameters
     ----------
     scene
-        The lidar scene; it has water.
+        Lidar scene with water.
     depths
-        Depths of the planes [m], increasing, shape (planes,).
+        Depths of the planes below the mean sea level [m], increasing, shape (planes,).
     photons
         Number of light paths in a pass.
     """
@@ -265,7 +244,7 @@ class CrossingTracer:
             direction, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
             sent = np.broadcast_to(np.array(energy, dtype=np.float64), count)
             path = CrossingPath.of(RandomWalkPath.start(scene.transmitter.pose, direction, energy, mi.Float(0)))
-            # No light is too late: there is no record.
+            # Infinite length: no record ends the paths.
             walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, np.inf)
             end = walk.run(path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False)
             outside = sent[np.array(end.outside_surface)].sum()

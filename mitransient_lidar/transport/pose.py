@@ -15,7 +15,7 @@ from mitransient_lidar.core.validation import finite, in_range, positive
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a transmitter or receiver is and where it looks.
+    """Position and axis of a transmitter or receiver.
 
     A point of the tangent plane about the axis is (angle_x, angle_y), in radians: its direction is the unit vector
     along ``axis + angle_x * far + angle_y * left``. +angle_x points away from nadir, and +angle_y along +y for the
@@ -36,16 +36,16 @@ class Pose:
 
     @classmethod
     def from_angles(cls, altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0) -> Pose:
-        """Return the pose whose axis lies in the x-z plane, points to +x and down, and meets z = 0 at the shot.
+        """Return the pose whose axis lies in the x-z plane and points to +x and down.
 
         Parameters
         ----------
         altitude
             Height above the mean sea level [m], positive.
         off_nadir_deg
-            Angle of the axis from the vertical [deg], 0 to below 90.
+            Angle of the axis from the vertical [deg], 0 to 89.9.
         aim_x, aim_y
-            Where the axis meets the mean sea level [m].
+            Point where the axis meets the mean sea level [m].
 
         Raises
         ------
@@ -101,7 +101,7 @@ class Pose:
         return float(np.degrees(np.arccos(np.clip(-self.axis[2], -1, 1))))
 
     def ground_point(self) -> NDArray[np.float64]:
-        """Return where the axis meets the mean sea level z = 0 [m]; far ahead when it does not look down."""
+        """Return where the axis meets the mean sea level z = 0 [m]; a distant point if it does not look down."""
         slope = min(float(self.axis[2]), -1e-6)
         return self.origin + self.axis * (-float(self.origin[2]) / slope)
 

@@ -27,8 +27,8 @@ class RandomWalkPath(Path):
         Sum over the path's scattering events of 1 / (b p), the inverse of the scattering coefficient [1/m] times the
         phase function [1/sr]: the density, up to a common factor, with which a merge at that event makes the same path.
     outside_surface
-        Whether the path has entered the water outside the surface mesh and continues as if the sea did not end there:
-        such paths measure what is lost.
+        Whether the path has entered the water outside the surface mesh, through level water: such paths measure the
+        loss.
     offset
         Distance from the last vertex to the next point along the path [m].
     """
@@ -44,7 +44,7 @@ class RandomWalkPath(Path):
 
     @classmethod
     def start(cls, pose: Pose, direction: mi.Vector3f, throughput: mi.Float, offset: mi.Float) -> RandomWalkPath:
-        """Return paths that start at the laser or at the receiver; a throughput of 0 makes no path."""
+        """Return paths that start at the laser or at the receiver, without those of throughput 0."""
         active = (throughput > 0) & dr.full(mi.Bool, True, dr.width(direction))
         state = Path.initial(opaque_point(pose.origin), direction, throughput, active)
         return cls(**state, mis_partial_sum=mi.Float(0), outside_surface=mi.Bool(False), offset=offset)
@@ -57,20 +57,20 @@ class Segments(Protocol):
         """Store the next segment of each path and return the offset of the first point beyond its end [m]."""
 
 
-#: Called where paths have met something: paths, interaction, active lanes.
+#: Callback at hits: paths, interaction, active lanes.
 Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
 
 
 class RandomWalk:
     """Random walk that draws directions from phase functions and BSDFs alone, and stores its segments in the water.
 
-    Free flights are drawn from the scattering coefficient; absorption is a weight. So as many paths reach the bottom of
-    absorbing water as its top, with weights that fall smoothly.
+    Free flights are drawn from the scattering coefficient, and absorption is a weight, so that absorption does not end
+    paths before the bottom.
 
     Parameters
     ----------
     scene
-        The scene; it has water.
+        Scene with water.
     mode
         ``Importance`` for light from the laser, ``Radiance`` for paths from the receiver.
     destination
@@ -98,20 +98,8 @@ class RandomWalk:
     ) -> RandomWalkPath:
         """Walk until all paths have ended.
 
-        Parameters
-        ----------
-        path, rng
-            Paths at their start, and their random numbers.
-        label
-            Label that is stored with each path's segments.
-        segments
-            Store of the segments in the water, up to the first solid.
-        on_solid
-            Called where a path meets a solid under water.
-        on_first_hit
-            Called where a path ends its first segment.
-        past_solids
-            Whether paths continue beyond the first solid.
+        Segments are stored with the label of their path. `on_solid` is called where a path meets a solid under water,
+        `on_first_hit` where its first segment ends. `past_solids` is whether paths continue beyond the first solid.
         """
         step = self._step
 
@@ -119,10 +107,10 @@ class RandomWalk:
             first, wet = path.length == 0, path.active & path.in_water
             vertex = step.next_vertex(path, rng)
             path.rays += dr.select(path.active, mi.UInt32(1), 0)
-            self._look_outside(path, vertex, first)
+            self._end_outside(path, vertex, first)
             path.active &= vertex.exists
-            useful = dr.minimum(vertex.length, self._longest(path))
-            path.offset = segments.add(path, useful, label, wet & path.active & path.before_first_solid)
+            in_record = dr.minimum(vertex.length, self._longest(path))
+            path.offset = segments.add(path, in_record, label, wet & path.active & path.before_first_solid)
             absorption = self._water.absorption_flight.optical_depth(path.depth, path.downward, vertex.length)
             path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
             step.arrive(path, vertex)
@@ -140,18 +128,16 @@ class RandomWalk:
         path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="random walk")
         return path
 
-    def _look_outside(self, path: RandomWalkPath, vertex: Vertex, first: mi.Bool) -> None:
-        """Let paths that miss the surface mesh end their first segment at the mean sea level."""
+    def _end_outside(self, path: RandomWalkPath, vertex: Vertex, first: mi.Bool) -> None:
+        """End the first segment of paths that miss the surface mesh at the mean sea level."""
         outside = path.active & first & (path.downward > 0)
         outside &= ~vertex.si.is_valid() | self.scene.outside_surface(vertex.si.p.z, mi.Bool(False))
         vertex.outside = outside
         vertex.length = dr.select(outside, -path.depth / path.downward, vertex.length)
 
     def _longest(self, path: RandomWalkPath) -> mi.Float:
-        """Return the length of the next segment in water beyond which its light arrives after the record [m].
-
-        The remaining distance to the destination falls at most by the segment's component towards it.
-        """
+        """Return the length of the next segment in water beyond which its light arrives after the record [m]."""
+        # The remaining distance to the destination decreases at most by the segment's component towards it.
         away = self._destination - path.point
         distance = dr.norm(away)
         spare = self._path_end - path.length - distance
@@ -165,22 +151,21 @@ class RandomWalk:
         event = step.scattering_event(path, vertex.scattered, rng)
         context = mi.PhaseFunctionContext()
         natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)
-        # The sum is over scattering coefficient times value of the phase function.
-        likely = self._water.coefficient(step.flight, event.scatterer) * weight[0] * pdf
-        path.mis_partial_sum += dr.select(vertex.scattered, dr.rcp(likely), 0)
+        b_p = self._water.coefficient(step.flight, event.scatterer) * weight[0] * pdf
+        path.mis_partial_sum += dr.select(vertex.scattered, dr.rcp(b_p), 0)
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         direction = dr.select(vertex.scattered, dr.normalize(natural), si.to_world(bs.wo))
         factor = dr.select(vertex.scattered, weight[0], dr.select(vertex.on_surface, bsdf_weight[0], 1))
         if step.adjoint:
             factor *= dr.select(vertex.on_surface, _shading_correction(si, path.direction, direction), 1)
-        # Solids reflect little light: a few paths carry it on.
+        # Russian roulette at solids, which reflect little light.
         survival = dr.select(vertex.on_solid, dr.minimum(factor, 1), 1)
         path.active &= (factor > 0) & (rng.next_float32() < survival)
         passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         step.redirect(path, vertex, direction, factor / survival, bs, passes)
 
     def _enter_outside(self, path: RandomWalkPath, outside: mi.Bool) -> None:
-        """Refract paths outside the surface mesh into level water, to measure what is lost there."""
+        """Refract paths outside the surface mesh into level water, to measure the loss."""
         index = self.scene.refractive_index
         entered, _ = refract_level(path.direction, 1 / index)
         path.direction = dr.select(outside, entered, path.direction)

@@ -45,11 +45,6 @@ class RefractedEmitterSampler(ABC):
 
     Their distribution is that of a flat interface with Gaussian slopes that is lit from the direction of the emitter.
     Its slope variance is that of ripples and waves together, so that it covers every facet of the real surface.
-
-    Parameters
-    ----------
-    scene
-        The scene.
     """
 
     def __init__(self, scene: WaterScene) -> None:
@@ -65,7 +60,7 @@ class RefractedEmitterSampler(ABC):
         return EmitterDirection(in_air, refract(in_air, mi.Normal3f(0, 0, 1), 1 / self.index))
 
     def sample(self, emitter: EmitterDirection, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-        """Sample a direction in the top index layer; return it and its density [1/sr], 0 where the facet is not lit."""
+        """Sample a direction in the top index layer, with its density [1/sr]; 0 where the facet is not lit."""
         slope = dr.sqrt(-self.slope_variance * dr.log(1 - u.x))
         sin, cos = dr.sincos(dr.two_pi * u.y)
         normal = mi.Normal3f(dr.normalize(mi.Vector3f(-slope * cos, -slope * sin, 1)))
@@ -106,13 +101,7 @@ class RefractedEmitterSampler(ABC):
 
 
 class RefractedLaserSampler(RefractedEmitterSampler):
-    """Directions towards the laser.
-
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-    """
+    """Directions towards the laser."""
 
     def __init__(self, scene: LidarScene) -> None:
         super().__init__(scene)
@@ -144,15 +133,7 @@ class RefractedLaserSampler(RefractedEmitterSampler):
 
 
 class RefractedSunSampler(RefractedEmitterSampler):
-    """Directions towards an emitter so far away that its direction is the same from every point.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    in_air
-        Unit direction from the surface to the emitter, one for each path or one for all; it points up.
-    """
+    """Directions towards an emitter at infinity, in a unit direction from the surface, for all paths or one a path."""
 
     def __init__(self, scene: WaterScene, in_air: mi.Vector3f) -> None:
         super().__init__(scene)
@@ -197,13 +178,11 @@ class TopLayerRay:
     Attributes
     ----------
     ray
-        The ray as it enters the top index layer, or starts in it.
-    optical_length
-        Optical length below the top index layer [m].
-    optical_depth
-        Optical depth below it [1].
+        The ray where it enters the top index layer, or starts in it.
+    optical_length, optical_depth
+        Optical length [m] and optical depth below the top index layer.
     factor
-        Factor of the radiance: square of the ratio of the refractive indices; 0 where something is in the way.
+        Factor of the radiance: square of the ratio of the refractive indices; 0 where the ray is blocked.
     """
 
     ray: mi.Ray3f
@@ -237,22 +216,13 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
 
 
 def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Connect a surface point to the laser by a straight line in the air.
-
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-    si
-        Surface point; ``si.wi`` is the direction in which the light continues.
-    active
-        Active lanes.
+    """Connect surface points to the laser by straight lines in the air.
 
     Returns
     -------
     radiance
         Energy per area and solid angle [J/(m^2 sr)] along ``si.wi``: intensity, BSDF with its cosine, and inverse
-        square of the distance; 0 where the line is blocked or the surface turns its wet side to the laser.
+        square of the distance; 0 where the line is blocked or meets the wet side of the sea surface.
     length
         Length of the line [m].
     """
@@ -270,21 +240,9 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
 def connect_sun(
     scene: WaterScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, irradiance: Any, active: mi.Bool
 ) -> mi.Float:
-    """Connect a surface point to an emitter at infinity, as `connect_laser` does to the laser.
+    """Connect surface points to an emitter at infinity in a unit direction, as `connect_laser` does to the laser.
 
-    Parameters
-    ----------
-    scene, si, active
-        As for `connect_laser`.
-    direction
-        Unit direction to the emitter.
-    irradiance
-        Its irradiance on a plane normal to its rays, in any unit.
-
-    Returns
-    -------
-    Radiance along ``si.wi`` [irradiance / sr]; 0 where the ray is blocked or the surface turns its wet side to the
-    emitter.
+    Return the radiance along ``si.wi`` [irradiance / sr], for the irradiance on a plane normal to the emitter's rays.
     """
     radiance = irradiance * _bsdf_towards_air(scene, si, direction, active)
     lit = active & (radiance > 0)

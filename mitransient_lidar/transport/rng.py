@@ -8,19 +8,9 @@ import numpy as np
 
 
 def pass_streams(seed: int, purpose: int, count: int) -> mi.PCG32:
-    """Return independent random number generators for `count` paths.
-
-    Parameters
-    ----------
-    seed
-        Seed of the pass.
-    purpose
-        Number of the stage that asks; stages of one pass are independent.
-    count
-        Number of paths.
-    """
+    """Return independent random number generators for `count` paths, of stage number `purpose` of a pass."""
     words = np.random.SeedSequence([seed, purpose]).generate_state(2, np.uint64)
-    # Opaque, so that another seed is the same kernel.
+    # Opaque, so that all seeds share a kernel.
     state, stream = (dr.opaque(mi.UInt64, int(word)) for word in words)
     index = dr.arange(mi.UInt32, count)
     # Neighbouring streams of PCG32 are correlated unless their states are scrambled (TEA, Zafar et al. 2010).
@@ -29,19 +19,10 @@ def pass_streams(seed: int, purpose: int, count: int) -> mi.PCG32:
 
 
 def stratified_point(index: mi.UInt32, count: int, rng: mi.PCG32) -> mi.Point2f:
-    """Return one random point of the unit square for each stratum.
+    """Return a random point of the unit square in stratum number `index` of `count`.
 
-    The strata are equal pieces of a Z-order curve (Morton 1966), so that neighbours in number are neighbours in
-    the square: rays of a packet stay together, and so do the memory accesses of what they find.
-
-    Parameters
-    ----------
-    index
-        Number of the stratum, 0 to count - 1.
-    count
-        Number of strata.
-    rng
-        Random numbers, one generator a lane.
+    The strata are equal pieces of a Z-order curve (Morton 1966): neighbours in number are neighbours in the square, so
+    that rays of a packet and their memory accesses stay together.
     """
     along = mi.UInt32(((mi.UInt64(index) << 32) | mi.UInt64(rng.next_uint32())) // count)
     rest = rng.next_uint32()
@@ -52,14 +33,14 @@ def stratified_point(index: mi.UInt32, count: int, rng: mi.PCG32) -> mi.Point2f:
 
 
 def unit_points(count: int) -> mi.Point2f:
-    """Return points that fill the unit square evenly, always the same: a rank-1 lattice."""
+    """Return the points of a rank-1 lattice in the unit square."""
     index = dr.arange(mi.Float, count)
-    turns = index * 0.6180339887
-    return mi.Point2f((index + 0.5) / count, turns - dr.floor(turns))
+    y = index * 0.6180339887
+    return mi.Point2f((index + 0.5) / count, y - dr.floor(y))
 
 
 def _even_bits(number: mi.UInt32) -> mi.UInt32:
-    """Return the 16 bits at even places, moved together."""
+    """Return the 16 bits at even places, next to each other."""
     number = number & 0x55555555
     number = (number | (number >> 1)) & 0x33333333
     number = (number | (number >> 2)) & 0x0F0F0F0F

@@ -16,7 +16,7 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
-#: Total slope variance assumed for a surface without a stated one: a broad distribution suits any sea.
+#: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
 
@@ -35,7 +35,7 @@ class WaterScene:
     surfaces
         Shapes that have the water as interior medium.
     slope_variance
-        Total slope variance of the sea, which shapes the proposals of the surface connection.
+        Total slope variance of the sea, for the sampling of surface connections.
     """
 
     mitsuba_scene: mi.Scene
@@ -47,9 +47,7 @@ class WaterScene:
     @property
     def solids(self) -> list[mi.Shape]:
         """All shapes that do not bound the water: bottom and targets."""
-        return [
-            shape for shape in self.mitsuba_scene.shapes() if not any(shape is surface for surface in self.surfaces)
-        ]
+        return _solids(self.mitsuba_scene, self.surfaces)
 
     @property
     def has_specular_or_dry_solids(self) -> bool:
@@ -60,10 +58,7 @@ class WaterScene:
 
     @property
     def facet_size(self) -> float:
-        """Side of the squares of which the sea surface's triangles are halves where the lidar looks [m].
-
-        Their mean for a mesh without a stated cell size.
-        """
+        """Side of the sea surface's cells, pairs of triangles, in the fine patch, or their mean in other meshes [m]."""
         sizes = [
             getattr(surface, "cell_size", None) or float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
@@ -128,21 +123,12 @@ class LidarScene(WaterScene):
 
     @classmethod
     def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor, receiver: Receiver | None = None) -> LidarScene:
-        """Find the parts in a loaded scene. Sun and sky may be present and are ignored.
-
-        Parameters
-        ----------
-        scene
-            The loaded scene.
-        sensor
-            A ``multipixel_receiver`` or ``pixel_fov`` with a ``time_gated_film``.
-        receiver
-            Receiver that replaces the sensor's own.
+        """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
 
         Raises
         ------
         UserError
-            When a part is missing, of a foreign kind, or there are several where one is allowed.
+            When a part is missing, not supported, or there are several where one is allowed.
         """
         receiver = receiver or find_receiver(sensor)
         film = sensor.film()
@@ -153,7 +139,7 @@ class LidarScene(WaterScene):
         if len(transmitters) != 1 or len(emitters) != 1:
             raise UserError(
                 f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
-                "allowed is exactly one lidar_transmitter, beside sun and sky"
+                "allowed is exactly one lidar_transmitter, besides sun and sky"
             )
         water, surfaces = find_water(scene)
         if receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
@@ -166,7 +152,7 @@ class LidarScene(WaterScene):
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
-    """Return the receiver of a sensor plugin; raise UserError when the sensor is of a foreign kind."""
+    """Return the receiver of a sensor plugin; raise UserError when the sensor has none."""
     receiver = getattr(sensor, "receiver", None)
     if not isinstance(receiver, Receiver):
         raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
@@ -179,7 +165,7 @@ def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape]]:
     Raises
     ------
     UserError
-        When a medium is of a foreign kind or in the wrong place, or there are several.
+        When a medium is not supported or in the wrong place, or there are several.
     """
     surfaces: list[mi.Shape] = []
     waters: list[mi.Medium] = []
@@ -202,8 +188,13 @@ def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape]]:
     return (waters[0] if waters else None), surfaces
 
 
+def _solids(scene: mi.Scene, surfaces: list[mi.Shape]) -> list[mi.Shape]:
+    """Return the shapes that are not among the surfaces of the water."""
+    return [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
+
+
 def largest_slope_variance(surfaces: list[mi.Shape]) -> float:
-    """Return the total slope variance of the roughest surface, or a usual one where none is stated."""
+    """Return the total slope variance of the roughest surface, or a typical one without ``ocean_surface``."""
     variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
     return float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
 
@@ -223,8 +214,7 @@ def _check_cells(surfaces: list[mi.Shape], transmitter: Any) -> None:
 
 def check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Any) -> None:
     """Refuse water layers below all solids, and index layers that begin within the waves."""
-    solids = [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
-    lowest = min((float(solid.bbox().min.z) for solid in solids), default=-np.inf)
+    lowest = min((float(solid.bbox().min.z) for solid in _solids(scene, surfaces)), default=-np.inf)
     deepest = float(water.column.layer_tops[-1])
     if not water.from_profile and -deepest <= lowest:
         raise UserError(f"layer_tops = {deepest:g} m is a layer below the bottom: it must be less than {-lowest:g} m")

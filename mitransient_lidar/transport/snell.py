@@ -7,12 +7,12 @@ import mitsuba as mi
 
 
 def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: float) -> mi.Vector3f:
-    """Return the direction beyond a facet of light that comes from `direction`, reversed to point back to the facet.
+    """Refract at a facet: return the unit direction, beyond the facet, from which light arrives at it.
 
     Parameters
     ----------
     direction
-        Unit direction from the facet to where the light comes from, on the side of the normal.
+        Unit direction from the facet to the source of the light, on the side of the normal.
     normal
         Unit normal of the facet.
     eta

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -25,9 +26,8 @@ from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
-#: Asymmetry of the Henyey-Greenstein lobe towards the emitter from which guided directions are drawn. Of asymmetries
-#: 0.7 to 0.95 with probabilities 0.1 to 0.55 this one, with the default probability, was best in clear and turbid
-#: water.
+#: Asymmetry of the Henyey-Greenstein lobe towards the emitter from which guided directions are drawn: the best from 0.7
+#: to 0.95 in clear and turbid water, with the default probability.
 _GUIDING_ASYMMETRY = 0.87
 
 #: Number of the random streams within a pass.
@@ -48,32 +48,20 @@ class VolpathOptions:
     complement_only: bool = False
 
 
-@dataclass
-class ScatterEvaluation:
-    """Value and density of a direction at a scattering event or a solid.
-
-    Attributes
-    ----------
-    value
-        Phase function [1/sr], or BSDF times cosine.
-    pdf
-        Density with which the path's own sampling draws the direction [1/sr].
-    """
-
-    value: mi.Float
-    pdf: mi.Float
-
-
-class PathLight(ABC):
-    """Light that the vertices of paths are connected to, and the record of what arrives.
+class PathLight(Protocol):
+    """Light to which the vertices of paths are connected, and the record of what arrives.
 
     Attributes
     ----------
     sampler
         Samples directions under water towards the emitter.
+    pixel, weight
+        Pixel of each path, and the weight of its light.
     """
 
     sampler: RefractedEmitterSampler
+    pixel: mi.UInt32
+    weight: mi.Float
 
     @abstractmethod
     def connect(
@@ -82,33 +70,21 @@ class PathLight(ABC):
         """Connect surface points to the emitter; return radiance along ``si.wi`` and length of the connection [m]."""
 
     @abstractmethod
-    def receive(
-        self, path: ConnectedPath, pixel: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool
-    ) -> None:
+    def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Record light that arrives along connected paths of an optical length [m]."""
 
     @abstractmethod
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
-        """Record light of connections that miss the end of the surface mesh, as if a flat surface were there.
+        """Add connections beyond the end of the surface mesh to the losses, as through a flat sea at normal incidence.
 
         `share` is the received energy per radiance above the surface at `crossing`.
         """
 
-    @abstractmethod
-    def escape(self, path: ConnectedPath, pixel: mi.UInt32, weight: mi.Float, active: mi.Bool) -> None:
-        """Record light that meets paths which leave the scene."""
+    def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
+        """Record light of emitters that paths meet when they leave the scene; there is none by default."""
 
-    @abstractmethod
-    def reflect(
-        self,
-        path: ConnectedPath,
-        si: mi.SurfaceInteraction3f,
-        pixel: mi.UInt32,
-        weight: mi.Float,
-        rng: mi.PCG32,
-        active: mi.Bool,
-    ) -> None:
-        """Record light of other emitters that the dry side of the sea surface reflects."""
+    def reflect(self, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> None:
+        """Record light of other emitters that the dry side of the sea surface reflects; there is none by default."""
 
     @abstractmethod
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
@@ -116,18 +92,10 @@ class PathLight(ABC):
 
 
 class LaserLight(PathLight):
-    """The laser, and the record of a pass.
+    """The laser, and the record of a pass."""
 
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-    record
-        Record of the pass.
-    """
-
-    def __init__(self, scene: LidarScene, record: PassRecord) -> None:
-        self.scene, self.record = scene, record
+    def __init__(self, scene: LidarScene, record: PassRecord, pixel: mi.UInt32, weight: mi.Float) -> None:
+        self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
         self.sampler: RefractedLaserSampler = RefractedLaserSampler(scene)
 
     def connect(
@@ -136,34 +104,18 @@ class LaserLight(PathLight):
         """Connect surface points to the laser."""
         return connect_laser(self.scene, si, active)
 
-    def receive(
-        self, path: ConnectedPath, pixel: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool
-    ) -> None:
+    def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy to the histogram."""
         # The connection goes up: from a vertex that was reached downwards it is one more reversal.
         reversals = path.reversals + dr.select(path.downward > 0, mi.UInt32(1), 0)
-        self.record.receive(pixel, path.scatterings, reversals, length, energy, active)
+        self.record.receive(self.pixel, path.scatterings, reversals, length, energy, active)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
-        """Add to the energy lost because the surface mesh ends, for a flat surface at normal incidence."""
+        """Add energy to the losses."""
         offset = opaque_point(self.scene.transmitter.pose.origin) - crossing
         intensity = self.scene.transmitter.intensity(-dr.normalize(offset))
         missing = share * level_transmittance(self.scene, emitter) * intensity / dr.squared_norm(offset)
         self.record.lose(missing, missing > 0)
-
-    def escape(self, path: ConnectedPath, pixel: mi.UInt32, weight: mi.Float, active: mi.Bool) -> None:
-        """Record nothing: no path meets the laser by chance."""
-
-    def reflect(
-        self,
-        path: ConnectedPath,
-        si: mi.SurfaceInteraction3f,
-        pixel: mi.UInt32,
-        weight: mi.Float,
-        rng: mi.PCG32,
-        active: mi.Bool,
-    ) -> None:
-        """Record nothing: there is no other emitter."""
 
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths whose light would arrive after the record."""
@@ -183,15 +135,6 @@ class PathTracer:
     the real surface, where it is connected; where the path itself reaches the surface unscattered it is connected, too.
     Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
     doi:10.1145/218380.218498).
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    options
-        Options.
-    light
-        Light, and record of what arrives.
     """
 
     def __init__(self, scene: WaterScene, options: VolpathOptions, light: PathLight) -> None:
@@ -199,23 +142,23 @@ class PathTracer:
         flight = scene.water.flight if scene.water is not None else None
         self._step = PathStep(scene, flight, mi.TransportMode.Radiance)
 
-    def trace(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> mi.Float64:
-        """Follow paths to their ends; their light counts for their pixels with their weights. Return the ray count."""
+    def trace(self, path: ConnectedPath, rng: mi.PCG32) -> mi.Float64:
+        """Follow paths to their ends; return the number of rays."""
 
         def body(path: ConnectedPath, rng: mi.PCG32) -> tuple[ConnectedPath, mi.PCG32]:
-            self._extend(path, rng, pixel, weight)
+            self._extend(path, rng)
             return path, rng
 
         path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="lidar_volpath")
         return dr.sum(mi.Float64(path.rays))
 
-    def _extend(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> None:
+    def _extend(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """Go to the next vertex, connect it to the emitter, and choose the next direction."""
         first = path.length == 0
         vertex = self._step.next_vertex(path, rng)
         wet = path.active & path.in_water & dr.isfinite(vertex.reach)
         transmittance = dr.exp(-self._optical_depth(path.point, path.direction, vertex.reach, wet))
-        self.light.escape(path, pixel, weight, path.active & ~vertex.exists)
+        self.light.escape(path, path.active & ~vertex.exists)
         path.active &= vertex.exists
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         if self.options.max_scatterings >= 0:
@@ -225,7 +168,7 @@ class PathTracer:
         if self.scene.water is not None:
             path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
         emitter = self.light.sampler.direction_from(path.point)
-        self._connect(path, rng, pixel, weight, vertex, event, emitter, transmittance, first)
+        self._connect(path, rng, vertex, event, emitter, transmittance, first)
         self._redirect(path, rng, vertex, event, emitter)
         path.emitter_ratio = dr.select(vertex.at_boundary, path.emitter_ratio / transmittance, path.emitter_ratio)
         self._step.cross_boundary(path, vertex.at_boundary & path.active)
@@ -236,8 +179,6 @@ class PathTracer:
         self,
         path: ConnectedPath,
         rng: mi.PCG32,
-        pixel: mi.UInt32,
-        weight: mi.Float,
         vertex: Vertex,
         event: ScatteringEvent,
         emitter: EmitterDirection,
@@ -250,34 +191,34 @@ class PathTracer:
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         up, density = light.sampler.sample_in_layer(emitter, u, path.index_layer)
         sampled = submerged & (density > 0) if self.options.connection != "phase" else mi.Bool(False)
-        scatter = self._evaluate(emitter, vertex, event, sampled, up)
+        value, pdf = self._evaluate(emitter, vertex, event, sampled, up)
         ray = dr.select(vertex.scattered, mi.Ray3f(path.point, up), si.spawn_ray(up))
         top = trace_to_top_layer(scene, ray, path.index_layer, sampled)
         above = scene.ray_intersect(top.ray, sampled)
         arrives = sampled & (top.factor > 0)
         met = arrives & above.is_valid() & scene.is_surface(above.shape)
-        # Where the surface mesh ends, a flat sea takes its place in the account of what is lost.
+        # Beyond the end of the surface mesh a flat sea takes its place, to estimate the loss.
         lost = arrives & ~above.is_valid() & (top.ray.d.z > 0)
         distance = dr.select(lost, dr.maximum(-top.ray.o.z, 0) / top.ray.d.z, above.t)
         crossed = top.optical_depth + self._optical_depth(top.ray.o, top.ray.d, distance, met | lost)
         clear = dr.exp(-crossed)
-        combined = density + (scatter.pdf * clear if self.options.connection == "mis" else 0)
-        connected = scatter.value * clear / combined * top.factor
+        combined = density + (pdf * clear if self.options.connection == "mis" else 0)
+        connected = value * clear / combined * top.factor
         factor = dr.select(met, connected, self._own_weight(path, transmittance))
         crossing = dr.select(met, above, si)
         direct = vertex.at_sea | (vertex.on_solid & ~vertex.in_water)
         radiance, air_length = light.connect(crossing, emitter, met | direct)
         water_length = dr.select(met, top.optical_length + above.t * scene.group_index, 0)
-        energy = weight * path.throughput * factor * radiance
+        energy = light.weight * path.throughput * factor * radiance
         if self.options.complement_only:
             energy = dr.select(self._merged(path, vertex, first), 0, energy)
         # One ray along the path, one up to the surface, one to the emitter.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(sampled, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
-        light.receive(path, pixel, path.length + water_length + air_length, energy, radiance > 0)
-        light.reflect(path, si, pixel, weight, rng, vertex.at_sea & ~vertex.in_water)
-        # In what is lost, the density of the sampled direction stands for that of the surface's BSDF.
-        share = weight * path.throughput * connected * density
+        light.receive(path, path.length + water_length + air_length, energy, radiance > 0)
+        light.reflect(path, si, rng, vertex.at_sea & ~vertex.in_water)
+        # For the loss, the density of the sampled direction replaces that of the surface's BSDF.
+        share = light.weight * path.throughput * connected * density
         light.lose(emitter, dr.select(lost, share, 0), top.ray(distance))
 
     @staticmethod
@@ -286,7 +227,7 @@ class PathTracer:
         return vertex.scattered | (vertex.on_solid & vertex.in_water)
 
     def _merged(self, path: ConnectedPath, vertex: Vertex, first: mi.Bool) -> mi.Bool:
-        """Return whether the connections of a vertex are left to ``lidar_merging``."""
+        """Return whether ``lidar_merging`` finds the connections of a vertex by merging."""
         seen_through = self._submerged(vertex) | (vertex.at_sea & (path.scatterings > 0))
         return (first & vertex.on_surface) | (path.before_first_solid & seen_through)
 
@@ -298,8 +239,8 @@ class PathTracer:
 
     def _evaluate(
         self, emitter: EmitterDirection, vertex: Vertex, event: ScatteringEvent, active: mi.Bool, direction: mi.Vector3f
-    ) -> ScatterEvaluation:
-        """Return value and density of a direction at scattering events and solids."""
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return phase function, or BSDF times cosine, of a direction and the density with which paths draw it."""
         value, pdf = mi.Float(0), mi.Float(0)
         probability, si = self.options.guiding_probability, vertex.si
         guided = henyey_greenstein(dr.dot(direction, emitter.in_water), _GUIDING_ASYMMETRY)
@@ -312,10 +253,10 @@ class PathTracer:
         on_solid = active & ~vertex.scattered
         solid_value, solid_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(direction), on_solid)
         solid_pdf = dr.select(_is_rough(si), dr.lerp(solid_pdf, guided, probability), solid_pdf)
-        return ScatterEvaluation(dr.select(on_solid, solid_value[0], value), dr.select(on_solid, solid_pdf, pdf))
+        return dr.select(on_solid, solid_value[0], value), dr.select(on_solid, solid_pdf, pdf)
 
     def _own_weight(self, path: ConnectedPath, transmittance: mi.Float) -> mi.Float:
-        """Return the weight of a connection that the path's own sampling made, against the sampled connection."""
+        """Return the weight of a connection made by the path's own sampling, against the sampled connection."""
         if self.options.connection == "phase":
             return mi.Float(1)
         if self.options.connection == "emitter":
@@ -325,14 +266,13 @@ class PathTracer:
     def _redirect(
         self, path: ConnectedPath, rng: mi.PCG32, vertex: Vertex, event: ScatteringEvent, emitter: EmitterDirection
     ) -> None:
-        """Draw the next direction, a part of them towards the emitter."""
+        """Draw the next direction; at scattering events and rough solids under water, some of them near the emitter."""
         probability, si = self.options.guiding_probability, vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         submerged = self._submerged(vertex)
-        # At scattering events and rough solids under water a part of the directions is drawn towards the emitter.
         mixed = vertex.scattered | (submerged & vertex.on_surface & _is_rough(si))
         guided = pick < probability
-        # The number that decides is rescaled and used again by the phase function and the BSDF.
+        # The random number is rescaled and reused by the phase function and the BSDF.
         rest = dr.clip((pick - probability) / (1 - probability), 0, 1)
         u_bsdf = dr.select(mixed, rest, pick)
         bs, bsdf_weight = si.bsdf().sample(self._step.context, si, u_bsdf, u, vertex.on_surface)
@@ -345,14 +285,14 @@ class PathTracer:
             cosine = sample_henyey_greenstein(u.x, _GUIDING_ASYMMETRY)
             towards = deflect(mi.Frame3f(emitter.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
             drawn = dr.select(guided, towards, natural)
-            scatter = self._evaluate(emitter, vertex, event, mixed, drawn)
+            value, mixed_pdf = self._evaluate(emitter, vertex, event, mixed, drawn)
             direction = dr.select(mixed, dr.normalize(drawn), direction)
-            pdf = dr.select(mixed, scatter.pdf, pdf)
-            factor = dr.select(mixed, scatter.value / scatter.pdf, factor)
+            pdf = dr.select(mixed, mixed_pdf, pdf)
+            factor = dr.select(mixed, value / mixed_pdf, factor)
         specular = vertex.on_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         passes = ~mixed & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if self.options.complement_only:
-            # What follows is merged, too, unless a mirror or a solid in the air can still come in between.
+            # Merging also finds what follows, unless a mirror or a solid in the air can still come in between.
             path.active &= ~(path.before_first_solid & vertex.on_solid & ~passes & submerged & ~specular)
             if not self.scene.has_specular_or_dry_solids:
                 path.active &= ~(path.before_first_solid & vertex.scattered)
@@ -384,25 +324,17 @@ def trace_connected(
     rng = pass_streams(seed, _STREAM, paths)
     start = sampler.sample(dr.arange(mi.UInt32, paths), paths, rng)
     path = ConnectedPath.start(scene.receiver.pose, start.direction, start.weight > 0)
-    tracer = PathTracer(scene, options, LaserLight(scene, record))
-    record.rays += tracer.trace(path, rng, start.pixel, start.weight)
+    light = LaserLight(scene, record, start.pixel, start.weight)
+    record.rays += PathTracer(scene, options, light).trace(path, rng)
 
 
 class VolpathRenderer(PassRenderer):
-    """Renders passes with the path tracer.
-
-    Parameters
-    ----------
-    scene, classes, paths
-        As for `PassRenderer`.
-    options
-        Options of the path tracer.
-    """
+    """Renders passes with the path tracer."""
 
     def __init__(self, scene: LidarScene, classes: PathClasses, paths: int, options: VolpathOptions) -> None:
         super().__init__(scene, classes, paths)
         self.options = options
 
     def trace(self, record: PassRecord, seed: int, paths: int) -> None:
-        """Trace the paths of one pass into a record."""
+        """Trace paths and connect them to the laser."""
         trace_connected(self.scene, self.sampler, self.options, record, seed, paths)

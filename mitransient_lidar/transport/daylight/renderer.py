@@ -21,10 +21,9 @@ from mitransient_lidar.transport.volpath import PathLight, PathTracer, VolpathOp
 #: Number of the random streams within a pass.
 _STREAM = 4
 
-#: Scattering events beyond which a tenth of the paths ends at each: without absorption light would be scattered for
-#: ever.
-_LONG = 100
-_LONG_SURVIVAL = 0.9
+#: Number of scattering events beyond which paths survive each with this probability: without absorption they would not
+#: end.
+_LONG, _LONG_SURVIVAL = 100, 0.9
 
 
 @dataclass
@@ -50,20 +49,12 @@ class DaylightRecord:
 
 
 class DaylightLight(PathLight):
-    """Sun and sky, and the record of a pass.
+    """Sun and sky, and the record of a pass; uniform random numbers `u` choose a point of the sun's disc per path."""
 
-    Parameters
-    ----------
-    scene
-        The scene.
-    record
-        Record of the pass.
-    u
-        Uniform random numbers that choose a point of the sun's disc, one for each path.
-    """
-
-    def __init__(self, scene: DaylightScene, record: DaylightRecord, u: mi.Point2f) -> None:
-        self.scene, self.record = scene, record
+    def __init__(
+        self, scene: DaylightScene, record: DaylightRecord, u: mi.Point2f, pixel: mi.UInt32, weight: mi.Float
+    ) -> None:
+        self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
         self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
         self.invalid = dr.zeros(mi.Bool, dr.width(record.found))
 
@@ -81,30 +72,20 @@ class DaylightLight(PathLight):
             return mi.Float(0), mi.Float(0)
         return connect_sun(self.scene, si, emitter.in_air, sun.sampled_irradiance, active), mi.Float(0)
 
-    def receive(
-        self, path: ConnectedPath, pixel: mi.UInt32, length: mi.Float, energy: mi.Float, active: mi.Bool
-    ) -> None:
+    def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add light of the sun."""
-        self._add(pixel, energy, active)
+        self._add(self.pixel, energy, active)
 
-    def escape(self, path: ConnectedPath, pixel: mi.UInt32, weight: mi.Float, active: mi.Bool) -> None:
+    def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
         """Add the sky where paths leave the scene, and the sun where they could not be connected to it."""
         scene = self.scene
         radiance = dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))
         if scene.sun is not None:
             radiance += dr.select(path.specular, scene.sun.radiance(path.direction), 0)
-        self._add(pixel, weight * path.throughput * radiance, active & ~path.in_water)
+        self._add(self.pixel, self.weight * path.throughput * radiance, active & ~path.in_water)
 
-    def reflect(
-        self,
-        path: ConnectedPath,
-        si: mi.SurfaceInteraction3f,
-        pixel: mi.UInt32,
-        weight: mi.Float,
-        rng: mi.PCG32,
-        active: mi.Bool,
-    ) -> None:
-        """Add the sky that the dry side of the sea surface reflects, where nothing is in the way."""
+    def reflect(self, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> None:
+        """Add the sky that the dry side of the sea surface reflects, where the ray is not blocked."""
         if self.scene.sky is None:
             return
         context = mi.BSDFContext()
@@ -116,10 +97,10 @@ class DaylightLight(PathLight):
         bright = active & (radiance > 0)
         bright &= ~self.scene.ray_test(ray, bright)
         path.rays += dr.select(active, mi.UInt32(1), 0)
-        self._add(pixel, weight * path.throughput * radiance, bright)
+        self._add(self.pixel, self.weight * path.throughput * radiance, bright)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
-        """Add to the light lost because the surface mesh ends, for a flat surface at normal incidence."""
+        """Add light of the sun to the losses."""
         sun = self.scene.sun
         if sun is not None:
             missing = share * level_transmittance(self.scene, emitter) * sun.sampled_irradiance
@@ -132,24 +113,14 @@ class DaylightLight(PathLight):
 
 
 class DaylightRenderer:
-    """Renders independent passes of daylight over one prepared scene.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    options
-        Options of the path tracer.
-    paths
-        Paths of one pass.
-    """
+    """Renders independent passes of daylight over one prepared scene, by default with `paths` paths each."""
 
     def __init__(self, scene: DaylightScene, options: VolpathOptions, paths: int) -> None:
         self.scene, self.options, self.paths = scene, options, paths
         self.sampler = FovSampler(scene.receiver)
 
     def render_pass(self, seed: int, *, paths: int | None = None) -> DaylightRecord:
-        """Render one pass: seed and, optionally, number of paths."""
+        """Render one pass; passes of different seeds are independent."""
         count = self.paths if paths is None else paths
         with dr.suspend_grad():
             rng = pass_streams(seed, _STREAM, count)
@@ -158,14 +129,15 @@ class DaylightRenderer:
             return self.follow(path, rng, start.pixel, start.weight)
 
     def follow(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> DaylightRecord:
-        """Trace paths from their last vertices to their ends; each counts for a pixel with a weight [sr]."""
+        """Trace paths from their last vertices to their ends, with the pixel and the weight [sr] of each."""
         pixels = self.scene.receiver.pixels.count
         found, sampled, lost = (dr.zeros(mi.Float64, count) for count in (pixels, pixels, 1))
         record = DaylightRecord(found, sampled, lost, mi.Float64(0))
         dr.scatter_add(record.sampled, mi.Float64(weight), pixel, weight > 0)
-        light = DaylightLight(self.scene, record, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        light = DaylightLight(self.scene, record, u, pixel, weight)
         options = self.options if self.scene.sun is not None else replace(self.options, connection="phase")
-        record.rays = PathTracer(self.scene, options, light).trace(path, rng, pixel, weight)
+        record.rays = PathTracer(self.scene, options, light).trace(path, rng)
         record.found = dr.select(light.invalid, dr.nan, record.found)
         dr.eval(record.found, record.sampled, record.edge_loss, record.rays)
         return record

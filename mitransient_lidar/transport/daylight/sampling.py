@@ -13,10 +13,10 @@ from mitransient_lidar.transport.rng import pass_streams, stratified_point
 from mitransient_lidar.transport.sensor.pixels import PixelArray, parse_layout
 from mitransient_lidar.transport.sensor.receiver import Receiver, SensorSample, solid_angle_factor
 
-#: Points along each axis of the field of view, at least, that measure the pixels' solid angles.
+#: Least number of points along each axis of the field of view for the solid angles of pixels.
 _LATTICE = 4096
 
-#: Rays that look for what lies outside the surface mesh.
+#: Number of rays for the share of the field of view outside the surface mesh.
 _RAYS = 2**14
 
 
@@ -25,28 +25,13 @@ class FovSampler:
 
     Samples are stratified. Where the optics blur, the place on the detector is drawn first, then the direction from
     which it receives light.
-
-    Parameters
-    ----------
-    receiver
-        Pose, aperture and pixels.
     """
 
     def __init__(self, receiver: Receiver) -> None:
         self.receiver = receiver
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> SensorSample:
-        """Sample one direction for each path; its weight is the solid angle that it represents [sr].
-
-        Parameters
-        ----------
-        index
-            Number of the path, 0 to count - 1.
-        count
-            Number of paths.
-        rng
-            Random numbers of the paths.
-        """
+        """Sample directions for paths number `index` of `count`; weights are the solid angles they represent [sr]."""
         pixels = self.receiver.pixels
         px, py = pixels.sample(stratified_point(index, count, rng))
         angle_x, angle_y = px, py
@@ -61,10 +46,9 @@ class FovSampler:
 def pixel_solid_angles(pixels: PixelArray) -> NDArray[np.float64]:
     """Return the solid angle of each pixel [sr], shape (pixels,), counted on a fine lattice of the field of view.
 
-    Whole cells of a layout are exact, other pixels within about a thousandth of the width of the lattice's cells over
-    their own.
+    Cells of a layout that the field of view does not cut are exact.
     """
-    # A whole number of points in every cell of a layout.
+    # An integer number of points in every cell of a layout.
     cells = parse_layout(pixels.layout) if pixels.layout[0].isdigit() else (1, 1)
     rows, columns = (cell * -(-_LATTICE // cell) for cell in cells)
     index = dr.arange(mi.UInt32, rows * columns)
@@ -74,7 +58,7 @@ def pixel_solid_angles(pixels: PixelArray) -> NDArray[np.float64]:
     u = mi.Float(index * mi.UInt32(2654435769) >> 8) * 2**-24
     pixel, here = pixels.pixel_at(angle_x, angle_y, u)
     found = dr.zeros(mi.Float64, pixels.count)
-    # Of pixels that overlap one is counted.
+    # Where pixels overlap, a random one counts.
     dr.scatter_add(found, mi.Float64(here * solid_angle_factor(angle_x, angle_y)), pixel, here > 0)
     return np.array(found) * full**2 / (rows * columns)
 

@@ -41,7 +41,7 @@ class DaylightScene(WaterScene):
         Raises
         ------
         UserError
-            When a part is missing, of a foreign kind, or there are several where one is allowed.
+            When a part is missing, not supported, or there are several where one is allowed.
         """
         receiver = find_receiver(sensor)
         found: dict[str, mi.Emitter] = {}
@@ -70,12 +70,12 @@ class DaylightScene(WaterScene):
         return mi.Float(0) if self.sky is None else self.sky.radiance(direction)
 
     def sun_directions(self, u: mi.Point2f) -> mi.Vector3f:
-        """Map uniform numbers to directions of the sun's disc; without a sun to the zenith."""
+        """Map uniform numbers to directions of the sun's disc, or to the zenith without a sun."""
         return mi.Vector3f(0, 0, 1) if self.sun is None else self.sun.sample(u)
 
 
 def _check_sun(sun: Any, sky: Any) -> None:
-    """Refuse a clear sky whose sun is elsewhere than the sun."""
+    """Refuse a clear sky with another direction of the sun."""
     apart = float(np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(sun.direction - sky.sun))))
     if apart > _SAME_DIRECTION_DEG:
         raise UserError(

@@ -17,13 +17,7 @@ _QUADRATURE_POINTS = 1024
 
 
 def read_direction(props: mi.Properties, prefix: str = "") -> tuple[float, NDArray[np.float64]]:
-    """Read ``zenith_deg`` and ``azimuth_deg`` of the sun; return the zenith angle [deg] and its unit direction.
-
-    Raises
-    ------
-    UserError
-        When an angle is out of range.
-    """
+    """Read ``zenith_deg`` and ``azimuth_deg`` of the sun; return the zenith angle [deg] and its unit direction."""
     name = f"{prefix}zenith_deg"
     zenith = in_range(name, props.get(name, 40.0), 0.0, LARGEST_SUN_ZENITH_DEG)
     azimuth = np.radians(finite(f"{prefix}azimuth_deg", props.get(f"{prefix}azimuth_deg", 0.0)))
@@ -37,9 +31,9 @@ def uniform_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
 
 
 def overcast_distribution(direction: mi.Vector3f, sun: mi.Vector3f) -> mi.Float:
-    """Return the relative radiance of a thickly overcast sky: three times as bright at the zenith as at the horizon.
+    """Return the relative radiance of an overcast sky: three times as bright at the zenith as at the horizon.
 
-    Moon and Spencer 1942, Illuminating Engineering 37, 707; the cardioidal sky.
+    Cardioidal sky of Moon and Spencer 1942, Illuminating Engineering 37, 707.
     """
     return 1 + 2 * direction.z
 

@@ -15,19 +15,19 @@ from mitransient_lidar.core.validation import finite, in_range, non_negative, po
 class BubblePlume:
     """Bubbles of even density behind a ship, from the surface down.
 
-    They scatter and do not absorb. The plume adds to the layers of water that it lies in: a flight ends in whichever
-    comes first, and that is exact for the sum of both.
+    They scatter and do not absorb. A flight ends at the event of bubbles or of the water layers that comes first, which
+    is exact for their sum.
 
     Parameters
     ----------
     scattering
-        What the bubbles add to the scattering coefficient [1/m].
+        Scattering coefficient of the bubbles [1/m], added to that of the water.
     x, y
-        Where it begins, at the stern [m].
+        Start of the plume, at the stern [m].
     bearing
-        Where the ship goes [rad], counter-clockwise from +x; the plume lies behind.
+        Heading of the ship [rad], counter-clockwise from +x; the plume lies behind.
     length, width, depth
-        How long, wide and deep it is [m].
+        Extent of the plume [m].
     """
 
     scattering: float
@@ -74,7 +74,7 @@ class BubblePlume:
             (point.z, direction.z, -self.depth, 1e4),
         )
         for place, speed, low, high in slabs:
-            # A ray that runs along a slab's faces is inside for ever or never.
+            # A ray parallel to a slab's faces is inside everywhere or nowhere.
             safe = dr.select(dr.abs(speed) > 1e-9, speed, 1e-9)
             first, second = (low - place) / safe, (high - place) / safe
             near, far = dr.maximum(near, dr.minimum(first, second)), dr.minimum(far, dr.maximum(first, second))
@@ -86,7 +86,7 @@ class BubblePlume:
         return self.scattering * dr.maximum(dr.minimum(far, length) - near, 0)
 
     def distance(self, point: mi.Point3f, direction: mi.Vector3f, optical_depth: mi.Float) -> mi.Float:
-        """Return how far a ray goes until it has crossed an optical depth of bubbles [m], infinite if it never does."""
+        """Return the distance at which a ray has crossed an optical depth of bubbles [m], infinite if it never does."""
         near, far = self.crossing(point, direction)
         end = near + optical_depth / self.scattering
         return dr.select(end < far, end, dr.inf)

@@ -7,21 +7,16 @@ import mitsuba as mi
 
 from mitransient_lidar.physics.water.layers import WaterColumn
 
-#: What is left of a flight at least where it ends: in clear water even that is never reached.
+#: Least optical depth left in the last layer of a flight: in clear water even this is never crossed.
 _SMALLEST_OPTICAL_DEPTH = 1e-30
 
 
 class LayeredFlight:
-    """Dr.Jit side of a :class:`WaterColumn`: which layer, how far, how much is left.
+    """Free flights, optical depths and coefficients of a `WaterColumn`.
 
     Optical depths are exact in every direction: within the layer where a segment starts or ends they are the product
     of attenuation and length (no division by the vertical component), between layers the difference of tabulated
     vertical optical depths.
-
-    Parameters
-    ----------
-    column
-        The layers.
     """
 
     def __init__(self, column: WaterColumn) -> None:
@@ -33,7 +28,7 @@ class LayeredFlight:
         self._edge = mi.Float(column.edge_optical_depth)
 
     def layer_at(self, depth: mi.Float) -> mi.UInt32:
-        """Return the layer at a depth [m]; the first layer holds everything above z = 0, too."""
+        """Return the layer at a depth [m]; the first one includes everything above z = 0."""
         if self.count == 1:
             return mi.UInt32(0)
         # The layer whose upper edge is the last one at or above the depth.
@@ -53,26 +48,19 @@ class LayeredFlight:
         return dr.gather(mi.Float, table, layer)
 
     def distance(self, depth: mi.Float, downward: mi.Float, optical_depth: mi.Float) -> mi.Float:
-        """Return how far light goes until it has crossed an optical depth [m], infinite when it never does.
+        """Return the distance at which light has crossed an optical depth [m], infinite if it never does.
 
-        Parameters
-        ----------
-        depth
-            Depth where it starts [m], negative in a wave crest.
-        downward
-            Vertical component of its unit direction, positive downwards.
-        optical_depth
-            Optical depth to cross, at least 0.
+        It starts at a depth [m], negative in a wave crest, in a unit direction of the component `downward`.
         """
         layer = self.layer_at(depth)
         here = self.attenuation(layer)
-        within = optical_depth / here  # infinite in clear water, as it should be
+        within = optical_depth / here  # infinite in clear water
         if self.count == 1:
             return within
         to_edge, edge = self._way_out(layer, depth, downward)
         beyond = optical_depth - here * to_edge
-        # The remaining optical depth, as a vertical one counted from z = 0, is found among the tabulated edges. Upwards
-        # an edge that rounding meets exactly is still to be crossed, and the clear layers that share it.
+        # The remaining optical depth, as a vertical one counted from z = 0, is looked up in the table of edges. An edge
+        # met exactly on the way up is still to be crossed, with the clear layers that have the same optical depth.
         from_edge = dr.gather(mi.Float, self._edge, edge)
         target = from_edge + beyond * downward
 
@@ -90,7 +78,7 @@ class LayeredFlight:
         return dr.select((beyond > 0) & (to_edge < dr.inf), through, within)
 
     def _way_out(self, layer: mi.UInt32, depth: mi.Float, downward: mi.Float) -> tuple[mi.Float, mi.UInt32]:
-        """Return the distance to the edge through which a ray leaves its layer, and the layer that begins there."""
+        """Return the distance to the edge through which a ray leaves its layer, and the layer below that edge."""
         edge = dr.select(downward > 0, layer + 1, layer)
         # Upwards from the first layer and downwards from the last there is no edge.
         leaves = dr.select(downward > 0, layer + 1 < self.count, (layer > 0) & (downward < 0))
@@ -99,17 +87,7 @@ class LayeredFlight:
         return dr.select(leaves, dr.maximum(to_edge, 0), dr.inf), edge
 
     def optical_depth(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
-        """Return the optical depth of a straight segment.
-
-        Parameters
-        ----------
-        depth
-            Depth where it starts [m].
-        downward
-            Vertical component of its unit direction, positive downwards.
-        length
-            Its length [m].
-        """
+        """Return the optical depth of a segment: depth of its start [m], downward component, length [m]."""
         layer = self.layer_at(depth)
         here = self.attenuation(layer)
         if self.count == 1:

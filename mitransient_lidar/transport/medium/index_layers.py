@@ -16,8 +16,8 @@ MOST_INDEX_LAYERS = 16
 class IndexLayers:
     """Index layers of a water column, numbered from the top.
 
-    Light that crosses the boundary of two index layers is refracted by Snell's law, or reflected totally. The partial
-    reflection (5e-6 at vertical incidence between fresh and sea water) is neglected.
+    Light at the boundary of two index layers is refracted by Snell's law, or reflected totally. The partial reflection
+    (5e-6 at vertical incidence between fresh and sea water) is neglected.
 
     Parameters
     ----------
@@ -59,19 +59,7 @@ class IndexLayers:
         return mi.Float(float(self.group_index[0])) if self.count == 1 else dr.gather(mi.Float, self._group, layer)
 
     def to_boundary(self, depth: mi.Float, downward: mi.Float, layer: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """Return the distance to the boundary at which rays leave their index layer [m], infinite where they never do.
-
-        Parameters
-        ----------
-        depth
-            Depths of the rays' origins [m].
-        downward
-            Vertical component of their unit directions, positive downwards.
-        layer
-            Their index layers.
-        active
-            Active lanes.
-        """
+        """Return the distance to the boundary at which rays leave their index layer [m], infinite if they never do."""
         down = downward > 0
         boundary = dr.select(down, dr.gather(mi.Float, self._bottom, layer), dr.gather(mi.Float, self._top, layer))
         leaves = active & dr.isfinite(boundary) & (downward != 0)

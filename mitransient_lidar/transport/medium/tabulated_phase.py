@@ -1,4 +1,4 @@
-"""Dr.Jit side of tabulated phase functions: evaluation and sampling of a ``PowerLawTable``."""
+"""Evaluation and sampling of phase functions given as a ``PowerLawTable``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
-#: Exponents closer to 1 than this are sampled as if this far: the density within a segment changes by 1e-5.
+#: Exponents are kept this far from 1 when sampled; the density within a segment changes by 1e-5.
 _SMALLEST_EXPONENT = 1e-3
 
 #: s = sin^2(theta/2) of 2e-7 rad, below which float32 directions are the same.
@@ -30,9 +30,7 @@ class TabulatedPhase:
     Parameters
     ----------
     tables
-        The phase functions, each normalised to 1 over the sphere, all with the same nodes. Of several, every lane
-        names its own by number: that costs a little more than one function, and far less than a call of its own for
-        each.
+        Phase functions, each normalised to 1 over the sphere, all with the same nodes. Lanes select theirs by number.
     """
 
     def __init__(self, *tables: PowerLawTable) -> None:
@@ -51,7 +49,7 @@ class TabulatedPhase:
     def eval(self, s: mi.Float, number: mi.UInt32 | int = 0) -> mi.Float:
         """Return a phase function [1/sr] at s = sin^2(theta/2)."""
         offset = dr.log(dr.maximum(s, _SMALLEST_S)) - self._log_s0
-        # Bounded as an integer: lanes that do not ask may hold anything, NaN included.
+        # Clamped after conversion to an integer: inactive lanes may hold NaN.
         cell = dr.minimum(mi.UInt32(dr.maximum(offset * (1 / self._step), 0)), self._nodes - 2)
         cell = dr.select(offset < 0, self._nodes - 1, cell)
         exponent, log_value = dr.gather(mi.Vector2f, self._value, cell + number * self._nodes)
@@ -105,7 +103,7 @@ class NumberedPhase:
 
 
 def _is_short(table: PowerLawTable) -> bool:
-    """Return whether s and p change so little over each segment that a series serves for its power law."""
+    """Return whether s and p change so little over each segment that a series can replace its power law."""
     change = float(np.abs(table.exponent[:-1]).max()) * table.step
     return table.step <= _SHORT_STEP and change <= _SMALL_CHANGE and np.exp(table.log_s0) <= _SMALL_CAP
 
@@ -185,6 +183,6 @@ def _alias_table(probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         scaled[high] -= 1 - scaled[low]
         if scaled[high] < 1:
             small.append(large.pop())
-    # Whatever rounding leaves over is a full cell.
+    # Cells left by rounding are full.
     scaled[small + large] = 1.0
     return scaled, alias

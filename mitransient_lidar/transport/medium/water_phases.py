@@ -1,9 +1,10 @@
-"""Phase functions of the layers of water: chosen, mixed with that of the water itself, and looked up by layer."""
+"""Phase functions of the layers of water: selection, mixture with pure water, and lookup by layer."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -16,29 +17,24 @@ from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_L
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase, deflect
 
-#: Phase functions that ``layered_water`` makes itself.
+#: Phase functions that ``layered_water`` creates.
 KINDS = ("fournier_forand", "petzold", "hg")
 
-#: Layers with more different mixtures than this share functions whose bb/b and share of water are this close.
+#: Beyond this number of different mixtures, bb/b and share of pure water are rounded to this step of their logarithms.
 _MOST_FUNCTIONS, _STEP = 16, 0.02
 
-#: bb/b where there are no particles: any will do.
+#: bb/b where there are no particles, without effect.
 _ANY_RATIO = 0.0183
 
-#: Share of the scattering below which that of the water itself is left out.
+#: Share of the scattering below which that of pure water is left out.
 _SMALLEST_SHARE = 1e-4
 
 
 class ScattererPhases:
     """Phase functions by the number of the scatterer: layers from the top, then bubbles.
 
-    Different functions that are tables with the same nodes are looked up in one large table; others are called through
-    pointers, which costs a call for each.
-
-    Parameters
-    ----------
-    phases
-        One function a scatterer, the same object where scatterers share it.
+    Functions that are tables with the same nodes are looked up in one large table; others are called through pointers,
+    which is slower. Scatterers may share a function object.
     """
 
     def __init__(self, phases: Sequence[mi.PhaseFunction]) -> None:
@@ -54,7 +50,7 @@ class ScattererPhases:
         self._numbers: mi.UInt32 | None = None
 
     def at(self, scatterer: mi.UInt32) -> Any:
-        """Return the phase function of a scatterer; what it is has Mitsuba's ``eval_pdf`` and ``sample``."""
+        """Return the phase function of each lane's scatterer, with Mitsuba's ``eval_pdf`` and ``sample``."""
         if self._single is not None:
             return self._single
         if self._numbers is None:
@@ -86,14 +82,13 @@ def phases_of_layers(
     nested
         Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
     kind
-        What to make where none is nested: one of `KINDS`.
+        One of `KINDS`, used where none is nested.
     phase_g
         Mean cosine for ``hg``.
     water_scattering
-        What the water itself scatters [1/m], shape (layers,), part of the column's scattering. It is mixed with the
-        particles by its share.
+        Scattering of pure water [1/m], shape (layers,), a part of the column's scattering.
     tabulated
-        Makes a phase function of a table.
+        Constructor of a phase function from a table.
 
     Raises
     ------
@@ -124,7 +119,7 @@ def phases_of_layers(
 def _fournier_forand(
     column: WaterColumn, water_scattering: np.ndarray, share: np.ndarray
 ) -> tuple[list[mi.PhaseFunction], np.ndarray]:
-    """Return functions of particles by their bb/b, and the water's share of the scattering; both one a layer."""
+    """Return phase functions of particles by their bb/b, and pure water's share of the scattering; both one a layer."""
     particles = column.scattering - water_scattering
     back = column.backscattering - water_scattering / 2
     for layer in np.flatnonzero((back < 0) & (particles > 0))[:1]:
@@ -145,26 +140,25 @@ def _fournier_forand(
 
 
 def _rounded(value: float) -> float:
-    """Return the value on a grid of equal ratios; what is too small for it is left to be refused."""
+    """Return the value rounded in its logarithm; values that are not positive are refused later."""
     return math.exp(_STEP * round(math.log(value) / _STEP)) if value > 0 else value
 
 
 def _mixed(
     particles: list[mi.PhaseFunction], share: np.ndarray, tabulated: Callable[[PowerLawTable], mi.PhaseFunction]
 ) -> list[mi.PhaseFunction]:
-    """Return the functions of particles mixed with the water's, which has a share of the scattering."""
-    made: dict[tuple[int, float], mi.PhaseFunction] = {}
-    for phase, part in zip(particles, share.tolist(), strict=True):
-        key = id(phase), part
-        if key in made:
-            continue
+    """Return phase functions of particles mixed with that of pure water, by its share of the scattering."""
+
+    @cache
+    def mixed(number: int, part: float) -> mi.PhaseFunction:
+        phase = different[number]
         if part <= _SMALLEST_SHARE:
-            made[key] = phase
-        else:
-            water = PowerLawTable.from_function(water_phase_function)
-            table = PowerLawTable.mixture([table_of(phase), water], [1 - part, part])
-            made[key] = tabulated(table)
-    return [made[id(phase), part] for phase, part in zip(particles, share.tolist(), strict=True)]
+            return phase
+        water = PowerLawTable.from_function(water_phase_function)
+        return tabulated(PowerLawTable.mixture([table_of(phase), water], [1 - part, part]))
+
+    different = {id(phase): phase for phase in particles}
+    return [mixed(id(phase), part) for phase, part in zip(particles, share.tolist(), strict=True)]
 
 
 def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
