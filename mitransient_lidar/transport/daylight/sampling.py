@@ -34,10 +34,8 @@ class FovSampler:
         """Sample directions for paths number `index` of `count`; weights are the solid angles they represent [sr]."""
         pixels = self.receiver.pixels
         px, py = pixels.sample(stratified_point(index, count, rng))
-        angle_x, angle_y = px, py
-        if self.receiver.blur is not None:
-            dx, dy = self.receiver.blur.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            angle_x, angle_y = px - dx, py - dy
+        dx, dy = self.receiver.displacement(rng)
+        angle_x, angle_y = px - dx, py - dy
         pixel, here = pixels.pixel_at(px, py, rng.next_float32())
         weight = pixels.area / count * solid_angle_factor(px, py)
         return SensorSample(self.receiver.pose.direction(angle_x, angle_y), pixel, dr.select(here > 0, weight, 0))

@@ -1,7 +1,4 @@
-"""Profiles of a laser beam in tangent-plane angles: density of its energy, sampling, widths and contours.
-
-Coordinates (angle_x, angle_y) are radians about the optical axis, +angle_x away from nadir.
-"""
+"""Profiles of a laser beam in tangent-plane angles: density of its energy, sampling, widths and contours."""
 
 from __future__ import annotations
 
@@ -22,10 +19,10 @@ from mitransient_lidar.transport.sensor.outlines import Outline, enclosed_area
 #: Shares of the peak irradiance at which a beam's outlines are drawn.
 OUTLINE_LEVELS = (float(np.exp(-0.5)), float(np.exp(-2)))
 
-#: Longest side of an image: finer ones would lose their cells in the digits of 32-bit random numbers.
+#: Longest side of an image: 32-bit random numbers do not resolve the cells of finer ones.
 _LONGEST_SIDE = 2048
 
-#: Outlines of an image that enclose less than this share of the largest are noise.
+#: Outlines of an image that enclose less than this share of the largest are dropped as noise.
 _SMALLEST_ISLAND = 0.02
 
 
@@ -61,15 +58,7 @@ class BeamProfile(ABC):
 
 @dataclass(frozen=True)
 class _Ellipse(BeamProfile):
-    """Beam that is circular once its second axis is stretched.
-
-    Parameters
-    ----------
-    along, across
-        Half angles [rad] along the first and the second axis, positive.
-    rotation
-        Azimuth of the first axis, from +angle_x towards +angle_y [rad].
-    """
+    """Elliptic beam of positive half angles [rad] along the first and across to the second axis."""
 
     along: float
     across: float
@@ -85,7 +74,7 @@ class _Ellipse(BeamProfile):
         return self.across / self.along
 
     def _to_circle(self, angle_x: mi.Float, angle_y: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Return the point of the circular beam of half angle `along` that stands for (angle_x, angle_y)."""
+        """Map (angle_x, angle_y) to a circular beam of half angle `along`."""
         if self.rotation != 0:
             sin, cos = float(np.sin(self.rotation)), float(np.cos(self.rotation))
             angle_x, angle_y = cos * angle_x + sin * angle_y, cos * angle_y - sin * angle_x
@@ -158,20 +147,13 @@ class TopHatBeam(_Ellipse):
 class ImageBeam(BeamProfile):
     """Measured beam: even irradiance within each cell of an image that is centred on the optical axis.
 
-    A point is sampled row first, then column, each by its cumulative distribution: exactly by the density.
-
     Parameters
     ----------
     irradiance
-        Image in any unit, shape (rows, columns): row 0 is the far edge (+angle_x), column 0 the -angle_y edge. Sides of
-        1 to 2048 cells; not negative, not all 0.
+        Image in any unit, shape (rows, columns), 1 to 2048 each: row 0 is the far edge (+angle_x), column 0 the
+        -angle_y edge. Finite, not negative, not all 0; else UserError.
     side
         Full angle [rad] from the first column's outer edge to the last one's, positive. Cells are squares.
-
-    Raises
-    ------
-    UserError
-        When the image is of another kind, or the side out of range.
     """
 
     def __init__(self, irradiance: NDArray[np.float64], side: float) -> None:
@@ -186,7 +168,7 @@ class ImageBeam(BeamProfile):
             raise UserError(f"beam image holds {image.min():g} but no irradiance may be negative")
         if image.max() == 0:
             raise UserError("beam image holds zeros only but must have light in at least one cell")
-        # Scaled first: the sum of irradiances in units of their own may overflow.
+        # Scaled first, as the sum of irradiances in small units may overflow.
         self._share = image / image.max()
         self._share /= self._share.sum()
         self._rows, self._columns = image.shape
@@ -201,7 +183,7 @@ class ImageBeam(BeamProfile):
         left = self._cell * (np.arange(self._columns) + 0.5 - 0.5 * self._columns)
         rows, columns = self._share.sum(axis=1), self._share.sum(axis=0)
         dx, dy = far - rows @ far, left - columns @ left
-        # Light is spread evenly within a cell.
+        # Variance of even light within a cell.
         within = self._cell**2 / 12
         mixed = float(dx @ self._share @ dy)
         moments = np.array([[rows @ dx**2 + within, mixed], [mixed, columns @ dy**2 + within]])

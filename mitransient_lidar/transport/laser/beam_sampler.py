@@ -1,4 +1,4 @@
-"""Sampling of the laser's beam, where the receiver looks."""
+"""Sampling of the laser's beam within the receiver's field of view."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mitransient_lidar.transport.rng import stratified_point, unit_points
 from mitransient_lidar.transport.sensor.fov_shapes import Sector
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
-#: The view is worth sampling when it holds less than this share of the beam.
+#: The field of view is sampled separately when it holds less than this share of the beam.
 _SMALLEST_SHARE = 0.5
 
-#: Room around the field of view, from which light still scatters into it.
+#: Diameter of the sampled region over the field of view, as light around it scatters into it.
 _ROOM = 1.5
 
 
@@ -22,13 +22,6 @@ class BeamSampler:
     """Samples the beam by its energy; half of the samples over the field of view when that is much narrower.
 
     Both halves are weighted by the balance heuristic. Samples are stratified.
-
-    Parameters
-    ----------
-    transmitter
-        The ``lidar_transmitter`` plugin.
-    receiver
-        Pose and pixels of the receiver.
     """
 
     def __init__(self, transmitter: mi.Emitter, receiver: Receiver) -> None:
@@ -45,17 +38,7 @@ class BeamSampler:
         return self.view.contains(angle_x - self.centre[0], angle_y - self.centre[1])
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
-        """Return unit directions, and the energy [J] that each stands for.
-
-        Parameters
-        ----------
-        index
-            Number of the photon, 0 to count - 1.
-        count
-            Number of photons.
-        rng
-            Random numbers of the photons.
-        """
+        """Return unit directions of photons number `index` of `count`, and the energy [J] that each represents."""
         transmitter = self.transmitter
         if not self.use_view:
             angle_x, angle_y = transmitter.sample_tangent(stratified_point(index, count, rng))
@@ -64,10 +47,8 @@ class BeamSampler:
         angle_x, angle_y = transmitter.sample_tangent(point)
         vx, vy = self.view.sample(point)
         of_view = (index & 1) == 1
-        angle_x, angle_y = (
-            dr.select(of_view, vx + self.centre[0], angle_x),
-            dr.select(of_view, vy + self.centre[1], angle_y),
-        )
+        angle_x = dr.select(of_view, vx + self.centre[0], angle_x)
+        angle_y = dr.select(of_view, vy + self.centre[1], angle_y)
         density = transmitter.tangent_density(angle_x, angle_y)
         mixture = 0.5 * (density + dr.select(self._inside(angle_x, angle_y), mi.Float(1 / self.view.area), 0))
         # A sample of the beam's rim may lie outside both by rounding.

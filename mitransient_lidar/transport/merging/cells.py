@@ -15,13 +15,13 @@ from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
-#: Texels a side of the table of surface heights.
-_HEIGHT_TEXELS = 512
+#: Cells on each side of the table of surface heights.
+_HEIGHT_CELLS = 512
 
-#: Number of rays that find the region, and what lies below it.
+#: Number of rays that find the region and the solids below it.
 PROBE_RAYS = 4096
 
-#: Share of rays that may fall outside the region on either side, and by how much it is widened.
+#: Share of rays that may fall outside the region on either side, and margin over its size.
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 
 #: Logarithm to base 2 of the number of buckets.
@@ -59,25 +59,29 @@ class Region:
         """Sides along x and y [m]."""
         return self.high[0] - self.low[0], self.high[1] - self.low[1]
 
+    def probe_points(self) -> tuple[mi.Float, mi.Float]:
+        """Return evenly distributed points (x, y) of the region [m]."""
+        x, y = unit_points(PROBE_RAYS)
+        return dr.lerp(opaque(self.low[0]), opaque(self.high[0]), x), dr.lerp(
+            opaque(self.low[1]), opaque(self.high[1]), y
+        )
+
     def track_length(self, scene: LidarScene) -> float:
-        """Return the mean way in the water to a solid, or to the depth of the record's end, along the axis [m]."""
+        """Return the mean distance in the water along the axis to a solid, or to the depth of the record's end [m]."""
         transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
         spot = transmitter.ground_point()
         sine = transmitter.axis[:2] / scene.refractive_index
         down = np.append(sine, -np.sqrt(1 - sine @ sine))
         air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
         longest = (scene.axis.path_end - air) / (2 * scene.group_index)
-        u = unit_points(PROBE_RAYS)
-        x, y = (
-            dr.lerp(opaque(low), opaque(high), part) for low, high, part in zip(self.low, self.high, u, strict=True)
-        )
+        x, y = self.probe_points()
         lowest = min(float(surface.bbox().min.z) for surface in scene.surfaces)
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, opaque(lowest - 1e-3)), mi.Vector3f(down.tolist())))
         length = dr.mean(dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), max(longest, 0.1)))
         return float(length[0])
 
     def within(self, box: mi.ScalarBoundingBox3f) -> bool:
-        """Return whether a bounding box covers the region with a margin of its width on every side."""
+        """Return whether a bounding box covers the region with a margin of its size on every side."""
         return all(
             float(box.min[axis]) < self.low[axis] - self.size[axis]
             and float(box.max[axis]) > self.high[axis] + self.size[axis]
@@ -95,7 +99,7 @@ class SurfaceHeights:
     """Height of the sea surface over a region, as a table."""
 
     def __init__(self, scene: LidarScene, region: Region) -> None:
-        n = _HEIGHT_TEXELS
+        n = _HEIGHT_CELLS
         self._low = [opaque(low) for low in region.low]
         self._per_metre = [opaque(n / size) for size in region.size]
         index = dr.arange(mi.UInt32, n * n)
@@ -107,7 +111,7 @@ class SurfaceHeights:
             si = scene.ray_intersect(ray, active)
             at_sea = si.is_valid() & scene.is_surface(si.shape)
             height = dr.select(active & at_sea, si.p.z, height)
-            # Look on beneath what stands above the sea.
+            # Continue below solids above the sea.
             active &= si.is_valid() & ~at_sea
             return dr.select(active, si.spawn_ray(ray.d), ray), height, active
 
@@ -121,28 +125,23 @@ class SurfaceHeights:
 
     def at(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Return the height at (x, y) [m]; outside the region, that of its nearest point."""
-        i = dr.clip(mi.Int32((x - self._low[0]) * self._per_metre[0]), 0, _HEIGHT_TEXELS - 1)
-        j = dr.clip(mi.Int32((y - self._low[1]) * self._per_metre[1]), 0, _HEIGHT_TEXELS - 1)
-        return dr.gather(mi.Float, self._height, mi.UInt32(j * _HEIGHT_TEXELS + i))
+        i = dr.clip(mi.Int32((x - self._low[0]) * self._per_metre[0]), 0, _HEIGHT_CELLS - 1)
+        j = dr.clip(mi.Int32((y - self._low[1]) * self._per_metre[1]), 0, _HEIGHT_CELLS - 1)
+        return dr.gather(mi.Float, self._height, mi.UInt32(j * _HEIGHT_CELLS + i))
 
 
 class WaterGrid:
     """Layout of cells that follow the sea surface and are sheared along the refracted beam.
 
-    Cells are horizontal squares, and layers of the depth below the surface above them. They are sheared as the beam is
-    inclined in still water, so that light along the beam stays in one column of cells. They begin at the surface, so
-    that none is cut by it.
+    Cells are horizontal squares in layers of the depth below the surface, so that the surface cuts none. They are
+    sheared along the beam in still water, so that its light stays in one column of cells.
 
     Parameters
     ----------
-    scene
-        The lidar scene.
-    heights
-        Heights of its surface.
     width, thickness
         Horizontal side of a cell at the surface, and its depth [m].
     growth
-        Growth of the width with depth [m/m]: light patterns of the waves blur with depth.
+        Growth of the width with depth [m/m], as light patterns of the waves blur with depth.
     depth
         Depth within which different layers have different buckets [m].
     """
@@ -164,26 +163,19 @@ class WaterGrid:
 
 
 class WaterCells:
-    """The cells of one pass: a `WaterGrid` shifted at random.
-
-    Parameters
-    ----------
-    grid
-        The layout.
-    shift
-        Three uniform random numbers. The uppermost layer is between half and one and a half layers thick.
-    """
+    """The cells of one pass: a `WaterGrid` shifted by three uniform random numbers."""
 
     def __init__(self, grid: WaterGrid, shift: mi.Point3f) -> None:
         self.grid = grid
         self._shift = mi.Point2f(shift.x, shift.y)
+        # Thickness of the uppermost layer.
         self._top = grid.thickness * (0.5 + shift.z)
 
     def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
         grid = self.grid
         depth = grid.heights.at(point.x, point.y) - point.z
-        # The table of heights is approximate: what it places above the surface lies just below.
+        # The table of heights is approximate: points above it are just below the surface.
         layer = dr.maximum(dr.floor((depth - self._top) * (1 / grid.thickness)) + 1, 0)
         width = dr.fma(layer, grid.growth * grid.thickness, grid.width)
         u = (point.x - grid.shear[0] * depth) / width + self._shift.x

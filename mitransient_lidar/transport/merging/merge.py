@@ -18,13 +18,13 @@ from mitransient_lidar.transport.scene import LidarScene
 
 
 def store_points(segments: SegmentBuffer, count: int, cells: WaterCells, classes: PathClasses) -> PhotonMap | None:
-    """Store the `count` points of light paths by their cells; return None without any."""
+    """Store the `count` points of light paths by their cells; return None if there are none."""
     if count == 0:
         return None
     index = dr.arange(mi.UInt32, count)
     bucket, _, _ = cells.locate(segments.points(index).point)
     photons = PhotonMap(cells.grid.buckets, bucket, classes.separate)
-    # Computed anew: reading the segments again costs less than keeping the points.
+    # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     _, tag, _ = cells.locate(points.point)
     position = dr.dot(points.point, points.direction)
@@ -38,10 +38,10 @@ def merge_in_water(
 ) -> None:
     """Merge points of the receiver's paths with the light in their cells.
 
-    A point stands for a track of length s and throughput beta, a photon for one of length s' and energy w; with the
-    cell's volume V each pair adds beta s w s' / V times scattering coefficient and phase function, weighted among all
-    merges that make the same path. Water and bubbles make different paths. `u`, a uniform random number for each
-    point, selects the photons of cells that hold too many.
+    A point represents a track of length s and throughput beta, a photon one of length s' and energy w. With the cell's
+    volume V each pair adds beta s w s' / V times scattering coefficient and phase function, weighted among all merges
+    that make the same path; water and bubbles make different paths. The uniform random numbers `u` select photons in
+    cells with too many.
     """
     water = scene.water
     bucket, cell, volume = cells.locate(points.point)
@@ -67,7 +67,7 @@ def merge_in_water(
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
             shared += dr.rcp(dr.rcp(scattering * value[0]) + points.mis_partial_sum + photon.mis_partial_sum)
-        # The photon continues to the plane across its direction through the point: times do not blur over the cell.
+        # The photon continues to the plane through the point normal to its direction, so that times do not blur.
         beyond = dr.dot(points.point, photon.direction) - photon.position
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + beyond * group
@@ -80,7 +80,7 @@ def merge_in_water(
 def merge_on_solids(
     patches: SolidPatches, record: PassRecord, photons: PhotonMap | None, pixel: mi.UInt32, rng: mi.PCG32
 ) -> Action:
-    """Return the action that merges the receiver's paths, where they meet solids, with the light there.
+    """Return the action that merges the receiver's paths with the light on the solids that they meet.
 
     A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF.
     """
@@ -99,8 +99,8 @@ def merge_on_solids(
             photon, tag = photons.photon(index, within)
             within &= tag == patch.tag
             outgoing = si.to_local(-photon.direction)
-            # Mitsuba's BSDFs hold the cosine of the shading normal, which stays. A photon's energy on an area is that
-            # of its radiance times the cosine of the true surface, which is divided out.
+            # Mitsuba's BSDFs include the cosine of the shading normal. The photon's energy per area includes that of
+            # the true surface, which is divided out.
             cosine = dr.abs(dr.dot(si.n, photon.direction))
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
             energy = weight * photon.weight * bsdf
@@ -114,7 +114,7 @@ def merge_on_solids(
 
 @dataclass(frozen=True)
 class SensorSubpath:
-    """The receiver's part of merged paths: pixel, events and reversals so far, direction and weight."""
+    """The receiver's part of merged paths."""
 
     pixel: mi.UInt32
     scatterings: mi.UInt32
@@ -133,8 +133,7 @@ class SensorSubpath:
         order, reversals = self.scatterings, self.reversals
         if record.classes.separate:
             _, before, reversed_before = record.classes.unpack(photon.label)
-            # Light continues against the direction of the receiver's part: a reversal where both point down, or both
-            # up.
+            # Light continues against the direction of the receiver's part: a reversal if both point down, or both up.
             here = dr.select(photon.direction.z * self.direction.z > 0, mi.UInt32(1), 0)
             reversals = reversals + reversed_before + here
             order = order + before + events

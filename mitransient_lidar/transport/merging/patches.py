@@ -10,16 +10,15 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import ORIGIN, PROBE_RAYS, Region, low_bits
 from mitransient_lidar.transport.opaque import is_one_of, opaque
-from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Logarithm to base 2 of the number of buckets along one side.
 _BUCKET_BITS = 9
 
-#: Height of the floors into which patches of bounded solids are cut, in widths of a patch.
-_FLOOR_WIDTHS = 8
+#: Height of the levels into which patches of bounded solids are cut, over the width of a patch.
+_LEVEL_WIDTHS = 8
 
-#: Surfaces that a vertical ray may meet where levels of one solid are looked for.
+#: Largest number of hits of a vertical ray in the search for solids of several levels.
 _MOST_LEVELS = 8
 
 #: Largest number of coverage samples: rounding may hide a sliver of a patch from all of them.
@@ -33,9 +32,9 @@ class Patch:
     Attributes
     ----------
     bucket, tag
-        Place of its photons; patches of one bucket differ in tag.
+        Bucket of its photons; patches of one bucket differ in tag.
     area
-        Area of the surface over the patch's square in projection, if the surface covers it [m^2].
+        Area of the surface over the patch's square in projection, if it covers all of it [m^2].
     corner
         Corner of that square, and height over it, in the coordinates (u, v, w) of the projection [m].
     axis
@@ -53,11 +52,8 @@ class Patch:
 
 
 def solids_of_several_levels(scene: LidarScene, region: Region) -> list[mi.Shape]:
-    """Return solids with parts above each other somewhere in the region, found with vertical rays."""
-    u = unit_points(PROBE_RAYS)
-    x, y = (
-        dr.lerp(opaque(low), opaque(high), part) for low, high, part in zip(region.low, region.high, u, strict=True)
-    )
+    """Return solids with parts above each other in the region, found with vertical rays."""
+    x, y = region.probe_points()
     top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
     ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
     looking = dr.full(mi.Bool, True, PROBE_RAYS)
@@ -76,8 +72,6 @@ class SolidPatches:
 
     Parameters
     ----------
-    scene
-        The lidar scene.
     region
         Region that is lit or seen.
     width
@@ -118,14 +112,14 @@ class SolidPatches:
         bits = _BUCKET_BITS
         side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
-        # Solids with overhangs have several floors over one square.
-        floor = mi.UInt32(mi.Int32(dr.floor(w / (_FLOOR_WIDTHS * self.width))) + ORIGIN)
-        floor = dr.select(self._is_bounded(si.shape), floor, 0)
+        # Solids with overhangs have several levels over one square.
+        level = mi.UInt32(mi.Int32(dr.floor(w / (_LEVEL_WIDTHS * self.width))) + ORIGIN)
+        level = dr.select(self._is_bounded(si.shape), level, 0)
         return Patch(
             bucket=low_bits(i, bits) | (low_bits(j, bits) << bits),
             tag=low_bits(i >> bits, 6)
             | (low_bits(j >> bits, 6) << 6)
-            | (low_bits(floor, 8) << 12)
+            | (low_bits(level, 8) << 12)
             | (side << 20)
             | (low_bits(shape, 9) << 23),
             area=self.width * self.width / dr.abs(normal),
@@ -139,16 +133,16 @@ class SolidPatches:
         return is_one_of(shape, self._bounded)
 
     def inverse_share(self, patch: Patch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
-        """Return an estimate of 1 / (covered share of the patch's square): edges cut some patches.
+        """Return an estimate of 1 / (covered share of the patch's square), for patches cut by edges.
 
-        The number of random points in the square until the first one on the patch has that mean (Booth 2007,
+        The mean of the number of random points in the square up to the first one on the patch (Booth 2007,
         doi:10.1080/2151237X.2007.10129248).
         """
         if not self._bounded:
             return mi.Float(1)
         reach = 2 * self.width
 
-        def look(samples: mi.Float, rng: mi.PCG32, looking: mi.Bool) -> tuple[mi.Float, mi.PCG32, mi.Bool]:
+        def probe(samples: mi.Float, rng: mi.PCG32, searching: mi.Bool) -> tuple[mi.Float, mi.PCG32, mi.Bool]:
             u = patch.corner.x + self.width * rng.next_float32()
             v = patch.corner.y + self.width * rng.next_float32()
             w = patch.corner.z + reach * patch.faces
@@ -163,12 +157,12 @@ class SolidPatches:
             )
             ray = mi.Ray3f(origin, down)
             ray.maxt = 2 * reach
-            si = self.scene.ray_intersect(ray, looking)
+            si = self.scene.ray_intersect(ray, searching)
             found = si.is_valid() & (self.locate(si).tag == patch.tag)
-            looking &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
-            return samples + dr.select(looking, mi.Float(1), 0), rng, looking
+            searching &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
+            return samples + dr.select(searching, mi.Float(1), 0), rng, searching
 
         state = mi.Float(1), mi.PCG32(rng), active & self._is_bounded(shape)
-        samples, advanced, _ = dr.while_loop(state, lambda samples, rng, looking: looking, look, label="coverage")
+        samples, advanced, _ = dr.while_loop(state, lambda samples, rng, searching: searching, probe, label="coverage")
         rng.state = advanced.state
         return samples

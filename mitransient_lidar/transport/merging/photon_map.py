@@ -11,11 +11,8 @@ from mitransient_lidar.transport.merging.patches import Patch
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 
-#: Numbers of a photon in memory.
-_RECORD = 8
-
-#: Photons of a bucket that are used for one point. Where a beam or view is no wider than a cell there are thousands,
-#: which would take minutes and reduce the variance little; in usual scenes the fullest buckets hold fifteen.
+#: Largest number of photons of a bucket that are used for one point. Where a beam or field of view is no wider than a
+#: cell, thousands would take minutes and reduce the variance little; usually the fullest buckets hold fifteen.
 _MOST_PHOTONS = 32
 
 
@@ -32,11 +29,11 @@ class Photon:
     weight
         Energy [J], in the water times track length [J m]; negative for paths outside the surface mesh.
     mis_partial_sum
-        That of its path, see `RandomWalkPath`.
+        As in `RandomWalkPath`.
     position
-        Position along its direction: scalar product of both [m].
+        Scalar product of position and direction [m].
     label
-        Events and reversals of its path (`PathClasses.pack`).
+        Scattering events and reversals of its path (`PathClasses.pack`).
     """
 
     direction: mi.Vector3f
@@ -48,17 +45,7 @@ class Photon:
 
 
 class PhotonMap:
-    """Photons by bucket, sorted by counting.
-
-    Parameters
-    ----------
-    buckets
-        Number of buckets.
-    bucket
-        Bucket of each photon, shape (photons,).
-    labelled
-        Whether to keep labels.
-    """
+    """Photons sorted by bucket, by counting: `bucket` is that of each photon, `labelled` whether labels are kept."""
 
     def __init__(self, buckets: int, bucket: mi.UInt32, labelled: bool) -> None:
         self.count = dr.width(bucket)
@@ -71,31 +58,25 @@ class PhotonMap:
         self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
 
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
-        """Store the photons in the order of their buckets; within a bucket, tags separate cells."""
+        """Store the photons in the order of their buckets, with their cells' tags."""
         place = dr.gather(mi.UInt32, self._end, self._bucket) - 1 - self._rank
-        self._record = dr.empty(mi.Float, _RECORD * self.count)
+        self._record = dr.empty(mi.Float, 8 * self.count)
         where = mi.Vector4f(photon.direction.x, photon.direction.y, photon.direction.z, photon.length)
-        tag = dr.reinterpret_array(mi.Float, tag)
+        rest = mi.Vector4f(photon.weight, photon.mis_partial_sum, dr.reinterpret_array(mi.Float, tag), photon.position)
         dr.scatter(self._record, where, 2 * place)
-        dr.scatter(
-            self._record, mi.Vector4f(photon.weight, photon.mis_partial_sum, tag, photon.position), 2 * place + 1
-        )
+        dr.scatter(self._record, rest, 2 * place + 1)
         if self._label is not None:
             dr.scatter(self._label, photon.label, place)
         dr.eval(self._record, self._end, self._label)
         self._bucket, self._rank = mi.UInt32(), mi.UInt32()
 
-    def bucket(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return first photon and end of a bucket; both 0 where inactive."""
-        end = dr.gather(mi.UInt32, self._end, bucket, active)
-        return dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0)), end
-
     def sample(self, bucket: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return first photon, end, and step through a bucket with too many photons for all to be used.
+        """Return first photon, end and step of the photons of a bucket that are used; nothing where inactive.
 
-        Every photon is used with a probability of one over the step, chosen by the uniform number `u`.
+        The uniform number `u` selects each photon with a probability of one over the step.
         """
-        first, end = self.bucket(bucket, active)
+        end = dr.gather(mi.UInt32, self._end, bucket, active)
+        first = dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0))
         step = (end - first) // (_MOST_PHOTONS + 1) + 1
         return first + dr.minimum(mi.UInt32(u * mi.Float(step)), step - 1), end, step
 
@@ -109,15 +90,7 @@ class PhotonMap:
 
 
 class PhotonBuffer:
-    """Light on patches of solids, in any order.
-
-    Parameters
-    ----------
-    capacity
-        Largest number of photons; more are counted, but not stored.
-    classes
-        Classes of the received light, which labels carry.
-    """
+    """Light on patches of solids, in any order; at most `capacity` photons are stored, but all are counted."""
 
     def __init__(self, capacity: int, classes: PathClasses) -> None:
         self.capacity = capacity
@@ -140,7 +113,7 @@ class PhotonBuffer:
             dr.scatter(self._label, self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals), slot, keep)
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
-        """Return the photons in a map, None without any, and their number, stored or not."""
+        """Return the photons in a map, or None, and their number, stored or not."""
         dr.eval(self._stored, self._patch, self._record, self._weight, self._label)
         wanted = int(self._stored[0])
         if wanted == 0:

@@ -27,11 +27,11 @@ from mitransient_lidar.transport.volpath import VolpathOptions, trace_connected
 #: Numbers of the random streams within a pass; the path tracer has the next one.
 _COMMON_STREAM, _LIGHT_STREAM, _SENSOR_STREAM = 0, 1, 2
 
-#: Points on the way from the surface to the bottom, or to the depth that the end of the record allows. Images need more
-#: paths rather than more points: half of them cost a third less time and increase the water's variance by a half.
+#: Points from the surface to the bottom, or to the depth that the end of the record allows. In images, half as many
+#: points take a third less time and increase the water's variance by a half: more paths are better there.
 _POINTS_PER_PATH, _POINTS_PER_IMAGE_PATH = 20, 10
 
-#: Default numbers of paths and photons of a pass; images get so many paths for each pixel.
+#: Default numbers of paths and photons of a pass.
 _PATHS, _PATHS_PER_PIXEL, _MOST_PATHS = 2**15, 16, 2**21
 _PHOTONS, _PHOTONS_FOR_IMAGES = 2**15, 2**16
 
@@ -41,8 +41,8 @@ _IMAGE_PIXELS = 4096
 #: Width of the cells at the surface, over the beam's standard deviation there and over the side of the sea's facets.
 _CELL_PER_FOOTPRINT, _CELL_PER_FACET = 0.0125, 0.05
 
-#: Growth of the width with depth, over the width at the surface: per metre, as ripples blur the patterns of the waves,
-#: and per scattering length, as scattering does.
+#: Growth of the width with depth, over the width at the surface: per metre, for the blur of light patterns by ripples,
+#: and per scattering length, for that by scattering.
 _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 
 #: Width of the patches of solids, over the width of the cells at the surface.
@@ -51,16 +51,16 @@ _PATCH_PER_CELL = 3.2
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.35, 0.3
 
-#: Sensor paths for each path of the path tracer, which adds what merging leaves out, where that is next to nothing.
+#: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
 
-#: Capacity for segments and hits, over what the last pass needed.
+#: Capacity for segments and hits over the need of the last pass.
 _CAPACITY_MARGIN = 1.25
 
 
 @dataclass(frozen=True)
 class MergingOptions:
-    """Options of merging; the plugin ``lidar_merging`` documents them. None or 0 takes the default."""
+    """Options of merging, documented in the plugin ``lidar_merging``; None or 0 selects the default."""
 
     paths_per_pass: int | None = None
     photons_per_pass: int | None = None
@@ -85,7 +85,7 @@ class MergingLayout:
     patch_width
         Width of the patches of solids [m].
     light_segments, sensor_segments, hits
-        Segments and hits of solids for each path; they grow when a pass needs more.
+        Capacities for segments and hits of solids of each path; they grow when a pass needs more.
     """
 
     region: Region
@@ -116,7 +116,7 @@ class MergingLayout:
         width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * scene.facet_size)
         growth = width * (_GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min()))
         grid = WaterGrid(scene, SurfaceHeights(scene, region), width, growth, thickness, reach)
-        # Rounded, so that the next shot has the same kernels.
+        # Rounded, so that other shots use the same kernels.
         segments = 0.5 * np.ceil(3 * (1 + scattering * reach)) + 1
         return cls(region, uneven, grid, spacing, _PATCH_PER_CELL * width, segments, segments)
 
@@ -127,19 +127,7 @@ def paths_of_pass(options: MergingOptions, pixels: int) -> int:
 
 
 class MergingRenderer(PassRenderer):
-    """Renders passes by merging.
-
-    Parameters
-    ----------
-    scene
-        The lidar scene; it has water.
-    classes
-        Classes into which the received light is separated.
-    options
-        Options of merging.
-    layout
-        Points and cells of another scene to use here, or None.
-    """
+    """Renders passes of a scene with water by merging, with its own layout or that of another scene."""
 
     def __init__(
         self, scene: LidarScene, classes: PathClasses, options: MergingOptions, layout: MergingLayout | None = None
@@ -157,7 +145,7 @@ class MergingRenderer(PassRenderer):
             record.clear()
 
     def _attempt(self, record: PassRecord, seed: int, paths: int) -> bool:
-        """Trace one pass; return False when a buffer was too small, which is larger then."""
+        """Trace one pass; return False, with larger capacities, when a buffer was too small."""
         scene, layout = self.scene, self.layout
         common = np.random.default_rng([seed, _COMMON_STREAM]).random(5, np.float32)
         shifts = [dr.opaque(mi.Float, float(shift)) for shift in common]
@@ -166,11 +154,10 @@ class MergingRenderer(PassRenderer):
         light = self._trace_light(record, seed, cells, patches)
         if light is None or not self._trace_sensor(record, seed, paths, cells, patches, *light):
             return False
-        # The path tracer adds what merging leaves out.
-        few = max(paths // _PATHS_PER_COMPLEMENT_PATH, 1024)
-        complement = VolpathOptions(complement_only=True)
-        count = paths if scene.has_specular_or_dry_solids else few
-        trace_connected(scene, self.sampler, complement, record, seed, count)
+        # The path tracer adds the light that merging leaves out.
+        if not scene.has_specular_or_dry_solids:
+            paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, 1024)
+        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, seed, paths)
         return True
 
     def _trace_light(
@@ -222,10 +209,9 @@ class MergingRenderer(PassRenderer):
         def connect(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             radiance, length = connect_laser(scene, si, active)
             path.rays += dr.select(active, mi.UInt32(1), 0)
-            # The end of the first segment: no scattering event, and one reversal.
-            none, one = mi.UInt32(0), mi.UInt32(1)
             energy = path.throughput * radiance
-            record.receive(start.pixel, none, one, path.length + length, energy, radiance > 0)
+            # No scattering event, and one reversal.
+            record.receive(start.pixel, mi.UInt32(0), mi.UInt32(1), path.length + length, energy, radiance > 0)
 
         merge = merge_on_solids(patches, record, on_patches, start.pixel, rng)
         path = walk.run(path, rng, start.pixel, segments, on_solid=merge, on_first_hit=connect, past_solids=False)

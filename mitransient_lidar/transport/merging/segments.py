@@ -29,9 +29,9 @@ class SegmentPoints:
         Throughput of the path up to the point times the track length of the point [m]; negative for paths outside the
         surface mesh.
     mis_partial_sum
-        That of the path, see `RandomWalkPath`.
+        As in `RandomWalkPath`.
     label
-        Label of the path, with its events and reversals so far (`PathClasses.pack`).
+        Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
     """
 
     point: mi.Point3f
@@ -43,18 +43,9 @@ class SegmentPoints:
 
 
 class SegmentBuffer:
-    """Segments in the water of many paths, in any order, with points at equal distances along each path.
+    """Segments in the water of many paths, in any order, with points at equal distances `spacing` [m] along each path.
 
-    Parameters
-    ----------
-    water
-        The ``layered_water``.
-    classes
-        Classes of the received light, which labels carry.
-    spacing
-        Distance between points along a path [m].
-    capacity
-        Largest number of segments; more are counted, but not stored.
+    At most `capacity` segments are stored, but all are counted.
     """
 
     def __init__(self, water: Any, classes: PathClasses, spacing: float, capacity: int) -> None:
@@ -71,19 +62,7 @@ class SegmentBuffer:
         self._segment = mi.UInt32()
 
     def add(self, path: RandomWalkPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """Store the next segment of each path and return the offset of the first point beyond its end [m].
-
-        Parameters
-        ----------
-        path
-            Paths at the start of the segment.
-        length
-            Length of the segment [m].
-        label
-            Label of the path.
-        active
-            Lanes with a segment to store.
-        """
+        """Store the next segment of each path, of a length [m]; return the offset of the first point beyond it [m]."""
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
         number = dr.select(active, number, 0)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)

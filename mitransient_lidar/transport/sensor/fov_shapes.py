@@ -1,7 +1,4 @@
-"""Shapes of a field of view in tangent-plane angles: area, membership and uniform sampling.
-
-Coordinates (angle_x, angle_y) are radians about the optical axis, +angle_x away from nadir; areas are radians squared.
-"""
+"""Shapes of a field of view in tangent-plane angles [rad]: area [rad^2], membership and uniform sampling."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, in_range, positive
 
-#: Bisection steps that bring an inverted distribution function to float32 accuracy.
+#: Bisection steps that invert a distribution function to float32 accuracy.
 _BISECTION_STEPS = 25
 
 _NOT_SIMPLE = "polygon: its edges must not cross each other, nor touch or overlap"
@@ -41,7 +38,7 @@ class FovShape(ABC):
         """Return (angle_x_min, angle_x_max, angle_y_min, angle_y_max)."""
 
     def comes_near(self, angle_x: NDArray[np.float64], angle_y: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        """Return whether the region may have a point within `reach` [rad] of each point, with no false negatives."""
         angle_x_min, angle_x_max, angle_y_min, angle_y_max = self.bounds()
         return np.asarray(
             (angle_x >= angle_x_min - reach)
@@ -70,8 +67,7 @@ class Sector(FovShape):
     outer, inner
         Radii [rad], 0 <= inner < outer.
     start, extent
-        Azimuth at which the sector begins, from +angle_x towards +angle_y, and its size [rad]; extent 2 pi is a whole
-        ring.
+        Azimuth at which the sector begins, from +angle_x towards +angle_y, and its size [rad], up to 2 pi.
     centre
         (angle_x, angle_y) of the centre [rad].
     """
@@ -83,9 +79,7 @@ class Sector(FovShape):
     centre: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        # NumPy scalars would turn Dr.Jit arrays into NumPy ones in the formulas below.
-        for name in ("outer", "inner", "start", "extent"):
-            object.__setattr__(self, name, float(getattr(self, name)))
+        _convert_to_float(self, "outer", "inner", "start", "extent")
         positive("outer radius of the field of view", self.outer)
         in_range("inner radius of the field of view", self.inner, 0.0, self.outer * (1 - 1e-9))
         positive("extent of the field-of-view sector", self.extent)
@@ -114,16 +108,16 @@ class Sector(FovShape):
         return dr.fma(r, cos, self.centre[0]), dr.fma(r, sin, self.centre[1])
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Return (angle_x_min, angle_x_max, angle_y_min, angle_y_max) of the whole circle."""
+        """Return the bounds of the circle."""
         (x, y), r = self.centre, self.outer
         return x - r, x + r, y - r, y + r
 
     def comes_near(self, angle_x: NDArray[np.float64], angle_y: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        """Return whether the region may have a point within `reach` [rad] of each point, with no false negatives."""
         x, y = angle_x - self.centre[0], angle_y - self.centre[1]
         r = np.hypot(x, y)
         near = (r <= self.outer + reach) & (r >= self.inner - reach)
-        # Seen from the centre, the surroundings of a point are this wide to either side; all round when it is in them.
+        # Half angle of a point's surroundings about the centre, pi where they include it.
         width = np.where(r > reach, np.arcsin(np.minimum(1, reach / np.maximum(r, reach))), np.pi)
         off_middle = np.arctan2(y, x) - self.start - 0.5 * self.extent
         off_middle = np.abs(off_middle - 2 * np.pi * np.round(off_middle / (2 * np.pi)))
@@ -140,8 +134,7 @@ class Rectangle(FovShape):
     angle_y_max: float
 
     def __post_init__(self) -> None:
-        for name in ("angle_x_min", "angle_x_max", "angle_y_min", "angle_y_max"):
-            object.__setattr__(self, name, float(getattr(self, name)))
+        _convert_to_float(self, "angle_x_min", "angle_x_max", "angle_y_min", "angle_y_max")
         positive("extent of the field of view along angle_x", self.angle_x_max - self.angle_x_min)
         positive("extent of the field of view along angle_y", self.angle_y_max - self.angle_y_min)
 
@@ -170,23 +163,14 @@ class Rectangle(FovShape):
 
 @dataclass(frozen=True)
 class Strip(FovShape):
-    """Part of a circle about the axis between two lines of constant angle_x: a pixel of the published 1x4 receiver.
-
-    Parameters
-    ----------
-    radius
-        Radius of the circle [rad], positive.
-    angle_x_min, angle_x_max
-        The lines [rad]; they must leave a part of the circle between them.
-    """
+    """Part of a circle about the axis between two lines of constant angle_x [rad], as in the published 1x4 receiver."""
 
     radius: float
     angle_x_min: float
     angle_x_max: float
 
     def __post_init__(self) -> None:
-        for name in ("radius", "angle_x_min", "angle_x_max"):
-            object.__setattr__(self, name, float(getattr(self, name)))
+        _convert_to_float(self, "radius", "angle_x_min", "angle_x_max")
         positive("radius of the field of view", self.radius)
         low, high = self._limits()
         if not high > low:
@@ -200,7 +184,7 @@ class Strip(FovShape):
 
     @staticmethod
     def _half_disc(x: float) -> float:
-        """Area of the unit disc's part with abscissa below x, less half the disc."""
+        """Area of the part of the unit disc with abscissa below x, minus half the disc."""
         return float(x * np.sqrt(max(0.0, 1 - x * x)) + np.arcsin(x))
 
     @property
@@ -235,7 +219,7 @@ class Strip(FovShape):
         return low, high, -self.radius, self.radius
 
     def comes_near(self, angle_x: NDArray[np.float64], angle_y: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        """Return whether the region may have a point within `reach` [rad] of each point, with no false negatives."""
         return super().comes_near(angle_x, angle_y, reach) & (np.hypot(angle_x, angle_y) <= self.radius + reach)
 
 
@@ -245,8 +229,8 @@ class Polygon(FovShape):
     Parameters
     ----------
     vertices
-        Corners (angle_x, angle_y) [rad] in order, shape (n, 2), at least three, not all on one line. The first one may
-        be repeated at the end.
+        Corners (angle_x, angle_y) [rad] in order, shape (n, 2), at least three, not all on one line. The first may be
+        repeated at the end.
     """
 
     def __init__(self, vertices: Sequence[tuple[float, float]] | NDArray[np.float64]) -> None:
@@ -273,9 +257,9 @@ class Polygon(FovShape):
         self._cdf = np.cumsum(areas) / areas.sum()
 
     def contains(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Bool:
-        """Return whether points lie inside: an odd number of edges is crossed on the way to angle_x = infinity."""
+        """Return whether points lie inside: an odd number of edges lies between them and angle_x = infinity."""
         inside = mi.Bool(False)
-        # NumPy's numbers would turn Dr.Jit arrays into NumPy ones.
+        # Python numbers: NumPy scalars would turn Dr.Jit arrays into NumPy ones.
         ends = self.vertices.tolist(), np.roll(self.vertices, -1, axis=0).tolist()
         for (x0, y0), (x1, y1) in zip(*ends, strict=True):
             if y0 == y1:
@@ -306,7 +290,7 @@ class Polygon(FovShape):
         return float(x0), float(x1), float(y0), float(y1)
 
     def comes_near(self, angle_x: NDArray[np.float64], angle_y: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-        """Return whether the region may have a point within `reach` [rad] of each point; never wrongly False."""
+        """Return whether the region may have a point within `reach` [rad] of each point, with no false negatives."""
         near, inside = np.zeros(angle_x.shape, dtype=bool), np.zeros(angle_x.shape, dtype=bool)
         for (x0, y0), (x1, y1) in zip(self.vertices, np.roll(self.vertices, -1, axis=0), strict=True):
             x, y, along_x, along_y = angle_x - x0, angle_y - y0, x1 - x0, y1 - y0
@@ -317,11 +301,14 @@ class Polygon(FovShape):
         return near | inside
 
 
-def _cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Twice the signed area of triangles, positive where their corners turn left; corners in the last axis.
+def _convert_to_float(shape: FovShape, *names: str) -> None:
+    """Convert attributes to Python numbers: NumPy scalars would turn Dr.Jit arrays into NumPy ones."""
+    for name in names:
+        object.__setattr__(shape, name, float(getattr(shape, name)))
 
-    It is 0 where rounding would decide whether the corners lie on one line.
-    """
+
+def _cross(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return twice the area of triangles, negative if clockwise, 0 where their corners lie on a line to rounding."""
     ab, ac = b - a, c - a
     area = ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
     sides = np.linalg.norm(ab, axis=-1) * np.linalg.norm(ac, axis=-1)
@@ -336,16 +323,16 @@ def _meets_itself(points: np.ndarray) -> bool:
         return True
     for i, (a, b) in enumerate(zip(start, end, strict=True)):
         c, d = (corners[i + 2 : len(points) - (i == 0)] for corners in (start, end))
-        # Edges along one line pass the second test wherever they are, and the first one only if they touch.
-        beside = (np.maximum(a, b) < np.minimum(c, d)) | (np.maximum(c, d) < np.minimum(a, b))
+        # The second test is true of all edges on one line; the first one excludes those that do not touch.
+        apart = (np.maximum(a, b) < np.minimum(c, d)) | (np.maximum(c, d) < np.minimum(a, b))
         meets = (_cross(a, b, c) * _cross(a, b, d) <= 0) & (_cross(c, d, a) * _cross(c, d, b) <= 0)
-        if (meets & ~beside.any(axis=1)).any():
+        if (meets & ~apart.any(axis=1)).any():
             return True
     return False
 
 
 def _triangulate(points: np.ndarray) -> list[tuple[int, int, int]]:
-    """Cut ears off a simple polygon whose corners turn left."""
+    """Triangulate a simple polygon of counter-clockwise corners by ear clipping."""
     rest, triangles = list(range(len(points))), []
     while len(rest) > 3:
         for k in range(len(rest)):

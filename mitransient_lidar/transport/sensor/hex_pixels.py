@@ -17,14 +17,13 @@ _ROOT3 = math.sqrt(3.0)
 
 
 class HexPixels(PixelArray):
-    """A hexagon and rings of hexagons around it, in rows across range.
+    """A hexagon and rings of hexagons around it, in rows along angle_y.
 
-    Every hexagon has two corners along angle_x, so that rows of them run along angle_y. The field of view is the circle
-    about the axis that just holds the array: of N hexagons with side s it has the radius sqrt(N) s, and they fill 3
-    sqrt(3) / (2 pi) = 82.7 % of it, whatever N is.
+    The field of view is the circumscribed circle about the axis: for N hexagons of side s its radius is sqrt(N) s, and
+    they fill 3 sqrt(3) / (2 pi) = 82.7 % of it for any N.
 
     The array without its central hexagon is three parallelograms of n x (n + 1) hexagons for n rings. Points are drawn
-    in these and then given to the hexagon that they fall into, so the number of pixels costs nothing.
+    in these and assigned to hexagons afterwards, at a cost that does not depend on N.
 
     Parameters
     ----------
@@ -51,7 +50,7 @@ class HexPixels(PixelArray):
         self.area = fill_factor * count * 1.5 * _ROOT3 * self._side**2
         self.field_of_view = field_of_view
         self.field_of_view_shape = "circle"
-        # Of each pixel, from the far row to the near one, and in a row from -angle_y to +angle_y.
+        # Axial coordinates of each pixel, from the far row to the near one, and from -angle_y to +angle_y in a row.
         rows = [(rings - k, 2 * rings + 1 - abs(rings - k)) for k in range(2 * rings + 1)]
         self._axial = np.array([(i - rings - min(row, 0), row) for row, length in rows for i in range(length)])
         names = [f"r{k}c{i}" for k, (_, length) in enumerate(rows) for i in range(length)]
@@ -66,15 +65,15 @@ class HexPixels(PixelArray):
         across = dr.select(of_centre, u.x * count, (part - third) * rings)
         along = dr.select(of_centre, u.y, u.y * (rings + 1))
         a, b = dr.floor(across), dr.floor(along)
-        # The lattice's cell that is a rhombus holds the same points as the hexagon, moved by lattice vectors.
+        # The rhombic cell of the lattice holds the same points as the hexagon, moved by lattice vectors.
         column, row = across - a, along - b
         near_column, near_row = _round(column, row)
         angle_x, angle_y = self._position(column - near_column, row - near_row)
-        # Of the first parallelogram, from next to the centre; the others are turned by 120 and 240 degrees.
+        # In the first parallelogram, next to the centre; the others are rotated by 120 and 240 degrees.
         column, row = dr.select(of_centre, 0, a + 1 - b), dr.select(of_centre, 0, b)
-        for turn in (1, 2):
-            turned = ~of_centre & (third >= turn)
-            column, row = dr.select(turned, -column - row, column), dr.select(turned, column, row)
+        for rotation in (1, 2):
+            rotated = ~of_centre & (third >= rotation)
+            column, row = dr.select(rotated, -column - row, column), dr.select(rotated, column, row)
         x, y = self._position(column, row)
         return dr.fma(angle_x, self._shrink, x), dr.fma(angle_y, self._shrink, y)
 
@@ -89,7 +88,7 @@ class HexPixels(PixelArray):
             x, y = dr.abs(angle_x - x), dr.abs(angle_y - y)
             inside &= dr.maximum(y, 0.5 * (_ROOT3 * x + y)) <= 0.5 * _ROOT3 * self._side * self._shrink
         i, k = mi.Int32(dr.select(inside, column, 0)), rings - mi.Int32(dr.select(inside, row, 0))
-        # Hexagons in the rows before this one: rows have rings + 1 hexagons up to 2 rings + 1 and back.
+        # Hexagons in the rows before this one: rows grow from rings + 1 hexagons to 2 rings + 1, and shrink again.
         past = dr.maximum(k - rings, 0)
         before = k * (rings + 1) + (k * (k - 1)) // 2 - past * past + past
         index = before + i + rings + dr.minimum(rings - k, 0)
@@ -110,7 +109,7 @@ def hexagon_count(layout: str) -> int:
     Raises
     ------
     UserError
-        When the number is not that of a hexagon and whole rings around it, or is above 2^20.
+        When the number is not that of a hexagon and complete rings around it, or is above 2^20.
     """
     match = re.fullmatch(r"hex([1-9]\d*)", layout)
     count = int(match.group(1)) if match else 0
@@ -123,7 +122,7 @@ def hexagon_count(layout: str) -> int:
 
 
 def _round(column: mi.Float, row: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Return the axial coordinates of the hexagon around a point: round all three cube coordinates, mend the worst."""
+    """Return the axial coordinates of the hexagon around a point: round three cube coordinates, correct the worst."""
     third = -column - row
     c, r, t = dr.round(column), dr.round(row), dr.round(third)
     off_c, off_r, off_t = dr.abs(c - column), dr.abs(r - row), dr.abs(t - third)

@@ -15,23 +15,14 @@ _SUFFIXES = (".png", ".npy", ".exr")
 
 
 def read_image(name: str, path: str) -> NDArray[np.float64]:
-    """Read an image of one channel; PNG files hold whole numbers from 0 to 255 or 65535.
+    """Read an image of one channel, shape (rows, columns), row 0 at the top, from a .png, .npy or .exr file.
 
-    Parameters
-    ----------
-    name
-        Parameter that names the file, for messages.
-    path
-        A .png, .npy or .exr file.
-
-    Returns
-    -------
-    Values, shape (rows, columns), row 0 on top.
+    Values of PNG files are integers from 0 to 255 or 65535. Messages call the file the parameter `name`.
 
     Raises
     ------
     UserError
-        When the file cannot be read, is of another kind, or holds anything but finite real numbers in two dimensions.
+        When the file cannot be read, or does not hold finite real numbers in two dimensions.
     """
     where = f"{name} = {path!r}"
     if Path(path).suffix.lower() not in _SUFFIXES:
@@ -70,7 +61,7 @@ class ImageSampler:
         self.shape = weights.shape
         of_rows = weights.sum(axis=1)
         self._rows = mi.Float(np.cumsum(of_rows) / of_rows.sum())
-        # Rows without weight are never asked for.
+        # Rows without weight are never drawn.
         columns = np.cumsum(weights, axis=1) / np.where(of_rows > 0, of_rows, 1)[:, None]
         self._columns = mi.Float(columns.ravel())
 
@@ -84,7 +75,6 @@ class ImageSampler:
 
 def _choose(cdf: mi.Float, first: mi.UInt32, count: int, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
     """Choose one of `count` cells whose cumulative shares begin at `first`, and reuse the number for a place in it."""
-    cell = dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, cdf, first + mi.UInt32(i)) <= u)
-    cell = mi.UInt32(cell)
+    cell = mi.UInt32(dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, cdf, first + mi.UInt32(i)) <= u))
     low = dr.select(cell > 0, dr.gather(mi.Float, cdf, first + cell - 1, cell > 0), 0)
     return cell, dr.clip((u - low) / (dr.gather(mi.Float, cdf, first + cell) - low), 0, 1)

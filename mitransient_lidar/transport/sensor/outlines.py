@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 
-#: Points along each side of the raster on which a region is traced, bisections that bring its outline to 1/1000 of a
-#: cell, and largest distance of lines from the points that they leave out, in cells.
-_RASTER = 128
-_BISECTIONS = 10
-_CELL_TOLERANCE = 0.05
+#: Points along each side of the raster on which a region is traced, bisections that find its outline to 1/1000 of a
+#: cell, and largest distance of simplified lines from the points that they leave out, in cells.
+_RASTER, _BISECTIONS, _CELL_TOLERANCE = 128, 10, 0.05
 
 #: Points along each side of the raster that finds the pixels.
 _PIXEL_RASTER = 400
@@ -29,13 +27,13 @@ Region = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
 
 
 def enclosed_area(loop: Outline) -> float:
-    """Return the area that a closed line encloses, shape (n, 2), positive when it turns left."""
+    """Return the area that a closed line encloses, shape (n, 2), positive if counter-clockwise."""
     x, y = loop.T
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def pixel_outlines(pixels: PixelArray) -> list[list[Outline]]:
-    """Return the closed lines (angle_x, angle_y) [rad] about each pixel, none for pixels too small to be found."""
+    """Return the outlines of each pixel, closed lines (angle_x, angle_y) [rad]; none for very small pixels."""
     fields = getattr(pixels, "fields", None)
     if fields is not None:
         # Each by itself: pixels may overlap.
@@ -65,9 +63,9 @@ def _equal_to(pixel_at: Callable[..., NDArray[np.int64]], index: int) -> Region:
 
 
 def traced_outlines(inside: Region, bounds: tuple[float, float, float, float]) -> list[Outline]:
-    """Return the closed lines about a region within some bounds: contours of a raster, moved onto the region's edge."""
+    """Return the outlines of a region within some bounds: contours of a raster, moved onto the region's edge."""
     for _ in range(2):
-        # Rows outside the region close its lines. The second raster fits the region closely.
+        # Rows outside the region close its outlines. The second raster fits the region closely.
         steps = [(bounds[i + 1] - bounds[i]) / (_RASTER - 3) for i in (0, 2)]
         axes = [np.linspace(bounds[2 * i] - steps[i], bounds[2 * i + 1] + steps[i], _RASTER) for i in (0, 1)]
         angle_x, angle_y = np.meshgrid(*axes, indexing="ij")

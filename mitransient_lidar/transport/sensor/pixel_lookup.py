@@ -1,4 +1,4 @@
-"""Lookup of the pixels that hold a point, so that many pixels cost no more than a few."""
+"""Lookup of the pixels that hold a point."""
 
 from __future__ import annotations
 
@@ -17,13 +17,7 @@ _CELLS_PER_PIXEL, _MOST_CELLS = 8, 256
 
 
 class FovLookup:
-    """Asks of many fields only those that come near a point, which a table of square cells names.
-
-    Parameters
-    ----------
-    fields
-        Shapes of the pixels, at least one.
-    """
+    """Tests only the fields near a point, which a table of square cells lists, so that many cost no more than a few."""
 
     def __init__(self, fields: Sequence[FovShape]) -> None:
         self._contains = [field.contains for field in fields]
@@ -35,7 +29,7 @@ class FovLookup:
         self._per_radian = (1 / size).tolist()
         ticks = (np.arange(self._side) + 0.5)[:, None] * size + low
         angle_x, angle_y = (g.ravel() for g in np.meshgrid(*ticks.T, indexing="ij"))
-        # Half the diagonal of a cell, with room for points that rounding puts into the next one.
+        # Half the diagonal of a cell, with a margin for points that rounding puts into the next one.
         reach = 0.501 * float(np.hypot(*size))
         near = np.stack([field.comes_near(angle_x, angle_y, reach) for field in fields], axis=1)
         self._first = mi.UInt32(np.concatenate([[0], np.cumsum(near.sum(axis=1))]))
@@ -53,7 +47,7 @@ class FovLookup:
         cell = i * self._side + j
         first, end = (dr.gather(mi.UInt32, self._first, cell + step) for step in (0, 1))
         chosen, count = self._holder(angle_x, angle_y, first, end, mi.UInt32(0))
-        # Only a point in several fields has to be looked at again, when it is not the first of them that is chosen.
+        # A second search, only where another field than the first is chosen.
         wanted = dr.minimum(mi.UInt32(u * mi.Float(count)), dr.maximum(count, 1) - 1)
         other, _ = self._holder(angle_x, angle_y, dr.select(wanted > 0, first, end), end, wanted)
         return dr.select(wanted > 0, other, chosen), count
@@ -61,7 +55,7 @@ class FovLookup:
     def _holder(
         self, angle_x: mi.Float, angle_y: mi.Float, first: mi.UInt32, end: mi.UInt32, wanted: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return which field is number `wanted` of those in part of the list that hold a point, and how many do."""
+        """Return field number `wanted` of those in a part of the list that hold a point, and how many do."""
 
         def step(index: mi.UInt32, chosen: mi.UInt32, count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
             field = dr.gather(mi.UInt32, self._fields, index)

@@ -11,21 +11,20 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.sensor.image_sampling import ImageSampler, read_image
 from mitransient_lidar.transport.sensor.pixels import MOST_PIXELS, PixelArray
 
-#: Whole numbers up to this are exact in 32-bit images.
+#: Integers up to this are exact in 32-bit images.
 _LARGEST_LABEL = 2**24
 
 
 class MappedPixels(PixelArray):
     """A square field of view divided into pixels by an image of labels.
 
-    The image's cells with one label are one pixel, named ``label`` and the number, wherever they are. Cells with the
-    label 0 receive nothing. Points are drawn over all labelled cells, so the number of pixels costs nothing and the
-    pixels sum to the single pixel of the same cells path by path.
+    All cells with one label are one pixel, named ``label`` and the number; those with the label 0 receive nothing.
+    Points are drawn over all labelled cells, so that the pixels sum to the single pixel of the same cells path by path.
 
     Parameters
     ----------
     labels
-        Whole numbers, not all 0, shape (rows, columns); row 0 is the far edge (+angle_x), column 0 the -angle_y edge.
+        Integers from 0, not all 0, shape (rows, columns); row 0 is the far edge (+angle_x), column 0 the -angle_y edge.
     field_of_view
         Side of the square [rad], positive.
     """
@@ -47,7 +46,7 @@ class MappedPixels(PixelArray):
 
     @classmethod
     def from_file(cls, path: str, field_of_view: float) -> MappedPixels:
-        """Read the labels from a .png, .npy or .exr file; raise UserError when it holds none, or anything else."""
+        """Read the labels from a .png, .npy or .exr file; raise UserError when it holds no valid labels."""
         values = read_image("pixel_map", path)
         where = f"pixel_map = {path!r}"
         if (values != np.round(values)).any() or values.min() < 0 or values.max() > _LARGEST_LABEL:

@@ -1,4 +1,4 @@
-"""Arrays of pixels: which pixel sees a tangent-plane point, and where to sample."""
+"""Arrays of pixels: sampling, and lookup of the pixel that sees a tangent-plane point."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ logger = logging.getLogger(__name__)
 #: Names of the four pixels of the published receivers, in pixel order.
 PUBLISHED_NAMES = ("red", "green", "blue", "black")
 
-#: Layouts of more pixels than this are imagers unless the scene says otherwise.
+#: Layouts of more pixels than this are imagers by default.
 _LARGEST_LAYOUT = 16
 
-#: A receiver has no more pixels than this.
+#: Largest number of pixels of a receiver.
 MOST_PIXELS = 2**20
 
 #: Points in each pixel that find overlaps.
@@ -72,10 +72,7 @@ class PixelArray(ABC):
 
     @abstractmethod
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """Return the pixel at a point and how many pixels hold it (0 outside all).
-
-        Where pixels overlap, the uniform number `u` picks one of them.
-        """
+        """Return the pixel at a point, one of several by the uniform number `u`, and how many hold it (0 outside)."""
 
     @abstractmethod
     def centres(self) -> NDArray[np.float64]:
@@ -85,23 +82,22 @@ class PixelArray(ABC):
 class LayoutPixels(PixelArray):
     """A circular, square or rectangular field of view cut into rows and columns.
 
-    Points are drawn over the whole field of view and then given to the pixel that they fall into, so the number of
-    pixels costs nothing and the pixels sum to the single pixel of the same field of view, path by path.
+    Points are drawn over the field of view and then assigned to pixels, so that these sum to the single pixel of the
+    same field of view path by path.
 
     Parameters
     ----------
     layout
         ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the -angle_y edge. ``1x4`` is
-        the published receiver of four strips across range, the same as ``4x1``.
+        ``4x1``.
     field_of_view
         Diameter or side [rad], positive; of a rectangle (height along angle_x, width along angle_y).
     shape
-        ``circle`` or ``square``; a pair of sides makes a rectangle of any.
+        ``circle`` or ``square``; different sides make a rectangle.
     imager
-        Whether rows and columns stay apart in the result; None decides by the number of pixels.
+        Whether rows and columns are separate dimensions of the result; None decides by the number of pixels.
     fill_factor
-        Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre. The circle cuts
-        what lies outside it, as a field stop does.
+        Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre, cut by the circle.
     """
 
     def __init__(
@@ -124,7 +120,7 @@ class LayoutPixels(PixelArray):
         self.layout = layout
         self.field_of_view = max(self.sides)
         self.field_of_view_shape = shape
-        # Of cells that leave gaps the whole ones are sampled, though the circle cuts some.
+        # With gaps, all of each cell is sampled, though the circle cuts some.
         self._shrink = math.sqrt(fill_factor)
         self.area = fill_factor * self.sides[0] * self.sides[1] if fill_factor < 1 else self.field.area
         self._rows, self._columns = rows, columns
@@ -148,10 +144,8 @@ class LayoutPixels(PixelArray):
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether the field of view holds it (1 or 0)."""
         height, width = self.sides
-        down, across = (
-            (0.5 * height - angle_x) * (self._rows / height),
-            (angle_y + 0.5 * width) * (self._columns / width),
-        )
+        down = (0.5 * height - angle_x) * (self._rows / height)
+        across = (angle_y + 0.5 * width) * (self._columns / width)
         row = dr.clip(mi.Int32(dr.floor(down)), 0, self._rows - 1)
         column = dr.clip(mi.Int32(dr.floor(across)), 0, self._columns - 1)
         inside = self.field.contains(angle_x, angle_y)
@@ -179,15 +173,7 @@ class LayoutPixels(PixelArray):
 
 
 class ShapedPixels(PixelArray):
-    """Pixels of any shape each, which may leave gaps and may overlap.
-
-    Parameters
-    ----------
-    fields
-        Shape of each pixel, at least one.
-    names
-        Name of each pixel, all different.
-    """
+    """Pixels of any shapes, at least one, with different names; they may leave gaps and overlap."""
 
     def __init__(self, fields: Sequence[FovShape], names: Sequence[str]) -> None:
         if len(set(names)) < len(fields):
@@ -226,8 +212,7 @@ class ShapedPixels(PixelArray):
 
     def _sample_in(self, pixel: mi.UInt32, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to uniform points of the given pixels."""
-        angle_x, angle_y = dr.switch(pixel, [field.sample for field in self.fields], u)
-        return angle_x, angle_y
+        return tuple(dr.switch(pixel, [field.sample for field in self.fields], u))
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to points: a pixel by its area, then uniform in it."""
@@ -253,7 +238,7 @@ def parse_layout(layout: str) -> tuple[int, int]:
     Raises
     ------
     UserError
-        When the text is not two positive whole numbers with an x between them, or has more than 2^20 pixels.
+        When the text is not two positive integers with an x between them, or has more than 2^20 pixels.
     """
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", layout)
     if not match:

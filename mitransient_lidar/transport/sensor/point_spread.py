@@ -18,7 +18,7 @@ _WIDEST = 1000.0
 
 
 class PointSpread(ABC):
-    """Where the light of one direction falls on the detector, relative to where sharp optics would focus it."""
+    """Displacement on the detector of the light of one direction, against the focus of sharp optics."""
 
     @abstractmethod
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
@@ -26,12 +26,12 @@ class PointSpread(ABC):
 
     @staticmethod
     def from_properties(props: mi.Properties) -> PointSpread | None:
-        """Read ``blur_mrad``, or ``blur_file`` and ``blur_file_mrad``, of a sensor plugin; None is sharp.
+        """Read ``blur_mrad``, or ``blur_file`` and ``blur_file_mrad``, of a sensor plugin; None for sharp optics.
 
         Raises
         ------
         UserError
-            When a value is out of range, both kinds are given, or the file is no point-spread function.
+            When a value is out of range, both kinds are given, or the file is not a point-spread function.
         """
         if "blur_file" not in props:
             if "blur_file_mrad" in props:
@@ -51,13 +51,7 @@ class PointSpread(ABC):
 
 
 class GaussianPointSpread(PointSpread):
-    """Light is spread as a round Gaussian.
-
-    Parameters
-    ----------
-    sigma
-        Standard deviation along each axis [rad], positive.
-    """
+    """Circular Gaussian, of a standard deviation [rad] along each axis."""
 
     def __init__(self, sigma: float) -> None:
         self.sigma = sigma
@@ -73,14 +67,13 @@ class GaussianPointSpread(PointSpread):
 
 
 class MeasuredPointSpread(PointSpread):
-    """Light is spread as an image shows it.
+    """Measured point-spread function, constant in each square cell of an image about the focus of sharp optics.
 
     Parameters
     ----------
     values
-        Values in any unit, not negative and not all 0, shape (rows, columns), constant in each of the square cells. Row
-        0 is the far edge (+angle_x), column 0 the -angle_y edge, and the middle of the image is where sharp optics
-        focus.
+        Values in any unit, not negative and not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x), column
+        0 the -angle_y edge.
     width
         Extent of the columns along angle_y [rad], positive.
     """

@@ -1,4 +1,4 @@
-"""What every receiver has, whatever its pixels: pose, aperture, losses, and the sampling of its view."""
+"""Pose, aperture and losses of a receiver, and the sampling of its field of view."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from mitransient_lidar.transport.rng import pass_streams, stratified_point, unit
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 
-#: The laser's footprint is worth sampling when the field of view holds at least this share of it.
+#: The laser's footprint is sampled when the field of view holds more than this share of it.
 _SMALLEST_FOOTPRINT_SHARE = 0.05
 
-#: An aperture that is blocked as a whole receives nothing.
+#: Largest blocked share of the aperture.
 _LARGEST_OBSCURATION = 0.999
 
 
@@ -33,11 +33,11 @@ class ReceiverOptics:
     optical_efficiency
         Share of the collected light that reaches the detector, above 0 to 1.
     two_way_atmospheric_transmittance
-        Share of the light that survives the way through the air and back, above 0 to 1.
+        Share of the light that the air transmits both ways, above 0 to 1.
     response_time_ns
         Time constant of the receiver's exponential (single-pole) impulse response [ns]; 0 is ideal.
     obscuration
-        Share of the aperture's area that is blocked, as by a secondary mirror, 0 to below 1.
+        Share of the aperture's area that is blocked, as by a secondary mirror, 0 to 0.999.
     """
 
     aperture_area: float
@@ -67,7 +67,7 @@ class ReceiverOptics:
 
 @dataclass(frozen=True)
 class Receiver:
-    """What the integrators need of a sensor plugin, which holds it as ``receiver``.
+    """The attribute ``receiver`` of a sensor plugin.
 
     Pixels are places on the detector: light from the direction g falls on g + delta, with delta drawn from the
     point-spread function `blur`; sharp optics (None) have delta = 0.
@@ -78,10 +78,16 @@ class Receiver:
     pixels: PixelArray
     blur: PointSpread | None = None
 
+    def displacement(self, rng: mi.PCG32) -> tuple[mi.Float, mi.Float]:
+        """Draw displacements on the detector; sharp optics use no random numbers."""
+        if self.blur is None:
+            return mi.Float(0), mi.Float(0)
+        return self.blur.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
+
     def sensor_ray(
         self, time: mi.Float, position: mi.Point2f, spread: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Serve Mitsuba's own integrators: a ray of the view whose weight turns radiance into energy."""
+        """Return a ray of the field of view and the factor from radiance to energy, for Mitsuba's own integrators."""
         angle_x, angle_y = self.pixels.sample(position)
         _, here = self.pixels.pixel_at(angle_x, angle_y, mi.Float(0))
         if self.blur is not None:
@@ -100,14 +106,12 @@ def solid_angle_factor(angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True)
 class SensorSample:
-    """One sample of the receiver's view for every path.
+    """One sample of the receiver's field of view for every path.
 
     Attributes
     ----------
-    direction
-        Unit direction of the ray.
-    pixel
-        Index of the pixel that sees it.
+    direction, pixel
+        Unit direction of the ray, and index of the pixel that sees it.
     weight
         Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
     """
@@ -120,19 +124,10 @@ class SensorSample:
 class SensorSampler:
     """Samples the receiver's view, half of the paths over the field of view and half over the laser's footprint.
 
-    Both halves are weighted by the balance heuristic, so any beam and any field of view are served without bias.
-    Samples are stratified, and neighbouring ones look into neighbouring directions.
+    Both halves are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
 
-    Where the optics blur, the first half draws the place p on the detector and looks along p - delta, and the second
-    half draws the direction g and receives it at g + delta. Both draw delta from the point-spread function, whose
-    density is in the integrand too and cancels.
-
-    Parameters
-    ----------
-    receiver
-        Pose, aperture and pixels.
-    transmitter
-        The ``lidar_transmitter`` plugin.
+    With blur, the first half draws the place p on the detector and the direction p - delta, the second half the
+    direction g and the place g + delta. Both draw delta from the point-spread function, whose density cancels.
     """
 
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
@@ -146,15 +141,9 @@ class SensorSampler:
     def _footprint_share(self) -> float:
         """Return the share of the footprint's samples that fall inside a pixel."""
         angle_x, angle_y = self._sample_footprint(unit_points(4096))
-        dx, dy = self._displacement(pass_streams(0, 0, 4096))
+        dx, dy = self.receiver.displacement(pass_streams(0, 0, 4096))
         _, count = self.receiver.pixels.pixel_at(angle_x + dx, angle_y + dy, mi.Float(0.5))
         return float(dr.mean(dr.select(count > 0, mi.Float(1), 0))[0])
-
-    def _displacement(self, rng: mi.PCG32) -> tuple[mi.Float, mi.Float]:
-        """Draw displacements on the detector; sharp optics use no random numbers."""
-        if self.receiver.blur is None:
-            return mi.Float(0), mi.Float(0)
-        return self.receiver.blur.sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
 
     def _sample_footprint(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         radius = self.sigma * dr.sqrt(-2 * dr.log(1 - u.x))
@@ -166,17 +155,7 @@ class SensorSampler:
         return dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * self.sigma * self.sigma)
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> SensorSample:
-        """Sample one view for each path.
-
-        Parameters
-        ----------
-        index
-            Number of the path, 0 to count - 1.
-        count
-            Number of paths.
-        rng
-            Random numbers of the paths.
-        """
+        """Sample directions and pixels for paths number `index` of `count`."""
         if self.use_footprint:
             of_footprint = (index & 1) == 1
             point = stratified_point(index >> 1, (count + 1) // 2, rng)
@@ -184,7 +163,7 @@ class SensorSampler:
             of_footprint, point = mi.Bool(False), stratified_point(index, count, rng)
         # Places on the detector (px, py), and directions (angle_x, angle_y) whose light falls on them.
         px, py = self.receiver.pixels.sample(point)
-        dx, dy = self._displacement(rng)
+        dx, dy = self.receiver.displacement(rng)
         angle_x, angle_y = px - dx, py - dy
         if self.use_footprint:
             fx, fy = self._sample_footprint(point)
@@ -194,10 +173,8 @@ class SensorSampler:
         density = pixels_here / self.receiver.pixels.area
         if self.use_footprint:
             density = 0.5 * (density + self._footprint_density(angle_x, angle_y))
-        # A point in several pixels stands for each of them in turn: weight by their number.
-        weight = (
-            pixels_here * (self.receiver.optics.collection / count) * solid_angle_factor(angle_x, angle_y) / density
-        )
-        return SensorSample(
-            self.receiver.pose.direction(angle_x, angle_y), pixel, dr.select(pixels_here > 0, weight, 0)
-        )
+        # A point in several pixels is assigned to one of them at random: weight by their number.
+        collection = pixels_here * (self.receiver.optics.collection / count)
+        weight = collection * solid_angle_factor(angle_x, angle_y) / density
+        direction = self.receiver.pose.direction(angle_x, angle_y)
+        return SensorSample(direction, pixel, dr.select(pixels_here > 0, weight, 0))
