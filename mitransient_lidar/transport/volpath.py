@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -48,7 +47,7 @@ class VolpathOptions:
     complement_only: bool = False
 
 
-class PathLight(Protocol):
+class PathLight:
     """Light to which the vertices of paths are connected, and the record of what arrives.
 
     Attributes
