@@ -5,9 +5,9 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitransient_lidar.core.validation import integer, non_negative
-from mitransient_lidar.plugins.lidar_integrator import LidarIntegrator
+from mitransient_lidar.plugins.bases import LidarIntegrator
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
-from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -26,17 +26,17 @@ class LidarMerging(LidarIntegrator):
                                on
     cell_size         float    Horizontal width of the cells at the surface [m]; 0: from the footprint and the facets of
                                the sea. Smaller cells have less bias and more noise. Default: 0
-    point_spacing     float    Distance between points along a path [m]; 0: a twentieth of the way to the bottom or to
-                               the depth that the record allows, a tenth from 4096 pixels on. Default: 0
+    point_spacing     float    Distance between points along a path [m]; 0: a twentieth of the distance to the bottom or
+                               to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
     ================  =======  =========================================================================================
 
-    Nearly every echo goes down, is reversed once, and comes up, and both ways are easy to sample from their own ends.
+    Nearly every echo goes down, is reversed once, and comes up; both parts are easy to sample from their own ends.
     Light is traced from the laser and paths from the receiver, both through waves and ripples into the water, with
-    natural scattering of any order. Along both, points are set at equal distances. Where a point of a light path and
-    one of a receiver's path lie in the same small cell, the two are merged into a complete path, with the phase
-    function between their directions; likewise where both meet the same small patch of the bottom or of a target, with
-    the BSDF (photon mapping in a medium: Jensen and Christensen 1998, doi:10.1145/280814.280925; points at equal
-    distances instead of collisions: the track-length estimator of Spanier 1966, doi:10.1137/0114057, at both ends).
+    scattering of any order, and points are placed at equal distances along both. Where a point of a light path and one
+    of a receiver's path lie in the same small cell, they are merged into a complete path, with the phase function
+    between their directions; likewise on the same small patch of the bottom or of a target, with the BSDF (photon
+    mapping in a medium: Jensen and Christensen 1998, doi:10.1145/280814.280925; points at equal distances instead of
+    collisions: the track-length estimator of Spanier 1966, doi:10.1137/0114057, at both ends).
 
     A path with several scattering events can arise from a merge at each of them. The balance heuristic (Veach and
     Guibas 1995, doi:10.1145/218380.218498) weights these merges: with coefficient :math:`b_i` and phase function
@@ -44,18 +44,18 @@ class LidarMerging(LidarIntegrator):
 
     .. math:: b_k\, p_k\, \frac{1 / (b_k p_k)}{\sum_i 1 / (b_i p_i)} = \Big(\sum_i \frac{1}{b_i p_i}\Big)^{-1},
 
-    which is bounded by the event of the smallest :math:`b_i p_i` and keeps the forward peak from making noise. Paths
-    that meet a solid are merged at the first one seen from the receiver only.
+    which is bounded by the event of the smallest :math:`b_i p_i`, so that the forward peak does not cause noise. Paths
+    that meet a solid are merged only at the first one from the receiver.
 
-    Echoes from the surface and from solids in the air are connected to the laser directly. The rest, such as light that
-    meets the sea twice without scattering, mirrors under water, and solids in the air seen by reflection, comes from
-    ``lidar_volpath`` with ``complement_only``, so that every path counts once.
+    Echoes from the surface and from solids in the air are connected to the laser directly. ``lidar_volpath`` with
+    ``complement_only`` adds all other paths, such as light that meets the sea twice without scattering, mirrors under
+    water, and solids in the air seen by reflection.
 
-    Merging in cells blurs the light by their width: where waves focus beam and view alike, the signal is a little low.
-    Cells follow the surface, so that none is cut by it, and are sheared along the beam; times and absorption are those
-    of the receiver's point; patches cut by edges count by their covered share. With the default cells the water's
-    signal in the published geometry is about 0.5 % low in the first metre, 0.1 % below, and not at the bottom; the
-    error falls with ``cell_size``. There are no derivatives.
+    Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
+    follow the surface and are sheared along the beam; times and absorption are those of the receiver's point; patches
+    cut by edges count by their covered share. With the default cells the bias of the water's signal in the published
+    geometry is -0.5 % in the first metre, -0.1 % below, and 0 at the bottom; it falls with ``cell_size``. There are no
+    derivatives.
 
     .. code-block:: xml
 
@@ -87,38 +87,24 @@ class LidarMerging(LidarIntegrator):
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
     ) -> PassRenderer:
-        """Return the renderer of passes of a scene.
+        """Return the renderer of passes of a scene, by default with one class of light and the sensor's own receiver.
 
-        Parameters
-        ----------
-        scene, sensor
-            The scene and its sensor.
-        classes
-            Classes into which the received light is separated.
-        receiver
-            Receiver that replaces the sensor's own.
-        layout_of
-            Renderer of another scene whose points and cells are used: the same seeds then make the same paths in scenes
-            that differ by a target.
+        `layout_of` is the renderer of another scene whose points and cells are used, so that the same seeds make the
+        same paths in scenes that differ by a target.
 
         Raises
         ------
         UserError
-            When the scene lacks a part or holds one that is not supported.
+            When the scene lacks a part or has one that is not supported.
         """
         lidar = LidarScene.from_scene(scene, sensor, receiver)
         classes = classes or PathClasses()
         if lidar.water is None:
-            # There is nothing to merge in: all light is connected.
+            # Without water all light is connected.
             paths = paths_of_pass(self.options, lidar.receiver.pixels.count)
             return VolpathRenderer(lidar, classes, paths, VolpathOptions())
         layout = layout_of.layout if isinstance(layout_of, MergingRenderer) else None
         return MergingRenderer(lidar, classes, self.options, layout)
-
-    def develop(self, record: PassRecord, sensor: mi.Sensor) -> mi.TensorXf:
-        """Return the energy [J] of a pass, and leave it in the sensor's film."""
-        sensor.film().store(record.histogram)
-        return sensor.film().develop()
 
     def to_string(self) -> str:
         """Return a description."""

@@ -9,6 +9,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, in_range, positive
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
@@ -19,7 +20,7 @@ _WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": float(np.sqrt(2 * np.
 _PROFILES = ("gaussian", "top_hat", "image")
 
 
-class LidarTransmitter(mi.Emitter):
+class LidarTransmitter(EmitterWithoutExtent):
     r"""Pulsed laser transmitter (``lidar_transmitter``).
 
     ======================  =========  =================================================================================
@@ -39,14 +40,14 @@ class LidarTransmitter(mi.Emitter):
     divergence_1e2_mrad                only); give one of the three
     divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along
                                        angle_x, this the one along angle_y. Positive. Default: ``divergence_mrad``
-    ellipse_deg             float      Turns the ellipse: azimuth of the axis of ``divergence_mrad``, from +angle_x
-                                       (far) towards +angle_y [deg]. Default: 0
+    ellipse_deg             float      Azimuth of the ellipse's axis of ``divergence_mrad``, from +angle_x (far) towards
+                                       +angle_y [deg]. Default: 0
     profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
                                        image. Row 0 is the far edge (+angle_x), column 0 the -angle_y edge, the middle
                                        the axis
     profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
                                        positive; its cells are squares
-    wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; kept with the result. Default: 532
+    wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; recorded in results. Default: 532
     pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], positive. Default: 5
     pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit)
     ======================  =========  =================================================================================
@@ -57,8 +58,7 @@ class LidarTransmitter(mi.Emitter):
 
     (+angle_x is away from nadir, +angle_y along +y), with a sigma for each axis when it is elliptic; that of an image
     is even within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\,
-    dg_y`, so that the beam's energy is exactly the pulse's. The pulse's shape enters when waveforms are formed, not in
-    the transport.
+    dg_y`. The pulse's shape is applied to waveforms, not in the transport.
 
     .. code-block:: xml
 
@@ -95,20 +95,17 @@ class LidarTransmitter(mi.Emitter):
 
     @property
     def divergence(self) -> float:
-        """Full angle of the beam [rad] as ``divergence_mrad`` defines it; of an image twice its widest rms angle."""
+        """Full angle of the beam [rad] as in ``divergence_mrad``; of an image twice its widest rms angle."""
         return self.profile.divergence[0]
 
     @property
     def angular_spread(self) -> float:
-        """Root-mean-square angle of the beam along its narrowest transverse axis [rad].
-
-        What must resolve the beam goes by it: cells in the water and on the sea.
-        """
+        """Root-mean-square angle of the beam along its narrowest axis [rad], for cells that must resolve the beam."""
         return min(self.profile.spreads)
 
     @property
     def widest_angular_spread(self) -> float:
-        """Root-mean-square angle of the beam along its widest transverse axis [rad], for what must cover the beam."""
+        """Root-mean-square angle of the beam along its widest axis [rad], for regions that must cover the beam."""
         return max(self.profile.spreads)
 
     def intensity(self, direction: mi.Vector3f) -> mi.Float:
@@ -148,10 +145,10 @@ class LidarTransmitter(mi.Emitter):
         offset = ds.p - it.p
         ds.dist = dr.norm(offset)
         ds.d = offset / ds.dist
-        return ds, mi.Spectrum(self.intensity(-ds.d) / (ds.dist * ds.dist)) & active
+        return ds, self.eval_direction(it, ds, active)
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
-        """Return 0: a point cannot be hit by chance."""
+        """Return 0: no direction meets a point by chance."""
         return mi.Float(0)
 
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
@@ -162,13 +159,6 @@ class LidarTransmitter(mi.Emitter):
         """Return 0: the laser has no surface."""
         return mi.Spectrum(0)
 
-    def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Return the laser's position as a bounding box, which keeps it out of the scene's extent."""
-        return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed transmitter is loaded anew."""
-
     def to_string(self) -> str:
         """Return a description."""
         return (
@@ -178,15 +168,15 @@ class LidarTransmitter(mi.Emitter):
 
 
 def _profile(props: mi.Properties, kind: str) -> BeamProfile:
-    """Build the beam's shape from the plugin's parameters."""
+    """Return the beam profile of the plugin's parameters."""
     if kind not in _PROFILES:
         raise UserError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
-    ellipse = [*_WIDTHS, "divergence_across_mrad", "ellipse_deg"]
-    for name in ellipse if kind == "image" else ("profile_file", "profile_mrad"):
+    image_names = ("profile_file", "profile_mrad")
+    for name in (*_WIDTHS, "divergence_across_mrad", "ellipse_deg") if kind == "image" else image_names:
         if name in props:
             raise UserError(f"{name} does not go with beam_profile = {kind!r}")
     if kind == "image":
-        for name in ("profile_file", "profile_mrad"):
+        for name in image_names:
             if name not in props:
                 raise UserError(f"{name} is missing: beam_profile = 'image' needs it")
         image = read_image("profile_file", props["profile_file"])
@@ -198,12 +188,12 @@ def _profile(props: mi.Properties, kind: str) -> BeamProfile:
         across = 0.5e-3 * _angle("divergence_across_mrad", props["divergence_across_mrad"])
     elif "ellipse_deg" in props:
         raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
-    turn = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
-    return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, turn)
+    rotation = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
+    return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, rotation)
 
 
 def _divergence(props: mi.Properties, profile: str) -> float:
-    """Return the beam's divergence [rad] as the project defines it, from whichever definition was given."""
+    """Return the full angle of the beam [rad] as in ``divergence_mrad``, from any of its three definitions."""
     given = [name for name in _WIDTHS if name in props]
     if len(given) > 1:
         raise UserError(f"lidar_transmitter: give one of {' and '.join(given)}, not both")

@@ -6,8 +6,8 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer
-from mitransient_lidar.plugins.lidar_integrator import LidarIntegrator
-from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.plugins.bases import LidarIntegrator
+from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -32,17 +32,17 @@ class LidarVolpath(LidarIntegrator):
     connection           string   How vertices under water are connected to the laser: ``mis`` (multiple importance
                                   sampling), or for tests ``emitter`` (directions sampled towards the laser) or
                                   ``phase`` (the path's own directions) alone. Default: ``mis``
-    complement_only      boolean  Whether to leave out what ``lidar_merging`` finds by merging: echoes of one vertex in
-                                  the air, all paths that scatter in the water and meet no solid, and those whose first
-                                  solid is under water and not a mirror. Default: false
+    complement_only      boolean  Whether to leave out the paths of ``lidar_merging``: echoes of one vertex in the air,
+                                  all paths that scatter in the water and meet no solid, and those whose first solid is
+                                  under water and not a mirror. Default: false
     ===================  =======  ======================================================================================
 
     The unbiased reference. Paths start at the receiver, cross the surface (waves and ripples), scatter to any order,
-    meet bottom and targets, and are reflected inside the surface. A point laser cannot be met by chance through a
-    refracting surface, so each vertex under water samples a direction in which the laser may appear through a flat sea
-    of the same total slope variance, traces it to the real surface, and connects there; where the path itself reaches
-    the surface unscattered it is connected, too. Both estimate the same paths and are combined by the balance heuristic
-    (Veach and Guibas 1995, doi:10.1145/218380.218498).
+    meet bottom and targets, and are reflected inside the surface. As no path meets a point laser by chance, each vertex
+    under water samples a direction in which the laser may appear through a flat sea of the same total slope variance,
+    traces it to the real surface, and connects there; where the path itself reaches the surface unscattered it is
+    connected, too. Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
+    doi:10.1145/218380.218498).
 
     Every segment is timed with the group index of the medium that it crosses. There are no derivatives.
 
@@ -73,31 +73,9 @@ class LidarVolpath(LidarIntegrator):
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
     ) -> VolpathRenderer:
-        """Return the renderer of passes of a scene.
-
-        Parameters
-        ----------
-        scene, sensor
-            The scene and its sensor.
-        classes
-            Classes into which the received light is separated.
-        receiver
-            Receiver that replaces the sensor's own.
-        layout_of
-            Not used: paths do not depend on a layout.
-
-        Raises
-        ------
-        UserError
-            When the scene lacks a part or holds one that is not supported.
-        """
+        """Return the renderer of passes of a scene, as `LidarMerging.prepare`; `layout_of` is not used."""
         lidar = LidarScene.from_scene(scene, sensor, receiver)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
-
-    def develop(self, record: PassRecord, sensor: mi.Sensor) -> mi.TensorXf:
-        """Return the energy [J] of a pass, and leave it in the sensor's film."""
-        sensor.film().store(record.histogram)
-        return sensor.film().develop()
 
     def to_string(self) -> str:
         """Return a description."""

@@ -6,16 +6,14 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, positive
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.plugins.bases import ReceiverSensor
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
-from mitransient_lidar.transport.sensor.point_spread import PointSpread
-from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
 
-class MultipixelReceiver(mi.Sensor):
-    r"""Receiver with one, four or a hundred thousand pixels (``multipixel_receiver``).
+class MultipixelReceiver(ReceiverSensor):
+    r"""Receiver with any number of pixels up to 2^20 (``multipixel_receiver``).
 
     =================================  =======  ========================================================================
     Parameter                          Type     Meaning
@@ -24,37 +22,37 @@ class MultipixelReceiver(mi.Sensor):
                                                 along range (row 0 is the far edge) and C columns (column 0 is the
                                                 -angle_y edge). ``1x4`` is the published receiver of four strips across
                                                 range, the same as ``4x1``. ``hexN``, with N = 1, 7, 19, 37, ... up to
-                                                2^20: a hexagon and whole rings of hexagons around it, in rows along
+                                                2^20: a hexagon and complete rings of hexagons around it, in rows along
                                                 angle_y. Default: ``2x2``
     fill_factor                        float    Share of each cell or hexagon of a layout that receives light, 0.01 to
                                                 1; the gaps receive none. Default: 1
-    imager                             boolean  Keep rows and columns apart in the result, (row, column, time) instead
-                                                of (pixel, time). Default: true above 16 pixels of ``RxC``
+    imager                             boolean  Result of shape (row, column, time) instead of (pixel, time). Default:
+                                                true above 16 pixels of ``RxC``
     pixel_map                          string   Instead of layout: image file (.png, .npy or .exr, one channel) of
-                                                labels over a square field of view, whole numbers from 0 to 2^24. Row 0
-                                                is the far edge, column 0 the -angle_y edge. Each label is a pixel, in
-                                                the order of labels and named ``label1``, ...; 0 is no pixel
+                                                labels over a square field of view, integers from 0 to 2^24. Row 0 is
+                                                the far edge, column 0 the -angle_y edge. Each label is a pixel, in
+                                                increasing order and named ``label1``, ...; 0 is no pixel
     field_of_view_mrad                 float    Full angle of the field of view [mrad], positive: diameter, side, or
-                                                diameter of the circle that just holds the hexagons. Default: 30
+                                                diameter of the hexagons' circumscribed circle. Default: 30
     field_of_view_shape                string   ``circle`` or ``square``, for ``RxC``. Default: ``circle``, or
                                                 ``square`` with a focal length
     focal_length_mm, pixel_pitch_um    float    Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the lens
                                                 and distance of square pixels on the detector, both positive. The field
                                                 of view is then R by C times pitch over focal length, a rectangle (or,
-                                                with ``circle`` and R = C, the circle within)
+                                                with ``circle`` and R = C, the inscribed circle)
     (nested)                           sensor   ``pixel_fov`` sensors instead of layout and field of view
     blur_mrad                          float    Optical blur: standard deviation along each axis of a Gaussian
                                                 point-spread function [mrad], 0 (sharp) to 1000. Default: 0
     blur_file                          string   Instead: image file (as for ``pixel_map``) of a measured point-spread
-                                                function in any unit, not negative; its middle is where sharp optics
-                                                focus. Values are constant in each cell, and normalised
-    blur_file_mrad                     float    Angle over which that image reaches along its columns (angle_y) [mrad],
-                                                above 0 to 1000; its cells are squares
+                                                function in any unit, not negative, about the focus of sharp optics.
+                                                Values are constant in each cell, and normalised
+    blur_file_mrad                     float    Width of that image along angle_y [mrad], above 0 to 1000; its cells are
+                                                squares
     aperture_area                      float    Area of the aperture [m^2], positive. Default: 0.025
     obscuration                        float    Share of that area which is blocked, as by a secondary mirror, 0 to
                                                 0.999. Default: 0
     optical_efficiency                 float    Share of light that the optics pass, above 0 to 1. Default: 0.9
-    two_way_atmospheric_transmittance  float    Share of light that survives the air, both ways. Default: 0.9
+    two_way_atmospheric_transmittance  float    Share of light that the air transmits, both ways. Default: 0.9
     response_time_ns                   float    Time constant of the exponential response [ns]. Default: 0
     altitude, off_nadir_deg, aim_x,             Pose, as for ``lidar_transmitter``
     aim_y, to_world
@@ -64,16 +62,15 @@ class MultipixelReceiver(mi.Sensor):
     Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is +y.
     Pixels of a circular field of view that lie outside the circle exist and stay dark.
 
-    Paths are drawn over the whole field of view and then given to the pixel that they fall into, so more pixels cost
-    nothing and the pixels of a layout sum to the single pixel of the same field of view path by path. So do those of a
-    pixel map, to the map with a single label in their place. Hexagons do not fill their circle: N of them have 82.7 %
-    of its area, whatever N is.
+    Paths are drawn over the field of view and then assigned to pixels: more pixels take no more time, and the pixels of
+    a layout or of a pixel map sum to a single pixel of the same area path by path. Hexagons have 82.7 % of the area of
+    their circle.
 
     With a fill factor each cell of ``RxC`` shrinks about its centre, sides by the square root of the factor, and a
     circular field of view cuts the shrunk cells as a field stop does.
 
-    Blur moves light on the detector: what comes from the direction (angle_x, angle_y) is spread around that
-    place by the point-spread function, the same one all over the field of view, and what leaves the pixels is lost.
+    Blur distributes light from the direction (angle_x, angle_y) around that place on the detector by the point-spread
+    function, the same one all over the field of view. Light beside the pixels is lost.
 
     .. code-block:: xml
 
@@ -91,29 +88,7 @@ class MultipixelReceiver(mi.Sensor):
 
     def __init__(self, props: mi.Properties) -> None:
         nested = [child for _, child in props.objects() if isinstance(child, mi.Sensor)]
-        super().__init__(props)
-        pixels = _nested_pixels(props, nested) if nested else _own_pixels(props)
-        self.receiver = Receiver(
-            Pose.from_properties(props),
-            ReceiverOptics.from_properties(props),
-            pixels,
-            PointSpread.from_properties(props),
-        )
-        self.m_needs_sample_2 = True
-        self.m_needs_sample_3 = self.receiver.blur is not None
-
-    def sample_ray(
-        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
-    ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Sample a ray uniformly over the field of view, for Mitsuba's own integrators."""
-        return self.receiver.sensor_ray(time, sample2, sample3, active)
-
-    def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Return an invalid box: the sensor does not extend the scene."""
-        return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed receiver is loaded anew."""
+        super().__init__(props, _nested_pixels(props, nested) if nested else _own_pixels(props))
 
     def to_string(self) -> str:
         """Return a description."""
@@ -158,10 +133,10 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
         return HexPixels(layout, field_of_view, fill_factor)
     if any(name in props for name in _LENS):
         only_for("receivers without a focal length", "field_of_view_mrad")
-        sides, shape = _sides_of_lens(props, layout), "square"
-        return LayoutPixels(layout, sides, props.get("field_of_view_shape", shape), props.get("imager"), fill_factor)
+        shape = props.get("field_of_view_shape", "square")
+        return LayoutPixels(layout, _sides_of_lens(props, layout), shape, props.get("imager"), fill_factor)
     shape = props.get("field_of_view_shape", "circle")
-    return LayoutPixels(layout, field_of_view, shape, props.get("imager", None), fill_factor)
+    return LayoutPixels(layout, field_of_view, shape, props.get("imager"), fill_factor)
 
 
 def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:

@@ -20,47 +20,47 @@ class OceanSurface(mi.Mesh):
                                        or ``flat``: no waves, all slopes are ripples. Default: ``elfouhaily``
     wind_speed                float    Wind speed at 10 m [m/s], 0 to 30. Default: 3
     wind_direction_deg        float    Direction the wind blows towards, from +x to +y [deg]. Default: 0
-    fetch, inverse_wave_age   float    How far the wind has blown over water [m], or how young its waves are, 0.84
+    fetch, inverse_wave_age   float    Distance over which the wind has blown over water [m], or inverse wave age, 0.84
                                        (fully developed) to 5. Default: 0.84
     peak_enhancement          float    JONSWAP's gamma. Default: 3.3
     swell_height              float    Significant height of an added swell [m], 0 for none. Default: 0
     swell_wavelength          float    Its wavelength [m]. Default: 60
-    swell_direction_deg       float    Where it runs to [deg]. Default: 0
-    slope_variance            string   What sets the total slope variance of waves and ripples: ``cox_munk`` (measured,
-                                       clean sea, 1954; waves below 1 m are scaled to it), ``spectrum`` (the whole
+    swell_direction_deg       float    Direction it travels towards [deg]. Default: 0
+    slope_variance            string   Total slope variance of waves and ripples: ``cox_munk`` (measured, clean sea,
+                                       1954; waves below 1 m are scaled to it), ``spectrum`` (the integral of the
                                        spectrum) or a number, the total of an isotropic sea. Default: ``cox_munk``
-    surface_seed              integer  Which sea, 0 to 2^53: the same seed is the same sea at any resolution and
-                                       wherever the patch lies. Default: 1
-    time                      float    Moves the sea on [s]. Default: 0
-    water_depth               float    Depth that the waves feel [m]. Default: deep
+    surface_seed              integer  Seed of the waves, 0 to 2^53: the same sea at any resolution and position of the
+                                       patch. Default: 1
+    time                      float    Time at which the waves are taken [s]. Default: 0
+    water_depth               float    Water depth for the dispersion of the waves [m]. Default: deep
     current_speed             float    Current that carries the waves [m/s], 0 to 10. Default: 0
-    current_direction_deg     float    Where it flows to [deg]. Default: 0
+    current_direction_deg     float    Direction the current flows towards [deg]. Default: 0
     wake_speed                float    Speed of a ship whose Kelvin wake is added [m/s], 0 for none. Default: 0
-    wake_bearing_deg          float    Where it goes [deg]. Default: 0
-    wake_length               float    Its length [m], 1 to 500. Default: 20
-    wake_x, wake_y            float    Where its middle is [m]. Default: 0
+    wake_bearing_deg          float    Heading of the ship, from +x to +y [deg]. Default: 0
+    wake_length               float    Length of the ship [m], 1 to 500. Default: 20
+    wake_x, wake_y            float    Centre of the ship [m]. Default: 0
     refined_size              float    Side of the finely resolved patch [m], or ``auto``. Default: ``auto``
     cell_size                 float    Side of its cells [m], or ``auto``. Default: ``auto``
-    centre_x, centre_y        float    Middle of the patch [m]: where the beam hits the sea. Default: 0
-    size                      float    Side of the whole surface [m]: cells grow outside the patch. Default: 1000
-    period                    float    The sea repeats itself after so many metres, or ``auto``: three peak wavelengths
-                                       or more, in steps of 32 m, at most 512 m. Default: ``auto``
+    centre_x, centre_y        float    Centre of the patch [m], where the beam meets the sea. Default: 0
+    size                      float    Side of the surface [m]: cells grow outside the patch. Default: 1000
+    period                    float    Period of the sea [m], or ``auto``: three peak wavelengths or more, in steps of
+                                       32 m, at most 512 m. Default: ``auto``
     map_size                  float    Side of a height map that carries no positions [m]
-    altitude, off_nadir_deg,  float    Transmitter and receiver for whom ``auto`` chooses patch and cells: a quarter of
+    altitude, off_nadir_deg,  float    Transmitter and receiver for which ``auto`` chooses patch and cells: a quarter of
     field_of_view_mrad,                the beam's standard deviation, 0.02 to 0.5 m. Without them: 32 m of 0.25 m
     divergence_mrad
     (nested)                  bsdf     Any BSDF instead of the ripples
     interior                  medium   The water: ``layered_water``
     ========================  =======  =================================================================================
 
-    The mesh carries the waves that its facets resolve. The slope variance that is missing to the total, up- and
-    crosswind, makes an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, which is the
-    model of Gaussian slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across
-    the wind. With ``cox_munk`` and ``spectrum`` the total does not depend on the cells. The ripples are never smaller
-    than 1e-5, so that a point laser can be connected; `slope_variance` of the loaded object says what the total is.
+    The mesh represents the waves that its facets resolve. The rest of the total slope variance, along and across the
+    wind, is an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of Gaussian
+    slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With
+    ``cox_munk`` and ``spectrum`` the total does not depend on the cells. The variance of the ripples is at least 1e-5,
+    so that a point laser can be connected; `slope_variance` of the loaded object is the total.
 
-    Outside the patch the facets are longer and carry fewer slopes, with the ripples of the patch: light that has
-    scattered far still meets water. Light beyond ``size`` is lost and reported after rendering.
+    Outside the patch the facets are longer and resolve fewer slopes, with the ripples of the patch, for light that has
+    scattered far. Light beyond ``size`` is lost and reported after rendering.
 
     Other surfaces: any mesh (``ply``, ``obj``) with a ``layered_water`` as its interior medium and a dielectric BSDF.
 
@@ -77,23 +77,21 @@ class OceanSurface(mi.Mesh):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        #: What the surface is made from (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
+        #: Shape of the surface (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
         self.sea = SeaSurface.read(props.get)
+        #: Slope variances of the ripples along and across the wind, and in total with those of the waves.
+        self.ripple_variance, self.slope_variance = self.sea.ripple_variance, self.sea.slope_variance
+        #: Side of the cells of the fine patch, pairs of triangles [m]; infinite for a flat sea.
+        self.cell_size = self.sea.cell_size
         children = [child for _, child in props.objects()]
         water = next((child for child in children if isinstance(child, mi.Medium)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
         if self.has_ripples:
-            props["ripples"] = mi.load_dict(
-                {
-                    "type": "roughdielectric",
-                    "distribution": "beckmann",
-                    "alpha_u": float(np.sqrt(2 * self.ripple_variance[0])),
-                    "alpha_v": float(np.sqrt(2 * self.ripple_variance[1])),
-                    "int_ior": getattr(water, "refractive_index", 1.34),
-                    "ext_ior": 1.0,
-                }
-            )
-        # Facets, not interpolated normals: the slope variance is that of the facets, and energy is conserved.
+            alpha_u, alpha_v = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)
+            indices = {"int_ior": getattr(water, "refractive_index", 1.34), "ext_ior": 1.0}
+            ripples = {"type": "roughdielectric", "distribution": "beckmann", "alpha_u": alpha_u, "alpha_v": alpha_v}
+            props["ripples"] = mi.load_dict(ripples | indices)
+        # Facet normals, not interpolated ones, have the slope variance of the mesh and conserve energy.
         props["face_normals"] = True
         mesh = self.sea.mesh()
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
@@ -103,21 +101,6 @@ class OceanSurface(mi.Mesh):
         buffers["faces"] = mi.UInt32(mesh.faces.ravel())
         buffers.update()
         self.initialize()
-
-    @property
-    def ripple_variance(self) -> tuple[float, float]:
-        """Slope variances of the ripples along and across the wind [1]."""
-        return self.sea.ripple_variance
-
-    @property
-    def slope_variance(self) -> float:
-        """Total slope variance of waves and ripples, both axes [1]."""
-        return self.sea.slope_variance
-
-    @property
-    def cell_size(self) -> float:
-        """Side of the squares of the fine patch whose halves are its triangles [m]; infinite for a flat sea."""
-        return self.sea.cell_size
 
     def to_string(self) -> str:
         """Return a description."""

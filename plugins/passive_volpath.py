@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.validation import integer
-from mitransient_lidar.plugins.lidar_integrator import LidarIntegrator
+from mitransient_lidar.plugins.bases import LidarIntegrator
 from mitransient_lidar.plugins.lidar_volpath import read_options
 from mitransient_lidar.transport.daylight.renderer import DaylightRecord, DaylightRenderer
 from mitransient_lidar.transport.daylight.scene import DaylightScene
@@ -20,22 +20,20 @@ class PassiveVolpath(LidarIntegrator):
     ===================  =======  ======================================================================================
     paths_per_pass       integer  Paths of one pass, 1024 to 2^28, unless the sample count per pixel (``spp``) is given
                                   to ``mi.render``. Default: 262144
-    guiding_probability  float    Probability that a direction is drawn from a lobe towards the sun, 0 to 0.99. No
-                                  record ends the paths here, so that a large one would give a few of them very large
-                                  weights. Default: 0.1
+    guiding_probability  float    Probability that a direction is drawn from a lobe towards the sun, 0 to 0.99. Large
+                                  values give a few paths very large weights. Default: 0.1
     max_scatterings,              As for ``lidar_volpath``
     roulette_threshold,
     connection
     ===================  =======  ======================================================================================
 
-    Renders the radiance that each pixel sees, in the unit of ``sun`` and ``sky``: W m^-2 sr^-1 nm^-1. Paths start
-    uniformly over the field of view and are traced as those of ``lidar_volpath``: through the sea's waves and ripples,
-    to scattering events in the water, to targets and the bottom. Vertices are connected to the sun as they are to the
-    laser there; each path is connected to one point of the sun's disc. The sky is what paths meet that leave the scene;
-    the sky that the sea reflects is sampled by a ray of its own, as one path in fifty is reflected.
+    Renders the radiance of each pixel [W m^-2 sr^-1 nm^-1]. Paths start uniformly over the field of view and are traced
+    as in ``lidar_volpath``, where the sun replaces the laser: each path is connected to one point of the sun's disc.
+    Paths that leave the scene meet the sky; the sky that the sea reflects is sampled by a separate ray, as few paths
+    are reflected.
 
-    The sea must be rough, as every ``ocean_surface`` is: through a smooth ``dielectric`` the sun's disc is met by
-    chance only, and the image is noisy.
+    The sea must be rough, as every ``ocean_surface`` is: through a smooth ``dielectric`` paths meet the sun's disc only
+    by chance, and the image is noisy.
 
     Light from outside the surface mesh is lost. The air is clear; the receiver's optics do not affect the radiance.
     There are no derivatives.

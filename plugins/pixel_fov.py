@@ -7,14 +7,12 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, finite_array, in_range, positive
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.plugins.bases import ReceiverSensor
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
-from mitransient_lidar.transport.sensor.point_spread import PointSpread
-from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
 
 
-class PixelFov(mi.Sensor):
+class PixelFov(ReceiverSensor):
     r"""Field of view of one pixel (``pixel_fov``).
 
     ============================  ======  ==============================================================================
@@ -60,31 +58,9 @@ class PixelFov(mi.Sensor):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
         self.field = _field(props)
         self.pixel_name = str(props.get("pixel_name", ""))
-        pixels = ShapedPixels([self.field], [self.pixel_name or "pixel"])
-        self.receiver = Receiver(
-            Pose.from_properties(props),
-            ReceiverOptics.from_properties(props),
-            pixels,
-            PointSpread.from_properties(props),
-        )
-        self.m_needs_sample_2 = True
-        self.m_needs_sample_3 = self.receiver.blur is not None
-
-    def sample_ray(
-        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
-    ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Sample a ray uniformly over the field of view, for Mitsuba's own integrators."""
-        return self.receiver.sensor_ray(time, sample2, sample3, active)
-
-    def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Return an invalid box: the sensor does not extend the scene."""
-        return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed pixel is loaded anew."""
+        super().__init__(props, ShapedPixels([self.field], [self.pixel_name or "pixel"]))
 
     def to_string(self) -> str:
         """Return a description."""
@@ -115,23 +91,16 @@ def _field(props: mi.Properties) -> FovShape:
         return Rectangle(centre[0] - height, centre[0] + height, centre[1] - width, centre[1] + width)
     if shape == "strip":
         radius = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
-        low = in_range(
-            "angle_x_min_mrad", props.get("angle_x_min_mrad", -1e3 * radius), -1e6, 1e3 * radius * (1 - 1e-6)
-        )
-        high = max(low, -1e3 * radius) * (1 + 1e-6) + 1e-9
-        return Strip(
-            radius,
-            1e-3 * low,
-            1e-3 * in_range("angle_x_max_mrad", props.get("angle_x_max_mrad", 1e3 * radius), high, 1e6),
-        )
+        edge = 1e3 * radius
+        low = in_range("angle_x_min_mrad", props.get("angle_x_min_mrad", -edge), -1e6, edge * (1 - 1e-6))
+        least = max(low, -edge) * (1 + 1e-6) + 1e-9
+        high = in_range("angle_x_max_mrad", props.get("angle_x_max_mrad", edge), least, 1e6)
+        return Strip(radius, 1e-3 * low, 1e-3 * high)
     if shape == "polygon":
-        words = str(props.get("vertices_mrad", "")).replace(",", " ").split()
-        numbers = finite_array("vertices_mrad", words)
+        text = str(props.get("vertices_mrad", ""))
+        numbers = finite_array("vertices_mrad", text.replace(",", " ").split())
         if numbers.size % 2 or numbers.size < 6:
-            raise UserError(
-                f"vertices_mrad = {props.get('vertices_mrad', '')!r} must hold pairs 'angle_x angle_y' of at least "
-                "three corners"
-            )
+            raise UserError(f"vertices_mrad = {text!r} must hold pairs 'angle_x angle_y' of at least three corners")
         return Polygon(1e-3 * numbers.reshape(-1, 2))
     raise UserError(f"shape = {shape!r} must be one of circle, ring, sector, rectangle, strip, polygon")
 

@@ -1,4 +1,4 @@
-"""Emitter plugin ``sky``: what the sky sends to the sea beside the sun."""
+"""Emitter plugin ``sky``: diffuse daylight."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import non_negative
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.daylight.sky import SKIES, read_direction, relative_irradiance
 
 
-class Sky(mi.Emitter):
+class Sky(EmitterWithoutExtent):
     r"""Sky (``sky``).
 
     ===============  ======  ===========================================================================================
@@ -20,16 +21,16 @@ class Sky(mi.Emitter):
     distribution     string  ``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon),
                              ``overcast`` (Moon and Spencer 1942: three times as bright at the zenith as at the
                              horizon), or ``uniform``. Default: ``clear``
-    irradiance       float   What it gives at the sea on a level plane [W m^-2 nm^-1], at least 0. Default for
-                             ``clear``: that of a clear sky at 532 nm
-                             (`mitransient_lidar.physics.lidar.clear_sky.clear_sky_irradiance`); the others need it
+    irradiance       float   Irradiance at the sea on a level plane [W m^-2 nm^-1], at least 0. Default for ``clear``:
+                             that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`); required
+                             for the others
     sun_zenith_deg   float   ``clear``: angle of the sun from the vertical [deg], 0 to 89. Default: 40
-    sun_azimuth_deg  float   ``clear``: where it stands, from +x towards +y [deg]. Default: 0
+    sun_azimuth_deg  float   ``clear``: azimuth of the sun, from +x towards +y [deg]. Default: 0
     ===============  ======  ===========================================================================================
 
-    The upper half of an infinite sphere; the lower half is black. The radiance is a shape (after Harrison and Coombes
-    1988, doi:10.1016/0038-092X(88)90072-2, for ``clear``) scaled to the irradiance. The sun itself is the plugin
-    ``sun``; its angles and those of a clear sky must be the same. The lidar integrators leave the sky out.
+    The upper half of an infinite sphere; the lower half is black. The radiance distribution (for ``clear`` of Harrison
+    and Coombes 1988, doi:10.1016/0038-092X(88)90072-2) is scaled to the irradiance. The sun itself is the plugin
+    ``sun``, whose angles must be those of a clear sky. The lidar integrators leave the sky out.
 
     .. code-block:: xml
 
@@ -43,7 +44,7 @@ class Sky(mi.Emitter):
         {'type': 'sky', 'distribution': 'clear', 'sun_zenith_deg': 40.0}
     """
 
-    #: What kind of daylight it is, by which integrators know it.
+    #: Kind of daylight, by which integrators identify it.
     daylight = "sky"
 
     def __init__(self, props: mi.Properties) -> None:
@@ -72,15 +73,8 @@ class Sky(mi.Emitter):
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Draw a direction in proportion to its cosine from the vertical; the weight is radiance over density."""
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.d = mi.warp.square_to_cosine_hemisphere(sample)
+        ds = self.distant_sample(it, mi.warp.square_to_cosine_hemisphere(sample))
         ds.pdf = mi.warp.square_to_cosine_hemisphere_pdf(ds.d)
-        ds.dist = dr.largest(mi.Float)
-        ds.p = it.p + ds.d * 1e6
-        ds.n = -ds.d
-        ds.time = it.time
-        ds.delta = False
-        ds.emitter = mi.EmitterPtr(self)
         weight = dr.select(ds.pdf > 0, self.radiance(ds.d) / ds.pdf, 0)
         return ds, mi.Spectrum(weight) & active
 
@@ -93,15 +87,8 @@ class Sky(mi.Emitter):
         return mi.Spectrum(self.radiance(ds.d)) & active
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        """Return the radiance that a ray meets which leaves the scene [W m^-2 sr^-1 nm^-1]."""
+        """Return the radiance on a ray that leaves the scene [W m^-2 sr^-1 nm^-1]."""
         return mi.Spectrum(self.radiance(-si.wi)) & active
-
-    def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Return an invalid box: the sky does not extend the scene."""
-        return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed sky is loaded anew."""
 
     def to_string(self) -> str:
         """Return a description."""

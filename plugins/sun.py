@@ -8,26 +8,26 @@ import numpy as np
 
 from mitransient_lidar.core.validation import in_range, non_negative
 from mitransient_lidar.physics.lidar.clear_sky import SUN_RADIUS_DEG, clear_sky_irradiance
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.daylight.sky import read_direction
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
 
-class Sun(mi.Emitter):
+class Sun(EmitterWithoutExtent):
     r"""Sun (``sun``).
 
     ==================  =====  =========================================================================================
     Parameter           Type   Meaning
     ==================  =====  =========================================================================================
-    zenith_deg          float  Angle of the sun's middle from the vertical [deg], 0 to 89. Default: 40
-    azimuth_deg         float  Where it stands, from +x (the way the receiver looks) towards +y [deg]. Default: 0
-    irradiance          float  What it gives at the sea on a plane normal to its rays [W m^-2 nm^-1], at least 0.
-                               Default: that of a clear sky at 532 nm
-                               (`mitransient_lidar.physics.lidar.clear_sky.clear_sky_irradiance`)
+    zenith_deg          float  Angle of the sun's centre from the vertical [deg], 0 to 89. Default: 40
+    azimuth_deg         float  Its azimuth, from +x (the receiver's viewing direction) towards +y [deg]. Default: 0
+    irradiance          float  Irradiance at the sea on a plane normal to its rays [W m^-2 nm^-1], at least 0. Default:
+                               that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)
     angular_radius_deg  float  Radius of its disc [deg], 0.001 to 5. Default: 0.2666
     ==================  =====  =========================================================================================
 
-    The disc is even, at infinity, of the radiance :math:`E / (\pi \sin^2 r)`. ``passive_volpath`` draws one point of it
-    for each path; the lidar integrators leave it out. Mitsuba's own integrators sample its disc, and do not meet it by
+    A disc at infinity of the uniform radiance :math:`E / (\pi \sin^2 r)`. ``passive_volpath`` draws one point of it for
+    each path; the lidar integrators leave it out. Mitsuba's own integrators sample the disc, and do not meet it by
     chance.
 
     .. code-block:: xml
@@ -42,7 +42,7 @@ class Sun(mi.Emitter):
         {'type': 'sun', 'zenith_deg': 40.0, 'azimuth_deg': 120.0}
     """
 
-    #: What kind of daylight it is, by which integrators know it.
+    #: Kind of daylight, by which integrators identify it.
     daylight = "sun"
 
     def __init__(self, props: mi.Properties) -> None:
@@ -51,10 +51,10 @@ class Sun(mi.Emitter):
         default = clear_sky_irradiance(self.zenith_deg).direct_normal
         self.irradiance = non_negative("irradiance", props.get("irradiance", default))
         radius = in_range("angular_radius_deg", props.get("angular_radius_deg", SUN_RADIUS_DEG), 1e-3, 5.0)
-        # sin^2 of half the radius: cosines of so small angles are 1 to rounding.
+        # sin^2 of half the radius, as the cosine of so small an angle is 1 to rounding.
         self._edge = float(np.sin(0.5 * np.radians(radius)) ** 2)
         self._radiance = self.irradiance / (np.pi * np.sin(np.radians(radius)) ** 2)
-        #: Irradiance that each direction of the disc stands for when all are drawn evenly [W m^-2 nm^-1].
+        #: Irradiance that each of the directions of `sample` represents [W m^-2 nm^-1].
         self.sampled_irradiance = float(self._radiance * 4 * np.pi * self._edge)
         self.m_needs_sample_2 = True
         self.m_flags = mi.EmitterFlags.Infinite.value | mi.EmitterFlags.DeltaDirection.value
@@ -65,7 +65,7 @@ class Sun(mi.Emitter):
         return dr.select(inside, mi.Float(self._radiance), 0)
 
     def sample(self, u: mi.Point2f) -> mi.Vector3f:
-        """Map uniform numbers to directions that are even in the disc's solid angle."""
+        """Map uniform numbers to directions uniform in the disc's solid angle."""
         frame = mi.Frame3f(mi.Vector3f(self.direction.tolist()))
         return dr.normalize(deflect(frame, u.x * self._edge, dr.two_pi * u.y))
 
@@ -73,35 +73,21 @@ class Sun(mi.Emitter):
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Draw a direction of the disc; the weight is the irradiance normal to it [W m^-2 nm^-1]."""
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.d = self.sample(sample)
-        ds.dist = dr.largest(mi.Float)
-        ds.p = it.p + ds.d * 1e6
-        ds.n = -ds.d
-        ds.time = it.time
-        ds.delta = True
-        ds.pdf = 1.0
-        ds.emitter = mi.EmitterPtr(self)
-        return ds, mi.Spectrum(self.sampled_irradiance) & active
+        ds = self.distant_sample(it, self.sample(sample))
+        ds.delta, ds.pdf = True, 1.0
+        return ds, self.eval_direction(it, ds, active)
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
-        """Return 0: only its own samples find the disc."""
+        """Return 0: only `sample_direction` finds the disc."""
         return mi.Float(0)
 
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
-        """Return the irradiance that a direction of the disc stands for [W m^-2 nm^-1]."""
+        """Return the irradiance that a direction of the disc represents [W m^-2 nm^-1]."""
         return mi.Spectrum(self.sampled_irradiance) & active
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        """Return 0: only its own samples find the disc."""
+        """Return 0: only `sample_direction` finds the disc."""
         return mi.Spectrum(0)
-
-    def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Return an invalid box: the sun does not extend the scene."""
-        return mi.ScalarBoundingBox3f()
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed sun is loaded anew."""
 
     def to_string(self) -> str:
         """Return a description."""

@@ -21,7 +21,8 @@ OLDEST_USABLE_LLVM = 17
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
 _PLUGIN_MODULES = (
-    "phase.tabulated",  # first: others derive from it
+    "bases",  # first, with phase.tabulated: others derive from them
+    "phase.tabulated",
     "phase.fournier_forand",
     "phase.petzold",
     "phase.sea_water",
@@ -37,7 +38,6 @@ _PLUGIN_MODULES = (
     "pixel_fov",
     "multipixel_receiver",
     "time_gated_film",
-    "lidar_integrator",  # before the integrators, which derive from it
     "lidar_volpath",
     "lidar_merging",
     "passive_volpath",

@@ -218,7 +218,7 @@ def test_look_at_agrees_with_altitude_and_angle():
 
 
 @pytest.mark.parametrize(
-    "module", [name for name in variants._PLUGIN_MODULES if name not in ("phase.tabulated", "lidar_integrator")]
+    "module", [name for name in variants._PLUGIN_MODULES if name not in ("phase.tabulated", "bases")]
 )
 def test_examples_in_the_manual_load(module, tmp_path, monkeypatch):
     # The file that an example reads: an isotropic phase function.

@@ -1,0 +1,123 @@
+"""Base classes of the plugins."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.sensor.pixels import PixelArray
+from mitransient_lidar.transport.sensor.point_spread import PointSpread
+from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
+
+
+class LidarIntegrator(mi.CppADIntegrator):
+    """Integrator that prepares a scene and renders one pass of it.
+
+    It has no state of a scene: every call of ``mi.render`` prepares the scene again, with changes by ``mi.traverse``.
+    ``mitransient_lidar.render`` prepares a scene once for all of its passes.
+    """
+
+    #: Name of the integrator in results.
+    plugin: str
+
+    #: Whether it renders daylight instead of a lidar's echoes.
+    passive = False
+
+    @abstractmethod
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> Any:
+        """Return the renderer of passes of a scene (`PassRenderer` or `DaylightRenderer`).
+
+        Raises
+        ------
+        UserError
+            When the scene lacks a part or has one that the integrator does not support.
+        """
+
+    def develop(self, record: Any, sensor: mi.Sensor) -> mi.TensorXf:
+        """Return the energy [J] of a pass, and store it in the sensor's film."""
+        sensor.film().store(record.histogram)
+        return sensor.film().develop()
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: mi.UInt32 = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render one pass; passes of different seeds are independent.
+
+        `spp` is the number of paths for each pixel; 0 selects the integrator's number of paths for all pixels together.
+        Without `develop` the result is empty; `evaluate` is not used.
+
+        Returns
+        -------
+        TensorXf
+            Received energy [J], shape (pixel, time) or (row, column, time); by daylight radiance [W m^-2 sr^-1 nm^-1],
+            shape (pixel,) or (row, column), 0 where no path started.
+        """
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        renderer = self.prepare(scene, sensor)
+        paths = spp * renderer.scene.receiver.pixels.count if spp > 0 else None
+        result = self.develop(renderer.render_pass(int(np.array(seed).item()), paths=paths), sensor)
+        return result if develop else mi.TensorXf()
+
+    def render_forward(self, *args: Any, **kwargs: Any) -> mi.TensorXf:
+        """Raise UserError: there are no derivatives."""
+        raise UserError(f"{self.plugin} has no derivatives: render without parameters that track gradients")
+
+    render_backward = render_forward
+
+
+class ReceiverSensor(mi.Sensor):
+    """Sensor of some pixels, with pose, optics and blur from its parameters."""
+
+    def __init__(self, props: mi.Properties, pixels: PixelArray) -> None:
+        super().__init__(props)
+        pose, optics = Pose.from_properties(props), ReceiverOptics.from_properties(props)
+        self.receiver = Receiver(pose, optics, pixels, PointSpread.from_properties(props))
+        self.m_needs_sample_2 = True
+        self.m_needs_sample_3 = self.receiver.blur is not None
+
+    def sample_ray(
+        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Sample a ray uniformly over the field of view, for Mitsuba's own integrators."""
+        return self.receiver.sensor_ray(time, sample2, sample3, active)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return an invalid box: the sensor does not extend the scene."""
+        return mi.ScalarBoundingBox3f()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters: a changed receiver is loaded again."""
+
+
+class EmitterWithoutExtent(mi.Emitter):
+    """Emitter that does not extend the scene and exposes no parameters."""
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return an invalid box: the emitter does not extend the scene."""
+        return mi.ScalarBoundingBox3f()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose no parameters: a changed emitter is loaded again."""
+
+    def distant_sample(self, it: mi.Interaction3f, direction: mi.Vector3f) -> mi.DirectionSample3f:
+        """Return the sample of a direction to infinity, without its density."""
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d, ds.n = direction, -direction
+        ds.dist = dr.largest(mi.Float)
+        ds.p = it.p + direction * 1e6
+        ds.time = it.time
+        ds.emitter = mi.EmitterPtr(self)
+        return ds
