@@ -11,6 +11,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite_array, in_range
 from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
@@ -35,34 +36,34 @@ class LayeredWater(mi.Medium):
     backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
     profile                  string  A file instead of the four above: .csv or .nc with ``depth`` [m], two of ``a``,
                                      ``b``, ``c``, ``omega``, and ``bb`` or ``bb_ratio`` (`physics.water.profiles`)
-    profile_tolerance        float   How far the layers that stand for the profile may be from it, relative, 1e-5 to
-                                     0.5. Default: 0.01
+    profile_tolerance        float   Largest relative error of the layers that approximate the profile, 1e-5 to 0.5.
+                                     Default: 0.01
     phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``. Default:
                                      ``fournier_forand``
     phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
-    water_scattering         string  What the water itself scatters, part of b [1/m], each layer or all; mixed with the
-                                     particles. 0.0022 is sea water at 532 nm. Default: 0, in the phase function already
+    water_scattering         string  Scattering of pure water, a part of b [1/m], of each layer or all; 0.0022 for sea
+                                     water at 532 nm. Default: 0, for phase functions that include it
     (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
                                      ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
-    refractive_index         string  Phase index, bends rays, 1.0001 to 2, of each layer or all. Default: 1.34
-    group_index              string  Group index, times them, 1 to 2, likewise. Default: 1.364 (sea water at 532 nm)
-    plume_scattering         float   What the bubbles behind a ship add to the scattering [1/m]. Default: 0, no bubbles
-    plume_x, plume_y         float   Where the bubbles begin, at the stern [m]. Default: 0
-    plume_bearing_deg        float   Where the ship goes, from +x to +y [deg]. Default: 0
-    plume_length             float   How far the bubbles reach astern [m]. Default: 200
-    plume_width              float   How wide [m]. Default: 8
-    plume_depth              float   How deep below the mean sea level [m], 0.01 to 100. Default: 2
-    plume_backscatter_ratio  float   Their bb/b for a Fournier-Forand function, 0.0001 to 0.4. Default: 0.02, between
-                                     clean bubbles and such with a film (Zhang, Lewis and Johnson 1998,
+    refractive_index         string  Phase index, 1.0001 to 2, of each layer or all. Default: 1.34
+    group_index              string  Group index, 1 to 2, of each layer or all. Default: 1.364 (sea water at 532 nm)
+    plume_scattering         float   Scattering of bubbles behind a ship, added to b [1/m]. Default: 0, no bubbles
+    plume_x, plume_y         float   Start of the bubbles, at the stern [m]. Default: 0
+    plume_bearing_deg        float   Heading of the ship, from +x to +y [deg]. Default: 0
+    plume_length             float   Length of the plume [m]. Default: 200
+    plume_width              float   Width of the plume [m]. Default: 8
+    plume_depth              float   Depth of the plume below the mean sea level [m], 0.01 to 100. Default: 2
+    plume_backscatter_ratio  float   bb/b of bubbles for a Fournier-Forand function, 0.0001 to 0.4. Default: 0.02,
+                                     between clean bubbles and coated ones (Zhang, Lewis and Johnson 1998,
                                      doi:10.1364/AO.37.006525)
     =======================  ======  ===================================================================================
 
-    The first layer also fills the wave crests above z = 0, the last goes down without end. With ``petzold``, ``hg`` or
-    a nested phase function, bb follows from that function and ``backscattering`` is only checked.
+    The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
+    nested phase function, bb follows from that function and ``backscattering`` is only checked.
 
     Between layers of different refractive index light is refracted, or reflected totally; the partial reflection (5e-6
-    between fresh and sea water at vertical incidence) is left out. Such layers begin below the troughs of the waves, at
-    most 16 of them.
+    between fresh and sea water at vertical incidence) is left out. At most 16 such layers are allowed, and they must
+    begin below the troughs of the waves.
 
     The lidar integrators sample free flights and transmittances through all layers in closed form. Mitsuba's own
     volumetric integrators work as well, with null collisions against the largest attenuation and the first layer's
@@ -85,37 +86,28 @@ class LayeredWater(mi.Medium):
     def __init__(self, props: mi.Properties) -> None:
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         self.column = _column(props)
-        #: Whether the layers stand for a profile from a file.
+        #: Whether the layers approximate a profile from a file.
         self.from_profile = bool(props.get("profile", ""))
-        indices = [
-            _per_layer(name, props.get(name, default), self.column.count)
-            for name, default in (("refractive_index", 1.34), ("group_index", 1.364))
-        ]
-        for name, values, low in zip(("refractive_index", "group_index"), indices, (1.0001, 1.0), strict=True):
-            for value in values:
+        indices = []
+        for name, default, low in (("refractive_index", 1.34, 1.0001), ("group_index", 1.364, 1.0)):
+            indices.append(_per_layer(name, props.get(name, default), self.column.count))
+            for value in indices[-1]:
                 in_range(name, value, low, 2.0)
         kind = props.get("phase_function", "fournier_forand")
         phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
         if kind not in KINDS:
             raise UserError(f"phase_function = {kind!r} must be one of {', '.join(KINDS)}")
-        #: Bubbles, if there are any, and their phase function.
+        #: Bubbles, or None.
         self.plume = BubblePlume.from_properties(props)
         ratio = in_range("plume_backscatter_ratio", props.get("plume_backscatter_ratio", 0.02), 1e-4, 0.4)
         bubbles = phases.pop("plume_phase", None)
         if bubbles is not None:
             del props["plume_phase"]
-        # Mitsuba's own media hold one phase function; the others are this plugin's.
+        # Mitsuba's media accept one phase function.
         for name in list(phases)[1:]:
             del props[name]
-        water_scattering = _water_scattering(props.get("water_scattering", 0.0), self.column)
-        of_layers = phases_of_layers(
-            self.column,
-            phases,
-            kind,
-            phase_g,
-            water_scattering,
-            lambda table: TabulatedPhaseFunction(mi.Properties(), table),
-        )
+        water = _water_scattering(props.get("water_scattering", 0.0), self.column)
+        of_layers = phases_of_layers(self.column, phases, kind, phase_g, water, _tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
         #: Runs of layers of one refractive and one group index.
@@ -128,7 +120,7 @@ class LayeredWater(mi.Medium):
         #: Phase functions of the layers, and last of the bubbles.
         self.phases = ScattererPhases(of_layers)
         if not phases:
-            # For Mitsuba's own integrators, which would take an isotropic function where none is nested.
+            # For Mitsuba's own integrators, whose default is an isotropic function.
             props["phase_0"] = of_layers[0]
         super().__init__(props)
         self.flight = LayeredFlight(self.column)
@@ -140,7 +132,7 @@ class LayeredWater(mi.Medium):
         self.m_has_spectral_extinction = False
 
     def free_flight(self, flight: LayeredFlight, path: Path, rng: mi.PCG32) -> mi.Float:
-        """Draw how far light goes until it meets what `flight` counts, or a bubble [m]."""
+        """Draw the distance to the next event of `flight`, or of the bubbles [m]."""
         distance = flight.distance(path.depth, path.downward, -dr.log(1 - rng.next_float32()))
         if self.plume is None:
             return distance
@@ -152,16 +144,16 @@ class LayeredWater(mi.Medium):
         return through if self.plume is None else through + self.plume.optical_depth(point, direction, length)
 
     def scatterer_at(self, flight: LayeredFlight, point: mi.Point3f, rng: mi.PCG32) -> mi.UInt32:
-        """Draw what a flight has met: the number of the layer, or the number of layers for a bubble."""
+        """Draw the scatterer at the end of a flight: the number of the layer, or the number of layers for a bubble."""
         layer = flight.layer_at(-point.z)
         if self.plume is None:
             return layer
-        bubbles = dr.select(self.plume.holds(point), mi.Float(self.plume.scattering), 0)
+        bubbles = self.plume.scattering_at(point)
         is_bubble = rng.next_float32() * (bubbles + flight.attenuation(layer)) < bubbles
         return dr.select(is_bubble, mi.UInt32(self.column.count), layer)
 
     def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32) -> mi.Float:
-        """Return what `flight` counts of a scatterer [1/m]."""
+        """Return the coefficient of a scatterer in `flight` [1/m]."""
         if self.plume is None:
             return flight.attenuation(scatterer)
         layer = dr.minimum(scatterer, self.column.count - 1)
@@ -180,36 +172,36 @@ class LayeredWater(mi.Medium):
 
     def get_scattering_coefficients(
         self, mei: mi.MediumInteraction3f, active: mi.Bool = True
-    ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
+    ) -> tuple[mi.UnpolarizedSpectrum, ...]:
         """Return scattering, null and total coefficient [1/m], for Mitsuba's own integrators."""
         layer = self.flight.layer_at(-mei.p.z)
         attenuation = self.flight.attenuation(layer)
         scattering = self.flight.albedo(layer) * attenuation
         if self.plume is not None:
-            bubbles = dr.select(self.plume.holds(mei.p), mi.Float(self.plume.scattering), 0)
+            bubbles = self.plume.scattering_at(mei.p)
             scattering, attenuation = scattering + bubbles, attenuation + bubbles
-        return (
-            mi.UnpolarizedSpectrum(scattering),
-            mi.UnpolarizedSpectrum(self._majorant - attenuation),
-            mi.UnpolarizedSpectrum(attenuation),
-        )
+        coefficients = scattering, self._majorant - attenuation, attenuation
+        return tuple(mi.UnpolarizedSpectrum(coefficient) for coefficient in coefficients)
 
     def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Return that the water has no bounds of its own: shapes bound it."""
+        """Return an infinite interval: shapes bound the water."""
         return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: changed water is loaded anew."""
+        """Expose no parameters: changed water is loaded again."""
 
     def to_string(self) -> str:
         """Return a description."""
-        return (
-            f"LayeredWater[{self.column}, refractive_index={self.refractive_index:g}, group_index={self.group_index:g}]"
-        )
+        indices = f"refractive_index={self.refractive_index:g}, group_index={self.group_index:g}"
+        return f"LayeredWater[{self.column}, {indices}]"
+
+
+def _tabulated(table: PowerLawTable) -> TabulatedPhaseFunction:
+    return TabulatedPhaseFunction(mi.Properties(), table)
 
 
 def _column(props: mi.Properties) -> WaterColumn:
-    """Return the layers that the parameters describe, or those of a profile."""
+    """Return the layers of the parameters, or of a profile."""
     path = props.get("profile", "")
     tolerance = props.get("profile_tolerance", 0.01)
     names = ("layer_tops", "attenuation", "scattering", "backscattering")
@@ -222,18 +214,14 @@ def _column(props: mi.Properties) -> WaterColumn:
 
 
 def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn, np.ndarray]:
-    """Return the column with neighbouring layers of equal properties joined, and the first layer of each.
-
-    Joined, they give what one layer does in every bit.
-    """
+    """Return the column with neighbouring layers of equal properties joined, and the first layer of each."""
     rows = np.array([column.attenuation, column.scattering, column.backscattering, *others])
     kept = np.append(0, 1 + np.flatnonzero(np.any(np.diff(rows, axis=1) != 0, axis=0)))
-    coefficients = (column.attenuation, column.scattering, column.backscattering)
-    return WaterColumn(column.layer_tops[kept], *(values[kept] for values in coefficients)), kept
+    return WaterColumn(column.layer_tops[kept], *rows[:3, kept]), kept
 
 
 def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
-    """Return one value a layer of what is given for all or for each."""
+    """Return one value a layer of a parameter given for all layers or for each."""
     values = np.atleast_1d(finite_array(name, given.replace(",", " ").split() if isinstance(given, str) else given))
     if values.size not in (1, count):
         raise UserError(f"{name} has {values.size} values but must have 1 or {count}, one a layer")
@@ -241,7 +229,7 @@ def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
 
 
 def _water_scattering(given: float | str, column: WaterColumn) -> np.ndarray:
-    """Return what the water itself scatters [1/m], one value a layer."""
+    """Return the scattering of pure water [1/m], one value a layer."""
     water = _per_layer("water_scattering", given, column.count)
     for layer in np.flatnonzero((water < 0) | (water > column.scattering))[:1]:
         raise UserError(

@@ -1,4 +1,4 @@
-"""BSDF plugin ``retroreflector``: a target that sends light back to where it came from."""
+"""BSDF plugin ``retroreflector``: a surface that reflects light towards its source."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mitsuba as mi
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
 
-#: Narrowest lobe [deg]: directions in 32-bit numbers are good to a thousandth of it.
+#: Narrowest lobe [deg]: 32-bit directions are accurate to a thousandth of it.
 _NARROWEST = 0.01
 
 
@@ -20,10 +20,10 @@ class Retroreflector(mi.BSDF):
     =============  =====  ==============================================================================================
     Parameter      Type   Meaning
     =============  =====  ==============================================================================================
-    reflectance    float  Share of the light that comes back, 0 to 1. Default: 0.5
+    reflectance    float  Reflected share of the light, 0 to 1. Default: 0.5
     width_deg      float  Full angle between the directions where the lobe has fallen to e^-1/2 of its peak [deg], 0.01
                           to 180. Default: 2
-    diffuse_share  float  Lambertian share of what comes back, 0 to 1. Default: 0
+    diffuse_share  float  Lambertian share of the reflected light, 0 to 1. Default: 0
     =============  =====  ==============================================================================================
 
     For reflective sheeting, beads and prisms on a target. Light that arrives from the direction :math:`\omega_i` leaves
@@ -35,13 +35,13 @@ class Retroreflector(mi.BSDF):
 
     with the angle :math:`\gamma` between the two, the reflectance *R*, the diffuse share *s* and the width *w*. *D* is
     the Gaussian of the sphere (Fisher 1953, doi:10.1098/rspa.1953.0064), normalised over all directions. The BSDF is
-    the same both ways round, and returns at most *R*: a narrow lobe of :math:`\sigma = w/2` loses the share
-    :math:`0.4\,\sigma \tan\theta_i` at oblique incidence, more where a part of it falls behind the surface. Straight
-    back it returns :math:`(1-s) R / (2\pi\sigma^2)` per steradian, whatever the angle of incidence; real prisms and
-    beads return less beyond 30 degrees or so.
+    reciprocal, and reflects at most *R*: a narrow lobe of :math:`\sigma = w/2` loses the share :math:`0.4\,\sigma
+    \tan\theta_i` at oblique incidence, more where a part of it falls behind the surface. In the direction of incidence
+    it reflects :math:`(1-s) R / (2\pi\sigma^2)` per steradian at any angle; real prisms and beads reflect less beyond
+    about 30 degrees.
 
-    It reflects on the side of its normal only and is black behind; ``twosided`` makes it reflect on both. A lobe that
-    is much narrower than the beam's spread under water, about 1 degree, makes noise.
+    It reflects on the side of its normal only; ``twosided`` makes it reflect on both. A lobe much narrower than the
+    beam's spread under water, about 1 degree, causes noise.
 
     .. code-block:: xml
 
@@ -63,8 +63,8 @@ class Retroreflector(mi.BSDF):
         self.diffuse_share = in_range("diffuse_share", props.get("diffuse_share", 0.0), 0.0, 1.0)
         self._concentration = 0.25 / math.sin(0.25 * self.width) ** 2
         self._mass = -math.expm1(-2 * self._concentration)
-        front = mi.BSDFFlags.FrontSide.value
-        self.m_components = [mi.BSDFFlags.GlossyReflection.value | front, mi.BSDFFlags.DiffuseReflection.value | front]
+        kinds = (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection)
+        self.m_components = [kind.value | mi.BSDFFlags.FrontSide.value for kind in kinds]
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def sample(
@@ -85,8 +85,7 @@ class Retroreflector(mi.BSDF):
         bs.wo = dr.select(in_lobe, back, mi.warp.square_to_cosine_hemisphere(sample2))
         bs.eta = 1.0
         bs.sampled_component = dr.select(in_lobe, mi.UInt32(0), mi.UInt32(1))
-        flags = [mi.UInt32(component) for component in self.m_components]
-        bs.sampled_type = dr.select(in_lobe, flags[0], flags[1])
+        bs.sampled_type = dr.select(in_lobe, *(mi.UInt32(component) for component in self.m_components))
         value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
         return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
 
@@ -109,7 +108,7 @@ class Retroreflector(mi.BSDF):
         lobe, diffuse = self._shares(ctx)
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         active = active & (cos_i > 0) & (cos_o > 0)
-        # From the difference of the directions: the cosine of a small angle between them has no digits left.
+        # From the difference of the directions: the cosine of a small angle is 1 to rounding.
         peak = self._concentration / (2 * dr.pi * self._mass)
         density = peak * dr.exp(-0.5 * self._concentration * dr.squared_norm(wo - si.wi))
         lambertian = cos_o * dr.inv_pi
@@ -118,13 +117,13 @@ class Retroreflector(mi.BSDF):
         return mi.Color1f(dr.select(active, self.reflectance * value, 0)), dr.select(active, pdf, 0)
 
     def _shares(self, ctx: mi.BSDFContext) -> tuple[float, float]:
-        """Return the shares of the lobe and of the Lambertian part that the caller asks for."""
+        """Return the shares of the lobe and of the Lambertian part, 0 where the context disables them."""
         glossy = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
         diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
         return (1 - self.diffuse_share) * glossy, self.diffuse_share * diffuse
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed surface is loaded anew."""
+        """Expose no parameters: a changed surface is loaded again."""
 
     def to_string(self) -> str:
         """Return a description."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -23,8 +22,7 @@ class TimeGatedFilm(mi.Film):
     ================  =======  =========================================================================================
     Parameter         Type     Meaning
     ================  =======  =========================================================================================
-    time_start_ns     float    Start of the first bin [ns]; 0 is when the pulse's peak leaves the transmitter. Default:
-                               1390
+    time_start_ns     float    Start of the first bin [ns] after the pulse's peak leaves the transmitter. Default: 1390
     bin_width_ns      float    Width of a bin [ns], positive. Default: 0.5
     bin_count         integer  Number of bins, 1 to 1 000 000. Default: 320
     gate_count        integer  Number of gates, 0 (none) to 100 000. Default: 0
@@ -39,12 +37,12 @@ class TimeGatedFilm(mi.Film):
     ================  =======  =========================================================================================
 
     Bins are half open, [start, start + width). After a render with a lidar integrator, ``develop`` returns the energy
-    [J] of that pass as a tensor (pixel, time), or (row, column, time) for imagers. Sums are integers, so that they do
-    not depend on their order: the same seed gives the same bits, and pixels sum exactly to the whole.
+    [J] of that pass as a tensor (pixel, time), or (row, column, time) for imagers. Energies are summed as integers, so
+    that the same seed gives the same bits.
 
-    Gates are cut from the waveform, after pulse and response, by ``mitransient_lidar.render``. Where the histogram of
-    an imager does not fit the allowed memory, each arrival is added to the gates that are open to a part of its pulse,
-    and no histogram is kept; ``bin_width_ns`` and ``bin_count`` then only set the end of the record.
+    ``mitransient_lidar.render`` cuts gates from the waveform, after pulse and response. Where the histogram of an
+    imager exceeds the allowed memory, each arrival is added to the gates open during its pulse instead, and
+    ``bin_width_ns`` and ``bin_count`` only set the end of the record.
 
     .. code-block:: xml
 
@@ -79,7 +77,7 @@ class TimeGatedFilm(mi.Film):
     def energy(self) -> np.ndarray:
         """Return the energy [J] of the last pass as float64, shape (pixel, time) or (row, column, time).
 
-        Bins to which a value was added that is not finite are NaN. Zeros of shape (1, time) before the first pass.
+        Bins are NaN where a value was not finite. Zeros of shape (1, time) before the first pass.
         """
         return np.zeros((1, self.axis.bin_count)) if self._pass is None else self._pass.energy()
 
@@ -88,7 +86,7 @@ class TimeGatedFilm(mi.Film):
         return mi.TensorXf(self.energy().astype(np.float32))
 
     def clear(self) -> None:
-        """Forget the last pass."""
+        """Remove the last pass."""
         self._pass = None
 
     def bitmap(self, raw: bool = False) -> mi.Bitmap:
@@ -101,7 +99,7 @@ class TimeGatedFilm(mi.Film):
         self.bitmap().write(path)
 
     def prepare(self, aovs: list[str]) -> int:
-        """Forget the last pass, for an integrator that is not a lidar integrator."""
+        """Remove the last pass, for an integrator that is not a lidar integrator."""
         self.clear()
         return 1
 
@@ -109,32 +107,26 @@ class TimeGatedFilm(mi.Film):
         """Return 1: energy."""
         return 1
 
-    def put_block(self, block: mi.ImageBlock) -> None:
-        """Refuse image blocks, which have no time."""
+    def put_block(self, *args: object, **kwargs: object) -> mi.ImageBlock:
+        """Raise UserError: image blocks have no time."""
         raise UserError("time_gated_film records time: use the integrator lidar_merging or lidar_volpath")
 
-    def create_block(self, size: object = None, normalize: bool = False, borders: bool = False) -> mi.ImageBlock:
-        """Refuse image blocks, which have no time."""
-        raise UserError("time_gated_film records time: use the integrator lidar_merging or lidar_volpath")
+    create_block = put_block
 
     def schedule_storage(self) -> None:
         """Do nothing: passes are stored evaluated."""
-        dr.schedule()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed film is loaded anew."""
+        """Expose no parameters: a changed film is loaded again."""
 
     def to_string(self) -> str:
         """Return a description."""
-        axis = self.axis
-        return (
-            f"TimeGatedFilm[time_start_ns={axis.start_ns:g}, bin_width_ns={axis.bin_width_ns:g}, "
-            f"bin_count={axis.bin_count}]"
-        )
+        start, width, count = self.axis.start_ns, self.axis.bin_width_ns, self.axis.bin_count
+        return f"TimeGatedFilm[time_start_ns={start:g}, bin_width_ns={width:g}, bin_count={count}]"
 
 
 def _gate_plan(props: mi.Properties) -> GatePlan | None:
-    """Read the gates of the film, None without any; raise UserError where parameters contradict each other."""
+    """Read the gates of the film, or None; raise UserError where parameters contradict each other."""
     count = integer("gate_count", props.get("gate_count", 0), 0, 100_000)
     given = [name for name in (*_GATE_SHAPE, *_GATE_START, "gate_step_ns", "gate_profile", "pulses") if name in props]
     if count == 0:

@@ -1,4 +1,4 @@
-"""Phase-function plugin ``measured_phase``: a user's table of angles and values."""
+"""Phase-function plugin ``measured_phase``: a table of angles and values from a file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 logger = logging.getLogger(__name__)
 
-#: Share by which a table may miss the normalisation without a warning.
+#: Largest relative error of the normalisation without a warning.
 _TOLERATED = 0.02
 
 
@@ -23,12 +23,12 @@ class MeasuredPhase(TabulatedPhaseFunction):
     Parameter  Type    Meaning
     =========  ======  =================================================================================================
     filename   string  Text file of two columns: scattering angle [deg], increasing, at least 10, the last 170 or more;
-                       and value [1/sr]. Any other unit serves, a volume scattering function too: the values are
-                       normalised, with a warning when they were off by more than 2 %
+                       and value in any unit, as of a volume scattering function: the values are normalised, with a
+                       warning where their integral is not 1 within 2 %
     =========  ======  =================================================================================================
 
-    Interpolated in log-log, and continued below the first angle with the power of the first two
-    (`mitransient_lidar.physics.water.phase_file.read_phase_table`). Sampled exactly into the forward peak.
+    Interpolated in log-log, and extrapolated below the first angle with the power law of the first two
+    (`mitransient_lidar.physics.water.phase_file.read_phase_table`).
 
     .. code-block:: xml
 

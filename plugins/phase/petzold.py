@@ -24,9 +24,9 @@ class Petzold(TabulatedPhaseFunction):
                        ``average_particle``
     =========  ======  =================================================================================================
 
-    Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised; below 0.1 degrees they go on as
-    powers of the angle. The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a
-    backscatter ratio of 0.0183 and a mean cosine of 0.924. The three waters hold the scattering of the water itself.
+    Measured by Petzold (1972) about 514 nm, interpolated in log-log and normalised, with power laws below 0.1 degrees.
+    The average particle is the table of Mobley et al. (1993), doi:10.1364/AO.32.007484, with a backscatter ratio of
+    0.0183 and a mean cosine of 0.924. The three waters include the scattering of pure water.
 
     .. code-block:: xml
 

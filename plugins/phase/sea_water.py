@@ -1,4 +1,4 @@
-"""Phase-function plugin ``sea_water``: what water scatters without anything in it."""
+"""Phase-function plugin ``sea_water``: scattering by pure sea water."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class SeaWater(TabulatedPhaseFunction):
                            Default: 0.039 (Zhang, Hu and He 2009, doi:10.1364/OE.17.005698)
     ==============  =====  =============================================================================================
 
-    :math:`p \propto 1 + \frac{1 - \delta}{1 + \delta} \cos^2 \theta` (Morel 1974): half of the light goes backward.
-    Water with particles has both; the parameter ``water_scattering`` of ``layered_water`` mixes them.
+    :math:`p \propto 1 + \frac{1 - \delta}{1 + \delta} \cos^2 \theta` (Morel 1974), with a backscatter ratio of 0.5.
+    The parameter ``water_scattering`` of ``layered_water`` mixes it with the function of particles.
 
     .. code-block:: xml
 

@@ -1,4 +1,4 @@
-"""What the phase-function plugins have in common whose function is a table. Not a plugin itself."""
+"""Base class of the phase-function plugins that use a table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, Ta
 
 
 class TabulatedPhaseFunction(mi.PhaseFunction):
-    """Phase function that is evaluated and sampled from a `PowerLawTable`, exactly into the forward peak."""
+    """Phase function that is evaluated and sampled from a `PowerLawTable`, exact in the forward peak."""
 
     def __init__(self, props: mi.Properties, table: PowerLawTable) -> None:
         super().__init__(props)
@@ -35,4 +35,4 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
         return NumberedPhase(self.tabulated, mi.UInt32(0)).sample(ctx, mei, sample1, sample2, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed phase function is loaded anew."""
+        """Expose no parameters: a changed phase function is loaded again."""

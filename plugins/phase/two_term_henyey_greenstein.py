@@ -43,9 +43,8 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         self.weight = in_range("weight", props.get("weight", 0.98), 0.0, 1.0)
         self.g_forward = in_range("g_forward", props.get("g_forward", 0.9), 0.0, 0.999)
         self.g_backward = in_range("g_backward", props.get("g_backward", 0.3), 0.0, 0.999)
-        self.backscatter_ratio = self.weight * henyey_greenstein_backscatter_ratio(self.g_forward) + (
-            1 - self.weight
-        ) * henyey_greenstein_backscatter_ratio(-self.g_backward)
+        forward, backward = (henyey_greenstein_backscatter_ratio(g) for g in (self.g_forward, -self.g_backward))
+        self.backscatter_ratio = self.weight * forward + (1 - self.weight) * backward
         self.m_flags = mi.PhaseFunctionFlags.Anisotropic.value
 
     def eval_pdf(
@@ -64,20 +63,17 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         active: mi.Bool = True,
     ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
         """Sample a direction distributed as the phase function."""
-        cosine = dr.select(
-            sample1 < self.weight,
-            sample_henyey_greenstein(sample2.x, self.g_forward),
-            sample_henyey_greenstein(sample2.x, -self.g_backward),
-        )
+        forward, backward = (sample_henyey_greenstein(sample2.x, g) for g in (self.g_forward, -self.g_backward))
+        cosine = dr.select(sample1 < self.weight, forward, backward)
         wo = deflect(mi.Frame3f(-mei.wi), 0.5 * (1 - cosine), dr.two_pi * sample2.y)
         return wo, mi.Spectrum(1), self._value(cosine)
 
     def _value(self, cosine: mi.Float) -> mi.Float:
-        forward = henyey_greenstein(cosine, self.g_forward)
-        return self.weight * forward + (1 - self.weight) * henyey_greenstein(cosine, -self.g_backward)
+        forward, backward = (henyey_greenstein(cosine, g) for g in (self.g_forward, -self.g_backward))
+        return self.weight * forward + (1 - self.weight) * backward
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose no parameters: a changed phase function is loaded anew."""
+        """Expose no parameters: a changed phase function is loaded again."""
 
     def to_string(self) -> str:
         """Return a description."""

@@ -62,6 +62,10 @@ class BubblePlume:
         astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
         return (astern >= 0) & (astern <= self.length) & (dr.abs(across) <= self.width / 2) & (point.z >= -self.depth)
 
+    def scattering_at(self, point: mi.Point3f) -> mi.Float:
+        """Return the scattering coefficient of the bubbles at a point [1/m]."""
+        return dr.select(self.holds(point), mi.Float(self.scattering), 0)
+
     def crossing(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Return where a ray enters and leaves the plume [m]; where it misses, it leaves before it enters."""
         near, far = mi.Float(0), mi.Float(dr.inf)

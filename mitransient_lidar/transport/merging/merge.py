@@ -51,8 +51,7 @@ def merge_in_water(
     layer = water.flight.layer_at(-points.point.z)
     scatterers = [(water.phases.at(layer), water.scattering_flight.attenuation(layer))]
     if water.plume is not None:
-        bubbles = dr.select(water.plume.holds(points.point), mi.Float(water.plume.scattering), 0)
-        scatterers.append((water.plume_phase, bubbles))
+        scatterers.append((water.plume_phase, water.plume.scattering_at(points.point)))
     absorption = water.absorption_flight.attenuation(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
     subpath = SensorSubpath(*record.classes.unpack(points.label), points.direction, points.weight)
