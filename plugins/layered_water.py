@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +12,6 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite_array, in_range
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
@@ -107,7 +107,8 @@ class LayeredWater(mi.Medium):
         for name in list(phases)[1:]:
             del props[name]
         water = _water_scattering(props.get("water_scattering", 0.0), self.column)
-        of_layers = phases_of_layers(self.column, phases, kind, phase_g, water, _tabulated)
+        tabulated = partial(TabulatedPhaseFunction, mi.Properties())
+        of_layers = phases_of_layers(self.column, phases, kind, phase_g, water, tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
         #: Runs of layers of one refractive and one group index.
@@ -194,10 +195,6 @@ class LayeredWater(mi.Medium):
         """Return a description."""
         indices = f"refractive_index={self.refractive_index:g}, group_index={self.group_index:g}"
         return f"LayeredWater[{self.column}, {indices}]"
-
-
-def _tabulated(table: PowerLawTable) -> TabulatedPhaseFunction:
-    return TabulatedPhaseFunction(mi.Properties(), table)
 
 
 def _column(props: mi.Properties) -> WaterColumn:

@@ -28,7 +28,7 @@ class LidarTransmitter(EmitterWithoutExtent):
     ======================  =========  =================================================================================
     altitude                float      Height above the mean sea level [m], positive. Default: 200
     off_nadir_deg           float      Angle of the axis from the vertical, towards +x [deg], 0 to 89.9. Default: 20
-    aim_x, aim_y            float      Where the axis meets the mean sea level [m]. Default: 0
+    aim_x, aim_y            float      Point where the axis meets the mean sea level [m]. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], positive. Default: 5
     optical_efficiency      float      Share of that energy which leaves the optics, above 0 to 1. Default: 0.9
@@ -79,8 +79,14 @@ class LidarTransmitter(EmitterWithoutExtent):
         self.pulse_energy = 1e-3 * positive("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
         self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
         self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)
+        #: Energy that leaves the optics [J].
+        self.energy = self.pulse_energy * self.optical_efficiency
         self.beam_profile = props.get("beam_profile", "gaussian")
         self.profile = _profile(props, self.beam_profile)
+        #: Full angle of the beam [rad] as in ``divergence_mrad``; of an image twice its widest rms angle.
+        self.divergence = self.profile.divergence[0]
+        #: Root-mean-square angles of the beam [rad]: the narrowest, which cells must resolve, and the widest.
+        self.angular_spread, self.widest_angular_spread = min(self.profile.spreads), max(self.profile.spreads)
         if "pulse_file" in props:
             self.pulse = Pulse.from_file(props["pulse_file"])
         else:
@@ -88,30 +94,10 @@ class LidarTransmitter(EmitterWithoutExtent):
         self.m_needs_sample_2 = False
         self.m_flags = mi.EmitterFlags.DeltaPosition.value
 
-    @property
-    def energy(self) -> float:
-        """Energy that leaves the optics [J]."""
-        return self.pulse_energy * self.optical_efficiency
-
-    @property
-    def divergence(self) -> float:
-        """Full angle of the beam [rad] as in ``divergence_mrad``; of an image twice its widest rms angle."""
-        return self.profile.divergence[0]
-
-    @property
-    def angular_spread(self) -> float:
-        """Root-mean-square angle of the beam along its narrowest axis [rad], for cells that must resolve the beam."""
-        return min(self.profile.spreads)
-
-    @property
-    def widest_angular_spread(self) -> float:
-        """Root-mean-square angle of the beam along its widest axis [rad], for regions that must cover the beam."""
-        return max(self.profile.spreads)
-
     def intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Return the radiant intensity [J/sr] in a unit direction of the world."""
         angle_x, angle_y, cos_axis = self.pose.tangent(direction)
-        # d(omega) = cos^3 dg: the tangent-plane density is divided by that.
+        # d(omega) = cos^3 d(angle_x) d(angle_y).
         density = self.tangent_density(angle_x, angle_y) / (cos_axis * cos_axis * cos_axis)
         return dr.select(cos_axis > 0, self.energy * density, 0)
 

@@ -70,7 +70,7 @@ class MultipixelReceiver(ReceiverSensor):
     circular field of view cuts the shrunk cells as a field stop does.
 
     Blur distributes light from the direction (angle_x, angle_y) around that place on the detector by the point-spread
-    function, the same one all over the field of view. Light beside the pixels is lost.
+    function, the same one all over the field of view. Light between pixels is lost.
 
     .. code-block:: xml
 

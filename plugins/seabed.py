@@ -30,7 +30,7 @@ _FEWEST_CELLS_PER_RIPPLE = 4.0
 #: Side of the fine square without height map and patches [m].
 _DEFAULT_SIZE = 20.0
 
-#: Name of the mesh attribute that holds the reflectance.
+#: Mesh attribute of the reflectance.
 REFLECTANCE = "vertex_reflectance"
 
 Get = Callable[[str, Any], Any]

@@ -36,7 +36,7 @@ class PathClasses:
         return 2 * (self.orders + 1) if self.separate else 1
 
     def pack(self, label: mi.UInt32, scatterings: mi.UInt32, reversals: mi.UInt32) -> mi.UInt32:
-        """Return a label that also holds numbers of scattering events and reversals."""
+        """Return a label packed with numbers of scattering events and reversals."""
         if not self.separate:
             return label
         return label | _packed(scatterings, _PIXEL_BITS) | _packed(reversals, _PIXEL_BITS + _ORDER_BITS)

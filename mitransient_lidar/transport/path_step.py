@@ -20,7 +20,7 @@ class Vertex:
     Attributes
     ----------
     si
-        What the ray meets, valid or not.
+        Intersection of the ray, valid or not.
     reach
         Distance to the surface or to the boundary of index layers, whichever is nearer [m].
     length
@@ -30,7 +30,7 @@ class Vertex:
     at_boundary
         Whether it ends at a boundary of index layers.
     outside
-        Whether it enters the water outside the surface mesh.
+        Whether it ends where it enters the water outside the surface mesh.
     in_water
         Whether the segment lies in water.
     at_sea, on_solid

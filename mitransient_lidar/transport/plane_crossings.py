@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
-
-FloatArray = NDArray[np.float64]
 
 #: Paths end after this multiple of the distance to the deepest plane, or when absorption leaves this share of light.
 _LONGEST_WAY, _SMALLEST_REST = 50.0, 1e-6
@@ -39,7 +38,7 @@ class CrossingPath(RandomWalkPath):
     submerged
         Whether its last segment lies in water.
     passed
-        Number of planes at or above it, kept because rounding could lose or repeat a crossing if it were computed anew.
+        Number of planes at or above it, stored because rounding could lose or repeat crossings if it were recomputed.
     """
 
     entry: mi.Point3f
@@ -82,7 +81,7 @@ class PlaneCrossings:
     scatterings
         Number of scattering events before.
     shift_x, shift_y
-        Horizontal distance from where it would cross the plane without scattering since it entered the water [m].
+        Horizontal distance from its crossing without scattering in the water [m].
     delay
         Delay against that crossing [s].
     """
@@ -204,8 +203,8 @@ class Crossings:
             ux, uy = ratio * direction[:, 0], ratio * direction[:, 1]
             # The ray of the top index layer also reaches planes above the trough of a wave.
             drop = np.minimum(depth, bottom) - top
-            way = np.where(bottom == edges[0], drop, np.maximum(drop, 0)) / np.sqrt(1 - ux**2 - uy**2)
-            x, y, length = x + way * ux, y + way * uy, length + way * group
+            distance = np.where(bottom == edges[0], drop, np.maximum(drop, 0)) / np.sqrt(1 - ux**2 - uy**2)
+            x, y, length = x + distance * ux, y + distance * uy, length + distance * group
             top = np.full_like(top, bottom)
         return x, y, length
 

@@ -47,10 +47,7 @@ class Pose:
         aim_x, aim_y
             Point where the axis meets the mean sea level [m].
 
-        Raises
-        ------
-        UserError
-            When a value is out of range.
+        Values out of range raise UserError.
         """
         altitude = positive("altitude", altitude)
         angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9))
@@ -101,7 +98,7 @@ class Pose:
         return float(np.degrees(np.arccos(np.clip(-self.axis[2], -1, 1))))
 
     def ground_point(self) -> NDArray[np.float64]:
-        """Return where the axis meets the mean sea level z = 0 [m]; a distant point if it does not look down."""
+        """Return where the axis meets the mean sea level z = 0 [m]; a distant point if it does not point down."""
         slope = min(float(self.axis[2]), -1e-6)
         return self.origin + self.axis * (-float(self.origin[2]) / slope)
 

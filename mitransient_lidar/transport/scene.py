@@ -33,7 +33,7 @@ class WaterScene:
     water
         The ``layered_water``, or None in a scene without water.
     surfaces
-        Shapes that have the water as interior medium.
+        Shapes that bound the water, with it as interior medium.
     slope_variance
         Total slope variance of the sea, for the sampling of surface connections.
     """
@@ -82,11 +82,11 @@ class WaterScene:
         return self.water.index_layers if self.water is not None else None
 
     def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
-        """Return what rays meet first."""
+        """Return the first intersections of rays."""
         return self.mitsuba_scene.ray_intersect(ray, active)
 
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
-        """Return whether rays meet anything."""
+        """Return whether rays are blocked."""
         return self.mitsuba_scene.ray_test(ray, active)
 
     def outside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
@@ -141,13 +141,10 @@ class LidarScene(WaterScene):
                 f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
                 "allowed is exactly one lidar_transmitter, besides sun and sky"
             )
-        water, surfaces = find_water(scene)
+        water, surfaces, variance = find_water(scene)
         if receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
             raise UserError("altitude: transmitter and receiver must be above the mean sea level z = 0")
         _check_cells(surfaces, transmitters[0])
-        if water is not None:
-            check_layers(scene, surfaces, water)
-        variance = largest_slope_variance(surfaces)
         return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
 
 
@@ -159,8 +156,10 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
     return receiver
 
 
-def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape]]:
-    """Return the water of a scene, None without any, and the shapes that have it as interior medium.
+def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape], float]:
+    """Return water, surfaces and slope variance of a scene, see `WaterScene`.
+
+    The slope variance is that of the roughest surface, or a typical one without ``ocean_surface``.
 
     Raises
     ------
@@ -185,18 +184,15 @@ def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape]]:
             raise UserError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
     if len(waters) > 1:
         raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
-    return (waters[0] if waters else None), surfaces
+    for water in waters:
+        _check_layers(scene, surfaces, water)
+    variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
+    return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
 
 
 def _solids(scene: mi.Scene, surfaces: list[mi.Shape]) -> list[mi.Shape]:
     """Return the shapes that are not among the surfaces of the water."""
     return [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
-
-
-def largest_slope_variance(surfaces: list[mi.Shape]) -> float:
-    """Return the total slope variance of the roughest surface, or a typical one without ``ocean_surface``."""
-    variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
-    return float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
 
 
 def _check_cells(surfaces: list[mi.Shape], transmitter: Any) -> None:
@@ -212,7 +208,7 @@ def _check_cells(surfaces: list[mi.Shape], transmitter: Any) -> None:
             )
 
 
-def check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Any) -> None:
+def _check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Any) -> None:
     """Refuse water layers below all solids, and index layers that begin within the waves."""
     lowest = min((float(solid.bbox().min.z) for solid in _solids(scene, surfaces)), default=-np.inf)
     deepest = float(water.column.layer_tops[-1])

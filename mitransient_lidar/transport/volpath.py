@@ -48,7 +48,7 @@ class VolpathOptions:
 
 
 class PathLight:
-    """Light to which the vertices of paths are connected, and the record of what arrives.
+    """Light to which the vertices of paths are connected, and its record.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class PathTracer:
     """Traces paths from the receiver and connects their vertices to a light.
 
     Each vertex under water samples a direction in which the emitter may appear through the surface, and traces it to
-    the real surface, where it is connected; where the path itself reaches the surface unscattered it is connected, too.
+    the real surface, where it is connected; so is the path itself where it reaches the surface unscattered.
     Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
     doi:10.1145/218380.218498).
     """
@@ -196,7 +196,7 @@ class PathTracer:
         above = scene.ray_intersect(top.ray, sampled)
         arrives = sampled & (top.factor > 0)
         met = arrives & above.is_valid() & scene.is_surface(above.shape)
-        # Beyond the end of the surface mesh a flat sea takes its place, to estimate the loss.
+        # Beyond the end of the surface mesh a flat sea replaces it, to estimate the loss.
         lost = arrives & ~above.is_valid() & (top.ray.d.z > 0)
         distance = dr.select(lost, dr.maximum(-top.ray.o.z, 0) / top.ray.d.z, above.t)
         crossed = top.optical_depth + self._optical_depth(top.ray.o, top.ray.d, distance, met | lost)
@@ -291,7 +291,7 @@ class PathTracer:
         specular = vertex.on_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         passes = ~mixed & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if self.options.complement_only:
-            # Merging also finds what follows, unless a mirror or a solid in the air can still come in between.
+            # Merging also finds the rest of the path, unless it can meet a mirror or a solid in the air first.
             path.active &= ~(path.before_first_solid & vertex.on_solid & ~passes & submerged & ~specular)
             if not self.scene.has_specular_or_dry_solids:
                 path.active &= ~(path.before_first_solid & vertex.scattered)

@@ -1,1 +1,1 @@
-"""Phase functions of water and of what floats in it."""
+"""Phase-function plugins of water and particles."""

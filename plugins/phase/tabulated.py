@@ -20,7 +20,7 @@ class TabulatedPhaseFunction(mi.PhaseFunction):
     def eval_pdf(
         self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Return the phase function [1/sr] of a direction, which is its density, too."""
+        """Return the phase function [1/sr] of a direction, as value and density."""
         return NumberedPhase(self.tabulated, mi.UInt32(0)).eval_pdf(ctx, mei, wo, active)
 
     def sample(

@@ -50,7 +50,7 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
     def eval_pdf(
         self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Return the phase function [1/sr] of a direction, which is its density, too."""
+        """Return the phase function [1/sr] of a direction, as value and density."""
         value = self._value(dr.dot(-mei.wi, wo))
         return mi.Spectrum(value), value
 

@@ -9,13 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.scene import (
-    WaterScene,
-    check_layers,
-    find_receiver,
-    find_water,
-    largest_slope_variance,
-)
+from mitransient_lidar.transport.scene import WaterScene, find_receiver, find_water
 
 #: Largest angle between the sun and the sun of a clear sky [deg].
 _SAME_DIRECTION_DEG = 0.05
@@ -58,12 +52,9 @@ class DaylightScene(WaterScene):
         sun, sky = found.get("sun"), found.get("sky")
         if sun is not None and sky is not None and sky.distribution == "clear":
             _check_sun(sun, sky)
-        water, surfaces = find_water(scene)
         if receiver.pose.origin[2] <= 0:
             raise UserError("altitude: the receiver must be above the mean sea level z = 0")
-        if water is not None:
-            check_layers(scene, surfaces, water)
-        return cls(scene, receiver, water, surfaces, largest_slope_variance(surfaces), sun, sky)
+        return cls(scene, receiver, *find_water(scene), sun, sky)
 
     def sky_radiance(self, direction: mi.Vector3f) -> mi.Float:
         """Return the radiance of the sky in a direction [W m^-2 sr^-1 nm^-1]; 0 below the horizon."""

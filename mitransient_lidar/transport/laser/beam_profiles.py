@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 import contourpy
 import drjit as dr
@@ -36,7 +35,7 @@ class BeamProfile(ABC):
     rotation
         Azimuth of the first of these axes, from +angle_x towards +angle_y [rad].
     divergence
-        Full angles along these axes as the transmitter's manual defines them [rad].
+        Full angles along these axes [rad], as defined for the parameter ``divergence_mrad`` of the transmitter.
     """
 
     spreads: tuple[float, float]
@@ -56,27 +55,23 @@ class BeamProfile(ABC):
         """Return contours: share of the peak irradiance, and closed lines (angle_x, angle_y) [rad], shape (n, 2)."""
 
 
-@dataclass(frozen=True)
 class _Ellipse(BeamProfile):
-    """Elliptic beam of positive half angles [rad] along the first and across to the second axis."""
+    """Elliptic beam of positive half angles [rad] along its first and its second axis."""
 
-    along: float
-    across: float
-    rotation: float = 0.0
+    #: Root-mean-square angles over the half angles.
+    _SPREAD: float
 
-    @property
-    def divergence(self) -> tuple[float, float]:  # type: ignore[override]
-        """Full angles along and across [rad]."""
-        return 2 * self.along, 2 * self.across
-
-    @property
-    def _ratio(self) -> float:
-        return self.across / self.along
+    def __init__(self, along: float, across: float, rotation: float = 0.0) -> None:
+        self.along, self.rotation = along, rotation
+        self.divergence = 2 * along, 2 * across
+        self.spreads = self._SPREAD * along, self._SPREAD * across
+        self._ratio = across / along
+        self._sin, self._cos = float(np.sin(rotation)), float(np.cos(rotation))
 
     def _to_circle(self, angle_x: mi.Float, angle_y: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Map (angle_x, angle_y) to a circular beam of half angle `along`."""
         if self.rotation != 0:
-            sin, cos = float(np.sin(self.rotation)), float(np.cos(self.rotation))
+            sin, cos = self._sin, self._cos
             angle_x, angle_y = cos * angle_x + sin * angle_y, cos * angle_y - sin * angle_x
         return angle_x, angle_y / self._ratio
 
@@ -85,8 +80,7 @@ class _Ellipse(BeamProfile):
         y = y * self._ratio
         if self.rotation == 0:
             return x, y
-        sin, cos = float(np.sin(self.rotation)), float(np.cos(self.rotation))
-        return cos * x - sin * y, sin * x + cos * y
+        return self._cos * x - self._sin * y, self._sin * x + self._cos * y
 
     def _rim(self, scale: float) -> Outline:
         azimuth = np.linspace(0, 2 * np.pi, 97)
@@ -97,10 +91,7 @@ class _Ellipse(BeamProfile):
 class GaussianBeam(_Ellipse):
     """Gaussian beam: the half angles are standard deviations."""
 
-    @property
-    def spreads(self) -> tuple[float, float]:  # type: ignore[override]
-        """Root-mean-square angles [rad]: the standard deviations."""
-        return self.along, self.across
+    _SPREAD = 1.0
 
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
@@ -120,12 +111,9 @@ class GaussianBeam(_Ellipse):
 
 
 class TopHatBeam(_Ellipse):
-    """Beam of even irradiance within an ellipse: the half angles are its semi-axes."""
+    """Beam of uniform irradiance within an ellipse: the half angles are its semi-axes."""
 
-    @property
-    def spreads(self) -> tuple[float, float]:  # type: ignore[override]
-        """Root-mean-square angles [rad]: half the semi-axes."""
-        return self.along / 2, self.across / 2
+    _SPREAD = 0.5
 
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
@@ -145,7 +133,7 @@ class TopHatBeam(_Ellipse):
 
 
 class ImageBeam(BeamProfile):
-    """Measured beam: even irradiance within each cell of an image that is centred on the optical axis.
+    """Measured beam: uniform irradiance within each cell of an image that is centred on the optical axis.
 
     Parameters
     ----------

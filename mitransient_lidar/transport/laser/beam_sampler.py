@@ -11,7 +11,7 @@ from mitransient_lidar.transport.rng import stratified_point, unit_points
 from mitransient_lidar.transport.sensor.fov_shapes import Sector
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
-#: The field of view is sampled separately when it holds less than this share of the beam.
+#: The field of view is sampled separately when it contains less than this share of the beam.
 _SMALLEST_SHARE = 0.5
 
 #: Diameter of the sampled region over the field of view, as light around it scatters into it.

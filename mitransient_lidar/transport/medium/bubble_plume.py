@@ -58,7 +58,7 @@ class BubblePlume:
         return -(cos * vector.x + sin * vector.y), cos * vector.y - sin * vector.x
 
     def holds(self, point: mi.Point3f) -> mi.Bool:
-        """Return whether a point lies in the plume."""
+        """Return whether a point is in the plume."""
         astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
         return (astern >= 0) & (astern <= self.length) & (dr.abs(across) <= self.width / 2) & (point.z >= -self.depth)
 
@@ -67,7 +67,7 @@ class BubblePlume:
         return dr.select(self.holds(point), mi.Float(self.scattering), 0)
 
     def crossing(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-        """Return where a ray enters and leaves the plume [m]; where it misses, it leaves before it enters."""
+        """Return the distances at which a ray enters and leaves the plume [m], in reverse order where it misses."""
         near, far = mi.Float(0), mi.Float(dr.inf)
         astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
         along_astern, along_across = self._frame(direction)

@@ -16,16 +16,16 @@ _SMALLEST_EXPONENT = 1e-3
 #: s = sin^2(theta/2) of 2e-7 rad, below which float32 directions are the same.
 _SMALLEST_S = 1e-14
 
-#: Spacing of the nodes in ln s, change of ln p from node to node, and first node, up to which a series takes the place
-#: of logarithm and exponential and the cap below the first node (2 microradian) is even: both are exact to float32.
+#: Largest spacing of the nodes in ln s, change of ln p between nodes, and first node for which a series replaces
+#: logarithm and exponential and the cap below the first node (2 microradian) is uniform: both are exact to float32.
 _SHORT_STEP, _SMALL_CHANGE, _SMALL_CAP = 0.02, 0.2, 1.1e-12
 
 
 class TabulatedPhase:
     """Evaluates and samples phase functions given as power laws in s = sin^2(theta/2).
 
-    A segment is picked by Walker's alias method (two look-ups, whatever the size of the table), and s within it by the
-    inverse of its power law, so that samples keep their accuracy in the forward peak.
+    A segment is drawn by Walker's alias method (two look-ups for any size of the table), and s within it by the inverse
+    of its power law, so that samples are accurate in the forward peak.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class TabulatedPhase:
         self._nodes = self.table.count
         self._short = all(_is_short(table) for table in tables)
         records = [_records(table, self._short) for table in tables]
-        # Of each cell: threshold and alias, the power law as sampled, and as evaluated. Packets are read at once.
+        # For each cell: threshold and alias, the power law for sampling, and for evaluation.
         self._choice, self._law, self._value = (
             mi.Float(np.concatenate([record[i] for record in records]).ravel()) for i in range(3)
         )
@@ -84,7 +84,7 @@ class NumberedPhase:
     def eval_pdf(
         self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Return the phase function [1/sr] of a direction, which is its density, too."""
+        """Return the phase function [1/sr] of a direction, as value and density."""
         value = self.functions.eval(half_angle(-mei.wi, wo), self.number)
         return mi.Spectrum(value), value
 

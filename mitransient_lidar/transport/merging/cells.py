@@ -1,4 +1,4 @@
-"""Cells of water in which light from the laser meets paths from the receiver."""
+"""Cells of water in which light from the laser is merged with paths from the receiver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Patches of solids on which light from the laser meets paths from the receiver."""
+"""Patches of solids on which light from the laser is merged with paths from the receiver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light from the laser, stored where it may meet paths from the receiver."""
+"""Light from the laser, stored by cell or patch."""
 
 from __future__ import annotations
 

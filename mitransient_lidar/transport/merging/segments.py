@@ -76,7 +76,7 @@ class SegmentBuffer:
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
 
     def finalize(self) -> tuple[int, int]:
-        """Finalize; return the number of points and the number of segments, stored or not."""
+        """Assign numbers to the points; return their number and that of the segments, stored or not."""
         dr.eval(self._stored, self._number, self._label, self._start, self._direction, self._weight)
         self._end = dr.cumsum(self._number)
         count = int(self._end[self.capacity - 1])

@@ -65,7 +65,7 @@ class HexPixels(PixelArray):
         across = dr.select(of_centre, u.x * count, (part - third) * rings)
         along = dr.select(of_centre, u.y, u.y * (rings + 1))
         a, b = dr.floor(across), dr.floor(along)
-        # The rhombic cell of the lattice holds the same points as the hexagon, moved by lattice vectors.
+        # The rhombic cell of the lattice has the same points as the hexagon, moved by lattice vectors.
         column, row = across - a, along - b
         near_column, near_row = _round(column, row)
         angle_x, angle_y = self._position(column - near_column, row - near_row)
@@ -78,7 +78,7 @@ class HexPixels(PixelArray):
         return dr.fma(angle_x, self._shrink, x), dr.fma(angle_y, self._shrink, y)
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """Return the pixel at a point and whether a hexagon holds it (1 or 0)."""
+        """Return the pixel at a point and whether a hexagon contains it (1 or 0)."""
         rings = self._rings
         row = angle_x / (1.5 * self._side)
         column, row = _round(angle_y / (_ROOT3 * self._side) - 0.5 * row, row)
@@ -115,7 +115,7 @@ def hexagon_count(layout: str) -> int:
     count = int(match.group(1)) if match else 0
     root = math.isqrt(max(12 * count - 3, 0))
     if root * root != 12 * count - 3:
-        raise UserError(f"layout = {layout!r} must have 1, 7, 19, 37, 61, ... hexagons, a centre and whole rings")
+        raise UserError(f"layout = {layout!r} must have 1, 7, 19, 37, 61, ... hexagons, a centre and complete rings")
     if count > MOST_PIXELS:
         raise UserError(f"layout = {layout!r} has {count} pixels; allowed are at most {MOST_PIXELS}")
     return count

@@ -36,7 +36,7 @@ def read_image(name: str, path: str) -> NDArray[np.float64]:
         is_array = Path(path).suffix.lower() == ".npy"
         values = np.load(path, allow_pickle=False) if is_array else np.array(mi.Bitmap(path))
     except (RuntimeError, ValueError, EOFError, OSError) as error:
-        raise UserError(f"{where} cannot be read: it is damaged, or not what its name says") from error
+        raise UserError(f"{where} cannot be read: it is damaged, or of another format than its name") from error
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
         raise UserError(f"{where} must hold real numbers")
     if values.ndim == 3 and values.shape[2] == 1:

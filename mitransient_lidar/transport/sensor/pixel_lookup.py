@@ -1,4 +1,4 @@
-"""Lookup of the pixels that hold a point."""
+"""Lookup of the pixels that contain a point."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FovLookup:
         self.neighbours: NDArray[np.int64] = np.argwhere(np.triu(shared, 1) > 0)
 
     def find(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return one of the fields that hold a point, chosen with the uniform number `u`, and how many hold it."""
+        """Return one of the fields that contain a point, chosen by the uniform number `u`, and how many do."""
         i, j = (
             mi.UInt32(dr.clip((g - low) * scale, 0, self._side - 1))
             for g, low, scale in zip((angle_x, angle_y), self._low, self._per_radian, strict=True)
@@ -55,7 +55,7 @@ class FovLookup:
     def _holder(
         self, angle_x: mi.Float, angle_y: mi.Float, first: mi.UInt32, end: mi.UInt32, wanted: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return field number `wanted` of those in a part of the list that hold a point, and how many do."""
+        """Return field number `wanted` of those in a part of the list that contain a point, and how many do."""
 
         def step(index: mi.UInt32, chosen: mi.UInt32, count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
             field = dr.gather(mi.UInt32, self._fields, index)

@@ -50,7 +50,7 @@ class MappedPixels(PixelArray):
         values = read_image("pixel_map", path)
         where = f"pixel_map = {path!r}"
         if (values != np.round(values)).any() or values.min() < 0 or values.max() > _LARGEST_LABEL:
-            raise UserError(f"{where} must hold labels that are whole numbers from 0 to {_LARGEST_LABEL}")
+            raise UserError(f"{where} must hold labels that are integers from 0 to {_LARGEST_LABEL}")
         if not values.any():
             raise UserError(f"{where} must have a label other than 0, which is no pixel")
         labels = values.astype(np.int64)

@@ -49,7 +49,7 @@ class PixelArray(ABC):
     area
         Area in which `sample` is uniform, counted once a pixel where pixels overlap [rad^2].
     field_of_view
-        Full angle that holds all pixels [rad]: diameter or side about the axis.
+        Full angle that contains all pixels [rad]: diameter or side about the axis.
     field_of_view_shape
         ``circle``, ``square``, ``rectangle`` or ``nested``.
     """
@@ -72,7 +72,7 @@ class PixelArray(ABC):
 
     @abstractmethod
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """Return the pixel at a point, one of several by the uniform number `u`, and how many hold it (0 outside)."""
+        """Return a pixel at a point, one of several by the uniform number `u`, and how many contain it (0 outside)."""
 
     @abstractmethod
     def centres(self) -> NDArray[np.float64]:
@@ -142,7 +142,7 @@ class LayoutPixels(PixelArray):
         return 0.5 * height - row * (height / self._rows), column * (width / self._columns) - 0.5 * width
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """Return the pixel at a point and whether the field of view holds it (1 or 0)."""
+        """Return the pixel at a point and whether the field of view contains it (1 or 0)."""
         height, width = self.sides
         down = (0.5 * height - angle_x) * (self._rows / height)
         across = (angle_y + 0.5 * width) * (self._columns / width)
@@ -223,7 +223,7 @@ class ShapedPixels(PixelArray):
         return self._sample_in(mi.UInt32(pixel), point)
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-        """Return one pixel at a point and how many pixels hold it."""
+        """Return one pixel at a point and how many pixels contain it."""
         pixel, count = self._lookup.find(angle_x, angle_y, u)
         return pixel, mi.Float(count)
 

@@ -15,7 +15,7 @@ from mitransient_lidar.transport.rng import pass_streams, stratified_point, unit
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 
-#: The laser's footprint is sampled when the field of view holds more than this share of it.
+#: The laser's footprint is sampled when the field of view contains more than this share of it.
 _SMALLEST_FOOTPRINT_SHARE = 0.05
 
 #: Largest blocked share of the aperture.
