@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
@@ -121,3 +122,13 @@ class EmitterWithoutExtent(mi.Emitter):
         ds.time = it.time
         ds.emitter = mi.EmitterPtr(self)
         return ds
+
+
+def fill_mesh(shape: mi.Mesh, mesh: SeaMesh) -> None:
+    """Set the buffers of a new Mitsuba mesh."""
+    buffers = mi.traverse(shape)
+    buffers["vertex_positions"] = mi.Float(mesh.vertices.ravel())
+    buffers["vertex_texcoords"] = mi.Float(mesh.texcoords.ravel())
+    buffers["faces"] = mi.UInt32(mesh.faces.ravel())
+    buffers.update()
+    shape.initialize()

@@ -70,11 +70,8 @@ class LidarMerging(LidarIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        counts = {
-            name: integer(name, props[name], 1024, 2**28)
-            for name in ("paths_per_pass", "photons_per_pass")
-            if name in props
-        }
+        given = [name for name in ("paths_per_pass", "photons_per_pass") if name in props]
+        counts = {name: integer(name, props[name], 1024, 2**28) for name in given}
         lengths = {name: non_negative(name, props.get(name, 0.0)) for name in ("cell_size", "point_spacing")}
         self.options = MergingOptions(**counts, **lengths)
 

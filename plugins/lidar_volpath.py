@@ -14,7 +14,29 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.volpath import CONNECTIONS, VolpathOptions, VolpathRenderer
 
 
-class LidarVolpath(LidarIntegrator):
+class VolpathIntegrator(LidarIntegrator):
+    """Integrator with the options of the path tracer; `guiding_probability` is the default."""
+
+    def __init__(self, props: mi.Properties, guiding_probability: float, complement_only: bool = False) -> None:
+        super().__init__(props)
+        self.paths_per_pass = integer("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
+        connection = props.get("connection", "mis")
+        if connection not in CONNECTIONS:
+            raise UserError(f"connection = {connection!r} must be one of {', '.join(CONNECTIONS)}")
+        self.options = VolpathOptions(
+            integer("max_scatterings", props.get("max_scatterings", -1), -1, 2**30),
+            in_range("roulette_threshold", props.get("roulette_threshold", 0.001), 0.0, 1.0),
+            in_range("guiding_probability", props.get("guiding_probability", guiding_probability), 0.0, 0.99),
+            connection,
+            complement_only,
+        )
+
+    def to_string(self) -> str:
+        """Return a description."""
+        return f"{type(self).__name__}[paths_per_pass={self.paths_per_pass}, connection={self.options.connection}]"
+
+
+class LidarVolpath(VolpathIntegrator):
     r"""Transient volumetric path tracer with surface connection (``lidar_volpath``).
 
     ===================  =======  ======================================================================================
@@ -60,9 +82,7 @@ class LidarVolpath(LidarIntegrator):
     plugin = "lidar_volpath"
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
-        self.paths_per_pass = integer("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
-        self.options = read_options(props, 0.4, bool(props.get("complement_only", False)))
+        super().__init__(props, 0.4, bool(props.get("complement_only", False)))
 
     def prepare(
         self,
@@ -76,24 +96,6 @@ class LidarVolpath(LidarIntegrator):
         """Return the renderer of passes of a scene, as `LidarMerging.prepare`; `layout_of` is not used."""
         lidar = LidarScene.from_scene(scene, sensor, receiver)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"LidarVolpath[paths_per_pass={self.paths_per_pass}, connection={self.options.connection}]"
-
-
-def read_options(props: mi.Properties, guiding_probability: float, complement_only: bool = False) -> VolpathOptions:
-    """Read the options of the path tracer; `guiding_probability` is the default. Raise UserError when out of range."""
-    connection = props.get("connection", "mis")
-    if connection not in CONNECTIONS:
-        raise UserError(f"connection = {connection!r} must be one of {', '.join(CONNECTIONS)}")
-    return VolpathOptions(
-        integer("max_scatterings", props.get("max_scatterings", -1), -1, 2**30),
-        in_range("roulette_threshold", props.get("roulette_threshold", 0.001), 0.0, 1.0),
-        in_range("guiding_probability", props.get("guiding_probability", guiding_probability), 0.0, 0.99),
-        connection,
-        complement_only,
-    )
 
 
 mi.register_integrator("lidar_volpath", lambda props: LidarVolpath(props))

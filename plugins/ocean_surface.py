@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
+from mitransient_lidar.plugins.bases import fill_mesh
 
 
 class OceanSurface(mi.Mesh):
@@ -95,12 +96,7 @@ class OceanSurface(mi.Mesh):
         props["face_normals"] = True
         mesh = self.sea.mesh()
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
-        buffers = mi.traverse(self)
-        buffers["vertex_positions"] = mi.Float(mesh.vertices.ravel())
-        buffers["vertex_texcoords"] = mi.Float(mesh.texcoords.ravel())
-        buffers["faces"] = mi.UInt32(mesh.faces.ravel())
-        buffers.update()
-        self.initialize()
+        fill_mesh(self, mesh)
 
     def to_string(self) -> str:
         """Return a description."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import integer
-from mitransient_lidar.plugins.bases import LidarIntegrator
-from mitransient_lidar.plugins.lidar_volpath import read_options
+from mitransient_lidar.plugins.lidar_volpath import VolpathIntegrator
 from mitransient_lidar.transport.daylight.renderer import DaylightRecord, DaylightRenderer
 from mitransient_lidar.transport.daylight.scene import DaylightScene
 
 
-class PassiveVolpath(LidarIntegrator):
+class PassiveVolpath(VolpathIntegrator):
     r"""Volumetric path tracer for images by daylight (``passive_volpath``).
 
     ===================  =======  ======================================================================================
@@ -53,9 +51,7 @@ class PassiveVolpath(LidarIntegrator):
     passive = True
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
-        self.paths_per_pass = integer("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
-        self.options = read_options(props, 0.1)
+        super().__init__(props, 0.1)
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
         """Return the renderer of passes of a scene; raise UserError when a part is missing or not supported."""
@@ -66,10 +62,6 @@ class PassiveVolpath(LidarIntegrator):
         pixels = sensor.receiver.pixels
         radiance = dr.select(record.sampled > 0, record.found / record.sampled, 0)
         return mi.TensorXf(mi.Float(radiance), shape=pixels.grid or (pixels.count,))
-
-    def to_string(self) -> str:
-        """Return a description."""
-        return f"PassiveVolpath[paths_per_pass={self.paths_per_pass}, connection={self.options.connection}]"
 
 
 mi.register_integrator("passive_volpath", lambda props: PassiveVolpath(props))

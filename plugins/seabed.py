@@ -14,6 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.height_maps import read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
+from mitransient_lidar.plugins.bases import fill_mesh
 
 #: Steepest tilt [deg] and steepest ripples, height over length, so that facets are at most at 45 degrees with either.
 _STEEPEST_TILT, _STEEPEST_RIPPLE = 45.0, 0.3
@@ -38,7 +39,7 @@ Get = Callable[[str, Any], Any]
 
 @dataclass(frozen=True)
 class Patch:
-    """Disc of another reflectance: middle [m], radius [m], reflectance 0 to 1."""
+    """Disc of another reflectance, 0 to 1: centre [m] and radius [m]."""
 
     x: float
     y: float
@@ -255,12 +256,7 @@ class Seabed(mi.Mesh):
         mesh = triangulate(self.bottom.heights(x, y), x, y, 0.0)
         super().__init__("seabed", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         self.add_attribute(REFLECTANCE, 1, self.bottom.reflectances(x, y).ravel().tolist())
-        buffers = mi.traverse(self)
-        buffers["vertex_positions"] = mi.Float(mesh.vertices.ravel())
-        buffers["vertex_texcoords"] = mi.Float(mesh.texcoords.ravel())
-        buffers["faces"] = mi.UInt32(mesh.faces.ravel())
-        buffers.update()
-        self.initialize()
+        fill_mesh(self, mesh)
 
     def to_string(self) -> str:
         """Return a description."""

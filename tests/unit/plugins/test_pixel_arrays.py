@@ -154,8 +154,8 @@ def refused(plugin):
 MAPS = [
     (np.zeros((4, 4), np.uint8), "map.png", "must have a label other than 0"),
     (np.array([[0.5, 1]]), "map.npy", "must hold labels that are integers from 0 to 16777216"),
-    (np.array([[-1, 1]]), "map.npy", "must hold labels that are whole numbers"),
-    (np.array([[1, 2**25]]), "map.npy", "must hold labels that are whole numbers"),
+    (np.array([[-1, 1]]), "map.npy", "must hold labels that are integers"),
+    (np.array([[1, 2**25]]), "map.npy", "must hold labels that are integers"),
     (np.array([[np.nan, 1]]), "map.npy", "must hold finite numbers"),
     (np.ones((2, 3, 4)), "map.npy", "has the shape (2, 3, 4): it must have rows and columns"),
     (np.ones(3), "map.npy", "has the shape (3,)"),
