@@ -1,1 +1,1 @@
-"""Mitsuba plugins of the lidar simulator, one a file; run again for every variant that is set."""
+"""Mitsuba plugins of the lidar simulator, one a file, executed again for every variant that is set."""

@@ -30,7 +30,7 @@ class LidarMerging(LidarIntegrator):
                                to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
     ================  =======  =========================================================================================
 
-    Nearly every echo goes down, is reversed once, and comes up; both parts are easy to sample from their own ends.
+    Nearly every echo has one vertical reversal, and both parts of its path are easy to sample from their own ends.
     Light is traced from the laser and paths from the receiver, both through waves and ripples into the water, with
     scattering of any order, and points are placed at equal distances along both. Where a point of a light path and one
     of a receiver's path lie in the same small cell, they are merged into a complete path, with the phase function

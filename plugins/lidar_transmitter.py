@@ -43,8 +43,8 @@ class LidarTransmitter(EmitterWithoutExtent):
     ellipse_deg             float      Azimuth of the ellipse's axis of ``divergence_mrad``, from +angle_x (far) towards
                                        +angle_y [deg]. Default: 0
     profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
-                                       image. Row 0 is the far edge (+angle_x), column 0 the -angle_y edge, the middle
-                                       the axis
+                                       image about the axis. Row 0 is the far edge (+angle_x), column 0 the -angle_y
+                                       edge
     profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
                                        positive; its cells are squares
     wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; recorded in results. Default: 532

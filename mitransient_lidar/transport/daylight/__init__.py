@@ -1,1 +1,1 @@
-"""Daylight: sun and sky, the radiance that each pixel sees, and how it is sampled."""
+"""Daylight: sun and sky, sampling of the field of view, and the radiance of each pixel."""

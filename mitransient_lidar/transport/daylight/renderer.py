@@ -1,4 +1,4 @@
-"""Passes of daylight: the radiance that each pixel sees."""
+"""Passes of daylight, for the radiance of each pixel."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ class SensorSample:
 
 
 class SensorSampler:
-    """Samples the receiver's view, half of the paths over the field of view and half over the laser's footprint.
+    """Samples the receiver's rays, half of the paths over the field of view and half over the laser's footprint.
 
     Both halves are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
 

@@ -1,4 +1,4 @@
-"""What all integrators have in common: scenes as they are now, no derivatives, nothing kept."""
+"""All integrators: changes of loaded scenes, refused derivatives, and release of scenes from memory."""
 
 import gc
 
@@ -48,7 +48,7 @@ def test_derivatives_are_refused(lidar_scene, name):
 
 
 def living():
-    """Return the number of laid-out scenes in memory."""
+    """Return the number of prepared scenes in memory."""
     gc.collect()
     return sum(isinstance(one, LidarScene | DaylightScene) for one in gc.get_objects())
 

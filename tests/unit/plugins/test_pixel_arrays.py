@@ -1,4 +1,4 @@
-"""Hexagons, pixel maps, gaps and nested pixels in a receiver: what they sum to, and what one has to do with another."""
+"""Hexagons, pixel maps, gaps and nested pixels: sums over pixels, overlaps and errors."""
 
 import dataclasses
 import re
@@ -21,7 +21,7 @@ def polygon(corners, **more):
 
 
 def assert_alike(first, second):
-    """Means over independent passes agree within their errors, of all bins together (Sidak), and are known well."""
+    """Assert that means over independent passes agree in all bins (Sidak), with small errors."""
     (a, b), count = (first, second), len(first)
     error = np.hypot(a.std(axis=0, ddof=1), b.std(axis=0, ddof=1)) / np.sqrt(count)
     total = np.abs(a.mean(axis=0).sum())
@@ -48,7 +48,7 @@ def png(tmp_path):
 
 
 class OnePixel:
-    """The pixels of an array taken for one."""
+    """The pixels of an array as a single pixel."""
 
     def __init__(self, pixels):
         self._pixels, self.names, self.grid = pixels, ["single"], None
@@ -63,7 +63,7 @@ class OnePixel:
     "receiver", [{"layout": "hex37"}, {"layout": "hex7", "fill_factor": 0.5}, {"layout": "3x5", "fill_factor": 0.5}]
 )
 def test_pixels_of_a_layout_share_its_light_without_loss(receiver, lidar_scene, passes):
-    """The same paths, told apart or not: the same sum to the last bit."""
+    """The sum over pixels has the same bits as a single pixel of the same paths."""
     scene = lidar_scene(rx={**receiver, "blur_mrad": 1.0}, **BRIGHT)
     apart = passes(scene, 2)
     sensor = scene.sensors()[0]
@@ -96,7 +96,7 @@ def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
     angles = np.radians(60 * np.arange(6))
     corners = []
     for a in angles + np.radians(30):
-        # The outer hexagon in this direction has its corners 3 to 5 away from the middle, one of them shared.
+        # The outer hexagon in this direction has its corners 3 to 5 away from the centre, one of them shared.
         centre = np.sqrt(3) * side * np.array([np.cos(a), np.sin(a)])
         for turn in (-90, -30, 30):
             corners.append(centre + side * np.array([np.cos(a + np.radians(turn)), np.sin(a + np.radians(turn))]))
@@ -108,7 +108,7 @@ def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
 
 
 def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
-    """With gaps, out of the middle: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
+    """With gaps, away from the centre: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
     layout = lidar_scene(rx={**SQUARE, "layout": "4x3", "fill_factor": 0.64}, **MERGING)
     centre, half = (2.5, 20 / 3), (2.0, 0.4 * 20 / 3)
     corners = [(centre[0] + i * half[0], centre[1] + j * half[1]) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -119,7 +119,7 @@ def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
 
 
 def test_a_nested_pixel_sees_the_same_alone_and_among_others(lidar_scene, passes):
-    """Others overlap it, hold it, or lie far away."""
+    """Others overlap it, contain it, or are far away."""
     ring = {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 16.0, "inner_mrad": 8.0, "pixel_name": "ring"}
     others = {
         "a": {"type": "pixel_fov", "field_of_view_mrad": 30.0, "pixel_name": "all"},

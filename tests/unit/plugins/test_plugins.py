@@ -1,4 +1,4 @@
-"""Plugins: what their constructors refuse, what their manuals promise, and how they work with Mitsuba's own parts."""
+"""Plugins: errors of their constructors, examples of their manual pages, and use with Mitsuba's own plugins."""
 
 import ast
 import importlib
@@ -71,7 +71,7 @@ REFUSED = [
     ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 1 1, 2 2"}, "lie on one line"),
     ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 3, 4 0, 0 2"}, "must not cross each other"),
     ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 4, 4 0, 0 4"}, "must not cross each other"),
-    # A tooth that runs back, a spike, a repeated corner, corners on an edge and at a corner, and an edge along another.
+    # An edge that reverses, a spike, a repeated corner, corners on an edge and at a corner, and overlapping edges.
     ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 6 2, 3 1, 0 4"}, "nor touch or overlap"),
     ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 3 1, 6 2, 3 1, 0 4"}, "nor touch or overlap"),
     ({"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "0 0, 4 0, 4 0, 0 4"}, "nor touch or overlap"),
@@ -177,7 +177,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("plugin", "message"), REFUSED)
-def test_what_plugins_refuse_is_told_in_one_sentence(plugin, message):
+def test_invalid_parameters_are_named_in_one_sentence(plugin, message):
     with pytest.raises(UserError, match=re.escape(message)) as caught, scenes.as_user_error():
         mi.load_dict(plugin)
     assert "\n" not in str(caught.value)
@@ -209,7 +209,7 @@ def test_defaults_are_the_published_system():
 
 
 def test_look_at_agrees_with_altitude_and_angle():
-    """Local x of Mitsuba's look_at is +angle_y, local y is +angle_x: mixed up, far and left pixels would be swapped."""
+    """Local x of Mitsuba's look_at is +angle_y, local y is +angle_x: exchanged, far and left pixels would swap."""
     place = [-200 * np.tan(np.radians(20)), 0, 200]
     to_world = mi.ScalarTransform4f().look_at(origin=place, target=[0, 0, 0], up=[0, 0, 1])
     poses = [mi.load_dict({"type": "lidar_transmitter", **p}).pose for p in ({}, {"to_world": to_world})]
@@ -292,7 +292,7 @@ def test_no_wind_is_a_flat_sea():
 
 
 def test_other_integrators_see_the_layers():
-    """Mitsuba's volumetric path tracers ask for coefficients with a null part up to the largest attenuation."""
+    """Mitsuba's volumetric path tracers use null collisions up to the largest attenuation."""
     water = mi.load_dict(
         {"type": "layered_water", "layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.6, 0.2"}
     )

@@ -1,4 +1,4 @@
-"""Poses, views, film and transmitter as Mitsuba plugins: axes, solid angles, and who owns an edge."""
+"""Poses, fields of view, film and transmitter as Mitsuba plugins: axes, solid angles, and points on edges."""
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +22,7 @@ def uniform_pair(count=COUNT, seed=1):
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 75.0])
 def test_gx_points_away_from_nadir_and_gy_along_y(angle):
-    """With angle_x towards nadir the far pixels would hear the echo first."""
+    """With angle_x towards nadir the echo would arrive in the far pixels first."""
     pose = Pose.from_angles(200.0, angle, 3.0, -2.0)
     frame = np.stack([pose.left, pose.far, pose.axis])
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-15)
@@ -42,7 +42,7 @@ def test_direction_and_tangent_are_inverse():
     np.testing.assert_allclose(np.array(x), angle_x, atol=2e-6)
     np.testing.assert_allclose(np.array(y), angle_y, atol=2e-6)
     np.testing.assert_allclose(np.array(cosine), 1 / np.sqrt(1 + angle_x**2 + angle_y**2), rtol=1e-6)
-    # Behind the tangent plane the cosine tells, though the projected point looks like any other.
+    # Behind the tangent plane the cosine is negative, and the projected point is finite.
     assert float(pose.tangent(mi.Vector3f((-pose.axis).tolist()))[2][0]) == pytest.approx(-1)
 
 
@@ -88,7 +88,7 @@ def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, so
 
 
 def test_view_counts_every_overlapping_pixel_in_full():
-    """Two concentric circles: were the light shared between them, the small one would get half."""
+    """Two concentric circles: light shared between them would halve the small one."""
     fields = {"wide": 30.0, "narrow": 10.0}
     nested = {
         name: {"type": "pixel_fov", "field_of_view_mrad": width, "pixel_name": name} for name, width in fields.items()
@@ -135,7 +135,7 @@ def test_stratified_points_are_uniform_in_their_strata():
 
 
 def test_imager_rows_go_from_far_to_near_and_columns_from_right_to_left(lidar_scene, passes):
-    """A beam aimed 1.5 m towards +y, as seen 200 m away, lights the columns of +angle_y; near rows hear it first."""
+    """A beam aimed 1.5 m towards +y, as seen 200 m away, lights the columns of +angle_y, near rows first."""
     scene = lidar_scene(
         tx={"aim_y": 1.5},
         rx={"layout": "4x6", "field_of_view_shape": "square"},

@@ -1,4 +1,4 @@
-"""The bottom: heights, patches, cells, and what it refuses."""
+"""The bottom: heights, patches, cells and errors."""
 
 import mitsuba as mi
 import numpy as np
@@ -64,7 +64,7 @@ def test_height_map_is_added(tmp_path):
     heights = 0.5 * x - 0.25 * y[:, None]
     np.savez(tmp_path / "map.npz", heights=heights, x=x, y=y)
     z, _, _ = look_down(load(filename=str(tmp_path / "map.npz"), depth=4.0), [0.2, 3.9, 60.0], [11.1, 12.8, 11.5])
-    # Beyond the map its edge goes on.
+    # Beyond the map the heights of its edge continue.
     expected = [-4 + 0.1 - 2.775, -4 + 1.95 - 3.2, -4 + 2 - 2.875]
     np.testing.assert_allclose(z, expected, atol=1e-3)
 
@@ -135,7 +135,7 @@ def test_reads_from_xml():
         ({"slope_x_deg": 20.0, "centre_x": 30.0}, "puts the bottom at z = 2.92 m in its middle, .* below the sea"),
     ],
 )
-def test_mistakes_are_told(parameters, message):
+def test_invalid_parameters_are_named(parameters, message):
     with pytest.raises(RuntimeError, match=message):
         load(**parameters)
 
@@ -146,7 +146,7 @@ def test_bottom_that_rises_through_the_sea_is_refused_only_where_the_receiver_lo
         scene = lidar_scene(bottom=None, extra={"bottom": seabed})
         return mitransient_lidar.render(scene, passes=2)
 
-    # On the mean sea level at x = 29.9 m, where nothing looks; then at x = 1.1 m.
+    # At the mean sea level at x = 29.9 m, outside the field of view; then at x = 1.1 m.
     assert float(render(8.0).impulse_response.sum()) > 0
     with pytest.raises(UserError, match="rises through the sea surface where the receiver looks: a bottom must lie"):
         render(0.3)

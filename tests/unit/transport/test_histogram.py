@@ -46,7 +46,7 @@ def test_sums_are_exact():
 
 
 def test_sums_do_not_depend_on_their_order():
-    """A million energies over 14 decades, in two orders: the same bits, and right to single precision."""
+    """A million energies over 14 decades, in two orders: equal bits, and accurate to single precision."""
     energies = np.float32(10.0 ** np.random.default_rng(3).uniform(-14, 0, 2**20))
     found = []
     for order in (energies, energies[::-1]):
@@ -58,7 +58,7 @@ def test_sums_do_not_depend_on_their_order():
 
 
 def test_small_and_large_energies_are_summed_without_bias():
-    """Energies far below the coarse unit would vanish in it, and a shift by half a unit would show."""
+    """Coarse units alone would lose energies far below them, and a shift by half a unit would be significant."""
     for emitted, energy in ((1.0, 1e-26), (1.0, 3e-19), (1.0, 1e-17), (1.0, 1e-6), (4.5e-3, 1e-22)):
         sums = histogram(1, emitted=emitted)
         spread = np.float32(energy * np.random.default_rng(1).uniform(0.5, 1.5, 2**16))

@@ -8,7 +8,7 @@ from scipy.stats import kstest
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 
-#: Edges are float32 numbers, so that NumPy and Dr.Jit agree on which side of them a depth lies.
+#: Edges are float32 numbers, so that NumPy and Dr.Jit place a depth on the same side of them.
 COLUMNS = {
     "one": WaterColumn.from_text("0", "0.3", "0.15", "0.006"),
     "two": WaterColumn.from_text("0, 3", "0.9, 0.5", "0.7, 0.35", "0.014, 0.007"),
@@ -25,10 +25,10 @@ DEPTHS = [-0.5, 0.0, 0.7, 2.0, 3.0, 4.9, 12.0]
 
 
 def rounding(column, depth, downward, length):
-    """Return the optical depth that float32 depths may miss: their rounding over the slope, by the range of c."""
+    """Return the error of optical depths from float32 depths: their rounding over the slope, times the range of c."""
     reach = np.abs(depth) + np.abs(downward) * length + column.layer_tops.max()
     blur = np.finfo(np.float32).eps * reach / np.maximum(np.abs(downward), np.finfo(np.float32).eps)
-    # A level ray cannot gain or lose more than its whole length in the wrong layer.
+    # The error of a level ray is at most that of all its length in the wrong layer.
     return 4 * np.minimum(blur, length) * np.ptp(column.attenuation) * (downward != 0)
 
 
@@ -39,7 +39,7 @@ def exact(column, depth, downward, length):
 @pytest.mark.parametrize("name", COLUMNS)
 @pytest.mark.parametrize("downward", DIRECTIONS)
 def test_optical_depth_is_the_sum_over_the_layers(name, downward):
-    """A difference of cumulative depths over the slope would be 0/0 level, and noise below a slope of 1e-3."""
+    """A difference of cumulative depths over the slope would be 0/0 for level rays, and noise below a slope of 1e-3."""
     column = COLUMNS[name]
     depth, length = (g.ravel() for g in np.meshgrid(DEPTHS, [0.01, 0.5, 3.0, 9.0]))
     depth = depth.astype(np.float32).astype(np.float64)
@@ -65,7 +65,7 @@ def test_distance_inverts_the_optical_depth(name, downward):
     got = exact(column, depth32[reached], downward, distance[reached])
     tolerance = 1e-4 * wanted[reached] + 2e-6 + rounding(column, depth32[reached], downward, distance[reached])
     assert np.all(np.abs(got - wanted[reached]) <= tolerance)
-    # What is never reached: level rays in clear water only.
+    # Only level rays in clear water never reach an optical depth.
     never = (column.attenuation[column.layer_at(depth32)] == 0) & (downward == 0)
     np.testing.assert_array_equal(~reached, never)
 
@@ -73,13 +73,13 @@ def test_distance_inverts_the_optical_depth(name, downward):
 @pytest.mark.parametrize("name", COLUMNS)
 @pytest.mark.parametrize(("depth", "downward"), [(0.0, 0.95), (6.0, -0.8), (-0.4, 0.3), (2.5, 1e-3), (1.7, 0.0)])
 def test_flights_follow_the_transmittance(name, depth, downward):
-    """1 - transmittance of the sampled distance is uniform; a sampler that ignores one edge fails by far."""
+    """1 - transmittance of the sampled distance is uniform; a sampler that ignores an edge fails clearly."""
     column = COLUMNS[name]
     drawn = -np.log(1 - np.random.default_rng(11).random(20_000 if name == "thousand" else 200_000))
     distance = LayeredFlight(column).distance(mi.Float(depth), mi.Float(downward), mi.Float(drawn))
     distance = np.array(distance, dtype=np.float64)
     if name == "clear_between" and depth == 2.5 and downward <= 1e-3:
-        # Nearly level in the clear layer, 2.5 m above its lower edge: far, but not without end.
+        # Nearly level in the clear layer, 2.5 m above its lower edge: long, but finite.
         assert distance.min() >= 2.5 / downward * (1 - 1e-6)
     uniform = -np.expm1(-exact(column, float(np.float32(depth)), float(np.float32(downward)), distance))
     assert kstest(uniform, "uniform").pvalue > 1e-4
@@ -95,7 +95,7 @@ def test_the_test_of_flights_sees_a_wrong_layer():
 def test_light_that_ends_in_clear_water_goes_on_for_ever():
     column = WaterColumn.from_text("0, 2", "0.5, 0", "0", "0")
     flight = LayeredFlight(column)
-    # 0.5 per metre over 2 m straight down is an optical depth of 1 and never more.
+    # 0.5 per metre over 2 m straight down is an optical depth of at most 1.
     distance = np.array(flight.distance(mi.Float(0, 0, 3), mi.Float(1, 1, 1), mi.Float(0.9, 1.1, 0.1)))
     np.testing.assert_allclose(distance, [1.8, np.inf, np.inf], rtol=1e-6)
     clear = LayeredFlight(WaterColumn.from_text("0", "0", "0", "0"))
