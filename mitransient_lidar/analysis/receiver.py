@@ -62,7 +62,7 @@ def detect_waveforms(
     (``response_time_ns``), the bandwidth of an amplifier smooths it again, and its shot noise lacks the correlation of
     that response: render with a response time of 0 for a chain with a bandwidth.
     """
-    receiver = _receiver(chain)
+    receiver = receiver_chain("chain", chain)
     dims, power = _waveform(dataset)
     axis = results.time_axis(dataset)
     width = axis.bin_width_ns
@@ -107,11 +107,12 @@ def detect_waveforms(
     return xr.Dataset(values, {**coords, "time": time, "shot": shot}, attributes)
 
 
-def _receiver(chain: ReceiverChain | str) -> ReceiverChain:
+def receiver_chain(name: str, chain: ReceiverChain | str) -> ReceiverChain:
+    """Return a receiver chain, which may be given by its name in `RECEIVERS`, as the parameter `name`."""
     if isinstance(chain, ReceiverChain):
         return chain
     if chain not in RECEIVERS:
-        raise UserError(f"chain = {chain!r} must be a ReceiverChain or one of {', '.join(RECEIVERS)}")
+        raise UserError(f"{name} = {chain!r} must be a ReceiverChain or one of {', '.join(RECEIVERS)}")
     return RECEIVERS[chain]
 
 

@@ -1,6 +1,6 @@
-"""Benchmark: how fast the integrators are, and how accurate for their time.
+"""Benchmark of the speed and the accuracy of the integrators.
 
-Every case and integrator runs in a process of its own, so that peak memory and compile time are its own.
+Every measurement runs in its own process, so that its peak memory and compile time are independent of the others.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.transport.passes import PassRenderer
 
-#: Parameters that turn a shipped scene into each case: (scene, parameters).
+#: Shipped scene and parameters of each case.
 CASES: dict[str, tuple[str, dict[str, str]]] = {
     "flat": ("fig09_2x2", {"spectrum": "flat"}),
     "clear": ("fig09_2x2", {}),
@@ -44,7 +45,7 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
     "imager": ("fig09_2x2", {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}),
 }
 
-#: What the case ``target`` has beside its scene: a plate of 1.5 m x 1.5 m at 8 m depth.
+#: Target of the case ``target``: a plate of 1.5 m x 1.5 m at a depth of 8 m.
 _TARGET = """
     <shape type="rectangle" id="target">
         <transform name="to_world"><scale value="0.75"/><translate z="-8"/></transform>
@@ -58,66 +59,9 @@ QUICK_CASES = ("flat", "clear")
 INTEGRATORS = ("lidar_merging", "lidar_volpath")
 
 #: Passes after the first one, which compiles.
-_QUICK_PASSES = 16
-_PASSES = 64
+_QUICK_PASSES, _PASSES = 16, 64
 
-
-def run(
-    *, quick: bool = False, json: bool = False, case: str | None = None, target_error: float | None = None
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Run the benchmark and print its figures to stdout.
-
-    Parameters
-    ----------
-    quick
-        Only the cases ``flat`` and ``clear``, with few passes.
-    json
-        Print one JSON object instead of a table.
-    case
-        Only this case.
-    target_error
-        Go on until the 95th percentile of the relative standard error has come down to this, greater than 0.
-
-    Returns
-    -------
-    dict
-        ``{case: {integrator: {wall_s, cpu_s, compile_s, paths_per_s, rays_per_s, ray_rate_ratio, peak_mb,
-        error_median, error_p95, figure_of_merit}}}``.
-
-    Raises
-    ------
-    UserError
-        When the case is unknown or the target is not positive.
-    """
-    if case is not None and case not in CASES:
-        raise UserError(f"case = {case!r} must be one of {', '.join(CASES)}")
-    if target_error is not None:
-        positive("target_error", target_error)
-    names = [case] if case else list(QUICK_CASES if quick else CASES)
-    figures: dict[str, dict[str, dict[str, float]]] = {}
-    if not json:
-        print(_row("case", "integrator", list(_COLUMNS.values())))
-    for name in names:
-        figures[name] = {}
-        for integrator in INTEGRATORS:
-            task = {"case": name, "integrator": integrator, "quick": quick, "target_error": target_error}
-            done = subprocess.run(
-                [sys.executable, "-m", "mitransient_lidar.studies.bench", json_module.dumps(task)],
-                check=False,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-            if done.returncode:
-                raise UserError(f"case {name} with {integrator} ended with exit code {done.returncode}")
-            figures[name][integrator] = json_module.loads(done.stdout)
-            if not json:
-                values = figures[name][integrator]
-                print(_row(name, integrator, [f"{values[key]:.4g}" for key in _COLUMNS]), flush=True)
-    if json:
-        print(json_module.dumps(figures, indent=2))
-    return figures
-
-
+#: Headings of the figures.
 _COLUMNS = {
     "wall_s": "wall s",
     "cpu_s": "CPU s",
@@ -132,12 +76,73 @@ _COLUMNS = {
 }
 
 
-def _row(case: str, integrator: str, cells: list[str]) -> str:
-    return f"{case:<8} {integrator:<14} " + " ".join(f"{cell:>10}" for cell in cells)
+def run(*, quick: bool = False, json: bool = False, case: str | None = None, target_error: float | None = None) -> None:
+    """Measure every case with every integrator; print a table or one JSON object to stdout.
+
+    Parameters
+    ----------
+    quick
+        Only the cases ``flat`` and ``clear``, with few passes.
+    json
+        Print one JSON object instead of a table.
+    case
+        Only this case.
+    target_error
+        Render until the 95th percentile of the relative standard error is this, greater than 0.
+
+    Raises
+    ------
+    UserError
+        When the case is unknown or the target is not positive.
+    """
+    if case is not None and case not in CASES:
+        raise UserError(f"case = {case!r} must be one of {', '.join(CASES)}")
+    if target_error is not None:
+        positive("target_error", target_error)
+    tasks = {
+        (name, integrator): {"case": name, "integrator": integrator, "quick": quick, "target_error": target_error}
+        for name in ([case] if case else list(QUICK_CASES if quick else CASES))
+        for integrator in INTEGRATORS
+    }
+    run_processes("mitransient_lidar.studies.bench", ("case", "integrator"), tasks, _COLUMNS, json)
+
+
+def run_processes(
+    module: str,
+    heading: tuple[str, ...],
+    tasks: Mapping[tuple[str, ...], Mapping[str, Any]],
+    columns: Mapping[str, str],
+    as_json: bool,
+) -> None:
+    """Run a module for each task in its own process, and print the figures; tasks and figures are passed as JSON.
+
+    Tasks are given by their labels, whose headings are `heading`; `columns` are the headings of the figures.
+    """
+    figures: dict[str, Any] = {}
+    if not as_json:
+        print(_row(heading, columns.values()))
+    for labels, task in tasks.items():
+        command = [sys.executable, "-m", module, json_module.dumps(task)]
+        done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True)
+        if done.returncode:
+            raise UserError(f"the benchmark of {' with '.join(labels)} ended with exit code {done.returncode}")
+        values = json_module.loads(done.stdout)
+        group = figures
+        for label in labels[:-1]:
+            group = group.setdefault(label, {})
+        group[labels[-1]] = values
+        if not as_json:
+            print(_row(labels, (f"{values[key]:.4g}" for key in columns)), flush=True)
+    if as_json:
+        print(json_module.dumps(figures, indent=2))
+
+
+def _row(labels: Iterable[str], cells: Iterable[str]) -> str:
+    return " ".join([*(f"{label:<14}" for label in labels), *(f"{cell:>10}" for cell in cells)])
 
 
 def measure(case: str, integrator: str, quick: bool, target_error: float | None) -> dict[str, float]:
-    """Measure one case with one integrator in this process; see `run` for the figures.
+    """Measure one case with one integrator in this process.
 
     Rates and times are those of the passes after the first one, which also compiles. The figure of merit is
     1 / (median relative variance x CPU time) of the waveform's bins.
@@ -146,40 +151,32 @@ def measure(case: str, integrator: str, quick: bool, target_error: float | None)
     from mitransient_lidar.rendering.session import choose_integrator
 
     marks: list[tuple[float, float]] = []
-
-    def progress(_: object) -> None:
-        marks.append((time.perf_counter(), time.process_time()))
-
     loaded = _load(case)
-    passes = None if target_error else 1 + (_QUICK_PASSES if quick else _PASSES)
     start = time.perf_counter()
     result = render(
         loaded,
         integrator=integrator,
-        passes=passes,
+        passes=None if target_error else 1 + (_QUICK_PASSES if quick else _PASSES),
         target_error=target_error,
         max_time=120.0 if target_error else None,
-        progress=progress,
+        progress=lambda _: marks.append((time.perf_counter(), time.process_time())),
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     renderer = choose_integrator(loaded, integrator).prepare(loaded, loaded.sensors()[0])
-    times = np.array(marks)
-    steps = np.diff(times[:, 0])
-    warm = len(steps)
-    wall, cpu = times[-1] - times[0]
-    relative_variance = result.attrs["error_median"] ** 2
-    rays = float(renderer.render_pass(0).rays[0]) * warm
+    steps = np.diff(np.array(marks)[:, 0])
+    wall, cpu = (float(last - first) for first, last in zip(marks[0], marks[-1], strict=True))
+    rays = float(renderer.render_pass(0).rays[0]) * len(steps)
     return {
-        "wall_s": float(wall),
-        "cpu_s": float(cpu),
+        "wall_s": wall,
+        "cpu_s": cpu,
         "compile_s": float(marks[0][0] - start - statistics.median(steps)),
-        "paths_per_s": renderer.paths * warm / float(wall),
-        "rays_per_s": rays / float(wall),
-        "ray_rate_ratio": rays / float(wall) / _plain_ray_rate(renderer),
+        "paths_per_s": renderer.paths * len(steps) / wall,
+        "rays_per_s": rays / wall,
+        "ray_rate_ratio": rays / wall / _plain_ray_rate(renderer),
         "peak_mb": peak,
         "error_median": result.attrs["error_median"],
         "error_p95": result.attrs["error_p95"],
-        "figure_of_merit": 1 / (relative_variance * float(cpu)),
+        "figure_of_merit": 1 / (result.attrs["error_median"] ** 2 * cpu),
     }
 
 
@@ -198,7 +195,7 @@ def _load(case: str) -> mi.Scene:
 
 
 def _plain_ray_rate(renderer: PassRenderer) -> float:
-    """Return how many rays a second plain ``ray_intersect`` traces from the receiver in the same scene."""
+    """Return the rays per second of plain ``ray_intersect`` from the receiver in the same scene."""
     import drjit as dr
     import mitsuba as mi
 
@@ -215,8 +212,7 @@ def _plain_ray_rate(renderer: PassRenderer) -> float:
         dr.eval(si.p, si.n)
         dr.sync_thread()
         rates.append(count / (time.perf_counter() - begin))
-    # The first one compiles.
-    return statistics.median(rates[1:])
+    return statistics.median(rates[1:])  # the first one compiles
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Signal of a target: a scene rendered with and without it, on the same random numbers."""
+"""Signal of a target: difference of a scene with and without it, from the same random numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -21,7 +21,7 @@ from mitransient_lidar.rendering.session import choose_integrator, open_scene, p
 #: Half width of the gate about the target's echo, in the pulse's full widths at half maximum.
 _HALF_GATE = 1.0
 
-#: Groups of passes whose spread gives the errors of ratios.
+#: Jackknife groups of passes.
 _GROUPS = 16
 
 
@@ -35,18 +35,18 @@ def target_signal(
     integrator: Any = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render a scene with and without a target, and measure the target's own signal.
+    """Render a scene with and without a target, and measure their difference.
 
-    Both renders take the same random numbers, and paths that do not meet the target are the same: the difference is
-    known far better than either record. It is the target's echo, and behind it the shadow in the water and on the
-    bottom, which is negative.
+    Both renders use the same random numbers: paths that do not meet the target are equal, so that the difference has
+    much smaller errors than either record. It is the echo of the target, and behind it the shadow in the water and on
+    the bottom, which is negative.
 
     Parameters
     ----------
     scene, params, seed, integrator
         As for `rendering.render.render`.
     target_id
-        Id of the shape that is the target.
+        Id of the target's shape.
     passes
         Number of passes of each render, 16 to 100 000.
     progress
@@ -56,28 +56,24 @@ def target_signal(
     -------
     xarray.Dataset
         Over ``pixel`` and ``time`` [ns]: ``waveform`` (with the target), ``background`` (without) and ``difference``
-        [W] with their standard errors. Over ``pixel``, within two pulse widths about the peak of the summed
-        difference: ``echo`` and ``backscatter`` [J], of the difference and of the background, the ``contrast`` echo
-        over backscatter, ``shadow`` [J], the negative part of the difference after the gate, and ``weight``, the best
-        weight of each pixel. Over ``combination`` (``sum``: the sum of all pixels, ``best``: their sum with these
-        weights): ``combined_echo``, ``combined_contrast`` and ``combined_detectability``. All with standard errors
-        (jackknife over 16 groups of passes).
+        [W]. Over ``pixel``, in a gate of two pulse widths about the peak of the summed difference: ``echo`` and
+        ``backscatter`` [J] of difference and background, their ratio ``contrast``, ``shadow`` [J] (negative part of the
+        difference after the gate), ``detectability`` and the best ``weight``. Over ``combination`` (``sum`` of all
+        pixels, ``best``: their weighted sum): ``combined_echo``, ``combined_contrast`` and
+        ``combined_detectability``. All with standard errors (of the gates: jackknife over 16 groups of passes).
 
     Raises
     ------
     UserError
-        When the scene, a parameter or an option is wrong, there is no such shape, it is above the sea or below the
-        bottom, or it returns no light.
-    UserError
-        When `passes` is out of range.
+        If the scene or a parameter is invalid, `passes` is out of range, there is no such shape, or it is above the
+        sea or below the bottom, or returns no light.
 
     Notes
     -----
-    Where backscatter limits detection, the noise of a pixel is that of the light around the target, of a variance in
-    proportion to its energy B. With an echo E in each pixel and weights w, the signal-to-noise ratio goes with
-    sum(w E) / sqrt(sum(w^2 B)); it is largest for w = E/B (matched filter), where it is sqrt(sum(E^2/B)). That is the
-    ``detectability`` [sqrt(J)], of the plain sum sum(E) / sqrt(sum(B)): ratios of detectabilities are ratios of
-    signal-to-noise ratios, whatever the detector.
+    Where backscatter limits detection, the variance of a pixel's noise is proportional to the energy B of the
+    backscatter. With echoes E and weights w, the signal-to-noise ratio is proportional to the ``detectability``
+    sum(w E) / sqrt(sum(w^2 B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of
+    detectabilities are ratios of signal-to-noise ratios for every detector.
     """
     passes = integer("passes", passes, _GROUPS, 100_000)
     session = open_scene(scene, params)
@@ -115,46 +111,42 @@ def target_map(
     progress: ProgressCallback | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """Measure a target's own signal at many places.
+    """Measure the signal of a target at many places.
 
     Parameters
     ----------
     scene, params
         An XML scene with the parameters ``target_x`` and ``target_y``.
     x, y
-        Offsets from the target's place in the scene [m], each at least one.
+        Offsets from the target's place in the scene [m], at least one of each.
     progress
         Called with a `passes.Progress` after every place.
     **options
-        As for `target_signal`.
+        Options of `target_signal`.
 
     Returns
     -------
     xarray.Dataset
-        Results of `target_signal` for pixels and combinations, over ``target_x`` and ``target_y`` [m], too.
+        Quantities of `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m].
 
     Raises
     ------
     UserError
-        As `target_signal`, and for a scene without these parameters.
+        If the scene lacks these parameters, or as for `target_signal`.
     """
     known = open_scene(scene, params).parameters
     for name in ("target_x", "target_y"):
         if name not in known:
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
     places = [float(known["target_x"]) + np.asarray(x, float), float(known["target_y"]) + np.asarray(y, float)]
-    rows: list[xr.Dataset] = []
-    for place_x in places[0]:
-        row = []
-        for place_y in places[1]:
-            moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
-            found = target_signal(scene, moved, **options)
-            row.append(found.drop_dims("time"))
-            if progress is not None:
-                done = len(rows) * len(places[1]) + len(row)
-                progress(Progress(done, len(places[0]) * len(places[1]), "place"))
-        rows.append(xr.concat(row, "target_y", combine_attrs="drop_conflicts"))
-    maps = xr.concat(rows, "target_x", combine_attrs="drop_conflicts")
+    cells: list[xr.Dataset] = []
+    for place_x, place_y in itertools.product(*places):
+        moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
+        cells.append(target_signal(scene, moved, **options).drop_dims("time"))
+        if progress is not None:
+            progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
+    rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]
+    maps = xr.combine_nested(rows, ["target_x", "target_y"], combine_attrs="drop_conflicts")
     return maps.assign_coords(target_x=places[0], target_y=places[1])
 
 
@@ -165,12 +157,12 @@ def grid_offsets(count: int, max_offset: float) -> list[float]:
 
 
 def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
-    """Return the shape of a scene that is its target.
+    """Return the shape of the target.
 
     Raises
     ------
     UserError
-        When there is no such shape, or it is the sea, or wholly above the sea or below the bottom.
+        If there is no such shape, or it is the sea, or completely above the sea or below the bottom.
     """
     shapes = list(scene.shapes())
     names = [shape.id() for shape in shapes]
@@ -184,7 +176,7 @@ def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
 
 
 def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
-    """Return a scene without one of its shapes; all else is shared."""
+    """Return a scene without the target, which shares all other objects."""
     shapes, gone = list(scene.shapes()), find_target(scene, target_id)
     parts: dict[str, Any] = {"type": "scene", "integrator": scene.integrator()}
     parts |= {f"sensor_{i}": sensor for i, sensor in enumerate(scene.sensors())}
@@ -195,7 +187,7 @@ def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
 
 
 def _check_place(target: mi.Shape, others: list[mi.Shape]) -> None:
-    """Refuse a target that is wholly above the sea or below the bottom."""
+    """Reject a target that is completely above the sea or below the bottom."""
     low, high = float(target.bbox().min.z), float(target.bbox().max.z)
     seas = [float(shape.bbox().max.z) for shape in others if shape.is_medium_transition()]
     bottoms = [float(shape.bbox().min.z) for shape in others if not shape.is_medium_transition()]
@@ -208,31 +200,23 @@ def _check_place(target: mi.Shape, others: list[mi.Shape]) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Gated:
-    """Energies [J] of the pixels, shape (..., pixels): echo of the target, backscatter around it, shadow behind."""
-
-    echo: FloatArray
-    backscatter: FloatArray
-    shadow: FloatArray
-
-    def numbers(self) -> dict[str, FloatArray]:
-        """Return the quantities of each pixel, and of combinations of pixels."""
-        echo, backscatter = np.maximum(self.echo, 0), self.backscatter
-        quality = np.divide(echo, backscatter, out=np.zeros_like(echo), where=backscatter > 0)
-        weight = quality / max(float(np.max(quality)), 1e-300)
-        combined = [(np.sum(w * self.echo), np.sum(w * backscatter), np.sum(w**2 * backscatter)) for w in (1, weight)]
-        return {
-            "echo": self.echo,
-            "backscatter": backscatter,
-            "shadow": self.shadow,
-            "contrast": _ratio(self.echo, backscatter),
-            "weight": weight,
-            "detectability": _ratio(self.echo, np.sqrt(backscatter)),
-            "combined_echo": np.array([e for e, _, _ in combined]),
-            "combined_contrast": np.array([_ratio(e, b) for e, b, _ in combined]),
-            "combined_detectability": np.array([_ratio(e, np.sqrt(v)) for e, _, v in combined]),
-        }
+def _quantities(own: FloatArray, backscatter: FloatArray, shadow: FloatArray) -> dict[str, FloatArray]:
+    """Return the quantities of pixels and of their combinations, from energies of echo, water and shadow [J]."""
+    echo = np.maximum(own, 0)
+    quality = np.divide(echo, backscatter, out=np.zeros_like(echo), where=backscatter > 0)
+    weight = quality / max(float(np.max(quality)), 1e-300)
+    combined = [(np.sum(w * own), np.sum(w * backscatter), np.sum(w**2 * backscatter)) for w in (1, weight)]
+    return {
+        "echo": own,
+        "backscatter": backscatter,
+        "shadow": shadow,
+        "contrast": _ratio(own, backscatter),
+        "weight": weight,
+        "detectability": _ratio(own, np.sqrt(backscatter)),
+        "combined_echo": np.array([e for e, _, _ in combined]),
+        "combined_contrast": np.array([_ratio(e, b) for e, b, _ in combined]),
+        "combined_detectability": np.array([_ratio(e, np.sqrt(v)) for e, _, v in combined]),
+    }
 
 
 def _ratio(part: Any, total: Any) -> FloatArray:
@@ -243,36 +227,32 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
     """Return the result for energies [J] of shape (passes, 2, pixels, time), with and without the target."""
     time, bin_width = axis.centres_ns, axis.bin_width_ns
     power = waveform(records, bin_width, kernel)
-    curves = {}
-    for name, values in _curves(power):
+    curves = {"waveform": power[:, 0], "background": power[:, 1], "difference": power[:, 0] - power[:, 1]}
+    data: dict[str, Any] = {}
+    for name, values in curves.items():
         statistics = PassStatistics()
         for one in values:
             statistics.add(one)
-        curves[name] = (("pixel", "time"), statistics.mean, {"units": "W"})
-        curves[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr, {"units": "W"})
-    summed = curves["difference"][1].sum(axis=0)
+        data[name] = (("pixel", "time"), statistics.mean, {"units": "W"})
+        data[f"{name}_stderr"] = (("pixel", "time"), statistics.stderr, {"units": "W"})
+    summed = data["difference"][1].sum(axis=0)
     if not np.any(summed > 0):
-        raise UserError("target: it returns no light within the record; see its place, and that of the record")
+        raise UserError("target: it returns no light within the record; check its place, and the start of the record")
     peak = float(time[np.argmax(summed)])
     start, end = peak - _HALF_GATE * pulse_width, peak + _HALF_GATE * pulse_width
     gate = (time >= start) & (time <= end)
 
-    def gated(energy: FloatArray) -> dict[str, FloatArray]:
-        """Return the numbers for mean powers, shape (2, pixels, time)."""
-        difference, background = energy[0] - energy[1], energy[1]
-        seconds = bin_width * 1e-9
+    def gated(mean_power: FloatArray) -> dict[str, FloatArray]:
+        """Return the quantities of mean powers, shape (2, pixels, time)."""
+        difference, background = mean_power[0] - mean_power[1], mean_power[1]
         after = np.where(time > end, np.minimum(difference, 0), 0)
-        return _Gated(
-            difference[:, gate].sum(axis=-1) * seconds,
-            background[:, gate].sum(axis=-1) * seconds,
-            after.sum(axis=-1) * seconds,
-        ).numbers()
+        parts = (difference[:, gate], background[:, gate], after)
+        return _quantities(*(part.sum(axis=-1) * (bin_width * 1e-9) for part in parts))
 
     groups = np.array_split(np.arange(len(power)), _GROUPS)
     total = power.sum(axis=0)
     means = gated(total / len(power))
     left_out = [gated((total - power[group].sum(axis=0)) / (len(power) - len(group))) for group in groups]
-    data: dict[str, Any] = dict(curves)
     units = {"echo": "J", "backscatter": "J", "shadow": "J", "detectability": "J^(1/2)"}
     for name, value in means.items():
         error = np.sqrt((_GROUPS - 1) * np.mean([(other[name] - value) ** 2 for other in left_out], axis=0))
@@ -284,26 +264,10 @@ def _measure(records: FloatArray, axis: TimeAxis, kernel: tuple[int, FloatArray]
     return xr.Dataset(data, coords=coords, attrs={"gate_start_ns": start, "gate_end_ns": end, "peak_ns": peak})
 
 
-def _curves(power: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Yield name and values, shape (passes, pixels, time)."""
-    yield "waveform", power[:, 0]
-    yield "background", power[:, 1]
-    yield "difference", power[:, 0] - power[:, 1]
-
-
 def describe_target(result: xr.Dataset) -> list[str]:
-    """Return lines of a table of what `target_signal` has found.
+    """Return the lines of a table of a result of `target_signal`: gate, heading, pixels, and combinations of pixels.
 
-    Parameters
-    ----------
-    result
-        What `target_signal` returned.
-
-    Returns
-    -------
-    list
-        Where the echo is, a heading, one line a pixel, then the sum and the best combination. The relative SNR is
-        the detectability over that of the sum.
+    The relative SNR is the detectability over that of the sum.
     """
     attributes = result.attrs
     sum_echo, sum_snr = (float(result[f"combined_{name}"][0]) for name in ("echo", "detectability"))
@@ -329,18 +293,7 @@ def describe_target(result: xr.Dataset) -> list[str]:
 
 
 def describe_map(maps: xr.Dataset) -> list[str]:
-    """Return lines of a table of what `target_map` has found.
-
-    Parameters
-    ----------
-    maps
-        What `target_map` returned.
-
-    Returns
-    -------
-    list
-        A heading, and for each place the pixels' shares of the echo [%], contrasts, and the gain of the best weights.
-    """
+    """Return the lines of a table of a result of `target_map`: shares, contrasts and gain of the weights by place."""
     names = [str(name) for name in maps["pixel"].values]
     share = 100 * maps["echo"] / maps["combined_echo"].sel(combination="sum")
     snr = maps["combined_detectability"]
