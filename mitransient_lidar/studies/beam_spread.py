@@ -1,9 +1,9 @@
-"""Spread of the laser's light at depth, sideways and in time."""
+"""Spread of the laser's light at depth, horizontally and in time."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,14 +22,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: How far planes stay above the bottom [m]: where rays end on it is known to rounding only.
+#: Smallest distance of a plane from the bottom [m], larger than rounding errors of the intersections.
 _ABOVE_BOTTOM = 1e-3
 
-#: Number of radii and delays of the distributions, and the largest share of the light that lies beyond them.
-_STEPS, _BEYOND = 160, 2e-3
-
-#: Smallest radius over the largest, and smallest delay over the largest.
-_SMALLEST = 1e-3
+#: Number of radii and delays of the distributions, smallest over largest, and largest share of the light beyond them.
+_STEPS, _SMALLEST, _BEYOND = 160, 1e-3, 2e-3
 
 _MEANING = {
     "transmitted": ("1", "share of the pulse energy that passes the depth downwards"),
@@ -47,7 +44,7 @@ _MEANING = {
     "within_shift": ("1", "share of the light that scattering has shifted by at most a radius"),
     "within_delay": ("1", "share of the light that scattering has delayed by at most a delay"),
 }
-#: Variables that are distributions, with what they go over.
+#: Coordinates of the distributions.
 _CURVES = {"within_radius": "radius", "within_shift": "radius", "within_delay": "delay"}
 
 #: Columns of the table: heading, variable, and factor to its unit; and their width.
@@ -74,7 +71,7 @@ def beam_spread(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Trace light from the laser to horizontal planes under water, and measure where and when it gets there.
+    """Trace light from the laser to horizontal planes under water, and measure its places and delays.
 
     Parameters
     ----------
@@ -85,7 +82,7 @@ def beam_spread(
     passes
         Number of independent passes, 2 to 10 000.
     photons
-        Paths of light in each, 1024 to 2^24.
+        Photons of a pass, 1024 to 2^24.
     seed
         Seed of the random numbers, at least 0.
     progress
@@ -98,31 +95,33 @@ def beam_spread(
         laser), ``in_view`` (share of the light at the depth), ``centroid_x``, ``centroid_y``, ``radius_rms``,
         ``radius_50``, ``radius_90``, ``shift_rms`` [m], ``delay_mean``, ``delay_std`` [ns]. Over ``depth`` and
         ``radius`` [m] or ``delay`` [ns], the shares of the light ``within_radius``, ``within_shift`` and
-        ``within_delay``. Each has its standard error over the passes, ``..._stderr``. Where no light comes, all but the
-        first two are NaN.
+        ``within_delay``. Each has its standard error over the passes, ``..._stderr``. Without light, all but the first
+        two are NaN.
 
     Raises
     ------
     UserError
-        When the scene is wrong or has no water, or a number is out of range.
+        If the scene is invalid or has no water, or a number is out of range.
 
     Notes
     -----
-    Light counts before it meets any solid, each time that it passes the plane downwards under water. Light of many
-    scatterings may pass several times: this is the downward plane irradiance integrated over the plane. Light that
-    passes outside the surface mesh is left out; its share of the energy is the attribute ``beam_outside_surface``.
+    Light that has not met a solid counts each time that it passes the plane downwards: the result is the downward plane
+    irradiance integrated over the plane. Light outside the surface mesh is excluded; its share of the energy is the
+    attribute ``beam_outside_surface``.
 
-    Shift and delay are against the way on which the light entered the water, gone on without scattering: beam, waves
-    and ripples spread the light too, but are not in them. Where the light comes in at a slant, some of it takes a short
-    cut to the level plane, with a negative delay.
+    Shift and delay are relative to the unscattered continuation of the path on which the light entered the water: they
+    exclude the spread by beam, waves and ripples. At oblique incidence some delays are negative.
 
-    Light is in the field of view where the line of sight through a still sea from the receiver to it falls into a
-    pixel. Light has no record to be late for, but is given up after 50 times the slant way to the deepest plane, or
-    where less than a millionth of it can be left.
+    Light is in the field of view where the line of sight from the receiver to it through a level sea is in a pixel.
+    Paths end at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
     passes, photons = integer("passes", passes, 2, 10_000), integer("photons", photons, 1024, 2**24)
     seed = integer("seed", seed, 0, 2**53)
-    wanted = _depths(depths)
+    wanted = np.unique(finite_array("depths", depths))
+    if wanted.size == 0:
+        raise UserError("depths must hold at least one depth in metres")
+    if wanted[0] <= 0:
+        raise UserError(f"depths = {wanted[0]:g} m must be greater than 0")
     session = open_scene(scene, params)
     from mitransient_lidar.transport.plane_crossings import CrossingTracer
     from mitransient_lidar.transport.scene import LidarScene
@@ -141,7 +140,7 @@ def beam_spread(
         outside.append(missed)
         light = [crossings.select(crossings.downward & (crossings.plane == plane)) for plane in range(len(planes))]
         if not axes:
-            axes.update(radius=_axis([_radius, _shift], light), delay=_axis([_delay_ns], light))
+            axes.update(_axes(light))
         measured.append([_measure(system, *pair, axes) for pair in zip(light, planes, strict=True)])
         return 0.0
 
@@ -153,24 +152,12 @@ def beam_spread(
             "enlarge the surface's size",
             100 * missed,
         )
-    attributes = session.attributes(
-        **pass_attributes(log, seed), photons_per_pass=photons, beam_outside_surface=missed, **_describe(system)
-    )
-    return _dataset(measured, wanted, axes, attributes)
-
-
-def _depths(depths: npt.ArrayLike) -> FloatArray:
-    """Return the depths [m], increasing and different."""
-    values = np.unique(finite_array("depths", depths))
-    if values.size == 0:
-        raise UserError("depths must hold at least one depth in metres")
-    if values[0] <= 0:
-        raise UserError(f"depths = {values[0]:g} m must be greater than 0")
-    return values
+    described = {"photons_per_pass": photons, "beam_outside_surface": missed, **_describe(system)}
+    return _dataset(measured, wanted, axes, session.attributes(**pass_attributes(log, seed), **described))
 
 
 def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
-    """Return the depths of the planes [m]; refuse such as lie below a bottom, which light cannot get to."""
+    """Return the depths of the planes [m]; reject those below a bottom."""
     transmitter = system.transmitter
     spot = transmitter.pose.ground_point()
     reach = 3 * transmitter.widest_angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
@@ -178,7 +165,7 @@ def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
     for solid in system.solids:
         box = solid.bbox()
         low, high = np.array(box.min), np.array(box.max)
-        # Light passes beside what is smaller than the footprint.
+        # Light passes around a solid smaller than the footprint.
         if np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach) and low[2] < 0:
             bottoms.append(-float(low[2]))
     deepest = max(bottoms, default=np.inf)
@@ -187,27 +174,18 @@ def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
     return np.minimum(depths, deepest - _ABOVE_BOTTOM)
 
 
-def _radius(light: PlaneCrossings) -> FloatArray:
-    """Return distances from the centroid [m]."""
+def _spreads(light: PlaneCrossings) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return distances from the centroid [m], shifts [m] and delays [ns]."""
     x, y = (np.average(values, weights=light.weight) for values in (light.x, light.y))
-    return np.hypot(light.x - x, light.y - y)
+    return np.hypot(light.x - x, light.y - y), np.hypot(light.shift_x, light.shift_y), 1e9 * light.delay
 
 
-def _shift(light: PlaneCrossings) -> FloatArray:
-    return np.hypot(light.shift_x, light.shift_y)
-
-
-def _delay_ns(light: PlaneCrossings) -> FloatArray:
-    return 1e9 * light.delay
-
-
-def _axis(kinds: list[Callable[[PlaneCrossings], FloatArray]], light: list[PlaneCrossings]) -> FloatArray:
-    """Return values, in equal ratios, up to the largest that a depth needs."""
-    largest = [
-        _quantile(kind(part), part.weight, 1 - _BEYOND) for part in light if len(part.weight) > 0 for kind in kinds
-    ]
-    top = max(largest, default=0.0)
-    return np.geomspace(_SMALLEST, 1, _STEPS) * (top if top > 0 else 1.0)
+def _axes(light: list[PlaneCrossings]) -> dict[str, FloatArray]:
+    """Return radii [m] and delays [ns], in equal ratios, up to the largest of all depths."""
+    spreads = [(values, part.weight) for part in light if len(part.weight) > 0 for values in _spreads(part)]
+    largest = np.array([_quantile(values, weight, 1 - _BEYOND) for values, weight in spreads]).reshape(-1, 3)
+    top = {"radius": largest[:, :2].max(initial=0.0), "delay": largest[:, 2].max(initial=0.0)}
+    return {name: np.geomspace(_SMALLEST, 1, _STEPS) * (last if last > 0 else 1.0) for name, last in top.items()}
 
 
 def _quantile(values: FloatArray, weight: FloatArray, share: float) -> float:
@@ -218,7 +196,7 @@ def _quantile(values: FloatArray, weight: FloatArray, share: float) -> float:
 
 
 def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict[str, FloatArray]) -> dict[str, Any]:
-    """Return what one pass tells of one plane, by the names of the result."""
+    """Return the variables of one plane in one pass."""
     weight, energy = light.weight, system.transmitter.energy
     shares = {"transmitted": weight.sum() / energy, "unscattered": weight[light.scatterings == 0].sum() / energy}
     if len(weight) == 0:
@@ -233,7 +211,7 @@ def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict
         held = np.concatenate(([0.0], np.cumsum(weight[order])))
         return np.asarray(held[np.searchsorted(values[order], limits, side="right")] / held[-1])
 
-    radius, shift, delay = _radius(light), _shift(light), _delay_ns(light)
+    radius, shift, delay = _spreads(light)
     return {
         **shares,
         "in_view": mean(_in_view(system, light, depth)),
@@ -252,7 +230,7 @@ def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict
 
 
 def _in_view(system: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDArray[np.bool_]:
-    """Return whether the line of sight through a still sea from the receiver to the light falls into a pixel."""
+    """Return whether the line of sight from the receiver to the light through a level sea is in a pixel."""
     import mitsuba as mi
 
     pose, pixels = system.receiver.pose, system.receiver.pixels
@@ -268,7 +246,7 @@ def _in_view(system: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDA
 
 
 def _describe(system: LidarScene) -> dict[str, Any]:
-    """Return the attributes that readers and plots need."""
+    """Return the attributes of the lidar and the water."""
     from mitransient_lidar.transport.medium.water_phases import table_of
 
     water: Any = system.water
@@ -302,8 +280,8 @@ def _dataset(
         values = np.array([[row[name] for row in rows] for rows in measured])
         error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
         dims = ("depth", _CURVES[name]) if name in _CURVES else ("depth",)
-        told = {"units": units, "long_name": meaning, "ancillary_variables": f"{name}_stderr"}
-        data[name] = dims, values.mean(axis=0), told
+        labels = {"units": units, "long_name": meaning, "ancillary_variables": f"{name}_stderr"}
+        data[name] = dims, values.mean(axis=0), labels
         data[f"{name}_stderr"] = dims, error, {"units": units, "long_name": f"standard error of the {meaning}"}
     coordinates = {
         "depth": ("depth", depths, {"units": "m", "long_name": "depth below the mean sea level", "positive": "down"}),
@@ -316,8 +294,7 @@ def _dataset(
 def describe_spread(spread: xr.Dataset) -> list[str]:
     """Return the lines of a table of a result of `beam_spread`, with standard errors."""
     lines = ["".join(f"{heading:>{_COLUMN}}" for heading in ("depth (m)", *(column[0] for column in _COLUMNS)))]
-    for depth in range(spread.sizes["depth"]):
-        row = spread.isel(depth=depth)
+    for row in (spread.isel(depth=depth) for depth in range(spread.sizes["depth"])):
         cells = [f"{float(row['depth']):.4g}"]
         for _, name, factor in _COLUMNS:
             value, error = (factor * float(row[key]) for key in (name, f"{name}_stderr"))

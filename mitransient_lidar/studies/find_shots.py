@@ -1,4 +1,4 @@
-"""Places to shoot at on a sea, by the slope that the beam meets."""
+"""Places on a sea with given slopes of the surface over the footprint of the beam."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.transport.pose import Pose
 
-#: Slopes along and across the lidar's azimuth that a kind of shot looks for, in standard deviations of the sea's.
+#: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
 KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 
 #: Longest side of the sea that is searched [m].
 _LARGEST_SEARCH = 512.0
 
-#: Most pixels whose footprints are mapped.
-_MOST_OUTLINED_PIXELS = 64
+#: Largest number of pixels whose footprints are mapped.
+_MOST_MAPPED_PIXELS = 64
 
 _PASSES = 12
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A place on the sea where the beam's axis meets the mean level.
+    """Intersection of the beam's axis with the mean sea level.
 
     Attributes
     ----------
     kind
-        ``towards``, ``level``, ``away`` or ``sideways``; or how the caller calls it.
+        ``towards``, ``level``, ``away``, ``sideways``, or another label.
     x, y
         Place [m], the values of ``aim_x`` and ``aim_y``.
     along, across
-        Mean slopes over the beam's footprint along the lidar's azimuth and to its left [rad]: positive along is a
-        face turned towards the lidar.
+        Mean slopes over the beam's footprint along the lidar's azimuth and to its left [1]; positive along for a face
+        towards the lidar.
     """
 
     kind: str
@@ -75,13 +75,7 @@ class SeaMap:
 
     @classmethod
     def of_scene(cls, scene: mi.Scene) -> SeaMap:
-        """Find the sea and the beam of a loaded scene.
-
-        Raises
-        ------
-        UserError
-            When the scene has no ``ocean_surface`` with waves.
-        """
+        """Return the map of a scene; reject one without waves."""
         from scipy.ndimage import gaussian_filter
 
         sea = next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
@@ -93,23 +87,22 @@ class SeaMap:
         lines = np.arange(-count, count) * sea.cell_size
         heights = sea.heights(lines, lines)
         azimuth, spread_along, spread_across = _footprint(transmitter)
-        # The footprint is an ellipse; its mean radius serves a search.
+        # A circle of the same area replaces the elliptical footprint.
         sigma = math.sqrt(spread_along * spread_across) / sea.cell_size
-        # What has waves repeats itself at its edges, or there is nothing beyond them.
+        # The sea of a spectrum is periodic; a height map ends at its edges.
         smooth = gaussian_filter(heights, sigma, mode="wrap" if sea.spectrum != "height_map" else "nearest")
         up, right = np.gradient(smooth, sea.cell_size)
         cos, sin = math.cos(azimuth), math.sin(azimuth)
         return cls(lines, lines, heights, cos * right + sin * up, cos * up - sin * right)
 
     def slope_at(self, x: float, y: float) -> tuple[float, float]:
-        """Return the mean slopes (along, across) [1] over a footprint at a place [m]; the sea repeats itself."""
+        """Return the mean slopes (along, across) [1] over a footprint at a place [m] of the periodic sea."""
         spacing = self.x[1] - self.x[0]
-        i = round((x - self.x[0]) / spacing) % len(self.x)
-        j = round((y - self.y[0]) / spacing) % len(self.y)
+        i, j = (round((value - self.x[0]) / spacing) % len(self.x) for value in (x, y))
         return float(self.along[j, i]), float(self.across[j, i])
 
     def find(self, kind: str, slope_sigmas: float, count: int, apart: float) -> list[Shot]:
-        """Return the places whose slopes are nearest to those of a kind, at least `apart` metres from each other."""
+        """Return the places with the slopes nearest to those of a kind, at least `apart` metres from each other."""
         spread = np.sqrt([np.mean(self.along**2), np.mean(self.across**2)])
         wanted = slope_sigmas * np.array(KINDS[kind]) * spread
         distance = np.hypot((self.along - wanted[0]) / spread[0], (self.across - wanted[1]) / spread[1])
@@ -126,7 +119,7 @@ class SeaMap:
 
 @dataclass(frozen=True)
 class RenderedShots:
-    """Shots with their results, the sea about them, and the footprints of beam and pixels on the mean sea level.
+    """Shots with their results, the sea around them, and the footprints of beam and pixels on the mean sea level.
 
     Attributes
     ----------
@@ -139,9 +132,8 @@ class RenderedShots:
     azimuth, beam_spread
         Azimuth of the beam [rad], and standard deviations of its footprint along and across it [m].
     pixel_lines, pixel_map, pixel_count
-        Grid lines of a map about the place of a shot [m], shape (n,), the index of the pixel that sees each node, shape
-        (n, n), rows along y, and the number of pixels. The index is -1 outside all pixels, and everywhere for receivers
-        with more than 64 pixels.
+        Grid lines of a map about a shot [m], shape (n,), the index of the pixel at each node, shape (n, n), rows along
+        y, and the number of pixels. The index is -1 outside all pixels, and everywhere with more than 64 pixels.
     """
 
     scene: str
@@ -165,21 +157,19 @@ def find_shots(
     scene, params
         As for `rendering.render.render`.
     slope_sigmas
-        Slopes to look for, in standard deviations of the mean slope over a footprint, greater than 0.
+        Required slopes in standard deviations of the mean slope over a footprint, greater than 0.
     count
         Places of each kind, 1 to 100.
 
     Returns
     -------
     list of Shot
-        Those of one kind by how near their slopes are to the wanted ones.
+        Shots by kind, those with the nearest slopes first.
 
     Raises
     ------
     UserError
-        When the scene is wrong or has no waves.
-    UserError
-        When `slope_sigmas` or `count` is out of range.
+        If the scene is invalid or has no waves, or a number is out of range.
     """
     slope_sigmas, count = positive("slope_sigmas", slope_sigmas), integer("count", count, 1, 100)
     loaded = open_scene(scene, params).scene
@@ -198,29 +188,29 @@ def shots_at(scene: Any, places: Sequence[tuple[float, float]], params: Mapping[
 def render_found_shots(
     scene: Any, shots: Sequence[Shot], params: Mapping[str, Any] | None = None, *, waveforms: bool = True
 ) -> RenderedShots:
-    """Render shots at some places of a sea, with the sea and the footprints of beam and pixels.
+    """Render shots, and map the sea and the footprints of beam and pixels.
 
     Parameters
     ----------
     scene, params
         An XML scene with the parameters ``aim_x`` and ``aim_y``.
     shots
-        Places to aim at.
+        Places.
     waveforms
         Whether to render the shots.
 
     Raises
     ------
     UserError
-        When the scene is wrong, has no waves or no parameters ``aim_x`` and ``aim_y``.
+        If the scene is invalid, has no waves or no parameters ``aim_x`` and ``aim_y``.
     """
     session = open_scene(scene, params)
     loaded = session.scene
     sea = SeaMap.of_scene(loaded)
-    results = []
-    for shot in shots if waveforms else ():
-        place = {**(params or {}), "aim_x": shot.x, "aim_y": shot.y}
-        results.append(render(scene, params=place, passes=_PASSES))
+    results = [
+        render(scene, params={**(params or {}), "aim_x": shot.x, "aim_y": shot.y}, passes=_PASSES)
+        for shot in (shots if waveforms else ())
+    ]
     azimuth, along, across = _footprint(_transmitter(loaded))
     lines, pixel_map = _pixel_map(loaded)
     count = loaded.sensors()[0].receiver.pixels.count
@@ -228,7 +218,7 @@ def render_found_shots(
 
 
 def _pixel_map(scene: mi.Scene) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Return the grid lines [m] and the pixel at each node of a map of the mean sea level, see `RenderedShots`."""
+    """Return `pixel_lines` and `pixel_map` of `RenderedShots`."""
     import mitsuba as mi
 
     receiver = scene.sensors()[0].receiver
@@ -237,7 +227,7 @@ def _pixel_map(scene: mi.Scene) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     reach = 0.6 * receiver.pixels.field_of_view * float(np.linalg.norm(centre - pose.origin)) / -float(pose.axis[2])
     lines = np.linspace(-reach, reach, 301)
     x, y = np.meshgrid(lines, lines)
-    if receiver.pixels.count > _MOST_OUTLINED_PIXELS:
+    if receiver.pixels.count > _MOST_MAPPED_PIXELS:
         return lines, np.full(x.shape, -1)
     points = np.stack([x + centre[0], y + centre[1], np.zeros_like(x)], axis=-1).reshape(-1, 3) - pose.origin
     depth = points @ pose.axis

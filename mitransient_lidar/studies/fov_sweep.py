@@ -1,4 +1,4 @@
-"""Attenuation of the column signal against the field of view, from c down to a (Gordon 1982)."""
+"""Attenuation of the column signal as a function of the field of view (Gordon 1982)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnBins
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
@@ -41,18 +42,17 @@ def fov_sweep(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Measure how the slope of the column signal goes with the field of view.
+    """Measure the attenuation of the column signal as a function of the field of view.
 
     Parameters
     ----------
     scene, params
-        As for `rendering.render.render`. The receiver's pixels are replaced by one circle about the axis, and an XML
-        scene's ``field_of_view_mrad``, for which waves are laid out, by the largest of the fields.
+        As for `rendering.render.render`. The pixels are replaced by one circle about the axis, and the parameter
+        ``field_of_view_mrad`` of an XML scene, which determines the size of the surface, by the largest circle.
     fov_mrad
         Full angles of the circles [mrad], above 0, in any order.
     min_depth, max_depth
-        Between which depths the slope is measured, as in `effective_attenuation` [m]. The water must be the same
-        between them, and no bottom or target near.
+        Limits of the fit as in `effective_attenuation` [m], in homogeneous water and far from bottom and targets.
     passes
         Independent passes for each field of view, 4 to 10 000.
     seed
@@ -73,30 +73,28 @@ def fov_sweep(
     Raises
     ------
     UserError
-        When the scene is wrong, has no water, bubbles, or other water between the depths, an echo of a solid can come
-        from between them, a number is out of range, or for the reasons of `effective_attenuation`.
+        If the scene is invalid, has no water, bubbles, or several layers between the depths, the echo of a solid can
+        overlap with them, a number is out of range, or as for `effective_attenuation`.
 
     Notes
     -----
-    Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996: K is c where c R_s is far below 1 and comes down to
-    the diffuse attenuation where it is above 5 to 6. His beam is narrow. A beam's own width counts as much as the
-    view's: light that enters at x and leaves at x' counts by how often the beam's and the view's profile have the
-    distance x' - x, and so K goes with their correlation, whichever of them is the wide one. Of beam and view,
-    R = sqrt(R_s^2 + R_b^2) is the radius of a disc with the mean-square radius of their correlation; R_b, twice the
-    root-mean-square angle of the beam per axis times the slant range, is that of the beam alone. The fit takes 2 R for
-    its diameter. K can come near c only where c R_b, too, is far below 1.
+    Gordon (1982), Appl. Opt. 21, 2996, doi:10.1364/AO.21.002996: for a narrow beam, K is c for c R_s far below 1, and
+    falls to the diffuse attenuation at c R_s above 5 to 6. The signal depends on the correlation of the profiles of
+    beam and field of view, so that both widths have the same effect. R = sqrt(R_s^2 + R_b^2) is the radius of a disc
+    with the mean-square radius of the correlation; R_b is twice the root-mean-square angle of the beam per axis times
+    the slant range. The diameter in the fit is 2 R. K approaches c only if c R_b is also far below 1.
 
-    ``kd`` is Lee's (`water_types`): daylight's, averaged over depth. bb is that of the phase function in use.
-    Between the depths K may itself depend on depth; what is given is the mean of the fit.
+    ``kd`` is the depth-averaged Kd of daylight by Lee (`water_types`). bb is that of the phase function in use. K may
+    depend on depth: the result is the mean of the fit.
 
-    What comes out for the default water and a narrow beam on a level sea: the fall is Gordon's and ends by c R_s = 3,
-    but at absorption, 0.149 for a = 0.150 1/m, as Phillips and Koerber (1984), Aust. J. Phys. 37, 75, have it, and 14 %
-    below Lee's Kd. The forward peak keeps K below c in any practical view: at c R_s = 0.015 it is 0.91 c. The fit,
-    which knows no phase function, is up to 0.06 1/m too high between the limits.
+    For the default water and a narrow beam on a level sea, K falls as Gordon's until c R_s = 3, but to the absorption
+    coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 14 % below
+    Lee's Kd. Because of the forward peak, K stays below c in any practical view: 0.91 c at c R_s = 0.015. The fit,
+    which is independent of the phase function, is up to 0.06 1/m too high between the limits.
 
-    Each field is rendered for itself but for what lies inside the next smaller one, which is added from there: in a
-    narrow beam the rare paths near the middle would make most of the noise. So errors of neighbours go together. They
-    are jackknife estimates over the passes, with the correlation of the bins in them.
+    Rings between neighbouring circles are rendered and added up, since rare paths near the middle would cause most of
+    the noise. Errors of neighbouring circles are therefore correlated. They are jackknife estimates over the passes,
+    which include the correlation of the bins.
     """
     passes, seed = integer("passes", passes, 4, 10_000), integer("seed", seed, 0, 2**53)
     fields = np.unique(finite_array("fov_mrad", fov_mrad))
@@ -117,12 +115,14 @@ def fov_sweep(
     slopes = [slope_and_error(column, energy[field][:, column.inside]) for field in range(fields.size)]
     radius = 0.5e-3 * fields * geometry.slant_range
     beam = 2 * system.transmitter.widest_angular_spread * geometry.slant_range
+    # Kd is above c for nearly isotropic scattering, where the fit is not defined.
+    fit = system_attenuation(water.attenuation, min(water.kd, water.attenuation), 2 * np.hypot(radius, beam))
     per_field = {
         "effective_attenuation": ([slope for slope, _ in slopes], "1/m", "attenuation coefficient of the column"),
         "effective_attenuation_stderr": ([error for _, error in slopes], "1/m", "standard error of the attenuation"),
         "spot_radius": (radius, "m", "radius of the circle that the receiver sees on the surface"),
         "scaled_radius": (water.attenuation * radius, "1", "beam attenuation times spot radius"),
-        "system_attenuation": (_fit(water, radius, beam), "1/m", "fit to Gordon's results"),
+        "system_attenuation": (fit, "1/m", "fit to Gordon's results"),
     }
     data: dict[str, Any] = {
         key: ("field_of_view", np.asarray(values), {"units": units, "long_name": meaning})
@@ -151,7 +151,7 @@ def fov_sweep(
 
 
 def describe_fov_sweep(found: xr.Dataset) -> list[str]:
-    """Return the lines of a table of what `fov_sweep` returned."""
+    """Return the lines of a table of a result of `fov_sweep`."""
     columns = ("effective_attenuation", "effective_attenuation_stderr", "system_attenuation")
     lines = [f"{'field of view':>13}{'R_s':>9}{'c R_s':>8}{'K':>9}{'+-':>9}{'fit':>9}"]
     lines.append(f"{'(mrad)':>13}{'(m)':>9}{'':>8}{'(1/m)':>9}{'(1/m)':>9}{'(1/m)':>9}")
@@ -166,16 +166,13 @@ def describe_fov_sweep(found: xr.Dataset) -> list[str]:
 
 
 def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) -> Mapping[str, Any] | None:
-    """Return the parameters of an XML scene with its field of view as wide as the widest, where it has one."""
-    if isinstance(scene, (str, os.PathLike)):
-        known = catalogue.scene_parameters(catalogue.scene_path(scene))
-        if "field_of_view_mrad" in known:
-            return {**(params or {}), "field_of_view_mrad": widest}
-    return params
+    """Return the parameters with the widest field of view, if it is a parameter of the scene."""
+    known = catalogue.scene_parameters(catalogue.scene_path(scene)) if isinstance(scene, (str, os.PathLike)) else {}
+    return {**(params or {}), "field_of_view_mrad": widest} if "field_of_view_mrad" in known else params
 
 
 def _geometry(system: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:
-    """Return geometry and edge of the beam in a half angle [rad]; raise `UserError` if it reaches the horizon."""
+    """Return the geometry, and the edge of the beam within a half angle [rad]; reject a view of the horizon."""
     pose = system.receiver.pose
     off_nadir = math.acos(min(1.0, -float(pose.axis[2])))
     widest = 2e3 * math.tan(0.5 * math.pi - off_nadir)
@@ -186,7 +183,7 @@ def _geometry(system: LidarScene, half_view: float) -> tuple[LidarGeometry, floa
 
 
 def _water(system: LidarScene, min_depth: float, max_depth: float) -> InherentProperties:
-    """Return the water between two depths [m]; refuse several."""
+    """Return the water between two depths [m]; reject several layers."""
     from mitransient_lidar.transport.medium.water_phases import table_of
 
     water = system.water
@@ -206,8 +203,8 @@ def _water(system: LidarScene, min_depth: float, max_depth: float) -> InherentPr
 
 
 def _check_solids(system: LidarScene, geometry: LidarGeometry, edge: float, max_depth: float) -> None:
-    """Refuse a bottom or target whose echo can come from above a depth [m]."""
-    # Scattered light takes the shortest way to a level bottom, which is shorter by cos^2 than that along the axis.
+    """Reject a bottom or target whose echo can begin above a depth [m]."""
+    # The shortest path to a level bottom is shorter by cos^2 than that along the axis.
     for solid in system.solids:
         begin = -float(solid.bbox().max.z) * geometry.cos_water**2 - geometry.surface_depth(edge)
         if max_depth > begin:
@@ -249,19 +246,10 @@ def _render(
 
 def slope_and_error(column: ColumnBins, energy: FloatArray) -> tuple[float, float]:
     """Return K and its standard error over the passes [1/m], from energies of shape (passes, bins)."""
-    passes = len(energy)
-    total = energy.sum(axis=0)
+    passes, total = len(energy), energy.sum(axis=0)
     weights, _ = column.weights(total / passes, energy.std(axis=0, ddof=1) / math.sqrt(passes))
-    without = total - energy
-    if np.any(without <= 0):
+    left_out = total - energy
+    if np.any(left_out <= 0):
         raise UserError(f"the signal of a bin is that of a single one of {passes} passes: render more passes")
-    slopes = np.log(without / column.gain) @ weights
-    spread = (passes - 1) / passes * np.sum((slopes - slopes.mean()) ** 2)
-    return float(weights @ np.log(total / column.gain)), float(np.sqrt(spread))
-
-
-def _fit(water: InherentProperties, radius: FloatArray, beam_radius: float) -> FloatArray:
-    """Return the fit to Gordon's results [1/m] for radii of view and beam [m]."""
-    # Nearly isotropic scattering makes a Kd above c, where the fit has no meaning.
-    kd = min(water.kd, water.attenuation)
-    return system_attenuation(water.attenuation, kd, 2 * np.hypot(radius, beam_radius))
+    slopes = np.log(left_out / column.gain) @ weights
+    return float(weights @ np.log(total / column.gain)), jackknife_error(slopes)

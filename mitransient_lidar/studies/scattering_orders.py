@@ -30,16 +30,16 @@ def scattering_orders(
 ) -> xr.Dataset:
     """Render a scene and separate its light by the number of scattering events in the water.
 
-    Light that only the sea, the bottom or a target has returned is of order 0. Every echo is reversed, from going down
-    to going up, at least once; light with three reversals or more was scattered down and up again, met the bottom
-    twice, or was reflected inside the surface.
+    Light reflected only by the sea, the bottom or a target is of order 0. The vertical direction of every echo is
+    reversed at least once, and three times or more by scattering, a second reflection, or reflection inside the
+    surface.
 
     Parameters
     ----------
     scene, params, seed, integrator
         As for `rendering.render.render`.
     orders
-        Number of separate orders, 1 to 62: 0 to `orders` - 1, and all higher ones together.
+        Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
     passes
         Number of passes, 2 to 100 000.
     progress
@@ -49,17 +49,15 @@ def scattering_orders(
     -------
     xarray.Dataset
         ``impulse_response`` [J per bin] and ``waveform`` [W] with their standard errors, over ``pixel``, ``reversals``
-        (``one``, ``several``), ``order`` (the last includes all higher ones) and ``time`` [ns]. Summed over
-        ``reversals`` and ``order`` they are what `rendering.render.render` estimates. ``energy`` [J] of all pixels and
-        times and its standard error, over ``reversals`` and ``order``. After Ctrl-C it holds the passes done so far,
-        and the attribute ``interrupted`` is 1.
+        (``one``, ``several``), ``order`` (the last includes all higher ones) and ``time`` [ns]; their sums over
+        ``reversals`` and ``order`` are those of `rendering.render.render`. ``energy`` [J] of all pixels and times and
+        its standard error, over ``reversals`` and ``order``. After Ctrl-C it includes the completed passes, and the
+        attribute ``interrupted`` is 1.
 
     Raises
     ------
     UserError
-        When the scene, a parameter or an option is wrong.
-    UserError
-        When `orders` or `passes` is out of range.
+        If the scene or a parameter is invalid or out of range.
     """
     orders = integer("orders", orders, 1, MOST_ORDERS)
     passes = integer("passes", passes, 2, 100_000)
@@ -103,18 +101,10 @@ def scattering_orders(
 
 
 def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
-    """Return order, energy and its standard error [J], share of the whole, and of that order by several turns.
+    """Return order, energy and its standard error [J], share of all light, and share of the order by several reversals.
 
-    Parameters
-    ----------
-    result
-        What `scattering_orders` returned.
-
-    Returns
-    -------
-    list
-        One row an order and a last one for all; NaN where there is no light. Errors of sums are taken as if those of
-        the parts were of one sign, the largest that they can be.
+    One row for each order of a result of `scattering_orders`, and a last one for all; shares are NaN without light. The
+    error of a sum is the sum of the errors, its upper bound.
     """
     energy, stderr = result["energy"].values, result["energy_stderr"].values
     total = energy.sum()
@@ -122,15 +112,14 @@ def shares(result: xr.Dataset) -> list[tuple[str, float, float, float, float]]:
     names = [*(str(order) for order in range(last)), f">={last}", "all"]
     columns = np.column_stack([energy, energy.sum(axis=1)])
     errors = np.append(stderr.sum(axis=0), stderr.sum())
-    rows = []
-    for name, (one, several), error in zip(names, columns.T, errors, strict=True):
-        both = one + several
-        rows.append((name, float(both), float(error), _share(both, total), _share(several, both)))
-    return rows
+    return [
+        (name, float(one + several), float(error), _share(one + several, total), _share(several, one + several))
+        for name, (one, several), error in zip(names, columns.T, errors, strict=True)
+    ]
 
 
 def describe_orders(result: xr.Dataset) -> list[str]:
-    """Return lines of a table of what `scattering_orders` returned: one an order, and one for all."""
+    """Return the lines of a table of a result of `scattering_orders`: one for each order, and one for all."""
     lines = [f"{'order':<8}{'energy (J)':>22}{'share (%)':>12}{'several reversals (%)':>24}"]
     for name, energy, error, share, several in shares(result):
         known = f"{energy:.3e} +- {error:.0e}"

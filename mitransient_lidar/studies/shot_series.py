@@ -1,4 +1,4 @@
-"""Shots at random places of one sea, with the slopes that each of them meets."""
+"""Shots at random places of one sea, with the slopes of the surface there."""
 
 from __future__ import annotations
 
@@ -25,17 +25,10 @@ def random_shots(
     seed: int,
     progress: ProgressCallback | None,
 ) -> Iterator[tuple[Shot, xr.Dataset]]:
-    """Render shots at random places of a sea; the parameters are those of `render_shots`.
-
-    Yields
-    ------
-    Shot, xarray.Dataset
-        Place with its slopes, and the result.
-    """
+    """Yield shots at random places of a sea and their results; the parameters are those of `render_shots`."""
     places = np.random.default_rng(seed).uniform(sea.x[0], sea.x[-1], (count, 2))
     for number, (x, y) in enumerate(places):
-        place = {**(params or {}), "aim_x": x, "aim_y": y}
-        result = render(scene, params=place, passes=passes, seed=number)
+        result = render(scene, params={**(params or {}), "aim_x": x, "aim_y": y}, passes=passes, seed=number)
         if progress is not None:
             progress(Progress(number + 1, count, "shot"))
         yield Shot("random", x, y, *sea.slope_at(x, y)), result
@@ -59,9 +52,9 @@ def render_shots(
     count
         Number of shots, 2 to 100 000.
     passes
-        Passes of each, 2 to 10 000.
+        Passes of each shot, 2 to 10 000.
     seed
-        Seed of the places, at least 0; the same places for the same sea.
+        Seed of the places, at least 0.
     progress
         Called with a `passes.Progress` after every shot.
 
@@ -76,7 +69,7 @@ def render_shots(
     Raises
     ------
     UserError
-        When the scene is invalid or has no waves, or a number is out of range.
+        If the scene is invalid or has no waves, or a number is out of range.
     """
     count, passes = integer("count", count, 2, 100_000), integer("passes", passes, 2, 10_000)
     seed = integer("seed", seed, 0, 2**53)
@@ -85,13 +78,10 @@ def render_shots(
     shots, rendered = zip(*drawn, strict=True)
     kept = [result[["waveform", "waveform_stderr"]] for result in rendered]
     series: xr.Dataset = xr.concat(kept, "shot", combine_attrs="override")
-    for name, attribute, unit in (
-        ("aim_x", "x", "m"),
-        ("aim_y", "y", "m"),
-        ("true_slope_along", "along", "1"),
-        ("true_slope_across", "across", "1"),
-    ):
-        series[name] = ("shot", np.array([getattr(shot, attribute) for shot in shots]), {"units": unit})
+    numbers = np.array([(shot.x, shot.y, shot.along, shot.across) for shot in shots]).T
+    names = ("aim_x", "aim_y", "true_slope_along", "true_slope_across")
+    for name, values, unit in zip(names, numbers, ("m", "m", "1", "1"), strict=True):
+        series[name] = ("shot", values, {"units": unit})
     deviation = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     attributes = {**rendered[-1].attrs, "slope_deviation": deviation}
     return series.assign_coords(shot=np.arange(count)).assign_attrs(attributes)

@@ -1,4 +1,4 @@
-"""Statistics of echoes over shots at random places of a sea, against the slope that the beam meets."""
+"""Statistics of echoes over shots at random places of a sea, against the slope of the surface."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from mitransient_lidar.studies.shot_series import random_shots
 
 _PASSES = 8
 
-#: Half widths of the gates about the echoes on a level sea [ns].
-_SURFACE_GATE_NS, _BOTTOM_GATE_NS = 10.0, 10.0
+#: Half width of the gates about the echoes of a level sea [ns].
+_HALF_GATE_NS = 10.0
 
 
 def shot_statistics(
@@ -48,16 +48,14 @@ def shot_statistics(
     -------
     xarray.Dataset
         Over ``shot``: ``aim_x``, ``aim_y`` [m], ``slope_along``, ``slope_across`` (mean over the beam's footprint,
-        positive along is a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``,
-        ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] of the waveform's highest point in a gate of 20 ns
-        about the echo of a level sea; ``NaN`` where it lies on the gate's border.
+        positive along for a face towards the lidar, [1]). Over ``shot`` and ``pixel``: ``surface_peak``,
+        ``bottom_peak`` [W], ``surface_time``, ``bottom_time`` [ns] of the highest point of the waveform in a gate of
+        20 ns about the echo of a level sea; NaN where it lies at a limit of the gate.
 
     Raises
     ------
     UserError
-        When the scene is wrong, has no waves or no bottom, or the record does not hold the echoes.
-    UserError
-        When `count` is out of range.
+        If the scene is invalid, has no waves or no bottom, the record lacks an echo, or a number is out of range.
     """
     count, seed = integer("count", count, 2, 100_000), integer("seed", seed, 0, 2**53)
     sea = SeaMap.of_scene(open_scene(scene, params).scene)
@@ -65,48 +63,41 @@ def shot_statistics(
     drawn = random_shots(scene, params, sea, count=count, passes=_PASSES, seed=seed, progress=progress)
     for shot, result in drawn:
         row: dict[str, Any] = {"aim_x": shot.x, "aim_y": shot.y, "slope_along": shot.along, "slope_across": shot.across}
-        for name, middle, half in _gates(result):
-            row[f"{name}_peak"], row[f"{name}_time"] = highest_points(result, middle - half, middle + half)
+        for name, time in _echo_times(result).items():
+            gate = time - _HALF_GATE_NS, time + _HALF_GATE_NS
+            row[f"{name}_peak"], row[f"{name}_time"] = highest_points(result, *gate)
         rows.append(row)
-    pixels = [str(name) for name in result["pixel"].values]
-    arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     units = {"aim_x": "m", "aim_y": "m", "slope_along": "1", "slope_across": "1"}
-    data = {
-        name: (("shot", "pixel")[: values.ndim], values, {"units": units.get(name, "W" if "peak" in name else "ns")})
-        for name, values in arrays.items()
-    }
+    data = {}
+    for name in rows[0]:
+        values = np.array([row[name] for row in rows])
+        unit = units.get(name, "W" if "peak" in name else "ns")
+        data[name] = (("shot", "pixel")[: values.ndim], values, {"units": unit})
+    pixels = [str(name) for name in result["pixel"].values]
     return xr.Dataset(data, coords={"pixel": pixels}, attrs={**result.attrs, "places_seed": seed})
 
 
-def _gates(shot: xr.Dataset) -> list[tuple[str, float, float]]:
-    """Return name, middle [ns] and half width [ns] of the gates about surface and bottom echo of a level sea."""
+def _echo_times(shot: xr.Dataset) -> dict[str, float]:
+    """Return the times of surface and bottom echo of a level sea [ns]."""
     depth = shot.attrs.get("scene.bottom_depth")
     if depth is None or "surface_time_ns" not in shot.attrs:
         raise UserError("shot-statistics needs a scene with a sea and the parameter bottom_depth")
     geometry = LidarGeometry.from_attributes(shot.attrs)
-    bottom = float(geometry.time_of_depth(float(depth)))
-    return [("surface", geometry.surface_time_ns, _SURFACE_GATE_NS), ("bottom", bottom, _BOTTOM_GATE_NS)]
+    return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
 
 
 def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArray, FloatArray]:
-    """Find the highest point of each pixel's waveform in a gate, by a parabola through three bins.
-
-    Parameters
-    ----------
-    shot
-        A result with waveforms.
-    start, end
-        Gate [ns].
+    """Find the highest point of each pixel's waveform in a gate [ns], by a parabola through three bins.
 
     Returns
     -------
     height, time
-        Power [W] and time [ns], shape (pixels,); NaN where the highest bin lies on the gate's border.
+        Power [W] and time [ns], shape (pixels,); NaN where the highest bin lies at a limit of the gate.
 
     Raises
     ------
     UserError
-        When the record does not hold the gate.
+        If the gate is not within the record.
     """
     time = shot["time"].values
     inside = np.flatnonzero((time >= start) & (time <= end))
@@ -126,7 +117,7 @@ def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArr
 
 
 def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refractive_index: float) -> FloatArray:
-    """Return how much too deep a bottom appears where a ray is refracted by a slope [m].
+    """Return the error of the depth [m] of a bottom by refraction at a slope, positive for too deep a bottom.
 
     Parameters
     ----------
@@ -141,8 +132,8 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
 
     Notes
     -----
-    The published explanation (Tulldahl 2006, figure 12): a face turned away from the lidar bends the ray towards the
-    vertical, and the way to the bottom is shorter. The depth read from it is that of a level sea.
+    Explanation by Tulldahl (2006, figure 12): a face away from the lidar refracts the ray towards the vertical, which
+    shortens the path to the bottom. The depth is computed from the time as for a level sea.
     """
     tilt = np.arctan(slope_along)
     level = math.asin(math.sin(off_nadir) / refractive_index)
@@ -151,34 +142,29 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
 
 
 def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return the effects of the slopes on the echoes of a receiver with 2x2 pixels.
-
-    Parameters
-    ----------
-    shots
-        What `shot_statistics` returned.
+    """Return slopes [1] and their effects on the echoes of a receiver with 2x2 pixels, from `shot_statistics`.
 
     Returns
     -------
     dict
-        Slope [1] and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (of the
-        far pair's surface echo from the near pair's [ns]) and ``depth`` (error of the bottom's depth [m]) against the
-        slope along the azimuth; ``sideways`` (green's surface echo after red's [ns]) against the slope across.
+        Slope and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (delay of the
+        surface echo of the far pair after that of the near pair [ns]) and ``depth`` (error of the depth of the bottom
+        [m]) for the slope along the azimuth; ``sideways`` (delay of green after red [ns]) for the slope across.
 
     Raises
     ------
     UserError
-        When the pixels are others.
+        If the pixels are different ones.
     """
     if [str(name) for name in shots["pixel"].values] != ["red", "green", "blue", "black"]:
         raise UserError(f"pixels = {list(shots['pixel'].values)} must be the 2x2 of red, green, blue and black")
     geometry = LidarGeometry.from_attributes(shots.attrs)
-    due = float(geometry.time_of_depth(float(shots.attrs["scene.bottom_depth"])))
+    level = float(geometry.time_of_depth(float(shots.attrs["scene.bottom_depth"])))
     along, across = (shots[f"slope_{name}"].values for name in ("along", "across"))
     surface, bottom = shots["surface_time"], shots["bottom_time"]
     strength = shots["surface_peak"].sum("pixel", skipna=False).values
     separation = (surface[:, :2].mean("pixel", skipna=False) - surface[:, 2:].mean("pixel", skipna=False)).values
-    deeper = geometry.depth_per_ns * (bottom.mean("pixel", skipna=False).values - due)
+    deeper = geometry.depth_per_ns * (bottom.mean("pixel", skipna=False).values - level)
     return {
         "strength": (along, np.log10(strength)),
         "separation": (along, separation),

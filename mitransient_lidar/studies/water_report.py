@@ -1,4 +1,4 @@
-"""Optical properties and scene parameters of a water, from its type or a quantity measured of it."""
+"""Optical properties and scene parameters of a water, from its type or a measured quantity."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
 KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
 
 DEFAULT_TOLERANCE = 0.01
-"""What the medium ``layered_water`` lets the layers of a profile deviate from it, relative."""
+"""Default of ``profile_tolerance`` of the medium ``layered_water``."""
 
-#: How well each kind is known to stand for the water's own properties.
+#: Uncertainty of the properties of each kind.
 _CAUTION = {
-    "jerlov": "bb follows from Kd and is uncertain by half",
-    "chlorophyll": "single waters scatter twice or half as much",
-    "kd": "a Kd leaves the scattering open by a factor of 2",
-    "secchi": "a Secchi depth is a rough way in: a factor of 2",
-    "petzold": "measured at 514 to 530 nm; what is rendered is a Fournier-Forand function of the same bb/b",
-    "pure": "natural waters hold particles, which scatter more",
+    "jerlov": "bb is estimated from Kd and uncertain by half",
+    "chlorophyll": "the scattering of individual waters differs by a factor of 2",
+    "kd": "Kd determines the scattering within a factor of 2 only",
+    "secchi": "the Secchi depth determines the properties within a factor of 2 only",
+    "petzold": "measured at 514 to 530 nm; rendered with a Fournier-Forand function of the same bb/b",
+    "pure": "natural waters contain particles, which scatter more",
 }
 
 #: Titles of figures, by kind.
@@ -44,7 +44,7 @@ _TITLES = {
     "pure": "pure sea water",
 }
 
-#: Wavelengths [nm] at which Petzold's waters stand for themselves: from his filter's middle to the usual laser.
+#: Wavelengths [nm] at which Petzold's waters are used: from the centre of his filter to the usual laser.
 _PETZOLD_RANGE = (514.0, water_types.GREEN_RANGE[1])
 
 #: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
@@ -69,9 +69,7 @@ def water_of(
     Raises
     ------
     UserError
-        When the kind is unknown, the value missing or not a number.
-    UserError
-        When a value is out of range.
+        If the kind is unknown, or a value is missing, not a number or out of range.
     """
     if kind not in _CAUTION:
         raise UserError(f"kind = {kind!r} must be one of {', '.join(_CAUTION)}")
@@ -103,21 +101,22 @@ def describe_water(
     salinity: float,
     tolerance: float = DEFAULT_TOLERANCE,
 ) -> list[str]:
-    """Return lines that tell the properties of a water and what to render it with.
+    """Return lines with the properties of a water and the parameters to render it.
 
     Parameters
     ----------
     kind, value, wavelength_nm, temperature, salinity
         As for `water_of`; or the kind ``profile`` and the path of a file for `profiles.read_profile`.
     tolerance
-        Largest relative deviation of a profile's layers, 1e-5 to 0.5.
+        Largest relative deviation of the layers from a profile, 1e-5 to 0.5.
 
     Raises
     ------
     UserError
-        As `water_of`, for a value out of range, too; or when the file cannot be read.
+        As for `water_of`, or if the file cannot be read.
     """
-    _require_kind(kind)
+    if kind not in KINDS:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
     index = float(seawater.refractive_index(wavelength_nm, temperature, salinity))
     group = float(seawater.group_index(wavelength_nm, temperature, salinity))
     if kind == "profile":
@@ -154,15 +153,7 @@ def describe_water(
 def phase_function_of(
     kind: str, value: str | None, found: water_types.InherentProperties
 ) -> tuple[PhaseFunction, str, str]:
-    """Return the phase function of a water, its label, and a title with the properties of the water.
-
-    Parameters
-    ----------
-    kind, value
-        As for `water_of`.
-    found
-        The properties that `water_of` returned.
-    """
+    """Return the phase function of a water, its label, and a title with the properties `found` by `water_of`."""
     ratio = f"bb/b = {found.backscatter_ratio:.3g}"
     phase: PhaseFunction
     if kind == "pure":
@@ -176,19 +167,13 @@ def phase_function_of(
 
 
 def fournier_forand_of(backscatter_ratio: float) -> PhaseFunction:
-    """Return the Fournier-Forand function with a bb/b, which maps angles [rad] to p [1/sr].
-
-    Raises
-    ------
-    UserError
-        If no such function has this bb/b.
-    """
+    """Return the Fournier-Forand function of a bb/b, which maps angles [rad] to p [1/sr]; reject an impossible bb/b."""
     n, mu = fournier_forand_parameters(backscatter_ratio)
     return lambda theta: fournier_forand(theta, n, mu)
 
 
 def profile_of(file: str | None) -> Profile:
-    """Read the file of a profile; raise a `UserError` if there is none, or as `profiles.read_profile`."""
+    """Read the file of a profile, which must be given; raises as `profiles.read_profile`."""
     return read_profile(_given("profile", file))
 
 
@@ -207,7 +192,7 @@ def _describe_profile(file: str, tolerance: float, index: float, group: float) -
         "refractive index": f"{index:.5g}",
         "group index": f"{group:.5g}",
     }
-    # A scene may be rendered from another folder.
+    # An absolute path, since a scene may be rendered in another folder.
     element = f'<string name="profile" value={quoteattr(str(Path(file).absolute()))}/>'
     if tolerance != DEFAULT_TOLERANCE:
         element += f' <float name="profile_tolerance" value="{tolerance:g}"/>'
@@ -224,7 +209,7 @@ def _span(values: FloatArray) -> str:
 
 
 def _ratio_span(profile: Profile) -> str:
-    """Return the range of bb/b, whose extremes lie at nodes, where there is scattering."""
+    """Return the range of bb/b where there is scattering; its extremes lie at nodes."""
     scatters = profile.scattering > 0
     if not scatters.any():
         return "none, nothing scatters"
@@ -240,11 +225,6 @@ def _petzold(name: str, wavelength_nm: float) -> water_types.InherentProperties:
     a, b = PETZOLD_WATERS[name]
     share = PowerLawTable.from_function(petzold_water(name), _NODES).backscatter_ratio
     return water_types.InherentProperties(a, b, b * share)
-
-
-def _require_kind(kind: str) -> None:
-    if kind not in KINDS:
-        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
 
 
 def _given(kind: str, value: str | None) -> str:

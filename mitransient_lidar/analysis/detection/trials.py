@@ -17,6 +17,7 @@ import numpy.typing as npt
 from mitransient_lidar.analysis.detection import roc
 from mitransient_lidar.analysis.detection.matched_filter import delay_bound, delays
 from mitransient_lidar.analysis.detection.statistics import Cases, sample_moments, within_range
+from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
@@ -308,9 +309,7 @@ def _interval(value: float, changes: FloatArray) -> tuple[float, float, float]:
     """Return a value and the limits of its confidence interval from a jackknife's changes, by Student's t."""
     from scipy.stats import t
 
-    count = len(changes)
-    error = math.sqrt((count - 1) / count * float(np.sum((changes - changes.mean()) ** 2)))
-    reach = float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * error
+    reach = float(t.ppf((1 + CONFIDENCE) / 2, len(changes) - 1)) * jackknife_error(changes)
     return value, value - reach, value + reach
 
 
