@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array
+from mitransient_lidar.core.validation import FloatArray
 
 
 class Rates(NamedTuple):
@@ -29,32 +28,16 @@ class Area(NamedTuple):
 
 
 def binomial_rates(successes: npt.ArrayLike, trials: int, confidence: float = 0.95) -> Rates:
-    """Return rates with Clopper-Pearson intervals, in the shape of `successes`.
-
-    Parameters
-    ----------
-    successes, trials : array_like, int
-        Numbers of successes, integers from 0 to `trials`, and number of trials, at least 1.
-    confidence : float
-        Smallest coverage probability of an interval, above 0 and below 1.
-
-    Raises
-    ------
-    UserError
-        If an argument is out of range.
+    """Return rates with Clopper-Pearson intervals for numbers of successes, 0 to `trials`, in their shape.
 
     Notes
     -----
-    C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), doi:10.1093/biomet/26.4.404: exact and conservative. The
-    limits are quantiles of beta distributions.
+    C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), doi:10.1093/biomet/26.4.404: exact and conservative, so
+    that `confidence` is the smallest coverage probability. The limits are quantiles of beta distributions.
     """
     from scipy.special import betaincinv
 
-    count, tail = finite_array("successes", successes), _tail(confidence)
-    if trials < 1:
-        raise UserError(f"trials = {trials} must be at least 1")
-    if np.any(count < 0) or np.any(count > trials) or np.any(count != np.rint(count)):
-        raise UserError(f"successes must be integers between 0 and {trials}")
+    count, tail = np.asarray(successes, dtype=np.float64), (1 - confidence) / 2
     low = np.where(count > 0, betaincinv(np.maximum(count, 1), trials - count + 1, tail), 0.0)
     high = np.where(count < trials, betaincinv(count + 1, np.maximum(trials - count, 1), 1 - tail), 1.0)
     return Rates(count / trials, low, high)
@@ -66,31 +49,16 @@ def exceedance(values: npt.ArrayLike, thresholds: npt.ArrayLike, confidence: flo
     For shots without a target these are probabilities of false alarm, with a target those of detection; both for one
     threshold are a point of the receiver operating characteristic. The thresholds must not depend on the values;
     otherwise the intervals of `binomial_rates` are too narrow.
-
-    Raises
-    ------
-    UserError
-        If there are no values, some are not finite, or `confidence` is out of range.
     """
-    ordered, limits = np.sort(_trials("values", values)), finite_array("thresholds", thresholds)
-    above = ordered.size - np.searchsorted(ordered, limits, side="right")
-    return binomial_rates(above, ordered.size, confidence)
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    return binomial_rates(ordered.size - np.searchsorted(ordered, thresholds, side="right"), ordered.size, confidence)
 
 
 def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: float = 0.95) -> Area:
-    """Return the area under the receiver operating characteristic.
+    """Return the area under the receiver operating characteristic of outcomes without and with the target.
 
-    It is the probability that the value with a target is the larger of a pair; equal values count one half.
-
-    Parameters
-    ----------
-    null, target, confidence : array_like, shape (trials,), and float
-        Independent outcomes without and with the target, at least two of each; the confidence of `binomial_rates`.
-
-    Raises
-    ------
-    UserError
-        If there are too few values, some are not finite, or `confidence` is out of range.
+    It is the probability that the value with a target is the larger of a pair; equal values count one half. The
+    outcomes, shape (trials,), are independent, at least two of each.
 
     Notes
     -----
@@ -102,10 +70,10 @@ def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: flo
     from scipy.special import ndtri
     from scipy.stats import rankdata
 
-    without, with_target, tail = _trials("null", null, 2), _trials("target", target, 2), _tail(confidence)
-    n, m = without.size, with_target.size
+    without, with_target = np.asarray(null, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    n, m, tail = without.size, with_target.size, (1 - confidence) / 2
     ranks = rankdata(np.concatenate([without, with_target]))
-    # For each shot, the fraction of shots of the other kind that it is separated from.
+    # For each shot, the fraction of the shots of the other kind on the correct side of it.
     above = (ranks[n:] - rankdata(with_target)) / n
     below = 1 - (ranks[:n] - rankdata(without)) / m
     value = float(np.mean(above))
@@ -116,17 +84,3 @@ def area_under_curve(null: npt.ArrayLike, target: npt.ArrayLike, confidence: flo
     centre, reach = np.log(value / (1 - value)), -ndtri(tail) * error / (value * (1 - value))
     low, high = (1 / (1 + np.exp(-limit)) for limit in (centre - reach, centre + reach))
     return Area(value, error, float(low), float(high))
-
-
-def _trials(name: str, values: npt.ArrayLike, fewest: int = 1) -> FloatArray:
-    trials = finite_array(name, values)
-    if trials.ndim != 1 or trials.size < fewest:
-        raise UserError(f"{name} of shape {trials.shape} must be a list of {fewest} or more numbers")
-    return trials
-
-
-def _tail(confidence: float) -> float:
-    """Return the probability outside each end of an interval."""
-    if not 0 < confidence < 1:
-        raise UserError(f"confidence = {confidence:g} must be above 0 and below 1")
-    return (1 - confidence) / 2

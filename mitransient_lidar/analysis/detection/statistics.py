@@ -1,8 +1,4 @@
-"""Detection of a known echo in noise and clutter by the best weighted sum of samples.
-
-`sample_moments` gives mean and covariance of the samples of a receiver. `Cases` holds them without and with a target,
-for one sea or several; `Cases.statistic` returns the weights of the samples and the distribution of their weighted sum.
-"""
+"""Detection of a known echo in noise and clutter by the best weighted sum of samples."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import ELEMENTARY_CHARGE
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.detectors import photons_per_joule
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
@@ -33,33 +29,15 @@ def sample_moments(
 ) -> SampleMoments:
     """Return mean and covariance of some samples of a shot in closed form, in `chain.units` and their square.
 
-    Parameters
-    ----------
-    chain : ReceiverChain
-        The receiver.
-    power : array_like, shape (..., time)
-        Mean optical power of the signal on the detector in each bin [W], not negative.
-    bin_width_ns : float
-        Width of the bins [ns], positive.
-    samples : slice
-        Indices of the samples, without a step.
-    background : array_like
-        Steady power in addition to the signal [W], not negative: a number, or one per record.
-
-    Raises
-    ------
-    UserError
-        As `ReceiverChain.expected`, and without such samples.
+    The arguments are those of `ReceiverChain.expected`, and the indices of the samples, without a step.
 
     Notes
     -----
     Mean and variance are those of `ReceiverChain.expected`. The correlation of samples is that of the detector's charge
-    behind the low-pass, which a logarithm hardly changes; rounding errors are assumed independent.
+    after the low-pass, which a logarithm changes little; rounding errors are assumed independent.
     """
     expected = chain.expected(power, bin_width_ns, background)
     chosen = range(*samples.indices(expected.mean.shape[-1]))
-    if len(chosen) == 0 or chosen.step != 1:
-        raise UserError(f"samples = {samples} must choose one or more of {expected.mean.shape[-1]} without a step")
     light = np.asarray(power, dtype=np.float64)
     sky = np.asarray(background, dtype=np.float64)[..., None]
     bins = chain.stride(bin_width_ns) * np.array(chosen)
@@ -98,8 +76,8 @@ def within_range(
 ) -> ReceiverChain:
     """Return the chain with the transimpedance reduced, if necessary, for samples in the range of its electronics.
 
-    The arguments and errors are those of `sample_moments`. Samples with 6 standard deviations of noise are in range;
-    other samples, such as a surface echo, may be clipped.
+    The arguments are those of `sample_moments`. Samples with 6 standard deviations of noise are in range; other
+    samples, such as a surface echo, may be clipped.
     """
     if chain.amplifier is None:
         return chain
@@ -166,7 +144,7 @@ class Statistic(NamedTuple):
 
 @dataclass(frozen=True)
 class Cases:
-    """Samples without and with a target, on one sea or several.
+    """Moments of the samples without and with a target, for one sea or several.
 
     Parameters
     ----------
@@ -204,7 +182,7 @@ class Cases:
         return np.asarray((self.target_mean - self.null_mean).mean(axis=0))
 
     def covariance(self, with_target: bool = False) -> FloatArray:
-        """Return the covariance for the weights of each detector by itself, shape (samples, samples).
+        """Return the covariance for the independent weights of each detector, shape (samples, samples).
 
         It is that of the noise, with the target or else the mean of that without and with it. For several cases it
         includes, for each detector, the strongest principal component of its samples without the target: mostly the
@@ -236,15 +214,15 @@ class Cases:
     def statistic(self) -> Statistic:
         """Return the best weighted sum of the samples, and its distribution.
 
-        For one case, it is that against its noise alone; for several, against noise and clutter, with the weights of
-        each case from the other cases only. Since few seas do not determine a weight for every sample, each detector's
-        samples are weighted against its noise and the strongest component of its clutter, and then the detectors
-        against noise and their common clutter.
+        One case is weighted for its noise alone; at least three for noise and clutter, with the weights of each case
+        estimated from the others. Since few seas do not determine a weight for every sample, the samples of each
+        detector are weighted for its noise and the strongest component of its clutter, and then the detectors for noise
+        and their common clutter.
 
         Raises
         ------
         UserError
-            If the target changes no sample, or if there are two cases: clutter requires at least three.
+            If the target changes no sample.
 
         Notes
         -----
@@ -255,8 +233,6 @@ class Cases:
         Science, 2004, section 13.2.12).
         """
         count = len(self.null_mean)
-        if count == 2:
-            raise UserError("cases = 2 must be 1 or at least 3: the weights of each come from the others")
         training = [self] if count == 1 else [self.others(i) for i in range(count)]
         weights, offsets = np.empty_like(self.null_mean), np.empty(count)
         for i, cases in enumerate(training):
@@ -278,21 +254,13 @@ class Cases:
         )
 
 
-def matched_weights(signal: npt.ArrayLike, covariance: npt.ArrayLike) -> FloatArray:
+def matched_weights(signal: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return C^-1 s / (s C^-1 s), the weights of the matched filter of a signal s with noise of the covariance C.
 
-    Samples without variance get no weight.
-
-    Raises
-    ------
-    UserError
-        If shapes disagree, a value is not finite, the covariance is not positive, or no sample with noise has a signal.
+    The weights of samples without variance are 0. Without a signal in the samples with noise, `UserError` is raised.
     """
-    s, c = finite_array("signal", signal), finite_array("covariance", covariance)
-    if s.ndim != 1 or c.shape != (s.size, s.size):
-        raise UserError(f"covariance of shape {c.shape} must be ({s.size}, {s.size}) for a signal of shape {s.shape}")
-    filtered = _solved(c, s)
-    square = float(s @ filtered)
+    filtered = _solved(covariance, signal)
+    square = float(signal @ filtered)
     if square <= 0:
         raise UserError("signal must not be 0 in every sample that has noise, and covariance must be positive")
     return filtered / square
@@ -302,7 +270,7 @@ def _solved(covariance: FloatArray, signal: FloatArray) -> FloatArray:
     """Return the inverse of the covariance times the signal, 0 without variance."""
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
     noisy = np.flatnonzero(deviation > 0)
-    # In units of each sample's standard deviation: samples may differ by orders of magnitude.
+    # In units of the standard deviations, which may differ by orders of magnitude.
     correlation = covariance[np.ix_(noisy, noisy)] / np.outer(deviation[noisy], deviation[noisy])
     found = np.zeros_like(signal)
     try:
@@ -312,13 +280,8 @@ def _solved(covariance: FloatArray, signal: FloatArray) -> FloatArray:
     return found
 
 
-def clutter_covariance(samples: npt.ArrayLike) -> FloatArray:
+def clutter_covariance(values: FloatArray) -> FloatArray:
     """Return the covariance of samples (cases, samples) over few cases, with correlations shrunk towards 0.
-
-    Raises
-    ------
-    UserError
-        If there are fewer than two cases or values that are not finite.
 
     Notes
     -----
@@ -326,17 +289,14 @@ def clutter_covariance(samples: npt.ArrayLike) -> FloatArray:
     target D with unequal variances: the shrinkage is the estimated variance of the correlations over their sum of
     squares. With few cases, the sample covariance is singular, and weights would ignore the clutter in its null space.
     """
-    values = finite_array("samples", samples)
-    if values.ndim != 2 or len(values) < 2:
-        raise UserError(f"samples of shape {values.shape} must be (cases, samples) with 2 or more cases")
     n = len(values)
     deviation = values.std(axis=0, ddof=1)
     unit = np.divide(values - values.mean(axis=0), deviation, out=np.zeros_like(values), where=deviation > 0)
     products = unit.T @ unit / n
     correlation = n / (n - 1) * products
     variance = n / (n - 1) ** 3 * ((unit**2).T @ unit**2 - n * products**2)
-    beside = ~np.eye(values.shape[1], dtype=bool)
-    total = float(np.sum(correlation[beside] ** 2))
-    share = min(1.0, float(np.sum(variance[beside])) / total) if total > 0 else 1.0
-    correlation[beside] *= 1 - share
+    off_diagonal = ~np.eye(values.shape[1], dtype=bool)
+    total = float(np.sum(correlation[off_diagonal] ** 2))
+    share = min(1.0, float(np.sum(variance[off_diagonal])) / total) if total > 0 else 1.0
+    correlation[off_diagonal] *= 1 - share
     return np.asarray(correlation * np.outer(deviation, deviation))

@@ -63,20 +63,3 @@ def test_area_without_an_error_has_a_limit():
     assert (found.value, found.stderr, found.high) == (1, 0, 1)
     assert found.low == pytest.approx(0.05**0.05)
     assert area_under_curve(100 + np.arange(20), np.arange(30)).high == pytest.approx(1 - 0.05**0.05)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: binomial_rates([1], 0), "trials = 0 must be at least 1"),
-        (lambda: binomial_rates([4], 3), "integers between 0 and 3"),
-        (lambda: binomial_rates([0.5], 3), "integers between 0 and 3"),
-        (lambda: binomial_rates([1], 3, confidence=1), "confidence = 1 must be above 0 and below 1"),
-        (lambda: exceedance([], [1]), r"values of shape \(0,\) must be a list of 1 or more"),
-        (lambda: exceedance([np.nan], [1]), "values holds nan"),
-        (lambda: area_under_curve([1], [1, 2]), r"null of shape \(1,\) must be a list of 2 or more"),
-    ],
-)
-def test_invalid_input(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
