@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, IntArray, Records
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer, non_negative
+from mitransient_lidar.core.validation import FloatArray, integer, non_negative
 
 _FEWEST = 8  # bins of a column's fit
 _SEGMENT = 4  # fewest bins on either side of a change
@@ -48,7 +48,7 @@ def column_fit(
 ) -> ColumnFit:
     """Fit P(t) = gain(t) level exp(-decay (t - t_surface)) to the bins of a column.
 
-    Weighted least squares in the power, without the bias of a fit of logarithms, which serves as the first guess.
+    Weighted least squares in the power, unbiased, from the first guess of a fit of logarithms.
 
     Parameters
     ----------
@@ -62,12 +62,12 @@ def column_fit(
     Returns
     -------
     ColumnFit
-        Known with at least 8 bins in the column, and a positive level of an error below 100 %.
+        NaN for columns of less than 8 bins, and without a positive level of an error below 100 %.
     """
     start, end, surface = (np.asarray(v, dtype=np.float64)[:, np.newaxis] for v in (start_ns, end_ns, surface_ns))
     delay = records.time_ns - np.nan_to_num(surface)
     inside = (records.time_ns >= start) & (records.time_ns <= end)
-    shape = np.broadcast_to(finite_array("gain", gain), records.power.shape)
+    shape = np.broadcast_to(np.asarray(gain), records.power.shape)
     count = inside.sum(axis=1)
     enough = count >= _FEWEST
     scaled = np.where(inside, records.power / shape, 0)
@@ -149,25 +149,25 @@ def change_points(
 ) -> ChangePoints:
     """Test columns for changes of the level or the rate of their exponential.
 
-    Two lines through the logarithms, before and behind every bin in turn, are compared with one line through both.
-    With noise alone, the two additional parameters lower the weighted squares by more than x with the probability
-    exp(-x/2) at one bin, and with at most N exp(-x/2) at any of N bins (Bonferroni). Further changes are sought between
+    At every bin, two lines through the logarithms before and behind it are compared with one line through both. With
+    noise alone, the two additional parameters lower the weighted squares by more than x with the probability exp(-x/2)
+    at one bin, and with at most N exp(-x/2) at any of N bins (Bonferroni). Further changes are searched for between
     those already found (binary segmentation; Scott and Knott 1974, Biometrics 30, 507-512).
 
     Parameters
     ----------
     records : Records
-        The waveforms. They are used up to the first bin with a signal of less than six times the noise.
+        The waveforms, used up to the first bin with a signal of less than six times the noise.
     start_ns, end_ns : array_like, shape (n,)
         First and last bin centres of the column [ns]; NaN without a column.
     gain : array_like, shape () or (n, time)
         Relative signal by distance and refraction.
     layers : int
-        Number of changes to seek, 1 to 8.
+        Number of changes to search for, 1 to 8.
     model_error : float
         Relative deviation of a homogeneous column from an exponential, at least 0; it is added to the noise.
     blur_ns : float
-        Duration of a sudden change after pulse and beam [ns], at least 0: as many bins around it are excluded.
+        Duration of a sudden change after pulse and beam [ns], at least 0: the bins within it are excluded.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def change_points(
         high = np.stack([b for _, b in segments])[which, rows]
         found.append(sums.describe(records.time_ns[part], gains.max(axis=0), low, place, high))
         for index in range(len(segments)):
-            # The half before the change replaces the segment; the other one is new.
+            # The part before the change replaces the segment; the other one is appended.
             hit = which == index
             old_low, old_high = segments[index]
             segments[index] = (old_low, np.where(hit, np.maximum(place - gap, old_low), old_high))
@@ -226,11 +226,11 @@ class _Sums:
 
         power = records.power[:, part]
         noise = np.broadcast_to(records.noise, records.power.shape)[:, part]
-        shape = np.broadcast_to(finite_array("gain", gain), records.power.shape)[:, part]
+        shape = np.broadcast_to(np.asarray(gain), records.power.shape)[:, part]
         mean = uniform_filter1d(power, _RUN, axis=1, mode="nearest")
         clear = (mean > _CLEAR * noise) & (power > 0)
         member = inside[:, part]
-        # A column ends at the noise level, even with an echo behind it.
+        # A column ends where it is below the noise, even before an echo.
         usable = member & np.logical_and.accumulate(clear | ~member, axis=1)
         relative = np.where(usable, noise / np.where(usable, mean, 1.0), 1.0)
         # The mean logarithm of a noisy value is less than the logarithm of its mean.

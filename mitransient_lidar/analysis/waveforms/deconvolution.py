@@ -18,8 +18,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     smooth,
 )
 from mitransient_lidar.analysis.waveforms.echo_estimators import Window, centroid, ideal_echo, summit
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer, positive
+from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 
 Operator = Callable[[FloatArray], FloatArray]
@@ -28,7 +27,7 @@ _REACH = 0.75  # half the window of an echo in a deconvolved record, in echo wid
 
 
 def richardson_lucy(
-    waveforms: npt.ArrayLike, kernel: tuple[int, npt.ArrayLike], *, offset: npt.ArrayLike = 0.0, iterations: int = 50
+    y: FloatArray, kernel: tuple[int, FloatArray], *, offset: npt.ArrayLike = 0.0, iterations: int = 50
 ) -> FloatArray:
     """Deconvolve waveforms by the iteration of Richardson (1972) and Lucy (1974).
 
@@ -39,9 +38,9 @@ def richardson_lucy(
 
     Parameters
     ----------
-    waveforms : array_like, shape (n, time)
+    y : ndarray, shape (n, time)
         Samples less the baseline. Negative y + o are replaced by 0.
-    kernel : (int, array_like)
+    kernel : (int, ndarray)
         First lag in bins and weights of the pulse, of sum 1, as from `Pulse.kernel`.
     offset : array_like, shape (), (n, 1) or (n, time)
         In the unit of the samples, not negative.
@@ -53,29 +52,15 @@ def richardson_lucy(
     ndarray, shape (n, time)
         The record for a pulse shorter than a bin, in the unit of the samples and with their sum.
 
-    Raises
-    ------
-    UserError
-        If an argument is out of range.
-
     References
     ----------
     Richardson 1972, J. Opt. Soc. Am. 62(1), 55-59, doi:10.1364/JOSA.62.000055.
     Lucy 1974, Astron. J. 79(6), 745-754, doi:10.1086/111605.
     Snyder, Hammoud and White 1993, J. Opt. Soc. Am. A 10(5), 1014-1023, doi:10.1364/JOSAA.10.001014.
     """
-    y = finite_array("waveforms", waveforms)
     iterations = integer("iterations", iterations, 1, 10_000)
-    first, weights = int(kernel[0]), finite_array("kernel", kernel[1])
-    if y.ndim != 2 or not y.size:
-        raise UserError(f"waveforms of shape {y.shape} must have the shape (n, time) with at least one of each")
-    if weights.ndim != 1 or np.any(weights < 0) or abs(weights.sum() - 1) > 1e-6:
-        raise UserError(f"kernel must be a list of weights of sum 1, not negative, but sums to {weights.sum():g}")
-    added = finite_array("offset", offset)
-    if np.any(added < 0):
-        raise UserError(f"offset = {added.min():g} must not be negative")
-
-    forward, adjoint = _blur(first, weights, y.shape[1])
+    added = np.asarray(offset, dtype=np.float64)
+    forward, adjoint = _blur(*kernel, y.shape[1])
     data = np.maximum(y + added, 0)
     least = 1e-12 * np.maximum(data.max(axis=1, keepdims=True), 1e-300)
     seen = np.maximum(adjoint(np.ones((1, y.shape[1]))), 1e-6)
@@ -91,7 +76,7 @@ def _blur(first: int, weights: FloatArray, size: int) -> tuple[Operator, Operato
     from scipy.fft import irfft, next_fast_len, rfft
 
     length = next_fast_len(size + weights.size + abs(first), real=True)
-    # Kernels wrap around the start; the record is padded by more than their length.
+    # Weights at negative lags wrap around; the padding is longer than the kernel.
     spread = np.zeros(length)
     np.add.at(spread, (first + np.arange(weights.size)) % length, weights)
     transform = rfft(spread)
@@ -106,12 +91,11 @@ def _blur(first: int, weights: FloatArray, size: int) -> tuple[Operator, Operato
 
 
 def deconvolution_offset(
-    template: Template, kernel: tuple[int, npt.ArrayLike], bin_ns: float, echo_fwhm_ns: float, iterations: int = 50
+    template: Template, kernel: tuple[int, FloatArray], bin_ns: float, echo_fwhm_ns: float, iterations: int = 50
 ) -> float:
-    """Return the bias of `deconvolved_echo`, its time [ns] of an ideal echo that arrives at 0.
+    """Return the bias of `deconvolved_echo` [ns], its time of an ideal echo that arrives at 0.
 
-    The arguments are those of `deconvolved_echo` and `richardson_lucy`. It is zero for a symmetric pulse; a finite
-    number of iterations does not fully remove the tail of a receiver's response.
+    It is zero for a symmetric pulse; a finite number of iterations does not fully remove the tail of a response.
     """
     records, place = ideal_echo(template, bin_ns, echo_fwhm_ns)
     sharp = richardson_lucy(records.power, kernel, iterations=iterations)
@@ -120,20 +104,19 @@ def deconvolution_offset(
 
 
 def deconvolved_echo(
-    records: Records, sharp: FloatArray, bins: IntArray, template: Template, flags: IntArray, echo_fwhm_ns: float
+    records: Records, sharp: FloatArray, bins: IntArray, template: Template, flags: IntArray, width: float
 ) -> Echoes:
     """Measure an echo in records deconvolved by `richardson_lucy`, shape (n, time).
 
     Time and width are the first two moments of the deconvolved record within three quarters of an echo width on either
     side of its maximum near `bins`, the energy is its integral. The errors are those of a maximum-likelihood fit of one
-    echo of the width in the record, for the given noise. The scatter of the iteration, stopped early, agrees with them
-    within a fifth in time and energy; that of its width is smaller, by up to three quarters.
+    echo of the width in the record, for the given noise. The scatter after few iterations agrees with them within a
+    fifth in time and energy; that of the width is smaller, by up to three quarters. The amplitude is that of an echo of
+    this energy and the width of the pulse; the width excludes the pulse.
 
-    The amplitude is that of an echo of this energy and the width of the pulse; the width excludes the pulse. The other
-    arguments are the waveforms, the bins of the peaks and `EchoFlag` of the echoes, shape (n,), the shape of an ideal
-    echo, and the expected width of an echo in the records [ns], above 0.
+    The other arguments are the waveforms, the bins of the peaks and `EchoFlag` of the echoes, shape (n,), the shape of
+    an ideal echo, and the expected width of an echo in the records [ns].
     """
-    width = positive("echo_fwhm_ns", echo_fwhm_ns)
     exists = has_echo(flags)
     deconvolved = Records(sharp, records.time_ns, records.noise)
     blurred, _ = smooth(deconvolved, 0.3 * template.fwhm_ns)

@@ -1,8 +1,7 @@
 """Waveform records, the shape of an ideal echo, and detection of the echoes in records.
 
-All times are arrivals of light: an estimator that reads another point of the echo is calibrated with the transmitted
-pulse, so that all estimators give the same time for an echo of the pulse's shape. Samples are means over their bins, at
-the centres of the bins.
+All estimators give the same time for an echo with the shape of the pulse: their bias for it is subtracted. Samples are
+means over their bins.
 """
 
 from __future__ import annotations
@@ -67,13 +66,8 @@ class Records:
     def of(cls, waveforms: npt.ArrayLike, time_ns: npt.ArrayLike, noise: npt.ArrayLike = 0.0) -> Records:
         """Check waveforms, shape (n, time), at bin centres [ns], at least 8, evenly spaced and increasing.
 
-        The standard deviation of the samples, shape (), (n,) or (n, time), not negative, is raised to a millionth of
-        the largest sample of the record, for the weights of records without noise.
-
-        Raises
-        ------
-        UserError
-            If an array has another shape or is out of range.
+        The standard deviation of the samples, shape (), (n,) or (n, time), not negative, is at least a millionth of the
+        largest sample of the record, so that weights are finite. Invalid arrays raise `UserError`.
         """
         power, time, sigma = (
             finite_array(name, values)
@@ -106,7 +100,7 @@ class Records:
         return np.asarray(self.time_ns[np.clip(bins, 0, self.time_ns.size - 1)])
 
     def around(self, bins: IntArray, lags: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return samples, noise and whether they are inside the record, at lags from a bin of each record."""
+        """Return the samples at lags from a bin of each record, their noise, and whether they are in the record."""
         places = bins[:, np.newaxis] + lags
         inside = (places >= 0) & (places < self.time_ns.size)
         clipped = np.clip(places, 0, self.time_ns.size - 1)
@@ -133,16 +127,8 @@ class Template:
 
     @classmethod
     def of(cls, pulse: Pulse, bin_width_ns: float, response_time_ns: float = 0.0) -> Template:
-        """Return the shape of a pulse averaged over bins of a width [ns], above 0.
-
-        The receiver's response is a single pole with a time constant [ns] of at least 0.
-
-        Raises
-        ------
-        UserError
-            If a number is out of range.
-        """
-        step = positive("bin_width_ns", bin_width_ns) / _FINE
+        """Return the shape of a pulse after the response, a single pole, averaged over bins."""
+        step = bin_width_ns / _FINE
         first, weights = pulse.kernel(step, response_time_ns)
         shares = np.convolve(weights, np.full(_FINE, 1.0))
         time = np.asarray((first - (_FINE - 1) / 2 + np.arange(shares.size)) * step, dtype=np.float64)
@@ -237,18 +223,18 @@ def find_echoes(
 ) -> DetectedEchoes:
     """Find surface, target and bottom.
 
-    The surface echo is the first peak above the noise. Behind it, a peak stands out from the water column if the
-    smoothed signal w exceeds both w(t-d)^2/w(t-2d), the extrapolated column before it, and sqrt(w(t-d) w(t+d)), the
-    column interpolated between both sides. Both are exact for an exponential: neither the column nor a step down in it
-    is a peak. Where they would reach the surface echo, the signal must rise again after a dip. The last peak is the
-    bottom, the strongest before it a target; peaks below a fiftieth of the strongest are ignored.
+    The surface echo is the first peak above the noise. Behind it, a peak exceeds the water column if the smoothed
+    signal w exceeds both w(t-d)^2/w(t-2d), extrapolated from the column before it, and sqrt(w(t-d) w(t+d)),
+    interpolated between both sides. Both are exact for an exponential: neither the column nor a step down in it is a
+    peak. Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
+    strongest before it a target; peaks below a fiftieth of the strongest are ignored.
 
     Parameters
     ----------
     records : Records
         The waveforms.
     echo_fwhm_ns : float
-        Expected full width of an echo at half maximum [ns], above 0: pulse, response and spread over the footprint.
+        Expected full width of an echo at half maximum after pulse, response and footprint [ns], above 0.
     threshold : float
         Detection threshold of the smoothed signal [standard deviations of the noise], above 0.
     contrast : float
@@ -273,7 +259,7 @@ def find_echoes(
     reach = max(round(_REACH * width / records.bin_ns), 1)
     behind = bins > surface[:, np.newaxis]
     stands_out = _above_column(np.maximum(power, 0), reach)
-    # Near the surface, without a column to compare with, a rise after a dip stands out.
+    # Near the surface there is no column to extrapolate from: the excess is the rise after a dip.
     lowest = np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
     apart = width / records.bin_ns
     near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart)
@@ -283,9 +269,9 @@ def find_echoes(
     excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
     peaks = np.zeros(power.shape, dtype=bool)
     peaks[:, 1:-1] = (stands_out[:, 1:-1] > stands_out[:, :-2]) & (stands_out[:, 1:-1] >= stands_out[:, 2:])
-    # The signal and the two samples that it is compared with are all noisy.
+    # 1.5: the samples of the column are noisy, too.
     peaks &= (excess > 1.5 * threshold * noise) & (excess > contrast * power)
-    # A far weaker peak behind a strong echo belongs to its tail.
+    # Much weaker peaks are in the tail of a strong echo.
     peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
 
     bottom = np.where(peaks.any(axis=1), count - 1 - np.argmax(peaks[:, ::-1], axis=1), -1)
@@ -322,7 +308,7 @@ def _above_column(power: FloatArray, reach: int) -> FloatArray:
 
 
 def _hides_bottom(records: Records, power: FloatArray, width: float, surface: IntArray) -> BoolArray:
-    """Return where a surface echo without a column behind it is too wide for one echo: it includes the bottom."""
+    """Return where a surface echo without a column is too wide for one echo, and thus includes the bottom."""
     rows = np.arange(len(power))
     place = np.maximum(surface, 0)
     half = power >= 0.5 * power[rows, place][:, np.newaxis]

@@ -18,10 +18,9 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     Template,
     has_echo,
 )
-from mitransient_lidar.core.validation import FloatArray, in_range, positive
+from mitransient_lidar.core.validation import FloatArray
 
 _SUMMIT = 0.5  # lower limit of the summit of an echo, relative to its peak
-_CENTROID_REACH = 1.0  # half the window of a centroid, in echo widths
 _EDGE = 0.15  # half the samples that a crossing is read from, in pulse widths
 _ENERGY_REACH = 1.5  # half the window of an energy, in echo widths
 
@@ -58,18 +57,17 @@ class Window:
         cls,
         records: Records,
         bins: IntArray,
-        echo_fwhm_ns: float,
+        width: float,
         *,
         after: IntArray | None = None,
         decay: npt.ArrayLike = 0.0,
     ) -> Window:
         """Return the samples within 1.75 expected echo widths of the peaks in `bins`, shape (n,).
 
-        With `after`, shape (n,), the bins of the surface echoes before these echoes, a ramp is subtracted. It is as
-        long as the echo, between the mean levels 1.5 to 2.5 echo widths before and after the echo; the level before it
-        decays towards the echo as exp(-decay t) [1/ns], shape () or (n,).
+        With the bins of the preceding surface echoes `after`, shape (n,), a ramp as long as the echo is subtracted. It
+        connects the mean levels 1.5 to 2.5 echo widths before and after the echo; the level before it decays towards
+        the echo as exp(-decay t) [1/ns], shape () or (n,).
         """
-        width = positive("echo_fwhm_ns", echo_fwhm_ns)
         half = max(int(np.ceil(1.75 * width / records.bin_ns)), 3)
         lags = np.arange(-half, half + 1)
         u = np.asarray(lags * records.bin_ns, dtype=np.float64)
@@ -106,7 +104,7 @@ def _levels(
         error = np.sqrt(np.sum(np.where(counted, noise, 0) ** 2, axis=1)) / np.maximum(count, 1)
         if side < 0:
             fall = np.exp(-decay * np.sum(np.where(counted, -u, 0), axis=1) / np.maximum(count, 1))
-            # Without samples of its own near the surface echo: the dip between the two echoes.
+            # Without samples between the echoes: the dip between them.
             dip = np.min(np.where(inside & (u <= 0) & (behind_surface >= 0), power, np.inf), axis=1)
             alone = count == 0
             level = np.where(alone, np.where(np.isfinite(dip), dip, 0), level * fall)
@@ -130,7 +128,7 @@ def summit(window: Window, flags: IntArray) -> Echoes:
     log = np.log(np.where(usable, window.power, 1.0))
     weights = np.where(usable, (window.power / window.noise) ** 2, 0.0)
     few = np.count_nonzero(usable, axis=1) < 3
-    weights[few] = 1.0  # any regular system; the result is not used
+    weights[few] = 1.0  # regular, but not used
     for _ in range(3):
         normal = np.einsum("ib,nb,jb->nij", columns, weights, columns, optimize=True)
         right = np.einsum("ib,nb->ni", columns, weights * log, optimize=True)
@@ -190,9 +188,9 @@ def _nearest(window: Window, centre: FloatArray, width: FloatArray) -> IntArray:
     return np.clip(np.rint(ends / window.bin_ns).astype(np.intp) + half, 0, window.u.size - 1)
 
 
-def gate_energy(window: Window, centre_ns: FloatArray, echo_fwhm_ns: float) -> tuple[FloatArray, FloatArray]:
-    """Return the energy of each echo within 1.5 widths on either side, and its error [unit times s], shape (n,)."""
-    share = _share(window, centre_ns, _ENERGY_REACH * positive("echo_fwhm_ns", echo_fwhm_ns))
+def gate_energy(window: Window, centre_ns: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+    """Return the energy of each echo within 1.5 widths [ns] of it, and its error [unit times s], shape (n,)."""
+    share = _share(window, centre_ns, _ENERGY_REACH * width)
     seconds = window.bin_ns * 1e-9
     return np.sum(share * window.power, axis=1) * seconds, window.error_of_sum(share) * seconds
 
@@ -203,15 +201,12 @@ def _share(window: Window, centre_ns: FloatArray, half: float) -> FloatArray:
     return np.where(window.inside, np.clip(0.5 + (half - distance) / window.bin_ns, 0, 1), 0)
 
 
-def centroid(window: Window, first_ns: FloatArray, echo_fwhm_ns: float) -> tuple[FloatArray, FloatArray]:
-    """Return the centroid of each echo [ns] within one expected width on either side of it, and its standard error.
+def centroid(window: Window, centre: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
+    """Return the centroid of each echo [ns] within half a width [ns] of itself, and its standard error, shape (n,).
 
-    The first guess is NaN without an echo; the result, shape (n,), is NaN for it and for a sum of samples that is not
-    positive.
+    It is NaN for a first guess `centre` of NaN, and for a sum of samples that is not positive.
     """
-    half = _CENTROID_REACH * positive("echo_fwhm_ns", echo_fwhm_ns)
     time = window.middle[:, np.newaxis] + window.u
-    centre = first_ns
     for _ in range(8):
         weights = _share(window, centre, half)
         total = np.sum(weights * window.power, axis=1)
@@ -238,7 +233,7 @@ def crossing(
     Parameters
     ----------
     window, top : Window and Echoes
-        Samples around the peaks, and the output of `summit` for them.
+        Samples around the peaks, and their `summit`.
     level, level_stderr : ndarray, shape (n,)
         Power, between 0 and the amplitude, and its standard error if it is a fraction of the amplitude, else 0.
     template : Template
@@ -300,8 +295,7 @@ def crossing(
 def leading_edge(
     window: Window, top: Echoes, template: Template, fraction: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the arrival of each echo from its edge at a fraction, 0.05 to 0.95, of its height; see `crossing`."""
-    fraction = in_range("fraction", fraction, 0.05, 0.95)
+    """Return the arrival of each echo from its edge at a fraction of its height; see `crossing`."""
     level = np.where(np.isfinite(top.amplitude), fraction * top.amplitude, -1.0)
     return crossing(window, top, level, fraction * top.amplitude_stderr, template)
 
@@ -315,13 +309,9 @@ def ideal_echo(template: Template, bin_ns: float, echo_fwhm_ns: float) -> tuple[
 
 
 def calibrate(
-    read: Callable[[Window, Echoes], tuple[FloatArray, FloatArray]],
-    template: Template,
-    bin_ns: float,
-    echo_fwhm_ns: float,
+    time_of: Callable[[Window, Echoes], tuple[FloatArray, FloatArray]], template: Template, bin_ns: float, width: float
 ) -> float:
-    """Return the bias of an estimator, its time [ns] of an ideal echo that arrives at 0."""
-    records, place = ideal_echo(template, bin_ns, echo_fwhm_ns)
-    window = Window.around(records, place, echo_fwhm_ns)
-    top = summit(window, np.zeros(1, dtype=np.intp))
-    return float(read(window, top)[0][0])
+    """Return the bias of an estimator [ns], its time of an ideal echo that arrives at 0."""
+    records, place = ideal_echo(template, bin_ns, width)
+    window = Window.around(records, place, width)
+    return float(time_of(window, summit(window, np.zeros(1, dtype=np.intp)))[0][0])

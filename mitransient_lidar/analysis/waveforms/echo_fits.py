@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, Echoes, EchoFlag, IntArray, Records, has_echo
-from mitransient_lidar.core.validation import FloatArray, finite_array, positive
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 
 Model = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
@@ -20,33 +20,29 @@ _CLEAR = 10.0  # standard errors of a height above which it is not tested
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
 
 
-def gaussian_surface(
-    records: Records, bins: IntArray, echo_fwhm_ns: float, decay: npt.ArrayLike, flags: IntArray
-) -> Echoes:
+def gaussian_surface(records: Records, bins: IntArray, width: float, decay: npt.ArrayLike, flags: IntArray) -> Echoes:
     """Fit a surface echo together with the water column that begins at it.
 
     The model is A exp(-u^2/(2 s^2)) plus a column C exp(-k u) from u = 0 on, blurred by the same Gaussian, where u is
-    the time since the surface: both have the same time and width s. It is fitted from two echo widths before the peak
-    to two after it, and finds the surface even where the peak is that of the column.
+    the time since the surface. It is fitted from two echo widths before the peak to two after it, and determines the
+    surface even where the peak is that of the column. Amplitude, energy and width are those of A.
 
-    The fit of a surface that is low beside its column is nearly as good without A and one or two nanoseconds earlier.
-    Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to 0.45 of the
-    peak, weighted with their likelihood and a prior probability of one half for A = 0; the errors include the spread of
-    these fits.
-
-    Amplitude, energy and width are those of the Gaussian A, the echo of the surface itself.
+    A surface echo that is weak relative to the column is fitted nearly as well without A, one or two nanoseconds
+    earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to
+    0.45 of the peak, weighted with their likelihood and a prior probability of one half for A = 0; the errors include
+    the spread of these fits.
 
     Parameters
     ----------
     records, bins, flags : Records and ndarray of int, shape (n,)
         The waveforms, and the bins of the surface peaks and `EchoFlag` of the echoes.
-    echo_fwhm_ns : float
-        Expected width of the echo [ns], above 0.
+    width : float
+        Expected full width of the echo at half maximum [ns].
     decay : array_like, shape () or (n,)
         Rate k of decay of the column [1/ns], at least 0.
     """
-    data = _Data.of(records, bins, positive("echo_fwhm_ns", echo_fwhm_ns), decay, (-2, 2))
-    width, peak = data.width, data.peak()
+    data = _Data.of(records, bins, width, decay, (-2, 2))
+    peak = data.peak()
     sigma = np.full(peak.shape, width / FWHM_PER_SIGMA)
     start = np.stack([np.full(peak.shape, -0.3 * width), sigma, 0.5 * peak, 0.7 * peak], axis=1)
 
@@ -82,7 +78,7 @@ def gaussian_surface(
 def gaussian_echo(
     records: Records,
     bins: IntArray,
-    echo_fwhm_ns: float,
+    width: float,
     decay: npt.ArrayLike,
     flags: IntArray,
     *,
@@ -90,13 +86,12 @@ def gaussian_echo(
 ) -> Echoes:
     """Fit an echo at which the column ends.
 
-    The model is A exp(-u^2/(2 s^2)) plus a column with one level before and another one behind the echo, both decaying
-    as exp(-k u), with a step between them that is blurred like the echo. It is fitted from two echo widths before the
-    peak to one and a half after it, without samples less than an echo width behind the surface peaks, the bins `after`,
-    shape (n,). The other arguments are those of `gaussian_surface`.
+    The model is A exp(-u^2/(2 s^2)) plus a column exp(-k u) with one level before and another one behind the echo and a
+    step between them that is blurred like the echo. It is fitted from two echo widths before the peak to one and a half
+    after it, without samples less than an echo width behind the surface peaks in the bins `after`, shape (n,). The
+    other arguments are those of `gaussian_surface`.
     """
-    data = _Data.of(records, bins, positive("echo_fwhm_ns", echo_fwhm_ns), decay, (-2, 1.5))
-    width = data.width
+    data = _Data.of(records, bins, width, decay, (-2, 1.5))
     if after is not None:
         first = (np.minimum(after + width / records.bin_ns, 0.5 * (after + bins)) - bins) * records.bin_ns
         data = replace(data, usable=data.usable & (data.u >= first[:, np.newaxis]))
@@ -139,7 +134,7 @@ class _Data:
         cls, records: Records, bins: IntArray, width: float, decay: npt.ArrayLike, span: tuple[float, float]
     ) -> _Data:
         """Return the samples in a span of echo widths about the peaks."""
-        rate = np.broadcast_to(finite_array("decay", decay), bins.shape)[:, np.newaxis]
+        rate = np.broadcast_to(np.asarray(decay, dtype=np.float64), bins.shape)[:, np.newaxis]
         low, high = (end * width / records.bin_ns for end in span)
         lags = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
         power, noise, inside = records.around(bins, lags)
@@ -174,7 +169,7 @@ def _mean(tried: list[_Fit]) -> _Fit:
     cost = np.stack([np.where(fit.good, fit.cost, np.inf) for fit in tried])
     good = np.isfinite(cost).any(axis=0)
     likelihood = np.exp(-0.5 * (cost - np.where(good, cost.min(axis=0), 0)))
-    # A prior of one half for no height, and of one half spread evenly over the heights.
+    # Prior: one half for A = 0, one half uniform over the heights.
     prior = np.gradient(_HEIGHTS)
     prior[[0, -1]] *= 0.5
     prior /= prior.sum()
@@ -207,7 +202,7 @@ def _fit(
     covariance = np.full((count, size, size), np.nan)
     good = np.zeros(count, dtype=bool)
     damping = np.full(count, 1e-3)
-    # Fits with fixed heights are only compared, and none of their parameters is as poorly determined.
+    # Fits with fixed heights, which are only compared, need less accuracy.
     enough = np.where(fixed, 1e-3, 1e-9)
     weights = np.where(usable, 1 / data.noise, 0.0)
     unit = np.ones((count, size))
@@ -226,7 +221,7 @@ def _fit(
         normal = weighted @ weighted.transpose(0, 2, 1)
         right = (weighted @ (w * (y - found))[..., np.newaxis])[..., 0]
         diagonal = np.einsum("nii->ni", normal)
-        # A parameter that the samples do not constrain keeps its value.
+        # The ridge keeps a parameter that the samples do not constrain.
         ridge = damping[active][:, np.newaxis] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
         damped = normal + ridge[:, :, np.newaxis] * np.eye(size)
         step = np.linalg.solve(damped, right[..., np.newaxis])[..., 0]
@@ -245,7 +240,7 @@ def _fit(
         good[active] = settled | small
         found[better], jacobian[better] = tried[better], changed[better]
         if (done := settled | small).any():
-            active, found, jacobian = (of_each[~done] for of_each in (active, found, jacobian))
+            active, found, jacobian = active[~done], found[~done], jacobian[~done]
     if good.any():
         _, jacobian = model(values[good], u, rate[good])
         weighted = jacobian * (weights[good][:, np.newaxis, :] * unit[good][..., np.newaxis])

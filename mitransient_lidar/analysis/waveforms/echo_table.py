@@ -69,27 +69,27 @@ def extract(
     ----------
     dataset : xarray.Dataset
         A result with ``waveform`` [W], or a receiver's record with ``signal``, which takes precedence; over (pixel,
-        time) or (row, column, time), optionally after ``shot``. A signal behind a logarithm (attributes
-        ``receiver.logarithm.volts_per_decade`` and ``.knee_v`` of `receiver.detect_waveforms`) is first expanded to the
-        voltage before it, in which all quantities are given.
+        time) or (row, column, time), optionally after ``shot``. A signal after a logarithm (attributes
+        ``receiver.logarithm.volts_per_decade`` and ``.knee_v`` of `receiver.detect_waveforms`) is expanded to the
+        voltage before it, the unit of all quantities.
     estimators : str or sequence of str
-        Estimators of time: ``threshold`` (the leading edge crosses `threshold` standard deviations of the noise, or a
-        fiftieth of the echo if that is more), ``leading_edge`` (it crosses half the amplitude), ``peak`` (Gaussian
-        through the summit), ``centroid``, ``gaussian`` (decomposition into Gaussians on the column: the only estimator
-        that separates the surface from the column behind it), or ``deconvolution`` (Richardson-Lucy).
+        Estimators of time: ``threshold`` (the leading edge crosses `threshold` standard deviations of the noise, at
+        least a fiftieth of the echo), ``leading_edge`` (it crosses half the amplitude), ``peak`` (Gaussian through the
+        summit), ``centroid``, ``gaussian`` (decomposition into Gaussians and the column, which alone separates the
+        surface from the column), or ``deconvolution`` (Richardson-Lucy).
     pulse : Pulse, optional
         The transmitted pulse. By default, a Gaussian of the attribute ``pulse_fwhm_ns``.
     noise : float or array-like, optional
         Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
         ``waveform_stderr`` times the attribute ``error_inflation``, or ``signal_deviation``, or the spread before the
-        surface echo. That of a signal is at least this spread, times the ratio of the standard deviation of means over
-        a pulse to that of independent bins, from 20 or more shots of one result, or else before the surface echo.
+        surface echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over
+        a pulse to that of independent bins, from at least 20 shots, or else before the surface echo.
     threshold, contrast
         As for `echo_detection.find_echoes`.
     echo_fwhm_ns : float, optional
         Expected full width of an echo [ns]. By default, that of pulse, response and the beam's spread over the surface.
     saturation_level : float, optional
-        Smallest saturated sample, as recorded; the samples of the variable ``saturated`` are saturated, too.
+        Smallest saturated sample, as recorded, in addition to the variable ``saturated``.
     layers : int
         Number of changes in the column to test for, 0 to 8; see `column_fits.change_points`.
     depth_from : {'echo', 'mean'}
@@ -106,20 +106,19 @@ def extract(
         ``echo`` (surface, column, target, bottom): ``time_ns``, ``depth_m``, ``amplitude``, ``energy`` and ``width_ns``
         with ``_stderr``, and ``flags``, sums of `echo_detection.EchoFlag`. Over the dimensions of the waveforms alone:
         ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``:
-        ``layer_depth_m``, ``layer_p_value``, ``layer_step`` and the attenuations ``layer_attenuation_above`` and
-        ``_below``.
+        ``layer_depth_m``, ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and ``_below``.
 
     Raises
     ------
     UserError
-        If the dataset has other dimensions, lacks a coordinate or an attribute, holds values that are not finite, or an
-        argument is out of range.
+        If the dataset has other dimensions, lacks a coordinate or an attribute, has non-finite values, or an argument
+        is out of range.
 
     Notes
     -----
     Depth is (t - t_surface) c0 cos(theta_water) / (2 n_g), with the angle of the lidar's axis. Time, depth and energy
-    of the column are those of the samples between the surface echo and the next one, its amplitude is its level
-    extrapolated to the surface, and its width the time of decay to one half.
+    of the column are those of the samples between the surface echo and the next one, its amplitude is extrapolated to
+    the surface, and its width is the time of decay to one half.
 
     The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction. Bins of rendered
     waveforms are correlated: without ``error_inflation`` the errors are too small.
@@ -151,8 +150,7 @@ class _Settings:
 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
-    records, geometry = waveforms.records(rows), waveforms.geometry
-    width = waveforms.echo_fwhm_ns
+    records, geometry, width = waveforms.records(rows), waveforms.geometry, waveforms.echo_fwhm_ns
     found = find_echoes(
         records, width, threshold=settings.threshold, contrast=settings.contrast, earliest_ns=waveforms.quiet_until_ns
     )
@@ -160,7 +158,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     surface, target, bottom = found.bins
     start = np.where(surface >= 0, time[surface] + 1.75 * width, np.nan)
     following = np.where(target >= 0, target, bottom)
-    # The last bins lack the pulses of light that arrives after the end of the record.
+    # The last bins lack the rising edges of pulses after the end of the record.
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
     reference = time[surface]
     column = column_fit(records, start, end, reference, waveforms.gain)
@@ -178,19 +176,21 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         body = _column(records, column, start, end, surface_ns - reference)
         quantities.append(_with_depths([echoes[0], body, *echoes[1:]], waveforms, settings.depth_from))
     table = {name: np.stack([one[name] for one in quantities], axis=1) for name in quantities[0]}
-    attenuation_per_decay = 0.5 / geometry.metres_per_ns
-    table["attenuation"] = column.decay * attenuation_per_decay
-    table["attenuation_stderr"] = column.decay_stderr * attenuation_per_decay
+    per_metre = 0.5 / geometry.metres_per_ns
+    table |= {"attenuation": column.decay * per_metre, "attenuation_stderr": column.decay_stderr * per_metre}
     table["attenuation_chi2"] = column.chi2
     if settings.layers:
         changes = change_points(records, start, end, waveforms.gain, layers=settings.layers, blur_ns=width)
         first = table["time_ns"][:, 0, 0]
         from_echo = settings.depth_from == "echo"
         zero = np.where(np.isfinite(first), first, reference) if from_echo else geometry.surface_time_ns
-        table["layer_depth_m"] = (changes.time_ns - np.reshape(zero, (-1, 1))) * geometry.depth_per_ns
-        table["layer_p_value"], table["layer_step"] = changes.p_value, changes.step
-        table["layer_attenuation_above"] = changes.decay_before * attenuation_per_decay
-        table["layer_attenuation_below"] = changes.decay_after * attenuation_per_decay
+        table |= {
+            "layer_depth_m": (changes.time_ns - np.reshape(zero, (-1, 1))) * geometry.depth_per_ns,
+            "layer_p_value": changes.p_value,
+            "layer_step": changes.step,
+            "layer_attenuation_above": changes.decay_before * per_metre,
+            "layer_attenuation_below": changes.decay_after * per_metre,
+        }
     return table
 
 
@@ -198,8 +198,7 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
     """Return the columns between two times as echoes, with their level at a delay [ns] from the fits' reference."""
     known = np.isfinite(column.level)
     inside = (records.time_ns >= start[:, np.newaxis]) & (records.time_ns <= end[:, np.newaxis])
-    power = np.where(inside, records.power, 0)
-    noise = np.where(inside, records.noise, 0)
+    power, noise = np.where(inside, records.power, 0), np.where(inside, records.noise, 0)
     total = np.sum(power, axis=1)
     safe = np.where(known & (total > 0), total, 1.0)
     seconds = records.bin_ns * 1e-9
@@ -209,7 +208,7 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
     relative = column.level_stderr / column.level
     mixed = 2 * column.correlation * relative * delay * column.decay_stderr
     level_error = level * np.sqrt(np.maximum(relative**2 + (delay * column.decay_stderr) ** 2 - mixed, 0))
-    # The width of a column that does not decay is unknown.
+    # A column that does not decay has no width.
     decay = np.where(column.decay > 0, column.decay, np.nan)
     half = np.log(2) / decay
     return Echoes(
@@ -264,9 +263,8 @@ def _label(
     data["flags"] = of_echoes(table["flags"].astype(np.int64), meanings)
     for name, (unit, description) in _PER_WAVEFORM.items():
         if name in table:
-            values = table[name]
-            layer = ("layer",) if values.ndim > 1 else ()
-            values = values.reshape(*shape, *values.shape[1:])
+            layer = ("layer",) if table[name].ndim > 1 else ()
+            values = table[name].reshape(*shape, *table[name].shape[1:])
             data[name] = ((*dims, *layer), values, {"units": unit, "long_name": description})
     coords: dict[str, Any] = {
         str(name): coordinate for name, coordinate in dataset.coords.items() if set(coordinate.dims) <= set(dims)

@@ -28,9 +28,7 @@ _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 
 def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a dataset with ``waveform`` or ``signal`` into memory: a result, or a receiver's records.
-
-    The file is one of `results.save`, or of `xarray.Dataset.to_netcdf` in the format NetCDF-4.
+    """Read a dataset with ``waveform`` or ``signal`` into memory, from a file of `results.save` or a NetCDF-4 file.
 
     Raises
     ------
@@ -59,8 +57,8 @@ class Waveforms:
     dims, shape, unit
         Dimensions, their sizes and the unit of the variable.
     samples
-        Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal behind a
-        logarithm, the voltages before it.
+        Its values, shape (count, time), with all pixels of a shot before the next shot; of a signal after a logarithm,
+        the voltages before it.
     time_ns
         Centres of the bins [ns], shape (time,).
     baseline, noise
@@ -108,13 +106,7 @@ class Waveforms:
         echo_fwhm_ns: float | None,
         saturation_level: float | None,
     ) -> Waveforms:
-        """Read a dataset; the arguments are those of `echo_table.extract`.
-
-        Raises
-        ------
-        UserError
-            If the dataset lacks a variable, coordinate or attribute, or an argument is out of range.
-        """
+        """Read a dataset; the arguments and errors are those of `echo_table.extract`."""
         name = next((name for name in ("signal", "waveform") if name in dataset), None)
         if name is None:
             raise UserError("the dataset has neither signal nor waveform: it must be a result with a record in time")
@@ -134,10 +126,8 @@ class Waveforms:
         template = Template.of(shape, step, response)
         # Two-way time per angle from the axis, in the plane of incidence.
         ns_per_mrad = 2e6 * geometry.height * math.sin(geometry.off_nadir) / (C0 * math.cos(geometry.off_nadir) ** 2)
-        if echo_fwhm_ns is None:
-            width = _echo_width(dataset, template, ns_per_mrad)
-        else:
-            width = positive("echo_fwhm_ns", echo_fwhm_ns)
+        given = None if echo_fwhm_ns is None else positive("echo_fwhm_ns", echo_fwhm_ns)
+        width = given or _echo_width(dataset, template, ns_per_mrad)
         half_view = 0.5 * float(dataset.attrs.get("field_of_view_mrad", 0.0))
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
@@ -227,12 +217,12 @@ def _noise(
     spread = np.sqrt(np.mean(rest**2, axis=(0, 2)))[:, np.newaxis]
     if "signal_deviation" not in dataset:
         return np.asarray(spread * _inflation(rest, run))
-    # A sample at a limit does not scatter, but has no smaller error.
+    # The scatter of a sample at a limit is smaller than its error.
     deviation = np.maximum(dataset["signal_deviation"].values.reshape(-1, count), spread)
     shots = samples[: _MOST_SHOTS * pixels].reshape(-1, pixels, count)
     if len(shots) < _FEWEST_SHOTS:
         return np.asarray(deviation * _inflation(rest, run))
-    # Shots differ by noise only, which a filter correlates more under an echo than in the dark.
+    # Shots differ only by noise, whose correlation is larger in an echo than in the dark.
     floored = np.where(deviation > 0, deviation, 1.0)
     return np.asarray(deviation * _inflation((shots - shots.mean(axis=0)) / floored, run))
 

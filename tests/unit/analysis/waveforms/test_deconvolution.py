@@ -94,16 +94,6 @@ def test_no_echo_stays_unknown():
     assert got.flags[0] == EchoFlag.NO_ECHO
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"iterations": 0}, "iterations = 0 must lie between 1 and 10000"),
-        ({"offset": -1.0}, "offset = -1 must not be negative"),
-        ({"waveforms": np.ones(5)}, r"waveforms of shape \(5,\)"),
-        ({"kernel": (0, [0.5, 0.4])}, "kernel must be a list of weights of sum 1"),
-        ({"kernel": (0, [1.5, -0.5])}, "kernel must be a list of weights of sum 1"),
-    ],
-)
-def test_invalid_input(change, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        richardson_lucy(**{"waveforms": np.ones((1, 30)), "kernel": KERNEL, **change})
+def test_number_of_iterations_is_checked():
+    with pytest.raises(ValueError, match="iterations = 0 must lie between 1 and 10000"):
+        richardson_lucy(np.ones((1, 30)), KERNEL, iterations=0)
