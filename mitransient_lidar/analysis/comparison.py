@@ -13,12 +13,12 @@ from mitransient_lidar.core.validation import FloatArray
 #: Probability of a difference between two results of the same scene.
 SIGNIFICANCE = 0.01
 
-#: Neighbouring bins over which relative errors are averaged: over few passes of an estimator with rare large
-#: contributions, the error of a bin without them is too small and its value too low, like a difference.
+#: Neighbouring bins over which relative errors are averaged, since value and error of a bin without rare large
+#: contributions are both too small.
 _NEIGHBOURS = 5
 
-#: Largest relative error of a bin: the spread of few passes is a poor estimate of larger ones.
-LARGEST_RELATIVE_ERROR = 0.3
+#: Largest relative error of a bin; larger ones are estimated poorly by the spread of few passes.
+_LARGEST_RELATIVE_ERROR = 0.3
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     counts = [int(result.attrs.get("passes", 0)) for result in (first, second)]
     if min(counts) < 2:
         raise UserError(f"the results have {counts[0]} and {counts[1]} passes: both must have at least 2")
-    known = [error < LARGEST_RELATIVE_ERROR * value for value, error in zip(values, errors, strict=True)]
+    known = [error < _LARGEST_RELATIVE_ERROR * value for value, error in zip(values, errors, strict=True)]
     inside = np.ones(len(times[0]), dtype=bool)
     for result in (first, second):
         start, end = (result.attrs.get(f"window_{name}_ns") for name in ("start", "end"))
@@ -95,10 +95,10 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
         raise UserError("the results share no bin with a relative error below 30 %: render more passes")
     difference = np.where(counted, values[1] - values[0], np.nan)
     relative = [pooled_relative_variance(value, variance) for value, variance in zip(values, variances, strict=True)]
-    # If the results agree, both have the errors of their common mean.
+    # Under the null hypothesis both have the errors of their common mean.
     weight = np.where(counted, relative[0] + relative[1], np.nan)
     common = (relative[1] * values[0] + relative[0] * values[1]) / weight
-    # At least its own error: where rare paths are missing in one result, the common mean is too small.
+    # At least the original error, since the common mean is too small where one result lacks rare paths.
     parts = [np.maximum(part * common**2, own) for part, own in zip(relative, variances, strict=True)]
     total = parts[0] + parts[1]
     freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))

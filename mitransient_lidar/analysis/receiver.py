@@ -37,30 +37,28 @@ def detect_waveforms(
     shots, seed : int
         Number of shots of the waveform with independent noise, at least 1, and seed of the noise, at least 0.
     background_power : array-like or xarray.DataArray
-        Steady power on each pixel in addition to the waveform [W], not negative: a number, or one per pixel; for the
-        sunlit sea see `physics.lidar.clear_sky.background_power`.
+        Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
+        `physics.lidar.clear_sky.background_power`.
 
     Returns
     -------
     xarray.Dataset
         ``signal`` and ``saturated`` over (shot, pixel, time) or (shot, row, column, time); over the same dimensions
         without shot the closed forms ``signal_mean``, ``signal_deviation`` (standard deviation of a shot), ``snr``
-        and ``saturation`` (probability). The signal is in V, behind a counter in counts per bin, without an amplifier
-        in electrons per bin. The coordinates are those of the result; ``time`` [ns], ``time_start_ns`` and
-        ``bin_width_ns`` are those of the samples. The attributes are those of the result and, as ``receiver.*``, the
-        parameters of the chain.
+        and ``saturation`` (probability). The signal is in V, after a counter in counts per bin, without an amplifier
+        in electrons per bin. ``time`` [ns], ``time_start_ns`` and ``bin_width_ns`` are those of the samples; other
+        coordinates and attributes are those of the result, with the parameters of the chain as ``receiver.*``.
 
     Raises
     ------
     UserError
-        If the dataset is no such result, its waveform is not finite or negative, the receiver is unknown, or another
+        If the dataset has other dimensions, its waveform is not finite or negative, the receiver is unknown, or another
         argument is out of range.
 
     Notes
     -----
-    The receiver chain acts on the waveform as it is. If the result includes the receiver's response
-    (``response_time_ns``), the bandwidth of an amplifier smooths it again, and its shot noise lacks the correlation of
-    that response: render with a response time of 0 for a chain with a bandwidth.
+    If the result includes a response (``response_time_ns``), the bandwidth of an amplifier smooths it again, and the
+    shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     """
     receiver = receiver_chain("chain", chain)
     dims, power = _waveform(dataset)
@@ -76,21 +74,15 @@ def detect_waveforms(
     stride = receiver.stride(width)
     time = dataset["time"][::stride]
     sampled = {"units": receiver.units}
+    deviation = {**sampled, "long_name": "standard deviation of the recorded signal of a shot"}
+    probability = {"units": "1", "long_name": "probability that a sample is saturated"}
     values: dict[str, Any] = {
         "signal": (("shot", *dims), record.signal, {**sampled, "long_name": "recorded signal"}),
         "saturated": (("shot", *dims), record.saturated, {"long_name": "sample at a limit of amplifier or digitiser"}),
         "signal_mean": (dims, expected.mean, {**sampled, "long_name": "mean of the recorded signal"}),
-        "signal_deviation": (
-            dims,
-            np.sqrt(expected.variance),
-            {**sampled, "long_name": "standard deviation of the recorded signal of a shot"},
-        ),
+        "signal_deviation": (dims, np.sqrt(expected.variance), deviation),
         "snr": (dims, snr, {"units": "1", "long_name": "signal-to-noise ratio of a shot"}),
-        "saturation": (
-            dims,
-            expected.saturation,
-            {"units": "1", "long_name": "probability that a sample is saturated"},
-        ),
+        "saturation": (dims, expected.saturation, probability),
     }
     coords = {name: coordinate for name, coordinate in dataset.coords.items() if "time" not in coordinate.dims}
     shot = ("shot", np.arange(len(record.signal)), {"long_name": "number of the shot"})
@@ -134,10 +126,7 @@ def _background(dataset: xr.Dataset, power: npt.ArrayLike | xr.DataArray, dims: 
     if isinstance(power, xr.DataArray):
         if set(power.dims) - set(dims):
             raise UserError(f"background_power has the dimensions {power.dims}; they must be among {dims}")
-        if power.ndim:
-            power = power.broadcast_like(dataset["waveform"].isel(time=0)).transpose(*dims).values
-        else:
-            power = power.values
+        power = power.broadcast_like(dataset["waveform"].isel(time=0)).transpose(*dims) if power.ndim else power
     try:
         values = np.asarray(power, dtype=np.float64)
     except (TypeError, ValueError):

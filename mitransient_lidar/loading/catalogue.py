@@ -1,7 +1,7 @@
 """Shipped scenes: names, texts, parameters and copies.
 
-A scene is a Mitsuba XML file in ``mitransient_lidar.scenes``; its name is the file's name without the suffix. Files
-whose names begin with an underscore are parts that scenes include, and no scenes themselves.
+A scene is a Mitsuba XML file in ``mitransient_lidar.scenes``; its name is the file name without the suffix. Files
+whose names begin with an underscore are parts that scenes include.
 """
 
 from __future__ import annotations
@@ -25,22 +25,12 @@ def scene_names() -> list[str]:
 
 
 def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
-    """Find a scene.
-
-    Parameters
-    ----------
-    name_or_path : str or path
-        Name of a shipped scene, or path of an XML file. A shipped scene wins over a file of the same name.
-
-    Returns
-    -------
-    pathlib.Path
-        An existing file.
+    """Return the path of a shipped scene, which has priority over a file of the same name, or of an XML file.
 
     Raises
     ------
     UserError
-        If there is no such scene; the sentence lists shipped scenes of similar names.
+        If there is no such scene; the message lists shipped scenes of similar names.
     """
     names = scene_names()
     if str(name_or_path) in names:
@@ -71,22 +61,9 @@ def scene_summary(name: str | os.PathLike[str]) -> str:
 
 
 def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
-    """Return the parameters of a scene, the ``<default>`` tags of its XML and of the files that it includes.
+    """Return names and default values of the parameters of a scene, its ``<default>`` tags, in the order of `scene_text`.
 
-    Parameters
-    ----------
-    name : str or path
-        As in `scene_path`.
-
-    Returns
-    -------
-    dict of str to str
-        Parameter names and default values, in the order of `scene_text`.
-
-    Raises
-    ------
-    UserError
-        If there is no such scene, an included file is missing, or a file is not well-formed XML.
+    Name and errors as in `scene_text`.
     """
     path = scene_path(name)
     parameters: dict[str, str] = {}
@@ -96,24 +73,19 @@ def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
 
 
 def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".") -> Path:
-    """Write a scene as one self-contained file to edit, with copies of the data files beside it that it names.
+    """Write a scene as one self-contained file, with copies of its data files from the same folder.
 
     Parameters
     ----------
     name : str or path
         As in `scene_path`.
     destination : path
-        Folder to write into, or path of the new file.
-
-    Returns
-    -------
-    pathlib.Path
-        The new XML file.
+        Folder, or path of the new file, which is returned.
 
     Raises
     ------
     UserError
-        If there is no such scene, a file would be overwritten, or one cannot be read or written.
+        If there is no such scene, a file exists already, or one cannot be read or written.
     """
     source = scene_path(name)
     text = flat_text(source)

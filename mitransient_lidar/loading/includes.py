@@ -14,11 +14,11 @@ from mitransient_lidar.core.errors import UserError
 
 @dataclass
 class _Default:
-    """A parameter's ``<default>`` with the comments above it ("" for a blank line) and beside it."""
+    """The ``<default>`` of a parameter with the comments above it ("" for a blank line) and on its line."""
 
     element: minidom.Element
     above: list[str]
-    beside: str = ""
+    same_line: str = ""
 
 
 def read_scene(path: Path) -> str:
@@ -54,7 +54,7 @@ def flat_text(path: Path) -> str:
     str
         The file's own text if it includes no other. Otherwise indented XML with parameters before objects. Each
         parameter has one ``<default>``: at the place of its last declaration, with the value of its first one, which
-        is the one that Mitsuba uses, and with the first comment beside any of them.
+        is the one that Mitsuba uses, and with the first comment on the line of any of them.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def flat_text(path: Path) -> str:
     objects = _content(root, defaults)
     parameters: list[str] = []
     for default in _unique(defaults):
-        parameters += [*default.above, _element(default.element)[0] + default.beside]
+        parameters += [*default.above, _element(default.element)[0] + default.same_line]
     if objects[:1] != [""]:
         objects.insert(0, "")
     return "\n".join([*head, *_element(root, [*parameters, *objects, ""]), ""])
@@ -117,7 +117,7 @@ def _content(parent: minidom.Element, defaults: list[_Default]) -> list[str]:
             above.append("")
         if isinstance(node, minidom.Comment) and line_breaks == 0 and not above and (latest or lines):
             if latest:
-                latest.beside += f"  {node.toxml()}"
+                latest.same_line += f"  {node.toxml()}"
             else:
                 lines[-1] += f"  {node.toxml()}"
         elif isinstance(node, minidom.Comment):
@@ -146,9 +146,9 @@ def _unique(defaults: list[_Default]) -> list[_Default]:
     kept = []
     for same in declarations.values():
         first, last = same[0], same[-1]
-        beside = next((item.beside for item in same if item.beside), "")
+        same_line = next((item.same_line for item in same if item.same_line), "")
         above = first.above if first is last or in_order else [*last.above, *filter(None, first.above)]
-        kept.append(_Default(first.element, above, beside))
+        kept.append(_Default(first.element, above, same_line))
     return kept
 
 

@@ -1,4 +1,4 @@
-"""Loading of scenes, with errors of one sentence."""
+"""Loading of scenes, with error messages of one sentence."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
     Returns
     -------
     scene, name, parameters
-        The loaded scene, its name, and all its parameters with their values as text (empty unless it is XML).
+        The loaded scene, its name, and the parameters of an XML scene with their values as text.
 
     Raises
     ------
     UserError
-        When there is no such scene, a parameter is unknown, or a plugin refuses a value.
+        If there is no such scene, a parameter is unknown, or a plugin rejects a value.
     """
     import mitsuba as mi
 
@@ -56,17 +56,16 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
             raise UserError(f"parameter {name!r} is not one of scene {path.stem}: {hint}")
         parameters[name] = _text(value)
     with as_user_error():
-        # Not optimised: that would make one shape without a name of a bottom and a target of the same material.
+        # Optimisation would merge a bottom and a target of one material into a shape without a name.
         return mi.load_file(str(path), optimize=False, **parameters), path.stem, parameters
 
 
 @contextlib.contextmanager
 def as_user_error() -> Iterator[None]:
-    """Turn what Mitsuba's parser says about a scene into a UserError of one sentence.
+    """Convert a ``RuntimeError`` of Mitsuba's parser to a `UserError` of one sentence.
 
-    Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError``
-    comes out as what it was, and so does a wrapped Ctrl-C; any other wrapped exception is a bug and keeps its
-    traceback. A ``RuntimeError`` without a traceback is the parser's complaint about the scene.
+    Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError`` or
+    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback.
     """
     try:
         yield
@@ -75,21 +74,16 @@ def as_user_error() -> Iterator[None]:
             raise KeyboardInterrupt from error
         text = str(error)
         if wrapped := re.findall(r"UserError: (.*)", text):
-            raise UserError(_sentence(wrapped[-1])) from error
+            raise UserError(" ".join(wrapped[-1].split())) from error
         if empty := re.search(r'failed to instantiate shape plugin of type "(\w+)": jit_var', text):
             raise UserError(f"a shape of type {empty[1]} has no faces: its mesh must have at least one") from error
         if "Traceback (most recent call last)" in text:
             raise
-        raise UserError(_sentence(re.sub(r"\[\w+(\.cpp:\d+)?\] ", "", text))) from error
-
-
-def _sentence(text: str) -> str:
-    """Return a message on one line."""
-    return " ".join(text.split())
+        raise UserError(" ".join(re.sub(r"\[\w+(\.cpp:\d+)?\] ", "", text).split())) from error
 
 
 def _text(value: Any) -> str:
-    """Write a parameter's value as it stands in XML."""
+    """Return the value of a parameter as in XML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Mitsuba variants: finding LLVM, choosing a variant, registering the plugins for it."""
+"""Mitsuba variants: search for LLVM, choice of a variant, registration of the plugins."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mitransient_lidar.core.errors import UserError
 #: Variants that the plugins support, in the order of preference.
 SUPPORTED_VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 
-#: LLVM releases that abort the process with Dr.Jit 1.5 (15, 16) or are refused by it (older ones).
+#: Dr.Jit 1.5 aborts the process with LLVM 15 and 16, and rejects older releases.
 OLDEST_USABLE_LLVM = 17
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -47,7 +47,7 @@ _registered_for: str | None = None
 
 
 def find_llvm() -> Path | None:
-    """Return the shared LLVM library that the wheel in this environment carries, or None."""
+    """Return the shared LLVM library of the wheel in this environment, or None."""
     try:
         files = importlib.metadata.files(_LLVM_WHEEL) or []
     except importlib.metadata.PackageNotFoundError:
@@ -62,7 +62,7 @@ def find_llvm() -> Path | None:
 
 
 def llvm_advice(problem: str) -> str:
-    """Return one sentence that says what is wrong with LLVM and what to install."""
+    """Return a sentence with a problem of LLVM and the packages to install."""
     return (
         f"{problem}: install LLVM {OLDEST_USABLE_LLVM} or newer "
         f"(pip install {_LLVM_WHEEL} on Linux x86-64, else the system's LLVM package) "
@@ -71,18 +71,7 @@ def llvm_advice(problem: str) -> str:
 
 
 def check_llvm_path(path: str) -> None:
-    """Raise UserError when the name of an LLVM library says that Dr.Jit aborts with it.
-
-    Parameters
-    ----------
-    path
-        Path of a shared LLVM library, such as ``/usr/lib/llvm-19/lib/libLLVM.so.19.1``.
-
-    Raises
-    ------
-    UserError
-        When the file does not exist or its name tells a release older than 17.
-    """
+    """Raise `UserError` if there is no shared LLVM library at a path, or its name has a release older than 17."""
     if not Path(path).is_file():
         raise UserError(llvm_advice(f"{_LLVM_VARIABLE} = {path!r} is not a file"))
     resolved = Path(path).resolve().name
@@ -92,11 +81,8 @@ def check_llvm_path(path: str) -> None:
 
 
 def prepare_llvm() -> None:
-    """Tell Dr.Jit where LLVM is; a setting that the user made wins."""
-    if os.environ.get(_LLVM_VARIABLE):
-        return
-    path = find_llvm()
-    if path is not None:
+    """Set the path of LLVM for Dr.Jit unless it is set."""
+    if not os.environ.get(_LLVM_VARIABLE) and (path := find_llvm()):
         os.environ[_LLVM_VARIABLE] = str(path)
 
 
@@ -110,17 +96,17 @@ def loaded_llvm() -> tuple[int, ...] | None:
 
 
 def check_llvm() -> None:
-    """Raise UserError when Dr.Jit has no LLVM, or one with which it aborts the process.
+    """Raise `UserError` if Dr.Jit has no LLVM, or one with which it aborts the process.
 
-    Dr.Jit looks for LLVM once, when it is first imported; a variable that is set later comes too late.
+    Dr.Jit searches for LLVM once, when it is first imported; a variable that is set later has no effect.
     """
-    if os.environ.get(_LLVM_VARIABLE):
-        check_llvm_path(os.environ[_LLVM_VARIABLE])
+    own = os.environ.get(_LLVM_VARIABLE)
+    if own:
+        check_llvm_path(own)
     version = loaded_llvm()
     if version is not None and version[0] >= OLDEST_USABLE_LLVM:
         return
     problem = "Dr.Jit finds no LLVM" if version is None else f"LLVM {version[0]} does not work with Dr.Jit"
-    own = os.environ.get(_LLVM_VARIABLE)
     if own and Path(own) != find_llvm():
         raise UserError(llvm_advice(f"{problem} at {_LLVM_VARIABLE} = {own!r}"))
     if find_llvm() is not None:
@@ -132,13 +118,7 @@ def check_llvm() -> None:
 
 
 def choose_variant() -> str:
-    """Return the fastest supported variant that works on this machine.
-
-    Raises
-    ------
-    UserError
-        When neither a GPU nor LLVM is usable.
-    """
+    """Return the fastest supported variant that works on this machine; raise `UserError` if there is none."""
     import drjit as dr
 
     if dr.has_backend(dr.JitBackend.CUDA):
@@ -148,22 +128,14 @@ def choose_variant() -> str:
 
 
 def set_variant(name: str | None = None) -> str:
-    """Set Mitsuba's variant, by default the fastest one that works here, and register the plugins.
+    """Set Mitsuba's variant, register the plugins, and return the name of the variant.
 
-    Parameters
-    ----------
-    name
-        One of ``llvm_ad_mono`` and ``cuda_ad_mono``, or None.
-
-    Returns
-    -------
-    str
-        The variant now active.
+    `name` is ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active variant, or the fastest that works here.
 
     Raises
     ------
     UserError
-        When the variant is not supported or does not work on this machine.
+        If the variant is not supported or does not work on this machine.
     """
     import drjit as dr
     import mitsuba as mi
@@ -184,8 +156,8 @@ def set_variant(name: str | None = None) -> str:
 def register_plugins(_old: str | None, new: str) -> None:
     """Register every plugin for the variant ``new``; Mitsuba calls this when the variant changes.
 
-    Plugin classes derive from classes of the active variant, so their modules are run again for each one.
-    Variants that the plugins do not support are left alone.
+    Plugin classes derive from classes of the active variant, so that their modules are reloaded for each one.
+    Unsupported variants are ignored.
     """
     global _registered_for
     if new not in SUPPORTED_VARIANTS or new == _registered_for:
@@ -208,7 +180,7 @@ def versions() -> dict[str, str]:
 
 
 def describe() -> dict[str, str]:
-    """Return what ``mitransient-lidar info`` prints: versions, variant, LLVM and GPU."""
+    """Return versions, variant, LLVM and GPU as printed by ``mitransient-lidar info``."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""Accumulation over the passes of a render: histograms and waveforms, or gates alone when memory is short."""
+"""Accumulation over the passes of a render: histograms and waveforms, or only gates if memory is short."""
 
 from __future__ import annotations
 
@@ -38,19 +38,9 @@ _LIT = 0.05
 
 
 class PassAccumulator(ABC):
-    """Means and standard errors over the passes of a render.
+    """Means and standard errors over the passes of a render, with gates or without."""
 
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-    window
-        Bins in which errors count.
-    train
-        Gates, or None.
-    """
-
-    #: Gates that a pass sums instead of time bins, or None.
+    #: Gates that a pass accumulates instead of time bins, or None.
     gate_weights: GateWeights | None = None
 
     def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None) -> None:
@@ -67,16 +57,16 @@ class PassAccumulator(ABC):
         """Add the histogram of a pass."""
 
     def errors(self) -> FloatArray:
-        """Return the relative standard errors that decide the end of the render, any number of them.
+        """Return the relative standard errors of which the 95th percentile is compared with the target.
 
-        The error of a gate is the median over its lit pixels. Gates count whose middle lies between the surface echo
-        and the end of the bottom echo of some pixel.
+        That of a gate is the median over its lit pixels, for gates with their middle between the surface echo and the
+        end of the bottom echo of a pixel.
         """
         middles = self._train.middles_ns
         start, end = float(self.window.start_ns.min()), float(self.window.end_ns.max())
         chosen = np.flatnonzero((middles >= start) & (middles <= end))
         found: list[float] = []
-        # A sample of the pixels is enough, and ten times as fast.
+        # A sample of the pixels is ten times as fast.
         sample = slice(None, None, max(1, len(self.gates.mean) // _ERROR_PIXELS))
         mean, errors = self.gates.mean[sample], self.gates.stderr_of(sample)
         for gate in chosen if chosen.size else range(middles.size):
@@ -105,7 +95,7 @@ class PassAccumulator(ABC):
 
 
 class WaveformAccumulator(PassAccumulator):
-    """Keeps energy and power of every bin, and the gates cut from them."""
+    """Statistics of energy and power in every bin, and of the gates cut from them."""
 
     def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None) -> None:
         super().__init__(scene, window, train)
@@ -130,7 +120,7 @@ class WaveformAccumulator(PassAccumulator):
             self.gates.add(energy @ self._weights)
 
     def errors(self) -> FloatArray:
-        """Return the relative standard errors of the gates, or without gates of the bins that count."""
+        """Return the relative standard errors of the gates, or without gates of the bins in the window."""
         if self.train is not None:
             return super().errors()
         return self.window.relative_errors(self._power.mean, self._power.stderr)
@@ -157,7 +147,7 @@ class WaveformAccumulator(PassAccumulator):
 
 
 class GateAccumulator(PassAccumulator):
-    """Keeps gates alone, cut from each pass's histogram or summed in the pass."""
+    """Statistics of gates only, cut from the histogram of each pass or accumulated in the pass."""
 
     def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain, direct: bool) -> None:
         super().__init__(scene, window, train)
@@ -170,7 +160,7 @@ class GateAccumulator(PassAccumulator):
 
     @property
     def received(self) -> float:
-        """Energy in the gates of all passes [J]; where gates overlap it counts several times."""
+        """Energy in the gates of all passes [J], added up where gates overlap."""
         return float(np.nansum(self.gates.mean)) * self.gates.count
 
     def add(self, histogram: TransientHistogram) -> None:
@@ -192,24 +182,14 @@ class GateAccumulator(PassAccumulator):
 def choose_accumulator(
     scene: LidarScene, window: ErrorWindow, surface_time_ns: float | None, max_memory: float
 ) -> PassAccumulator:
-    """Return the accumulator that keeps most within the memory.
+    """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-    window
-        Bins in which errors count.
-    surface_time_ns
-        Mean time of the surface echo [ns], from which the depth of gates is counted; None when none is seen.
-    max_memory
-        Memory for film, means and errors [GB].
+    Depths of gates are relative to the mean time of the surface echo [ns], None without one.
 
     Raises
     ------
     UserError
-        When not even a single gate fits, when a histogram without gates does not, or when gates by depth have no
-        surface to count from.
+        If a histogram without gates or a single gate exceeds the memory, or gates by depth have no surface.
     """
     from mitransient_lidar.transport.histogram import TransientHistogram
 
@@ -242,7 +222,7 @@ def choose_accumulator(
 
 
 def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -> GateTrain | None:
-    """Return the scene's gates at their time, None without any."""
+    """Return the gates of the scene at their times."""
     plan = scene.gates
     if plan is None:
         return None
@@ -254,8 +234,8 @@ def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -
     sine = np.sqrt(max(0.0, 1 - float(scene.receiver.pose.axis[2]) ** 2)) / scene.refractive_index
     surface = 0.0 if surface_time_ns is None else surface_time_ns
     train = plan.placed(surface, scene.group_index, float(np.sqrt(1 - sine**2)))
-    seen = {} if surface_time_ns is None else {"surface_time_ns": surface, "window_start_ns": float(start_ns)}
-    check_train(train, seen, scene.axis)
+    echo = {} if surface_time_ns is None else {"surface_time_ns": surface, "window_start_ns": start_ns}
+    check_train(train, echo, scene.axis)
     return train
 
 

@@ -1,64 +1,52 @@
-"""Means and standard errors over independent passes, and the error by which a render is judged."""
+"""Means and standard errors over independent passes, and the relative errors that end a render."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mitransient_lidar.core.validation import FloatArray
 
-#: Pixels darker than this share of the median do not count in the errors of radiance.
+#: Pixels darker than this fraction of the median are excluded from the errors of radiance.
 _DARK_PIXEL = 1e-2
 
 
 class PassStatistics:
-    """Mean and standard error of arrays that come one a pass (Welford 1962, doi:10.1080/00401706.1962.10490022)."""
+    """Mean and standard error of one array for each pass (Welford 1962, doi:10.1080/00401706.1962.10490022)."""
 
     def __init__(self) -> None:
         self.count = 0
-        self._mean: FloatArray | None = None
-        self._squares: FloatArray | None = None
+        self.mean: FloatArray = np.zeros(())
+        self._squares: FloatArray = np.zeros(())
 
     def add(self, values: FloatArray) -> None:
         """Add the result of one pass."""
-        if self._mean is None or self._squares is None:
-            self._mean, self._squares = np.zeros_like(values), np.zeros_like(values)
+        if self.count == 0:
+            self.mean, self._squares = np.zeros_like(values), np.zeros_like(values)
         self.count += 1
-        deviation = values - self._mean
-        self._mean += deviation / self.count
-        self._squares += deviation * (values - self._mean)
-
-    @property
-    def mean(self) -> FloatArray:
-        """Mean over the passes."""
-        if self._mean is None:
-            raise ValueError("passes = 0 must be at least 1 for a mean")
-        return self._mean
+        deviation = values - self.mean
+        self.mean += deviation / self.count
+        self._squares += deviation * (values - self.mean)
 
     @property
     def stderr(self) -> FloatArray:
         """Standard error of the mean; NaN before the second pass."""
-        if self._squares is None:
-            raise ValueError("passes = 0 must be at least 1 for a standard error")
-        if self.count < 2:
-            return np.full_like(self._squares, np.nan)
-        return np.sqrt(self._squares / (self.count - 1) / self.count)
+        return self.stderr_of(slice(None))
 
     def stderr_of(self, part: slice) -> FloatArray:
-        """Return the standard error of the mean of part of the first axis."""
-        if self._squares is None or self.count < 2:
-            raise ValueError(f"passes = {self.count} must be at least 2 for a standard error")
+        """Return the standard error of the mean of part of the first axis; NaN before the second pass."""
+        if self.count < 2:
+            return np.full_like(self._squares[part], np.nan)
         return np.asarray(np.sqrt(self._squares[part] / (self.count - 1) / self.count))
 
 
 class RatioStatistics:
     """Ratio of two sums over passes, and its standard error.
 
-    Each pass gives, for each pixel, radiance times solid angle and the solid angle of its samples. The ratio of the
-    totals is the mean radiance; a pass without a sample in a pixel does no harm. The standard error is that of the
-    ratio of means to first order (Cochran 1977, Sampling Techniques, section 2.11).
+    Each pass adds, for each pixel, radiance times solid angle and the solid angle of its samples; the ratio of the sums
+    is the mean radiance. The standard error is that of a ratio of means to first order (Cochran 1977, Sampling
+    Techniques, section 2.11).
     """
 
     def __init__(self, count: int) -> None:
@@ -90,11 +78,11 @@ class RatioStatistics:
 
     @property
     def invalid(self) -> int:
-        """Number of pixels that were sampled and whose mean is not finite."""
+        """Number of sampled pixels whose mean is not finite."""
         return int(np.count_nonzero((self._sums[1] > 0) & ~np.isfinite(self.ratio)))
 
     def relative_errors(self) -> FloatArray:
-        """Return the relative standard errors of the pixels that are not dark."""
+        """Return the relative standard errors of the pixels, without dark ones."""
         ratio, stderr = self.ratio, self.stderr
         known = np.isfinite(ratio) & (ratio > 0)
         if not known.any():
@@ -104,10 +92,9 @@ class RatioStatistics:
 
 
 class ErrorInflation:
-    """How errors of sums over neighbouring bins grow beyond those of independent bins.
+    """Standard errors of sums over 2, 4, 8, ... neighbouring bins relative to independent bins.
 
-    Bins of one pass share paths, so that their errors go together. Sums over blocks of 2, 4, 8, ... bins are followed
-    from pass to pass.
+    Errors of the bins of a pass are correlated, since they share paths.
     """
 
     def __init__(self) -> None:
@@ -122,13 +109,10 @@ class ErrorInflation:
             size *= 2
 
     def over(self, mean: FloatArray, stderr: FloatArray) -> tuple[list[int], list[float]]:
-        """Return numbers of bins and, for each, the median ratio of a sum's true error to that of independent bins.
+        """Return numbers of bins and the median ratios of the errors of their sums to those of independent bins.
 
-        Parameters
-        ----------
-        mean, stderr
-            Mean and standard error of the bins, shape (pixels, time). Blocks that hold less than a millionth of the
-            brightest one do not count.
+        Mean and standard error are those of the bins, shape (pixels, time). Sums below a millionth of the brightest one
+        are excluded.
         """
         bins, inflation = [1], [1.0]
         for size, block in self._blocks.items():
@@ -145,7 +129,7 @@ class ErrorInflation:
 
 @dataclass(frozen=True)
 class ErrorWindow:
-    """The bins in which a waveform's error counts: from the surface echo to the end of the bottom echo.
+    """Bins whose errors end a render, from the surface echo to the end of the bottom echo.
 
     Parameters
     ----------
@@ -159,23 +143,15 @@ class ErrorWindow:
     end_ns: FloatArray
     time_ns: FloatArray
 
-    def bins(self) -> NDArray[np.bool_]:
-        """Return which bins count, shape (pixels, time)."""
-        return np.asarray((self.time_ns >= self.start_ns[:, None]) & (self.time_ns <= self.end_ns[:, None]))
-
     def relative_errors(self, waveform: FloatArray, stderr: FloatArray) -> FloatArray:
-        """Return the relative standard errors of the bins that count, infinite where nothing was received.
+        """Return the relative standard errors of a waveform, shape (pixels, time), infinite where it is 0.
 
-        Pixels that receive less than a thousandth of the brightest one are dark and do not count.
-
-        Parameters
-        ----------
-        waveform, stderr
-            Waveform and its standard error [W], shape (pixels, time).
+        Pixels with less than a thousandth of the energy of the brightest one are excluded.
         """
         energy = waveform.sum(axis=1)
         lit = energy > 1e-3 * energy.max(initial=0.0)
-        chosen = self.bins() & lit[:, None]
+        inside = (self.time_ns >= self.start_ns[:, None]) & (self.time_ns <= self.end_ns[:, None])
+        chosen = inside & lit[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = stderr[chosen] / waveform[chosen]
         return np.asarray(np.where(waveform[chosen] > 0, relative, np.inf))

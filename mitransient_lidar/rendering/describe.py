@@ -13,18 +13,18 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
 
-#: Receivers of more pixels than this are described by their field of view only.
+#: Largest number of pixels whose outlines are stored.
 _MOST_PIXELS = 256
 
-#: Longest text of an attribute: NetCDF files keep no more than 64 KiB in one.
+#: Longest text of an attribute; the limit of NetCDF files is 64 KiB.
 _LONGEST_TEXT = 60_000
 
-#: Largest distance of lines from the points that they leave out, over their size.
+#: Largest distance of simplified outlines from their points, relative to the size.
 _TOLERANCE = 5e-4
 
 
 def describe_lidar(scene: LidarScene) -> dict[str, Any]:
-    """Return the attributes of a result that readers and drawings need: lidar, water index, and layout."""
+    """Return the attributes of a result that describe lidar, refractive indices, and layout."""
     transmitter, receiver = scene.transmitter, scene.receiver
     pixels, optics, profile = receiver.pixels, receiver.optics, transmitter.profile
     return {
@@ -52,21 +52,12 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
 
 
 def describe_layout(scene: LidarScene) -> dict[str, Any]:
-    """Return the attributes of a result from which `plot_layout` draws.
+    """Return the attributes of a result that `plot_layout` draws.
 
-    Parameters
-    ----------
-    scene
-        The lidar scene.
-
-    Returns
-    -------
-    dict
-        ``receiver_pose`` and ``transmitter_pose``: origin [m], axis, far and left, 12 numbers each. As JSON texts:
-        ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of imagers, whose
-        grid is known) and ``target_outlines`` (lowest and highest point [m], and line of each). A line is closed and
-        holds angle_x, angle_y [mrad] of one point after the other, or x, y [m] for targets. Too long a text is left
-        out.
+    ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. JSON texts are
+    ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of imagers) and
+    ``target_outlines`` (lowest and highest point [m], and line of each). A line is closed, with the coordinates
+    angle_x, angle_y [mrad] of its points, or x, y [m] for targets. Texts above the limit are omitted.
     """
     transmitter, receiver = scene.transmitter, scene.receiver
     texts: dict[str, list[Any]] = {"target_outlines": _target_outlines(scene), "beam_outlines": []}
@@ -87,7 +78,7 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
 
 
 def _target_outlines(scene: LidarScene) -> list[dict[str, Any]]:
-    """Return depths and outlines seen from above of the solids that are smaller than what the receiver sees."""
+    """Return heights and outlines of the solids smaller than the field of view."""
     pose = scene.receiver.pose
     spot = pose.ground_point()
     reach = 0.5 * scene.receiver.pixels.field_of_view * float(np.linalg.norm(spot - pose.origin))
@@ -97,14 +88,14 @@ def _target_outlines(scene: LidarScene) -> list[dict[str, Any]]:
         box = solid.bbox()
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         covers = np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach)
-        beside = np.any(low[:2] > spot[:2] + 2 * reach) or np.any(high[:2] < spot[:2] - 2 * reach)
-        if not (covers or beside):
-            found.append({"z": [round(float(z), 4) for z in (low[2], high[2])], "line": _flat(_shadow(solid))})
+        outside = np.any(low[:2] > spot[:2] + 2 * reach) or np.any(high[:2] < spot[:2] - 2 * reach)
+        if not (covers or outside):
+            found.append({"z": [round(float(z), 4) for z in (low[2], high[2])], "line": _flat(_projection(solid))})
     return found
 
 
-def _shadow(solid: mi.Shape) -> FloatArray:
-    """Return the convex outline (x, y) of a solid seen from above."""
+def _projection(solid: mi.Shape) -> FloatArray:
+    """Return the convex outline (x, y) of the vertical projection of a solid."""
     from scipy.spatial import ConvexHull, QhullError
 
     known = mi.traverse(solid)
@@ -118,12 +109,12 @@ def _shadow(solid: mi.Shape) -> FloatArray:
     try:
         hull = flat[ConvexHull(flat).vertices]
     except QhullError:
-        hull = flat[[0, -1]]  # upright, seen from above as a line
+        hull = flat[[0, -1]]  # the projection is a line
     closed = np.concatenate([hull, hull[:1]])
     return simplified(closed, _TOLERANCE * float(np.ptp(closed)))
 
 
 def _flat(line: FloatArray) -> list[float]:
-    """Round to some 1/5000 of the largest number."""
+    """Return the rounded coordinates of a line, with errors of about 1/5000 of the largest."""
     digits = max(0, 3 - math.floor(math.log10(max(float(np.abs(line).max()), 1e-6))))
     return np.round(line, digits).ravel().tolist()

@@ -1,4 +1,4 @@
-"""Expected arrival of the echoes of a scene, found with rays: the window in which errors count."""
+"""Expected arrival of the echoes of a scene, estimated with rays."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 from mitransient_lidar.transport.snell import refract
 
-#: Number of rays, and share of the beam at either end of an echo that is left out of its window.
+#: Number of rays, and share of the beam excluded at either end of an echo.
 _RAYS = 2**16
 _TAIL = 0.05
 
-#: Receivers of more pixels are treated as one pixel: a pixel would get too few rays.
+#: Largest number of pixels; with more, each would get too few rays, and the receiver is treated as one pixel.
 _MOST_PIXELS = 1024
 
 
@@ -30,14 +30,13 @@ class EchoProbe:
 
     Attributes
     ----------
-    surface_ns
-        Earliest and mean arrival of the surface echo for each pixel [ns], shape (pixels, 2); NaN without one.
-    bottom_ns
-        Mean and latest arrival of the echo from the first solid under water [ns], shape (pixels, 2); NaN without.
+    surface_ns, bottom_ns
+        Earliest and mean arrival of the surface echo, and mean and latest arrival of the echo of the first solid under
+        water [ns], shape (pixels, 2) each; NaN without one.
     missed_beam
         Share of the beam inside the field of view that passes outside the surface mesh.
     pierced
-        Solids that are seen both in the air and through the sea, and whether each is larger than the field of view.
+        Solids visible both in the air and through the sea, and whether each is larger than the field of view.
     """
 
     surface_ns: NDArray[np.float64]
@@ -47,7 +46,7 @@ class EchoProbe:
 
 
 def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
-    """Trace rays through the facets of the surface, without ripples and scattering, and time their echoes."""
+    """Trace rays through the facets of the surface, without ripples and scattering."""
     start = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
     beam = start.weight * scene.transmitter.intensity(start.direction)
     laser = opaque_point(scene.transmitter.pose.origin)
@@ -56,28 +55,25 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     at_sea = first.is_valid() & scene.is_surface(first.shape)
     air = first.t + dr.norm(laser - first.p)
 
-    # Refract at the facet and continue to what lies under it.
+    # Refract at the facet.
     down = -dr.normalize(refract(-start.direction, first.n, 1 / scene.refractive_index))
     below = scene.ray_intersect(first.spawn_ray(down), at_sea)
     solid = at_sea & below.is_valid() & ~scene.is_surface(below.shape)
     water = 2 * below.t * scene.group_index
 
     pixel, weight = np.array(start.pixel), np.array(beam, dtype=np.float64)
-    surface, bottom = np.array(at_sea), np.array(solid)
-    pixels = scene.receiver.pixels.count
+    surface, pixels = np.array(at_sea), scene.receiver.pixels.count
     count = pixels if pixels <= _MOST_PIXELS else 1
     pixel = pixel if count > 1 else np.zeros_like(pixel)
     per_ns = 1e9 / C0
-    outside = ~surface if scene.surfaces else np.zeros_like(surface)
-    total = weight.sum()
-    return EchoProbe(
-        np.broadcast_to(_quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)), (pixels, 2)),
-        np.broadcast_to(
-            _quantiles(np.array(air + water) * per_ns, weight * bottom, pixel, count, (None, 1 - _TAIL)), (pixels, 2)
-        ),
-        float(weight[outside].sum() / total) if total > 0 else 1.0,
-        _pierced(scene, first, below, at_sea, solid),
+    arrivals = (
+        _quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)),
+        _quantiles(np.array(air + water) * per_ns, weight * np.array(solid), pixel, count, (None, 1 - _TAIL)),
     )
+    outside = ~surface if scene.surfaces else np.zeros_like(surface)
+    missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
+    echoes = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
+    return EchoProbe(*echoes, missed, _pierced(scene, first, below, at_sea, solid))
 
 
 def _pierced(
@@ -90,7 +86,7 @@ def _pierced(
     """Return the solids that rise through the sea in the field of view, and whether each is larger than it."""
     wet = np.array(first.p)[:2, np.array(at_sea)]
     pierced = []
-    # What is seen outside a small surface mesh lies lower.
+    # Solids visible outside a small surface mesh lie lower.
     lowest = min((float(surface.bbox().min.z) for surface in scene.surfaces), default=0.0)
     in_air = first.is_valid() & (first.p.z > lowest)
     for solid in scene.solids if wet.size else []:

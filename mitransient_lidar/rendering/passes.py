@@ -10,28 +10,26 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.validation import FloatArray, positive
-from mitransient_lidar.rendering.interruption import DeferredInterrupt
+from mitransient_lidar.rendering.interruption import deferred_interrupt
 
-#: With fewer passes the standard error itself is too uncertain for a decision (8 passes: 27 %).
+#: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
 
 
 @dataclass(frozen=True)
 class Progress:
-    """State of long work.
+    """Progress of a render or a study.
 
     Attributes
     ----------
     done, planned
-        Units done, and planned where their number is known.
+        Numbers of completed and, if known, planned units.
     unit
-        What is counted: ``pass``, ``shot``, ``place`` or ``render``.
+        ``pass``, ``shot``, ``place`` or ``render``.
     elapsed_s, remaining_s
-        Time since the start and estimate of the time left [s].
-    error_median, error_p95
-        Median and 95th percentile of the relative standard errors that decide the end.
-    target_error
-        The requested error.
+        Elapsed and estimated remaining time [s].
+    error_median, error_p95, target_error
+        Median and 95th percentile of the relative standard errors, and the requested error.
     """
 
     done: int
@@ -44,7 +42,7 @@ class Progress:
     target_error: float | None = None
 
 
-#: Called with the state of long work after every unit.
+#: Called after every unit.
 ProgressCallback = Callable[[Progress], None]
 
 
@@ -60,7 +58,7 @@ class Goal:
     def from_options(
         cls, target_error: float | None, max_time: float | None, passes: int | None, default: Goal
     ) -> Goal:
-        """Check the options of a render; without any of them, take the default."""
+        """Check the options of a render; without any of them, return the default."""
         for name, value in (("target_error", target_error), ("max_time", max_time)):
             if value is not None:
                 positive(name, value)
@@ -81,7 +79,7 @@ class Goal:
         return self.target_error is not None and done >= SMALLEST_PASS_COUNT and (error or np.inf) <= self.target_error
 
     def remaining(self, done: int, elapsed: float, error: float | None) -> float | None:
-        """Estimate the time left [s] from the time so far; errors fall with the square root of the passes."""
+        """Estimate the remaining time [s]; errors fall with the square root of the passes."""
         estimates = []
         if self.passes is not None:
             estimates.append(elapsed * (self.passes / done - 1))
@@ -99,14 +97,12 @@ class PassLog:
 
     Attributes
     ----------
-    count
-        Number of complete passes.
-    elapsed_s
-        Time of all passes [s].
+    count, elapsed_s
+        Number of complete passes, and their time [s].
     interrupted
         Whether Ctrl-C ended the loop.
     edge_loss
-        Sum of what the passes lost at the edge of the surface mesh [J].
+        Energy lost at the edge of the surface mesh [J].
     error_median, error_p95
         Median and 95th percentile of the relative standard errors, NaN without any.
     """
@@ -119,7 +115,7 @@ class PassLog:
     error_p95: float
 
     def edge_loss_share(self, received: float) -> float:
-        """Return the share of the energy lost at the edge of the surface mesh; `received` is that of all passes [J]."""
+        """Return the share of the energy lost at the edge of the surface mesh; `received` by all passes [J]."""
         return self.edge_loss / (self.edge_loss + received) if self.edge_loss > 0 else 0.0
 
 
@@ -137,13 +133,13 @@ def run_passes(
     Parameters
     ----------
     render_pass
-        Called with the number and the seed of each pass; returns what the pass lost at the edge of the surface mesh.
+        Called with the number and the seed of each pass; returns the energy lost at the edge of the surface mesh [J].
     goal
-        When to stop.
+        End of the render.
     seed
         Seed of the render, any integer.
     errors
-        Returns the relative standard errors so far, any number of them; called from the second pass on.
+        Returns the relative standard errors, an array of any size; called from the second pass on.
     smallest
         Number of passes from which a Ctrl-C keeps the result, at least 2; before, it is raised.
     progress
@@ -158,7 +154,7 @@ def run_passes(
     median = p95 = None
     start = time.perf_counter()
     try:
-        with DeferredInterrupt() as interruption:
+        with deferred_interrupt() as raise_interrupt:
             while not goal.reached(count, time.perf_counter() - start, p95):
                 lost += render_pass(count, pass_seed(seed, count))
                 count += 1
@@ -169,7 +165,7 @@ def run_passes(
                     left = goal.remaining(count, elapsed, p95)
                     progress(Progress(count, goal.passes, "pass", elapsed, left, median, p95, goal.target_error))
                 if count >= smallest:
-                    interruption.check()
+                    raise_interrupt()
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):
             raise
@@ -190,6 +186,6 @@ def _percentiles(errors: FloatArray) -> tuple[float | None, float | None]:
     """Return median and 95th percentile, None without errors."""
     if errors.size == 0:
         return None, None
-    # 'higher' keeps bins without any light, whose error is infinite, from turning into NaN.
+    # Interpolation ("linear") would turn infinite errors, of bins without light, into NaN.
     median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
     return float(median), float(p95)

@@ -36,13 +36,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: End of a frame without any of its options.
+#: Default end of a frame.
 DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
 
-#: Parameter of an XML scene: time of its sea [s].
-TIME_PARAMETER = "surface_time"
-
-_MOST_FRAMES = 10_000
+_TIME_PARAMETER = "surface_time"  # time of the sea of an XML scene [s]
 
 
 def render_passive(
@@ -65,30 +62,22 @@ def render_passive(
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, or a loaded scene, with a
-        ``sun``, a ``sky``, or both. A laser in it is ignored.
-    params
-        Values for the ``<default>`` parameters of an XML scene.
+        As for `render.render`, with a ``sun``, a ``sky``, or both. A laser in it is ignored.
     integrator
-        Name or dict of a passive integrator; by default the scene's own, or ``passive_volpath``.
-    target_error
-        Relative standard error, greater than 0: the passes of a frame end when 95 % of the pixels have reached it
-        (after at least 8 passes).
-    max_time
-        Longest time for the passes of a frame [s], greater than 0.
-    passes
-        Number of passes of a frame, at least 2. Without any of the three the target is 0.05 within 120 s.
+        Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
+    target_error, max_time, passes
+        End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s.
+    params, variant
+        As for `render.render`.
     seed
         Any integer; frames and passes have independent random numbers.
     frames
         Number of frames, 1 to 10 000.
     frame_step_s
-        Time between frames [s], greater than 0. The sea moves on by it: through ``surface_time`` of an XML scene, or
-        ``time`` of the ``ocean_surface`` of a dict.
+        Time between frames [s], greater than 0, added to the parameter ``surface_time`` of an XML scene, or to ``time``
+        of the ``ocean_surface`` of a dict.
     filter_width_nm
         Width of the receiver's filter [nm], greater than 0, for ``background_power``.
-    variant
-        ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
         Called with a `passes.Progress` of the frame after every pass.
 
@@ -97,15 +86,15 @@ def render_passive(
     xarray.Dataset
         As described in `results.radiance`. ``etendue`` [m^2 sr] is open area times solid angle of each pixel times
         the transmittance of optics and (one way) air; power is radiance times etendue times width of the filter. The
-        attribute ``background_radiance`` is the mean over the field of view. After Ctrl-C it holds the frames begun,
-        and the attribute ``interrupted`` is 1.
+        attribute ``background_radiance`` is the mean over the field of view. After Ctrl-C it includes the frames that
+        were begun, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
     UserError
-        When the scene, a parameter or an option is invalid.
+        If the scene, a parameter or an option is invalid.
     """
-    frames, step = integer("frames", frames, 1, _MOST_FRAMES), positive("frame_step_s", frame_step_s)
+    frames, step = integer("frames", frames, 1, 10_000), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
     goal = Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL)
     images: list[tuple[FloatArray, FloatArray]] = []
@@ -155,7 +144,7 @@ def render_passive(
 def _render_frame(
     renderer: DaylightRenderer, goal: Goal, seed: int, progress: ProgressCallback | None
 ) -> tuple[RatioStatistics, PassLog, float]:
-    """Render the passes of one frame; return their statistics, log and share of light lost at the surface's edge."""
+    """Render the passes of one frame; return statistics, log and share of the light lost at the surface's edge."""
     statistics, received = RatioStatistics(renderer.scene.receiver.pixels.count), 0.0
 
     def render_pass(number: int, seed: int) -> float:
@@ -171,14 +160,14 @@ def _render_frame(
 
 
 def _choose_integrator(session: Session, wanted: str | Mapping[str, Any] | None) -> Any:
-    """Return the caller's choice, the scene's own integrator if it is passive, or the default one."""
+    """Return the requested integrator, that of the scene if it is passive, or the default."""
     own = session.scene.integrator()
     default = own if getattr(own, "passive", False) else "passive_volpath"
     return choose_integrator(session.scene, default if wanted is None else wanted, passive=True)
 
 
 def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[Any, Mapping[str, Any] | None]:
-    """Return scene and parameters with the sea a time `later` [s]."""
+    """Return scene and parameters with the sea at a later time [s]."""
     if isinstance(scene, Mapping):
         moved = {name: copy.copy(part) if isinstance(part, dict) else part for name, part in scene.items()}
         seas = [part for part in moved.values() if isinstance(part, dict) and part.get("type") == "ocean_surface"]
@@ -190,16 +179,13 @@ def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[
     if not isinstance(scene, (str, os.PathLike)):
         raise UserError("frames need a scene by its name, path or dict: the time of a loaded one cannot be changed")
     defaults = catalogue.scene_parameters(catalogue.scene_path(scene))
-    if TIME_PARAMETER not in defaults:
-        raise UserError(
-            f"frames need a parameter {TIME_PARAMETER} of the scene, which is the time of its ocean_surface"
-        )
-    given = {**(params or {})}
+    if _TIME_PARAMETER not in defaults:
+        raise UserError(f"frames need the parameter {_TIME_PARAMETER} of the scene, the time of its ocean_surface")
+    given = {_TIME_PARAMETER: defaults[_TIME_PARAMETER], **(params or {})}
     try:
-        begin = float(given.get(TIME_PARAMETER, defaults[TIME_PARAMETER]))
+        return scene, {**given, _TIME_PARAMETER: float(given[_TIME_PARAMETER]) + later}
     except ValueError:
-        raise UserError(f"{TIME_PARAMETER} = {given.get(TIME_PARAMETER)!r} must be a number") from None
-    return scene, {**given, TIME_PARAMETER: begin + later}
+        raise UserError(f"{_TIME_PARAMETER} = {given[_TIME_PARAMETER]!r} must be a number") from None
 
 
 def _etendue(renderer: DaylightRenderer) -> FloatArray:
@@ -214,7 +200,7 @@ def _etendue(renderer: DaylightRenderer) -> FloatArray:
 
 
 def _describe(renderer: DaylightRenderer) -> dict[str, Any]:
-    """Return the attributes of an image that describe receiver and daylight; warn of a view outside the surface."""
+    """Return the attributes of receiver and daylight; warn of a field of view beyond the surface."""
     from mitransient_lidar.transport.daylight.sampling import share_outside_surface
 
     scene, receiver = renderer.scene, renderer.scene.receiver

@@ -31,12 +31,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: End of a render without any of its options, with waveforms and with gates.
+#: Default ends of a render without and with gates.
 DEFAULT_GOAL = Goal(target_error=0.03, max_time=300.0)
 DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
 
-#: Memory [GB].
-DEFAULT_MAX_MEMORY = 2.0
+_DEFAULT_MAX_MEMORY_GB = 2.0
 
 
 def render(
@@ -61,21 +60,21 @@ def render(
     params
         Values for the ``<default>`` parameters of an XML scene.
     integrator
-        Name or dict of an integrator plugin, or an integrator, instead of the scene's.
+        Name or dict of an integrator plugin, or an integrator; by default that of the scene.
     target_error
-        Relative standard error, greater than 0: passes end when 95 % of the waveform's bins, of every lit pixel from
-        the surface echo to the end of the bottom echo, have reached it (after at least 8 passes). In a scene with
-        gates: when 95 % of the gates have, in the median over the pixels that are lit in them.
+        Relative standard error, greater than 0, that ends the render (after at least 8 passes) when 95 % of the bins of
+        lit pixels from the surface echo to the end of the bottom echo have reached it; with gates, 95 % of the gates,
+        in the median over their lit pixels.
     max_time
         Longest time for the passes [s], greater than 0.
     passes
-        Number of passes, at least 2. Without any of the three the target is 0.03 within 300 s, or 0.1 within 60 s in a
-        scene with gates.
+        Number of passes, at least 2. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
+        or after 60 s.
     seed
         Any integer; the same seed gives the same result on the same machine.
     max_memory
-        Memory for histograms, means and errors [GB], greater than 0; 2 by default. When those of a scene with gates
-        take more, gates alone are kept, with a warning.
+        Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
+        only the gates are kept, with a warning.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
@@ -85,17 +84,17 @@ def render(
     -------
     xarray.Dataset
         ``impulse_response`` [J per bin], ``waveform`` [W] (after the pulse and the receiver's response) and their
-        standard errors, with dimensions (pixel, time) or (row, column, time); see `results.dataset`. With gates in the
-        scene's film also, or instead, ``gate_energy`` [J]; see `results.gate_stack`. After Ctrl-C it holds the passes
-        so far, and the attribute ``interrupted`` is 1.
+        standard errors, over (pixel, time) or (row, column, time); see `results.dataset`. With gates in the film,
+        ``gate_energy`` [J] in addition or instead; see `results.gate_stack`. After Ctrl-C it includes the completed
+        passes, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
     UserError
-        When the scene, a parameter or an option is invalid.
+        If the scene, a parameter or an option is invalid.
     """
     Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL)
-    max_memory = DEFAULT_MAX_MEMORY if max_memory is None else positive("max_memory", max_memory)
+    max_memory = _DEFAULT_MAX_MEMORY_GB if max_memory is None else positive("max_memory", max_memory)
     session = open_scene(scene, params, variant)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
@@ -107,9 +106,9 @@ def render(
     window = _error_window(lidar, probe)
     _check_record(lidar, probe)
     _check_solids(lidar, probe)
-    # The mean arrival over all pixels is the zero of the depth axis.
-    seen = probe.surface_ns[:, 1]
-    surface = {"surface_time_ns": float(np.nanmean(seen))} if np.isfinite(seen).any() else {}
+    # Depths are relative to the mean arrival of the surface echo over all pixels.
+    arrivals = probe.surface_ns[:, 1]
+    surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
     accumulator = choose_accumulator(lidar, window, surface.get("surface_time_ns"), max_memory)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
@@ -153,13 +152,13 @@ def _error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
     """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
     time_ns = lidar.axis.centres_ns
     start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * lidar.transmitter.pulse.fwhm_ns
-    # Without a surface (a plate in the air) or a bottom, the window reaches from the record's start or to its end.
+    # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
     start = np.where(np.isnan(start), time_ns[0], start)
     return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
 
 
 def _check_record(lidar: LidarScene, probe: EchoProbe) -> None:
-    """Refuse a record that ends before the surface echo."""
+    """Reject a record that ends before the surface echo."""
     axis, arrivals = lidar.axis, probe.surface_ns[:, 0]
     if np.isfinite(arrivals).any() and axis.end_ns <= (first := float(np.nanmin(arrivals))):
         raise UserError(
@@ -169,10 +168,7 @@ def _check_record(lidar: LidarScene, probe: EchoProbe) -> None:
 
 
 def _check_solids(lidar: LidarScene, probe: EchoProbe) -> None:
-    """Refuse a bottom that rises through the sea where the receiver looks, and a target below the bottom.
-
-    Warn of a target that rises through the sea, or lies above it.
-    """
+    """Reject a bottom above the sea in the field of view and a target below the bottom; warn of a target in the air."""
     bottom: Any = max(lidar.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
     highest = max((float(surface.bbox().max.z) for surface in lidar.surfaces), default=np.inf)
     for solid in lidar.solids:

@@ -1,4 +1,4 @@
-"""A loaded scene with its sensor and integrator, ready to be rendered."""
+"""Loaded scenes with their sensors and integrators."""
 
 from __future__ import annotations
 
@@ -23,17 +23,7 @@ TOLERATED_LOSS = 1e-3
 
 @dataclass(frozen=True)
 class Session:
-    """A loaded scene.
-
-    Attributes
-    ----------
-    scene, sensor
-        The Mitsuba scene and its first sensor.
-    name
-        Name of the scene.
-    parameters
-        Parameters of an XML scene with their values as text.
-    """
+    """A loaded scene with its first sensor, its name, and the parameters of an XML scene with their values as text."""
 
     scene: mi.Scene
     sensor: mi.Sensor
@@ -47,19 +37,12 @@ class Session:
 
 
 def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str | None = None) -> Session:
-    """Load a scene and find its sensor.
-
-    Parameters
-    ----------
-    scene, params
-        As for `loading.scenes.load_scene`.
-    variant
-        Mitsuba variant; by default the active one, or the fastest that works here.
+    """Load a scene as `loading.scenes.load_scene`, with a Mitsuba variant as for `loading.variants.set_variant`.
 
     Raises
     ------
     UserError
-        When the scene cannot be loaded, or has no sensor.
+        If the scene cannot be loaded, or has no sensor.
     """
     variants.set_variant(variant)
     loaded, name, parameters = load_scene(scene, params)
@@ -70,12 +53,12 @@ def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str
 
 
 def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Any:
-    """Return the integrator to use: the caller's choice (name, dict or integrator) or the scene's own.
+    """Return an integrator from its name, a dict or itself, by default that of the scene.
 
     Raises
     ------
     UserError
-        When it is no lidar integrator, or none for daylight where `passive` is true.
+        If it is not a lidar integrator, or for `passive`, not one for daylight.
     """
     import mitsuba as mi
 

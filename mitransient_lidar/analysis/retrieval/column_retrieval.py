@@ -13,13 +13,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, non_negative, positive
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
 from mitransient_lidar.physics.water.water_types import InherentProperties
 
-#: Diameters [m] of the spot in view at which a column decays with Kd, and from which on with a + bb.
+#: Diameters [m] of the field of view on the sea at which a column decays with Kd, and from which on with a + bb.
 SPOT_OF_KD, SPOT_OF_A_PLUS_BB = 6.4, 10.6
 
-#: Smallest diameter [m] of the spot: below it, the loss of light from the view is not distinct from attenuation.
+#: Smallest diameter [m]: below it, the loss of light from the field of view is not distinct from attenuation.
 SMALLEST_SPOT = 6.0
 
 #: Level of a column by multiple scattering over that by bb alone.
@@ -48,23 +48,13 @@ class WaterEstimate:
 def backscatter_of_level(level: npt.ArrayLike, gain: npt.ArrayLike, group_index: float) -> FloatArray:
     """Return b p(pi) = 2 n_g level/(c0 gain) [1/(m sr)], the backscatter at 180 degrees, including multiple scattering.
 
-    Parameters
-    ----------
-    level, gain : array_like
-        Power of the column's signal, extrapolated to the surface [W], and energy received per backscatter and metre
-        there [J sr], above 0: `LidarSystem.water_gain` times the fraction of the beam in view.
-    group_index : float
-        Group index of the water, at least 1.
-
-    Raises
-    ------
-    UserError
-        If a gain is not positive or the index out of range.
+    `level` is the power of the column's signal, extrapolated to the surface [W], and `gain` the energy received per
+    backscatter and metre there [J sr]: `LidarSystem.water_gain` times the fraction of the beam in view.
     """
-    factor = finite_array("gain", gain)
+    factor = np.asarray(gain, dtype=np.float64)
     if np.any(factor <= 0):
         raise UserError(f"gain = {factor.min():g} must be greater than 0")
-    speed = C0 / (2 * in_range("group_index", group_index, 1, np.inf))
+    speed = C0 / (2 * group_index)
     return np.asarray(np.asarray(level, dtype=np.float64) / (speed * factor))
 
 
@@ -80,14 +70,13 @@ def water_of_column(
 
     Parameters
     ----------
-    decay : array_like
-        Attenuation K along the path of the column's signal, exp(-2 K s) [1/m].
-    backscatter : array_like
-        Backscatter from its level at the surface, extrapolated with K [1/(m sr)]; see `backscatter_of_level`.
+    decay, backscatter : array_like
+        Attenuation K along the path of the column's signal, exp(-2 K s) [1/m], and `backscatter_of_level` of its level
+        at the surface, extrapolated with K [1/(m sr)].
     spot_diameter : float
         Diameter of the receiver's field of view on the sea surface [m], at least 6.
     first_path : float
-        Path at which the fit of the column begins [m], at least 0: above it, the signal decays with a + bb.
+        Path at which the fit of the column begins [m]: above it, the signal decays with a + bb.
     phase_factor : float
         2 pi p(pi) b/bb of the phase function [1], above 0: 0.92 to 1.06 for those of Fournier and Forand.
 
@@ -98,29 +87,28 @@ def water_of_column(
 
     Notes
     -----
-    bb = 2 pi backscatter exp(-2 (K - a - bb) s_1)/(1.13 phase_factor). K is a + bb where the receiver sees all light
-    that was scattered forward only (quasi-single scattering, Gordon 1982, doi:10.1364/AO.21.002996), from a spot of
-    10.6 m on, and Kd at 6.4 m; between them it is linear in the diameter. Kd is that of Lee, Du and Arnone (2005),
+    bb = 2 pi backscatter exp(-2 (K - a - bb) s_1)/(1.13 phase_factor). K is a + bb where all forward-scattered light is
+    received (quasi-single scattering, Gordon 1982, doi:10.1364/AO.21.002996), from a diameter of 10.6 m on, and Kd at
+    6.4 m; between them it is linear in the diameter. Kd is that of Lee, Du and Arnone (2005),
     doi:10.1029/2004JC002275. The diameters and the factor 1.13 are an empirical fit to columns rendered by this
     package, for one geometry: seven waters (c 0.18 to 1.4), a beam of 10 mrad, 200 m high, 2 to 5 m deep; their levels
     scattered by 8 %. The beam must be narrower than the field of view, and the column homogeneous.
 
-    c is ill-posed: forward-scattered light stays in view, so that the signal hardly depends on it. The estimate is
-    a + bb/r for r = 0.0183 (Petzold's average particle), 0.044 and 0.01, a range that includes most natural waters.
+    c is ill-posed: the signal hardly depends on forward scattering. The estimate is a + bb/r for r = 0.0183 (Petzold's
+    average particle), 0.044 and 0.01, a range that includes most natural waters.
     """
     diameter = in_range("spot_diameter", spot_diameter, SMALLEST_SPOT, np.inf)
-    start = non_negative("first_path", first_path)
     factor = positive("phase_factor", phase_factor)
     fall, level = np.broadcast_arrays(np.asarray(decay, dtype=np.float64), np.asarray(backscatter, dtype=np.float64))
     share = np.clip((SPOT_OF_A_PLUS_BB - diameter) / (SPOT_OF_A_PLUS_BB - SPOT_OF_KD), 0, 1)
     known = np.isfinite(fall) & np.isfinite(level) & (fall > 0) & (level > 0)
     k = np.where(known, fall, 1.0)
     apparent = 2 * np.pi * np.where(known, level, 0.0) / (MULTIPLE_SCATTERING * factor)
-    # Kd - a - bb is a small part of K: the iteration converges fast.
+    # The iteration converges fast, since Kd - a - bb is much smaller than K.
     a, bb = k.copy(), apparent
     for _ in range(60):
         excess = share * (_kd(np.maximum(a, 0), bb) - np.maximum(a, 0) - bb)
-        bb = apparent * np.exp(-2 * excess * start)
+        bb = apparent * np.exp(-2 * excess * first_path)
         a = 0.5 * (a + k - bb - excess)
     known &= a > 0
     kd = _kd(np.maximum(a, 0), bb)
@@ -129,7 +117,7 @@ def water_of_column(
 
 
 def _kd(absorption: FloatArray, backscattering: FloatArray) -> FloatArray:
-    """Return the diffuse attenuation [1/m], which depends on the scattering by bb only."""
+    """Return the diffuse attenuation [1/m], which depends on the scattering only through bb."""
     pairs = zip(absorption.ravel(), backscattering.ravel(), strict=True)
     return np.array([InherentProperties(a, bb, bb).kd for a, bb in pairs]).reshape(absorption.shape)
 
@@ -143,35 +131,19 @@ def bottom_reflectance(
 ) -> FloatArray:
     """Return the reflectance of a Lambertian bottom from its echo over the column's signal at the same time.
 
-    It is rho = pi (c0/2 n_g) backscatter energy/(power cos(alpha)) [1], NaN where the column is unknown.
-
-    Parameters
-    ----------
-    energy, column_power : array_like
-        Energy of the bottom echo [J], and power of the column's signal, extrapolated to the time of the echo [W], above
-        0 where known.
-    backscatter : array_like
-        Backscatter b p(pi) of the column's level [1/(m sr)].
-    cos_vertical : array_like
-        Cosine of the light's angle from the vertical in the water [1].
-    group_index : float
-        Group index of the water, at least 1.
-
-    Raises
-    ------
-    UserError
-        If the index is out of range.
+    It is rho = pi (c0/2 n_g) backscatter energy/(power cos(alpha)) [1], NaN where the column is unknown, with the
+    energy of the bottom echo [J], the power of the column, extrapolated to the time of the echo [W], its
+    `backscatter_of_level` [1/(m sr)], and the angle of the light from the vertical in the water, alpha.
 
     Notes
     -----
-    Column and bottom share pulse energy, atmosphere, transmission and slope of the surface, its focusing, and
-    attenuation: their ratio is independent of them and thus corrects a shot for the sea surface. Assumed: the same
-    water in all shots that are compared, homogeneous down to the bottom. An absolute reflectance is as accurate as the
-    backscatter.
+    The ratio is independent of pulse energy, atmosphere, transmittance, slope and focusing of the surface, and
+    attenuation, and thus corrects a shot for the sea surface. Assumptions: the same water in all shots, homogeneous
+    down to the bottom. An absolute reflectance is as accurate as the backscatter.
     """
     power = np.asarray(column_power, dtype=np.float64)
     known = power > 0
-    speed = C0 / (2 * in_range("group_index", group_index, 1, np.inf))
+    speed = C0 / (2 * group_index)
     scale = np.pi * speed * np.asarray(backscatter) / np.asarray(cos_vertical)
     return np.asarray(np.where(known, scale * np.asarray(energy) / np.where(known, power, 1.0), np.nan))
 
@@ -190,7 +162,7 @@ def bottom_class(
     Parameters
     ----------
     reflectance, stderr : array_like
-        Reflectance and its standard error [1], at least 0; they broadcast. NaN where unknown.
+        Reflectance and its standard error [1]; they broadcast. NaN where unknown.
     classes : dict of str to float, optional
         Names and lower edges, increasing from 0. By default: dark (mud, vegetation), medium from 0.1 (gravel, rock,
         mixed bottoms), bright from 0.2 (sand, shell). These edges are a convention: bottoms of one kind vary by a
@@ -199,7 +171,7 @@ def bottom_class(
     Raises
     ------
     UserError
-        If classes are out of order or an error is negative.
+        If classes are out of order.
     """
     from scipy.special import ndtr
 
@@ -208,8 +180,6 @@ def bottom_class(
     if lower.size == 0 or lower[0] != 0 or np.any(np.diff(lower) <= 0):
         raise UserError(f"classes = {edges} must have lower edges that increase from 0")
     value, error = np.broadcast_arrays(np.asarray(reflectance, dtype=np.float64), np.asarray(stderr, dtype=np.float64))
-    if np.any(error < 0):
-        raise UserError(f"stderr = {np.nanmin(error):g} must not be negative")
     distance = lower[1:] - value[..., np.newaxis]
     sharp = np.where(distance > 0, np.inf, -np.inf)
     wide = np.where(error > 0, error, 1.0)[..., np.newaxis]

@@ -17,7 +17,7 @@ from mitransient_lidar.results.geometry import LidarGeometry, required_number
 _FEWEST_BINS = 3  # of a fit
 _LARGEST_ERROR = 0.5  # relative standard error of a bin: the logarithm of a noisier one is biased
 
-#: Standard deviations at which the beam ends.
+#: Edge of the beam in standard deviations.
 BEAM_EDGE = 3.0
 
 
@@ -45,13 +45,8 @@ class ColumnBins:
     ) -> ColumnBins:
         """Return the bins of a record between two depths [m], 0 <= `min_depth` < `max_depth`.
 
-        `edge` is the largest angle from the axis of light that the receiver detects [rad].
-
-        Raises
-        ------
-        UserError
-            If the depths are out of order, the surface echo reaches below the first, or the record does not contain
-            them or less than three bins between them.
+        `edge` is the largest angle from the axis of light that the receiver detects [rad]. The errors are those of
+        `effective_attenuation`.
         """
         top, bottom = non_negative("min_depth", min_depth), positive("max_depth", max_depth)
         if bottom <= top:
@@ -102,8 +97,8 @@ def effective_attenuation(dataset: xr.Dataset, min_depth: float, max_depth: floa
     dataset
         A result of `rendering.render`. Pixels are summed.
     min_depth, max_depth
-        The depths below the mean sea level, on the axis [m], 0 <= `min_depth` < `max_depth`, without echoes of the
-        surface, the bottom or a target between them.
+        Depths below the mean sea level, on the axis [m], 0 <= `min_depth` < `max_depth`, without echoes of surface,
+        bottom or targets between them.
 
     Returns
     -------
@@ -114,24 +109,22 @@ def effective_attenuation(dataset: xr.Dataset, min_depth: float, max_depth: floa
     ------
     UserError
         If the depths are out of order, the surface echo of the beam's edge reaches below the first, the record does not
-        contain them, or a bin between them has no signal or a relative standard error above 0.5.
+        include them and at least 3 bins between them, or a bin has no signal or a relative standard error above 0.5.
 
     Notes
     -----
     The one-way path in the water at the time t is s = c0 (t - t_surface)/(2 n_g), along the refracted axis, to the
-    depth s cos(phi). The received energy of a bin, without the pulse, is divided by the solid angle of the aperture in
-    the water (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. So K is per metre of slant
-    path, as c is, and K = c exactly for singly scattered light. In a wide beam off nadir every bin mixes depths, which
-    does not change the slope of an exponential.
+    depth s cos(phi). The impulse response is divided by the solid angle of the aperture in the water
+    (`refraction.solid_angle_per_area`), and its logarithm fitted by A - 2 K s. K is per metre of slant path; K = c for
+    singly scattered light, even in a wide beam off nadir, since a mean over depths has the slope of the exponential.
 
-    Each bin has the weight 1/e^2, where e is its relative standard error over the passes, smoothed to an exponential of
-    the path s: a bin without its rare paths has too low a signal and too small an error, and must not weigh more. The
-    standard error is propagated from the bins as if they were independent. But bins of one pass share paths: the true
-    error can be up to 1.7 times as large. `fov_sweep.views` measures it.
+    Weights are 1/e^2, where e is the relative standard error, smoothed to an exponential of s, since a bin without rare
+    paths has too low a signal and too small an error. The standard error assumes independent bins. Bins of one pass
+    share paths: the true error can be up to 1.7 times as large; `fov_sweep` estimates it from the passes.
 
-    On a rough sea K depends on the sea. Ripples scatter light out of a narrow view, and waves that focus beam and view
-    alike increase the signal from some metres below: single scattering with c = 0.3, wind 3 m/s and 20 degrees off
-    nadir gave 0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
+    K depends on the sea. Ripples scatter light out of a narrow field of view, and waves that focus both beam and view
+    increase the signal from some metres below: single scattering with c = 0.3, wind 3 m/s and 20 degrees off nadir gave
+    0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
     """
     beam, view = (required_number(dataset.attrs, name) for name in ("divergence_mrad", "field_of_view_mrad"))
     geometry = LidarGeometry.from_attributes(dataset.attrs, surface="level")

@@ -1,7 +1,7 @@
-"""Slope of the sea, bottom and water of results, estimated from their echoes.
+"""Slope of the sea, bottom and water, estimated from the echoes of results.
 
-Every function takes a result, or recorded shots, with ``waveform`` [W] over (pixel, time) or (shot, pixel, time), and
-keeps the dimension ``shot``. Receiver and transmitter must share their place and axis.
+The functions take a dataset with ``waveform`` [W] over (pixel, time) or (shot, pixel, time), and keep the dimension
+``shot``. Receiver and transmitter must be coaxial.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.results.geometry import LidarGeometry, required_number
 
 _LOG = logging.getLogger(__name__)
-_SPOT_MARGIN = 1.75  # echo widths behind the surface at which `echo_table` begins to fit the column
+_COLUMN_START = 1.75  # echo widths after the surface at which `echo_table` begins to fit the column
 
 
 def surface_slopes(
@@ -37,8 +37,8 @@ def surface_slopes(
     dataset : xarray.Dataset
         Waveforms of at least two pixels.
     slope_deviation : (float, float), optional
-        Standard deviations of the sea's slopes along the lidar's azimuth and across, averaged over a footprint [1],
-        above 0, of a prior for the slopes. Without it, estimates from times alone are far steeper than the sea.
+        Prior: standard deviations of the slopes along the lidar's azimuth and across, averaged over a footprint [1],
+        above 0. Without it, the estimates are much steeper than the sea.
     facets : float
         As for `surface_slope.fit_plane`.
 
@@ -48,8 +48,7 @@ def surface_slopes(
         Over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive for
         a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
         the lidar's azimuth to the left [degree]; ``surface_range`` along the axis and ``surface_height`` above the mean
-        level [m]; ``plane_misfit`` [ns]. NaN where the pixels do not determine it, such as the slope across from strips
-        across the azimuth.
+        level [m]; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
 
     Raises
     ------
@@ -58,8 +57,8 @@ def surface_slopes(
 
     Notes
     -----
-    Times are those of the ``gaussian`` estimator. Positions of the light in pixels are those of a Gaussian beam inside
-    the outlines of the result, or without outlines the centres of the pixels, as if each were a point.
+    Times are those of the ``gaussian`` estimator. The light of a pixel is that of a Gaussian beam inside its outline,
+    or without outlines a point at its centre.
     """
     lidar = LidarGeometry.from_attributes(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
@@ -128,11 +127,11 @@ def bottom(
     Returns
     -------
     xarray.Dataset
-        Over ``shot`` if present and ``correction`` (level, slope, column): ``reflectance`` [1], through a level sea at
-        its mean height, through the shot's own plane, and by the ratio of the echo to the column, and ``depth_m`` below
-        the mean sea level [m], NaN for the last. Also ``bottom_energy`` [J], ``reflectance_stderr`` from noise, an
-        upper bound, and over ``bottom_class``: ``class_probability`` of the last reflectance. NaN without a bottom
-        echo; without a column that can be fitted, reflectances are NaN, with a warning.
+        Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
+        (``level``), through the plane of the shot (``slope``), and from the ratio of the echo to the column
+        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last. Also ``bottom_energy`` [J], and
+        for the last reflectance ``reflectance_stderr`` from noise, an upper bound, and ``class_probability`` over
+        ``bottom_class``. NaN without a bottom echo; reflectances are NaN without a column, with a warning.
 
     Raises
     ------
@@ -141,9 +140,8 @@ def bottom(
 
     Notes
     -----
-    Reflectances ``level`` and ``slope`` assume one attenuation for all shots, the mean column's. The ratio needs the
-    column of each shot, at least 8 bins long, but hardly depends on the slope, and corrects for the focusing by waves,
-    too.
+    Reflectances ``level`` and ``slope`` use the mean attenuation of all shots. The ratio needs a column of at least 8
+    bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
     """
     lidar = LidarGeometry.from_attributes(dataset.attrs)
     share = in_range("relative_error", relative_error, 0, 1)
@@ -221,8 +219,8 @@ def water(
     phase_factor : float
         As for `column_retrieval.water_of_column`.
     deepest_path : float
-        Path in the water down to which the column is used [m], above 0. In a view of 30 mrad the attenuation of a
-        column increases with depth; the constants of the retrieval are for 8 m.
+        Largest path in the water at which the column is used [m], above 0. The attenuation of a column depends on the
+        path; the constants of the retrieval are for 8 m.
 
     Returns
     -------
@@ -240,7 +238,7 @@ def water(
     end = lidar.surface_time_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
     echoes = echo_table.extract(summed.isel(time=summed["time"].values < end)).isel(pixel=0)
     level = echoes["amplitude"].sel(echo="column").values
-    start = _SPOT_MARGIN * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
+    start = _COLUMN_START * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
     gain = lidar.lidar_system(dataset.attrs, efficiency).water_gain(0.0, lidar.off_nadir)
     backscatter = column_retrieval.backscatter_of_level(level, gain, lidar.group_index)
     decay = echoes["attenuation"].values

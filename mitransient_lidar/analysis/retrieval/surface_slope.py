@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
+from mitransient_lidar.core.validation import FloatArray, finite_array, positive
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -44,14 +44,9 @@ class PixelLight:
 
     @classmethod
     def of_outlines(cls, outlines: list[list[npt.ArrayLike]], sigma: float) -> PixelLight:
-        """Integrate a Gaussian beam over the inside of each pixel.
+        """Integrate a Gaussian beam with a standard deviation [rad] over the area inside the outlines of each pixel.
 
-        Parameters
-        ----------
-        outlines : list of list of array_like, shape (points, 2)
-            Closed lines (angle_x, angle_y) of each pixel [rad]; a line inside another one is a hole.
-        sigma : float
-            Standard deviation of the beam's irradiance about the axis [rad], above 0.
+        Outlines are closed lines of points (angle_x, angle_y) [rad]; a line inside another one is a hole.
 
         Raises
         ------
@@ -121,7 +116,7 @@ def fit_plane(
     Parameters
     ----------
     time_ns : array_like, shape (n, pixels)
-        Two-way times of the surface echoes [ns], above 0; NaN for a pixel without an echo.
+        Two-way times of the surface echoes [ns]; NaN for a pixel without an echo.
     light : PixelLight
         Distribution of the light in the pixels.
     off_nadir : float
@@ -140,54 +135,42 @@ def fit_plane(
     Raises
     ------
     UserError
-        If shapes disagree or a number is out of range.
+        If `facets` is not positive.
 
     Notes
     -----
-    Let t be tan(off_nadir). From H - rho (cos - angle_x sin) = z0 + along (x) + across (rho angle_y) for the point at
-    rho follows B/A = (along - t)/(1 + along t) and C/A = across/(cos(off_nadir) + along sin(off_nadir)), hence along =
-    tan(off_nadir + arctan(B/A)). The fit is least squares in 1/rho with weights from the errors of the times.
+    With t = tan(off_nadir), B/A = (along - t)/(1 + along t) and C/A = across/(cos(off_nadir) + along sin(off_nadir)),
+    hence along = tan(off_nadir + arctan(B/A)). The fit is least squares in 1/rho with weights from the errors of the
+    times. Tulldahl (2006), FOI-R-2074-SE, section 3.1, states that times determine the slope, without a formula.
 
-    Assumptions: transmitter and receiver at one place; each pixel's echo comes from the centroid of the light in it;
-    the surface is plane within the footprint. Short waves violate the last two: few facets of a footprint of metres
-    face the lidar, anywhere in their pixel. This error dominates the noise. A centre that is d farther out is
-    tan(off_nadir - tilt) d farther away, relatively, where tilt is that of the face; it is taken as half the estimate,
-    with the uncertainty of that, since an estimate is as much error as slope. Hence faces away from the lidar have
-    larger errors. The centres of adjacent pixels, which the same crests cross, have errors with a correlation of 0.4
-    that falls with the distance in angle_x as exp(-dx^2/(2 spread^2)): it raises the error along and lowers that
-    across. One facet per pixel and 0.4 are from 600 rendered shots at 6 m/s along the wind, 20 degrees off nadir, views
-    of 15 and 30 mrad: the pixels' own centres erred by 0.85 to 1.13 of the spread, with correlations of 0.30 to 0.43
-    between adjacent pixels and -0.24 to 0.18 otherwise. The root mean square of error over stated error is then 1.04 to
-    1.28 along and 0.78 to 0.91 across, 0.86 to 1.00 with the sea's slopes as prior; in 120 shots across the wind, 0.81
-    to 1.24. Pixels narrow in angle_x are best, since it determines the time. Where pixels cut a wide beam their light
-    is skewed, and the time from a fit of a symmetric echo is nearer to the axis than its mean: a level sea then appears
-    to face the lidar by up to 1.5 degrees. Tulldahl (2006), FOI-R-2074-SE, section 3.1, states that times determine the
-    slope, without a formula.
+    Assumptions: transmitter and receiver at one place; the echo of each pixel comes from the centroid of its light; the
+    surface is plane within the footprint. Short waves violate the last two, since few facets anywhere in a pixel face
+    the lidar. This error dominates the noise. An error d of the centre changes the range by the relative amount
+    tan(off_nadir - tilt) d; the tilt of the face is taken as half the estimate, with the uncertainty of that. Hence
+    faces away from the lidar have larger errors. Errors of adjacent pixels, which the same crests cross, have a
+    correlation of 0.4 that falls with the distance in angle_x as exp(-dx^2/(2 spread^2)): it raises the error along and
+    lowers that across. One facet per pixel and 0.4 are from 600 rendered shots at 6 m/s along the wind, 20 degrees off
+    nadir, views of 15 and 30 mrad: centres of pixels had errors of 0.85 to 1.13 of the spread, with correlations of
+    0.30 to 0.43 between adjacent pixels and -0.24 to 0.18 otherwise. The root mean square of error over stated error is
+    1.04 to 1.28 along and 0.78 to 0.91 across, 0.86 to 1.00 with a prior; in 120 shots across the wind, 0.81 to 1.24.
+
+    Pixels narrow in angle_x are best, since it determines the time. The light of pixels that cut a wide beam is skewed,
+    and a fit of a symmetric echo too near to the axis: a level sea appears to face the lidar by up to 1.5 degrees.
     """
-    angle = in_range("off_nadir", off_nadir, 0, np.pi / 2 - 1e-3)
-    x, y, spread = (finite_array(name, getattr(light, name)) for name in ("angle_x", "angle_y", "spread"))
+    x, y, spread = light.angle_x, light.angle_y, light.spread
     time = np.asarray(time_ns, dtype=np.float64)
-    if x.ndim != 1 or x.shape != y.shape or x.shape != spread.shape or time.ndim != 2 or time.shape[1] != x.size:
-        raise UserError(f"time_ns of shape {time.shape} must be (shots, pixels), the pixels being those of light")
     known = np.isfinite(time)
-    if np.any(time[known] <= 0):
-        raise UserError(f"time_ns = {time[known].min():g} must be greater than 0")
     noise = np.broadcast_to(np.asarray(stderr_ns, dtype=np.float64), time.shape)
-    if np.any(noise < 0):
-        raise UserError(f"stderr_ns = {np.nanmin(noise):g} must not be negative")
-    if np.any(spread < 0):
-        raise UserError(f"spread = {spread.min():g} must not be negative")
-
     safe = np.where(known, time, 1.0)
     inverse = np.sqrt(1 + x**2 + y**2) / (_NS * safe)
     relative = spread / np.sqrt(positive("facets", facets))
     to_inverse = inverse / safe
     alone = to_inverse * np.hypot(np.nan_to_num(noise), _LEAST_ERROR_NS)
-    light, correlation = PixelLight(x, y, spread), _correlation(x, spread)
-    level = _planes(inverse, alone, inverse * np.tan(angle) * relative, known, light, correlation, angle)
+    correlation = _correlation(x, spread)
+    level = _planes(inverse, alone, inverse * np.tan(off_nadir) * relative, known, light, correlation, off_nadir)
     tilt, unsure = (np.nan_to_num(one)[:, np.newaxis] for one in (level.along, level.along_stderr))
-    steepness = np.hypot(np.tan(angle - np.arctan(_LIKELY * tilt)), np.sqrt(_LIKELY) * unsure)
-    return _planes(inverse, alone, inverse * steepness * relative, known, light, correlation, angle)
+    steepness = np.hypot(np.tan(off_nadir - np.arctan(_LIKELY * tilt)), np.sqrt(_LIKELY) * unsure)
+    return _planes(inverse, alone, inverse * steepness * relative, known, light, correlation, off_nadir)
 
 
 def _correlation(x: FloatArray, spread: FloatArray) -> FloatArray:
@@ -244,36 +227,24 @@ def _planes(
     # A deviation of 1/rho is one of time times t rho.
     misfit = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(free, 1)) / (_NS * a**2)
 
-    def keep(values: FloatArray, where: BoolArray) -> FloatArray:
-        return np.where(where, values, np.nan)
-
     return SurfacePlane(
-        keep(along, has_u),
-        keep(c / a * forward, has_v),
-        keep((1 + along**2) / (1 + (b / a) ** 2) * error(of_b) / a, has_u),
-        keep(np.abs(forward) * error(of_c) / a, has_v),
-        keep(1 / a, some),
-        keep(misfit, free > 0),
+        np.where(has_u, along, np.nan),
+        np.where(has_v, c / a * forward, np.nan),
+        np.where(has_u, (1 + along**2) / (1 + (b / a) ** 2) * error(of_b) / a, np.nan),
+        np.where(has_v, np.abs(forward) * error(of_c) / a, np.nan),
+        np.where(some, 1 / a, np.nan),
+        np.where(free > 0, misfit, np.nan),
     )
 
 
 def with_prior(slope: npt.ArrayLike, stderr: npt.ArrayLike, deviation: float) -> tuple[FloatArray, FloatArray]:
     """Return mean and standard deviation of a slope [1] with a Gaussian prior for the slopes of the sea.
 
-    Parameters
-    ----------
-    slope, stderr : array_like
-        Slope and its standard error [1]; the result is that of the prior where they are NaN.
-    deviation : float
-        Standard deviation of the sea's slopes averaged over a footprint, with mean 0 [1], above 0.
-
-    Raises
-    ------
-    UserError
-        If `deviation` is not positive.
+    The prior has the mean 0 and the standard deviation of the slopes averaged over a footprint [1]. It is the result
+    where `slope` or its standard error are NaN.
     """
     measured, error = np.asarray(slope, dtype=np.float64), np.asarray(stderr, dtype=np.float64)
-    variance = positive("deviation", deviation) ** 2
+    variance = deviation**2
     known = np.isfinite(measured) & np.isfinite(error)
     weight = np.where(known, variance / (variance + np.where(known, error, 1.0) ** 2), 0.0)
     return np.where(known, measured, 0.0) * weight, np.sqrt(variance * (1 - weight))
