@@ -61,7 +61,7 @@ def scene_summary(name: str | os.PathLike[str]) -> str:
 
 
 def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
-    """Return names and default values of the parameters of a scene, its ``<default>`` tags, in the order of `scene_text`.
+    """Return names and default values of the parameters (``<default>`` tags) of a scene, in the order of `scene_text`.
 
     Name and errors as in `scene_text`.
     """

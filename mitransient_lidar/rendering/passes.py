@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.validation import FloatArray, positive
-from mitransient_lidar.rendering.interruption import deferred_interrupt
+from mitransient_lidar.rendering.interruption import DeferredInterrupt
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
@@ -154,7 +154,7 @@ def run_passes(
     median = p95 = None
     start = time.perf_counter()
     try:
-        with deferred_interrupt() as raise_interrupt:
+        with DeferredInterrupt() as interruption:
             while not goal.reached(count, time.perf_counter() - start, p95):
                 lost += render_pass(count, pass_seed(seed, count))
                 count += 1
@@ -165,7 +165,7 @@ def run_passes(
                     left = goal.remaining(count, elapsed, p95)
                     progress(Progress(count, goal.passes, "pass", elapsed, left, median, p95, goal.target_error))
                 if count >= smallest:
-                    raise_interrupt()
+                    interruption.check()
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):
             raise
