@@ -1,4 +1,4 @@
-"""Output files of the commands: checks before long work, figures with their data, and the files of a gate stack."""
+"""Output files of the commands: checks before a render, figures with their data, and files of gate stacks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_writable(folder: Path, targets: list[Path]) -> None:
-    """Check before a long render, and without a trace, that the results can be written."""
+    """Check that files can be written into a folder, without creating it."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
@@ -33,7 +33,7 @@ def check_writable(folder: Path, targets: list[Path]) -> None:
 
 
 def check_figure(path: Path | None) -> None:
-    """Check before long work that a figure, and the NetCDF file beside it, can be written."""
+    """Check that a figure, and the NetCDF file of its data, can be written."""
     if path is None:
         return
     from mitransient_lidar.plots.drawing import check_format
@@ -58,13 +58,12 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
 
 
 def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Dataset, Path], Any]) -> None:
-    """Write a figure and its data beside it, and print both paths; without a path do nothing."""
-    if path is None:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot(dataset, path)
-    typer.echo(path)
-    write_netcdf(dataset, path.with_suffix(".nc"))
+    """Write a figure and a NetCDF file of its data, and print both paths; without a path do nothing."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        plot(dataset, path)
+        typer.echo(path)
+        write_netcdf(dataset, path.with_suffix(".nc"))
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,8 @@ class GateFiles:
     folder, stem
         Folder of the files, and beginning of their names.
     wanted
-        Kinds of file beside the EXR stack: ``drawings`` (all gates, and the depths seen in them), ``sequence``,
-        ``gif``, ``mp4`` and ``html``.
+        Files in addition to the EXR stack: ``drawings`` (gates, and their depths), ``sequence``, ``gif``, ``mp4`` and
+        ``html``.
     """
 
     folder: Path
@@ -86,7 +85,7 @@ class GateFiles:
 
     @classmethod
     def of(cls, folder: Path, stem: str, **wanted: bool) -> GateFiles:
-        """Return the files of a gate stack; the options name the kinds of file."""
+        """Return the files of a gate stack, given the options for the kinds of file."""
         return cls(folder, stem, frozenset(kind for kind, on in wanted.items() if on))
 
     def names(self) -> list[Path]:
@@ -103,7 +102,6 @@ class GateFiles:
 
         for path in self.names():
             if path.suffix in (".gif", ".mp4"):
-                # Before anything is written.
                 images.check_animation(stack, path)
         self.folder.mkdir(parents=True, exist_ok=True)
         for path in self.names():
@@ -124,7 +122,7 @@ class GateFiles:
 
 
 def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> bool:
-    """Draw the depths seen in the gates; return False where too few gates lie below the surface."""
+    """Draw the depths of the echoes in the gates; return False if too few gates are below the surface."""
     from mitransient_lidar.plots.gates.echoes import plot_depths
 
     try:

@@ -49,7 +49,6 @@ def gates(
     folder, stem = output or stack.parent, stack.stem.removesuffix("_gates")
     files = GateFiles.of(folder, stem, drawings=plot, sequence=sequence, gif=gif, mp4=mp4, html=html)
     check_writable(folder, files.names())
-
     from mitransient_lidar.analysis.gates import cut as gating
     from mitransient_lidar.results import gate_stack
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _WRONG_USE = 2
 _INTERRUPTED = 130  # what shells report after Ctrl-C
 
-#: Most pixels with a line of their own in the summary.
+#: Largest number of pixels listed in the summary.
 _LISTED_PIXELS = 12
 
 
@@ -32,7 +32,7 @@ def exit_on_error() -> Iterator[None]:
         typer.echo(str(error), err=True)
         raise typer.Exit(_WRONG_USE) from error
     except BrokenPipeError:
-        raise  # the reader of stdout has left; Typer ends quietly
+        raise  # stdout is closed; Typer exits without a message
     except OSError as error:
         place = f" {error.filename}" if error.filename else ""
         typer.echo(f"cannot use{place}: {error.strerror or error}.", err=True)
@@ -43,15 +43,15 @@ def exit_on_error() -> Iterator[None]:
 
 
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
-    """Exit with code 130 when Ctrl-C ended a render early, after its results have been written."""
+    """Exit with code 130 if Ctrl-C ended the render of a result."""
     if dataset.attrs.get("interrupted"):
-        typer.echo(f"interrupted after {dataset.attrs['passes']} passes; what was rendered is kept.", err=True)
+        typer.echo(f"interrupted after {dataset.attrs['passes']} passes; their result is kept.", err=True)
         raise typer.Exit(_INTERRUPTED)
 
 
 @contextlib.contextmanager
 def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """Show log messages on stderr, and on a terminal a progress bar; yield the function that moves the bar."""
+    """Show log messages on stderr, and on a terminal a progress bar; yield the function that updates the bar."""
     import logging
 
     logger = logging.getLogger("mitransient_lidar")
@@ -60,7 +60,6 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
         logger.propagate = False
         yield None
         return
-
     from rich.logging import RichHandler
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as ProgressBar
@@ -83,7 +82,7 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
 
 def _describe(state: Progress) -> str:
-    """Describe the state of long work in one line."""
+    """Describe the progress in one line."""
     planned = f"/{state.planned}" if state.planned is not None else ""
     parts = [f"{state.unit} {state.done}{planned}"]
     if state.error_median is not None:

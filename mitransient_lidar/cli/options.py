@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take, and how their text is read."""
+"""Arguments and options of several commands, and their conversion."""
 
 from __future__ import annotations
 
@@ -13,18 +13,7 @@ Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped s
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
 ]
-TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
-Passes = Annotated[int, typer.Option(help="Number of independent passes of each render.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
-TargetError = Annotated[float | None, typer.Option(help="Stop at this relative standard error, e.g. 0.01.")]
-MaxTime = Annotated[float | None, typer.Option(help="Stop after this many seconds.")]
-GoalPasses = Annotated[int | None, typer.Option("--passes", help="Stop after this many independent passes.")]
-Variant = Annotated[str | None, typer.Option(help="Mitsuba variant, e.g. llvm_ad_mono.")]
-Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
-Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; the data go to .nc beside it.")]
-OptionalFigure = Annotated[
-    Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write; the data go to .nc beside it.")
-]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
 

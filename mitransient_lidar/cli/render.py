@@ -1,4 +1,4 @@
-"""Commands that render a scene: by the laser, and by daylight."""
+"""Commands that render a scene with the laser or by daylight."""
 
 from __future__ import annotations
 
@@ -10,22 +10,17 @@ import typer
 
 from mitransient_lidar.cli.files import GateFiles, check_writable
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import (
-    Define,
-    Folder,
-    GoalPasses,
-    MaxTime,
-    Quiet,
-    Scene,
-    Seed,
-    TargetError,
-    Variant,
-    parameters,
-)
+from mitransient_lidar.cli.options import Define, Quiet, Scene, Seed, parameters
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
     import xarray as xr
+
+TargetError = Annotated[float | None, typer.Option(help="Stop at this relative standard error, e.g. 0.01.")]
+MaxTime = Annotated[float | None, typer.Option(help="Stop after this many seconds.")]
+GoalPasses = Annotated[int | None, typer.Option("--passes", help="Stop after this many independent passes.")]
+Variant = Annotated[str | None, typer.Option(help="Mitsuba variant, e.g. llvm_ad_mono.")]
+Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
 
 
 def render(
@@ -53,17 +48,15 @@ def render(
     gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short.
     """
     params = parameters(define)
-
     from mitransient_lidar.loading.catalogue import scene_path, scene_text
 
     name = scene_path(scene).stem
-    # Before a long render: a scene whose film has gates has the parameter gate_count.
+    # Checked before the render: films with gates have the parameter gate_count.
     if (gif or mp4 or html) and "gate_count" not in scene_text(scene):
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
     check_writable(output, [*targets, *gates.names()])
-
     from mitransient_lidar.rendering import render as rendering
 
     with reporting(quiet) as progress:
@@ -93,7 +86,7 @@ def render(
 
 
 def _write(dataset: xr.Dataset, target: Path) -> bool:
-    """Write a result or a drawing of it; return False for a layout of pixels that do not look at the sea."""
+    """Write a result or a figure of it; return False for the layout of pixels that do not see the sea."""
     from mitransient_lidar import results
     from mitransient_lidar.results import gate_files
 
@@ -120,8 +113,8 @@ def passive(
     scene: Scene,
     define: Define = None,
     output: Folder = Path("."),
-    frames: Annotated[int, typer.Option(help="Number of frames of a moving picture.")] = 1,
-    frame_step: Annotated[float, typer.Option(help="Time between frames [s], in which the waves move on.")] = 0.1,
+    frames: Annotated[int, typer.Option(help="Number of frames of an animation.")] = 1,
+    frame_step: Annotated[float, typer.Option(help="Time between frames [s].")] = 0.1,
     filter_width_nm: Annotated[
         float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")
     ] = None,
@@ -139,14 +132,12 @@ def passive(
     passes hold for each frame.
     """
     params = parameters(define)
-
     from mitransient_lidar.loading.catalogue import scene_path
 
     stem = f"{scene_path(scene).stem}_passive"
     suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and frames > 1 else [])]
     targets = [output / f"{stem}{suffix}" for suffix in suffixes]
     check_writable(output, targets)
-
     from mitransient_lidar.plots import passive as passive_plots
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.results.radiance import save_radiance

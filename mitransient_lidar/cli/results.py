@@ -24,11 +24,10 @@ def plot(
 ) -> None:
     """Draw the waveforms or the layout of a result.
 
-    Writes a PNG file beside FILE unless -o is given, and prints its path.
+    Writes a PNG file, by default in the folder of FILE, and prints its path.
     """
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
-
     from mitransient_lidar import results
     from mitransient_lidar.plots.layout import plot_layout
     from mitransient_lidar.plots.waveforms import plot_waveforms

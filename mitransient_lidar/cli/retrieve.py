@@ -31,7 +31,6 @@ def retrieve(
     deviations = None if slope_deviation is None else pair("--slope-deviation", slope_deviation)
     if output is not None:
         check_suffix("--output", output, ".nc")
-
     from mitransient_lidar import results
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
 
@@ -50,10 +49,8 @@ def _lines(found: Any) -> list[str]:
     lines = []
     for name, positive in (("along", "a face towards the lidar"), ("across", "a rise to the left")):
         slope, error = value[f"slope_{name}"], value[f"slope_{name}_stderr"]
-        text = (
-            "not observable with these pixels" if np.isnan(slope) else f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
-        )
-        lines.append(f"slope {name}: {text}")
+        known = f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
+        lines.append(f"slope {name}: {'not observable with these pixels' if np.isnan(slope) else known}")
     height = value["surface_height"]
     lines.append("surface: no echo" if np.isnan(height) else f"surface: {height:+.3f} m from the mean level")
     lines += _bottom_lines(found["depth_m"].values, found)
@@ -63,7 +60,7 @@ def _lines(found: Any) -> list[str]:
         return [*lines, "water: no column that can be fitted"]
     lines.append("water (1/m): " + ", ".join(f"{name} {value[key]:.4g}" for name, key in _WATER.items()))
     low, high = value["attenuation_low"], value["attenuation_high"]
-    return [*lines, f"c is a guess: {low:.2g} to {high:.2g} 1/m, as bb/b goes from 0.044 to 0.01"]
+    return [*lines, f"c is uncertain: {low:.2g} to {high:.2g} 1/m for bb/b from 0.044 to 0.01"]
 
 
 def _bottom_lines(depth: Any, found: Any) -> list[str]:

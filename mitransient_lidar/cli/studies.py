@@ -1,4 +1,4 @@
-"""Commands that study a scene, a sea or a water beyond one render."""
+"""Commands for studies that take several renders, and for the properties of waters."""
 
 from __future__ import annotations
 
@@ -10,20 +10,14 @@ import typer
 
 from mitransient_lidar.cli.files import check_figure, write_figure
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import (
-    Define,
-    DrawingOnly,
-    Figure,
-    OptionalFigure,
-    Passes,
-    Quiet,
-    Scene,
-    Seed,
-    TargetId,
-    numbers,
-    pair,
-    parameters,
-)
+from mitransient_lidar.cli.options import Define, DrawingOnly, Quiet, Scene, Seed, numbers, pair, parameters
+
+TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
+Passes = Annotated[int, typer.Option(help="Number of independent passes of each render.")]
+Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; the data go to .nc beside it.")]
+OptionalFigure = Annotated[
+    Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write; the data go to .nc beside it.")
+]
 
 
 def find_shots(
@@ -43,11 +37,7 @@ def find_shots(
     """
     params = parameters(define)
     places = [pair("--at", text) for text in at or []]
-    if output is not None:
-        from mitransient_lidar.plots.drawing import check_format
-
-        check_format(output)
-
+    check_figure(output)
     from mitransient_lidar.plots.find_shots import plot_found_shots
     from mitransient_lidar.studies import find_shots as study
 
@@ -73,14 +63,12 @@ def shot_statistics(
     quiet: Quiet = False,
 ) -> None:
     """Correlate the echoes of random shots with the sea's slopes."""
-    params = parameters(define)
     check_figure(output)
-
     from mitransient_lidar.plots.shot_statistics import plot_shot_statistics
     from mitransient_lidar.studies import shot_statistics as study
 
     with reporting(quiet) as progress:
-        shots = study.shot_statistics(scene, params, count=count, seed=seed, progress=progress)
+        shots = study.shot_statistics(scene, parameters(define), count=count, seed=seed, progress=progress)
     write_figure(shots, output, plot_shot_statistics)
     for name, value in study.slope_correlations(shots).items():
         typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
@@ -103,7 +91,6 @@ def target_signal(
     """
     params = parameters(define)
     check_figure(output)
-
     from mitransient_lidar.plots.target_signal import plot_target_map, plot_target_signal
     from mitransient_lidar.studies import target_signal as study
 
@@ -145,17 +132,15 @@ def detect(
 
     Compares one pixel, the sum and the best combination of pixels.
     """
-    params = parameters(define)
     places = numbers("--depths", depths) if depths else []
     check_figure(output)
-
     from mitransient_lidar.plots.detection import plot_detection
     from mitransient_lidar.studies import detection as study
 
     with reporting(quiet) as progress:
         found = study.detect(
             scene,
-            params,
+            parameters(define),
             receiver=receiver,
             pfa=pfa,
             pd=pd,
@@ -184,17 +169,15 @@ def beam_spread(
 ) -> None:
     """Measure the spread of the laser's light at depths.
 
-    The spread in space and in time, and the share of the light within the field of view.
+    Horizontal spread, delays, and share of the light within the field of view.
     """
-    params = parameters(define)
     wanted = numbers("--depths", depths)
     check_figure(output)
-
     from mitransient_lidar.plots.beam_spread import plot_beam_spread
     from mitransient_lidar.studies import beam_spread as study
 
     with reporting(quiet) as progress:
-        found = study.beam_spread(scene, wanted, params, passes=passes, seed=seed, progress=progress)
+        found = study.beam_spread(scene, wanted, parameters(define), passes=passes, seed=seed, progress=progress)
     write_figure(found, output, plot_beam_spread)
     if not quiet:
         _print(study.describe_spread(found))
@@ -214,16 +197,16 @@ def fov_sweep(
     quiet: Quiet = False,
 ) -> None:
     """Measure the water's attenuation for several fields of view."""
-    params = parameters(define)
     wanted = numbers("--fov-mrad", fov_mrad)
     check_figure(output)
-
     from mitransient_lidar.plots.fov_sweep import plot_fov_sweep
     from mitransient_lidar.studies import fov_sweep as study
 
     depths = {"min_depth": min_depth, "max_depth": max_depth}
     with reporting(quiet) as progress:
-        found = study.fov_sweep(scene, wanted, params, **depths, passes=passes, seed=seed, progress=progress)
+        found = study.fov_sweep(
+            scene, wanted, parameters(define), **depths, passes=passes, seed=seed, progress=progress
+        )
     write_figure(found, output, plot_fov_sweep)
     _print(study.describe_fov_sweep(found))
 
@@ -241,14 +224,13 @@ def scattering_orders(
 
     Each order is also separated by the number of reversals of the vertical direction: one, or several.
     """
-    params = parameters(define)
     check_figure(output)
-
     from mitransient_lidar.plots.scattering_orders import plot_scattering_orders
     from mitransient_lidar.studies import scattering_orders as study
 
+    options: dict[str, Any] = {"orders": orders, "passes": passes, "seed": seed}
     with reporting(quiet) as progress:
-        found = study.scattering_orders(scene, params, orders=orders, passes=passes, seed=seed, progress=progress)
+        found = study.scattering_orders(scene, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_scattering_orders)
     _print(study.describe_orders(found))
 
@@ -283,5 +265,4 @@ def water(
 
 
 def _print(lines: list[str]) -> None:
-    for line in lines:
-        typer.echo(line)
+    typer.echo("\n".join(lines))

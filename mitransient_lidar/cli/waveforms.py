@@ -13,8 +13,8 @@ from mitransient_lidar.core.errors import UserError
 if TYPE_CHECKING:
     import xarray as xr
 
-_LISTED = 200  # lines of a table that someone reads
-_LISTED_COLUMNS = 16  # waveforms whose layers are listed
+_MOST_LINES = 200  # of a printed table
+_MOST_WAVEFORMS = 16  # whose layers are printed
 
 
 def waveforms(
@@ -48,7 +48,6 @@ def waveforms(
         check_suffix("--csv", output, ".csv")
     elif not table:
         raise UserError("--no-table leaves nothing to do: give --csv OUT, too.")
-
     from mitransient_lidar.analysis.waveforms import csv_tables, records
     from mitransient_lidar.analysis.waveforms import echo_table as measuring
 
@@ -69,7 +68,7 @@ def waveforms(
 
 
 def _print(found: xr.Dataset) -> None:
-    """Print the echoes that are there, and what is known of the columns."""
+    """Print the echoes and the properties of the columns."""
     from rich.console import Console
     from rich.table import Table
 
@@ -89,15 +88,15 @@ def _print(found: xr.Dataset) -> None:
     left_out = 0
     for line in lines:
         cells = dict(zip(names, line, strict=True))
-        # No target, or no bottom within the record, is nothing to report.
+        # Only a missing surface is listed.
         if cells["flags"] == "no_echo" and cells["echo"] != "surface":
             continue
-        if table.row_count >= _LISTED:
+        if table.row_count >= _MOST_LINES:
             left_out += 1
             continue
         numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in csv_tables.NUMBERS]
         table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"])
-    # Lines are never folded: what is too wide for a terminal is still a table in a file.
+    # A fixed width keeps the lines unfolded.
     Console(highlight=False, width=200, markup=False).print(table)
     if left_out:
         typer.echo(f"{left_out} more lines: write them all with --csv OUT.")
@@ -105,7 +104,7 @@ def _print(found: xr.Dataset) -> None:
 
 
 def _print_columns(found: xr.Dataset) -> None:
-    """Print attenuations, and changes in the columns where they were sought."""
+    """Print attenuations, and the changes in the columns if tested for."""
     import numpy as np
 
     values = found["attenuation"].values.ravel()
@@ -114,7 +113,7 @@ def _print_columns(found: xr.Dataset) -> None:
         if values.size > 1:
             text += f", from {np.nanmin(values):.4f} to {np.nanmax(values):.4f}"
         typer.echo(text)
-    if "layer" not in found.dims or values.size > _LISTED_COLUMNS:
+    if "layer" not in found.dims or values.size > _MOST_WAVEFORMS:
         return
     layers: Any = found[["layer_depth_m", "layer_p_value", "layer_step"]]
     dims = list(found["attenuation"].dims)

@@ -72,8 +72,8 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     )
     outside = ~surface if scene.surfaces else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
-    echoes = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
-    return EchoProbe(*echoes, missed, _pierced(scene, first, below, at_sea, solid))
+    surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
+    return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, at_sea, solid))
 
 
 def _pierced(

@@ -99,7 +99,7 @@ def run(*, quick: bool = False, json: bool = False, case: str | None = None, tar
         raise UserError(f"case = {case!r} must be one of {', '.join(CASES)}")
     if target_error is not None:
         positive("target_error", target_error)
-    tasks = {
+    tasks: dict[tuple[str, ...], dict[str, Any]] = {
         (name, integrator): {"case": name, "integrator": integrator, "quick": quick, "target_error": target_error}
         for name in ([case] if case else list(QUICK_CASES if quick else CASES))
         for integrator in INTEGRATORS

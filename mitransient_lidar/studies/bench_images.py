@@ -48,7 +48,7 @@ def run(*, json: bool = False) -> None:
     Scene: the table system over a bottom at 8 m below a sea at 3 m/s, c = 0.3 /m, 64 gates of 10 ns, 1.5 ns apart. A
     render ends when the gate on the bottom is known to 10 %.
     """
-    tasks = {(layout,): {"layout": layout} for layout in LAYOUTS}
+    tasks: dict[tuple[str, ...], dict[str, str]] = {(layout,): {"layout": layout} for layout in LAYOUTS}
     run_processes("mitransient_lidar.studies.bench_images", ("layout",), tasks, _COLUMNS, json)
 
 

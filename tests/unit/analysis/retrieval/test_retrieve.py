@@ -240,7 +240,7 @@ def test_command(tmp_path):
     written = tmp_path / "out" / "found.nc"
     done = run("retrieve", tmp_path / "shot.nc", "-o", written, "--slope-deviation", "0.1,0.1")
     assert done.exit_code == 0, done.output
-    for text in ("slope along: ", "bottom: 8.0", "bright 9", "water (1/m): a 0.1", "c is a guess: "):
+    for text in ("slope along: ", "bottom: 8.0", "bright 9", "water (1/m): a 0.1", "c is uncertain: "):
         assert text in done.output
     expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
     xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
