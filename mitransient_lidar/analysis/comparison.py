@@ -28,8 +28,8 @@ class Comparison:
     Attributes
     ----------
     z
-        Difference of the impulse responses in its standard errors, second minus first, shape (pixel, time), converted
-        to the normal distribution for few passes; NaN in excluded bins.
+        Difference of the impulse responses in standard errors, second minus first, shape (pixel, time), converted to
+        the normal distribution for few passes; NaN in excluded bins.
     limit
         Critical ``abs(z)`` of the largest difference of all bins (Sidak 1967, doi:10.1080/01621459.1967.10482935).
     energy_ratio, energy_ratio_stderr

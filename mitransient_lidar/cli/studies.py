@@ -202,11 +202,9 @@ def fov_sweep(
     from mitransient_lidar.plots.fov_sweep import plot_fov_sweep
     from mitransient_lidar.studies import fov_sweep as study
 
-    depths = {"min_depth": min_depth, "max_depth": max_depth}
+    options: dict[str, Any] = {"min_depth": min_depth, "max_depth": max_depth, "passes": passes, "seed": seed}
     with reporting(quiet) as progress:
-        found = study.fov_sweep(
-            scene, wanted, parameters(define), **depths, passes=passes, seed=seed, progress=progress
-        )
+        found = study.fov_sweep(scene, wanted, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_fov_sweep)
     _print(study.describe_fov_sweep(found))
 

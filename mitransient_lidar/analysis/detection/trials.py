@@ -46,10 +46,10 @@ class Level:
 
     def limits(self, other: Level | None = None) -> tuple[float, float, float]:
         """Return the level, or the ratio of another level to it, and the limits of its confidence interval."""
-        limits = _interval(self.log, self.changes)
+        log, changes = self.log, self.changes
         if other is not None:
-            limits = _interval(other.log - self.log, other.changes - self.changes)
-        value, low, high = limits
+            log, changes = other.log - log, other.changes - changes
+        value, low, high = _interval(log, changes)
         return math.exp(value), math.exp(low), math.exp(high)
 
 
@@ -122,12 +122,12 @@ class Experiment:
                 joint[:, i, :, i, :] = covariance[:, i]
             width = detectors * samples
             found += [mean.reshape(count, width), joint.reshape(count, width, width)]
-        matrix = self.matrix(name, samples)
-        return Cases(found[0], found[1], found[2], found[3], detectors).combined(matrix, len(matrix) // samples)
+        matrix = self.matrix(name)
+        return Cases(*found, detectors=detectors).combined(matrix, len(matrix) // samples)
 
-    def matrix(self, name: str, samples: int) -> FloatArray:
+    def matrix(self, name: str) -> FloatArray:
         """Return the matrix from the samples of all detectors to those of a combination."""
-        pixels = self.background.shape[1]
+        pixels, samples = self.background.shape[1], self.samples.stop - self.samples.start
         weights = {
             "single": np.ones((1, 1)),
             "sum": np.ones((1, pixels)),
@@ -135,10 +135,6 @@ class Experiment:
             "best": np.eye(pixels),
         }
         return np.kron(weights[name], np.eye(samples))
-
-    def own_matrix(self, name: str) -> FloatArray:
-        """Return the matrix of a combination for the samples of this experiment."""
-        return self.matrix(name, self.samples.stop - self.samples.start)
 
     def draw(self, single: bool, light: FloatArray, chain: ReceiverChain, shots: int, seed: int) -> FloatArray:
         """Return random samples of shots, shape (shots, cases, detectors * samples)."""
@@ -197,7 +193,7 @@ def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) ->
     rates: dict[str, list[Any]] = defaultdict(list)
     for name in COMBINATIONS:
         statistic = trial.cases(name, share, 1).statistic()
-        matrix = trial.own_matrix(name)
+        matrix = trial.matrix(name)
         null, target = (
             (np.einsum("nci,ci->nc", record @ matrix.T, statistic.weights) - statistic.offsets).ravel()
             for record in records[name == "single"]
@@ -222,7 +218,7 @@ def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) ->
 
 
 def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float, metres_per_ns: float) -> Variables:
-    """Return bias and spread of the depth of the whole echo, from the time of the matched filter."""
+    """Return bias and spread of the depth of the full echo, from the time of the matched filter."""
     steps = HALF_SEARCH * pulse_fwhm_ns * np.linspace(-1, 1, _DELAYS)
     background, target = trial.light(1, 1)
     count = len(background)
@@ -233,7 +229,7 @@ def depth_errors(trial: Experiment, shots: int, seed: int, pulse_fwhm_ns: float,
         record = trial.draw(single, target, chain, -(-shots // count), _seed(seed, single, 2))
         for name in COMBINATIONS[:1] if single else COMBINATIONS[1:]:
             cases = trial.cases(name, 1, 1)
-            matrix = trial.own_matrix(name)
+            matrix = trial.matrix(name)
             times = []
             for i in range(count):
                 kept = [i] if count == 1 else [k for k in range(count) if k != i]

@@ -22,19 +22,7 @@ _INFLATION = ("error_inflation_bins", "error_inflation")
 
 
 def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
-    """Cut gates from the waveforms of a result.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        A result with ``waveform`` and ``waveform_stderr`` [W] over (row, column, time) or (pixel, time).
-    train : GateTrain
-        The gates, within the record.
-
-    Returns
-    -------
-    xarray.Dataset
-        The gate stack.
+    """Return the gate stack of a result with ``waveform`` and ``waveform_stderr`` [W].
 
     Raises
     ------
@@ -43,13 +31,12 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
 
     Notes
     -----
-    The waveform is the mean power in each bin: the energy of a gate is the sum of power times bin width times the exact
-    mean of the gate over the bin. The errors of bins are correlated, since bins of a pass share light, which the pulse
-    spreads over several bins. The standard error is the quadrature sum times the inflation of the error of a sum over
-    as many bins, measured over the passes of the render (attributes ``error_inflation_bins`` and ``error_inflation``;
-    linear in the logarithm of the number of bins, and beyond the last one in proportion to the square root). A gate
-    with weights w counts as (sum w)^2 / sum w^2 bins. The upper bound is the sum of the errors, which is used if the
-    inflation is unknown.
+    The energy of a gate is the sum of the mean power times bin width times the exact mean of the gate over the bin. The
+    errors of bins are correlated. The standard error is the quadrature sum times the inflation of the error of a sum
+    over as many bins, estimated from the passes of the render (attributes ``error_inflation_bins`` and
+    ``error_inflation``; linear in the logarithm of the number of bins, and beyond the last one proportional to the
+    square root). A gate with weights w is equivalent to (sum w)^2 / sum w^2 bins. The upper bound is the sum of the
+    errors, which is used if the inflation is unknown.
     """
     if missing := [name for name in ("waveform", "waveform_stderr") if name not in dataset]:
         raise UserError(

@@ -12,7 +12,7 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
 _SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most significant gate
-_BLOCK = 8192  # pixels per block: a few tens of MB for 64 gates
+_BLOCK = 8192  # pixels computed at once
 
 
 class Contrast(NamedTuple):
@@ -52,8 +52,8 @@ def contrast(
         Mean energies of two regions, such as target and background, or gates, and their standard errors, at least 0, in
         one unit; they broadcast.
     correlation : float
-        Correlation of the errors of a and b, -1 to 1. Overlapping gates share light: their correlation is at most the
-        shared fraction of the open time.
+        Correlation of the errors of a and b, -1 to 1; that of overlapping gates is at most the shared fraction of the
+        open time.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def contrast(
     covariance = in_range("correlation", correlation, -1, 1) * sx * sy
     total = np.where(x + y == 0, np.nan, x + y)
     y_known = np.where(y == 0, np.nan, y)
-    # Rounding may leave a variance of fully correlated errors just below 0.
+    # The variance of fully correlated errors may be rounded below 0.
     michelson_variance = np.maximum((y * sx) ** 2 + (x * sy) ** 2 - 2 * x * y * covariance, 0)
     weber_variance = np.maximum(sx**2 + (x / y_known * sy) ** 2 - 2 * x / y_known * covariance, 0)
     return Contrast(
@@ -106,20 +106,19 @@ def range_from_gates(
 
     Notes
     -----
-    Column: the signal of water falls exponentially. In each gate it is the larger of the exponential extrapolated from
-    the (up to) 4 gates before the echo, and of that interpolated between these and the 2 gates behind the echo; behind
-    the echo, where a target may have ended the column, it is at most the level of the 2 gates after it. Energies below
-    their error are replaced by it: the column is never below the noise.
+    Column: the larger of the exponential extrapolated from up to 4 gates before the echo, and of that interpolated
+    between these and the 2 gates behind the echo; behind the echo, at most the level of these 2 gates, since a target
+    may end the column. Energies below their error are replaced by it.
 
     Echo: the gate with the largest excess over the column, of those at least half as significant as the most
     significant one, which excludes the noise of the bright column near the surface. The depth is the centroid of the
-    excess within `reach`. Its error holds for gates not wider than the pulse, so that an echo fills more than one; with
-    wider gates the place of the echo within the gate is unknown. Errors of different gates count as independent.
+    excess within `reach`. Its error assumes independent errors and gates not wider than the pulse; the position of an
+    echo within a wider gate is unknown.
 
     The confidence is Phi(z)^m for an excess of z standard errors, the largest of m gates.
 
-    The first `reach` + 2 gates only serve to estimate the column: start the train between surface and target. A train
-    that contains the surface echo mostly finds the surface.
+    The first `reach` + 2 gates are only used to estimate the column: start the train between surface and target, since
+    a surface echo would be found instead of the target.
     """
     e, s = np.asarray(energy, dtype=np.float64), np.asarray(stderr, dtype=np.float64)
     mid = finite_array("gate_mid", gate_mid)
@@ -147,12 +146,11 @@ def range_from_gates(
 
 
 class _ColumnModel:
-    """Linear maps from the logarithms of a pixel's energies to those of the column under an echo in each gate.
+    """Linear maps from the logarithms of a pixel's energies to those of the column in the gate k of an echo.
 
-    An echo fills `half` gates on each side of its strongest one and is found from the gate `first` on. The logarithms
-    times column k of `mean` and `slope` give the line through the gates before an echo in gate k, which lies `lever`
-    behind their middle; times that of `between`, the line between the gates before and behind it in gate k. Energies
-    times column k of `deep` give the mean of the gates behind, if `has_deep`.
+    An echo includes `half` gates on each side of k, which is at least `first`. Columns k of `mean` and `slope` give the
+    line through the gates before the echo, k being `lever` behind their middle; that of `between` the line between the
+    gates before and behind the echo; that of `deep`, applied to energies, the mean of the gates behind, if `has_deep`.
     """
 
     def __init__(self, mid: FloatArray, half: int) -> None:
@@ -182,7 +180,7 @@ def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> Flo
 
     known = np.asarray(np.isfinite(energy + stderr).all(axis=1))
     e, s = np.where(known[:, None], energy, 0), np.where(known[:, None], stderr, 0)
-    # A floor far below every signal keeps logarithms finite without light and noise.
+    # The floor keeps logarithms finite without light and noise.
     floor = np.maximum(s, np.maximum(1e-15 * e.max(axis=1, initial=0), 1e-300)[:, None])
     clipped = np.maximum(e, floor)
     log, log_variance = np.log(clipped), (s / clipped) ** 2

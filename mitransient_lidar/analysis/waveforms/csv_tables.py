@@ -44,21 +44,10 @@ def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
 
 
 def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a table of `echo_table.extract` to a CSV file, with empty cells for unknown values.
-
-    An existing file is replaced.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
-    """
+    """Write or replace a CSV file of a table of `echo_table.extract`, with empty cells for unknown values."""
     names, lines = rows(table)
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        for line in lines:
-            writer.writerow([_cell(value) for value in line])
+        csv.writer(file).writerows([names, *([_cell(value) for value in line] for line in lines)])
 
 
 def _cell(value: Any) -> Any:
