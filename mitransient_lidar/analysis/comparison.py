@@ -72,25 +72,26 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     UserError
         If pixels or bins differ, or no bin is included.
     """
-    values = [_by_pixel(result, "impulse_response") for result in (first, second)]
-    errors = [_by_pixel(result, "impulse_response_stderr") for result in (first, second)]
-    times = [result["time"].values for result in (first, second)]
-    if values[0].shape != values[1].shape or not np.allclose(times[0], times[1]):
-        shapes = " and ".join(
-            f"{len(value)} pixels x {len(time)} bins" for value, time in zip(values, times, strict=True)
-        )
-        raise UserError(f"the results have {shapes}: they must have the same pixels and time bins")
-    variances = [error**2 for error in errors]
-    counts = [int(result.attrs.get("passes", 0)) for result in (first, second)]
+    results = first, second
+    times = [result["time"].values for result in results]
+    shapes = [_by_pixel(result, "impulse_response").shape for result in results]
+    if shapes[0] != shapes[1] or not np.allclose(times[0], times[1]):
+        described = " and ".join(f"{pixels} pixels x {bins} bins" for pixels, bins in shapes)
+        raise UserError(f"the results have {described}: they must have the same pixels and time bins")
+    values, errors = (
+        np.stack([_by_pixel(result, name) for result in results])
+        for name in ("impulse_response", "impulse_response_stderr")
+    )
+    variances = errors**2
+    counts = [int(result.attrs.get("passes", 0)) for result in results]
     if min(counts) < 2:
         raise UserError(f"the results have {counts[0]} and {counts[1]} passes: both must have at least 2")
-    known = [error < _LARGEST_RELATIVE_ERROR * value for value, error in zip(values, errors, strict=True)]
     inside = np.ones(len(times[0]), dtype=bool)
-    for result in (first, second):
+    for result in results:
         start, end = (result.attrs.get(f"window_{name}_ns") for name in ("start", "end"))
         if start is not None and end is not None:
             inside &= (times[0] >= start) & (times[0] <= end)
-    counted = known[0] & known[1] & inside & (variances[0] + variances[1] > 0)
+    counted = (errors < _LARGEST_RELATIVE_ERROR * values).all(axis=0) & inside & (variances[0] + variances[1] > 0)
     if not counted.any():
         raise UserError("the results share no bin with a relative error below 30 %: render more passes")
     difference = np.where(counted, values[1] - values[0], np.nan)
@@ -99,7 +100,7 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     weight = np.where(counted, relative[0] + relative[1], np.nan)
     common = (relative[1] * values[0] + relative[0] * values[1]) / weight
     # At least the original error, since the common mean is too small where one result lacks rare paths.
-    parts = [np.maximum(part * common**2, own) for part, own in zip(relative, variances, strict=True)]
+    parts = np.maximum(np.stack(relative) * common**2, variances)
     total = parts[0] + parts[1]
     freedom = _NEIGHBOURS * total**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
     z = _as_normal(difference / np.sqrt(total), freedom)

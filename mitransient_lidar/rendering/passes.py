@@ -64,19 +64,18 @@ class Goal:
                 positive(name, value)
         if passes is not None and passes < 2:
             raise UserError(f"passes = {passes} must be at least 2: their spread gives the standard error")
-        if target_error is None and max_time is None and passes is None:
-            return default
-        return cls(target_error, max_time, passes)
+        return default if target_error is max_time is passes is None else cls(target_error, max_time, passes)
 
     def reached(self, done: int, elapsed: float, error: float | None) -> bool:
         """Return whether to stop after `done` passes."""
         if done < 2:
             return False
-        if self.passes is not None and done >= self.passes:
-            return True
-        if self.max_time is not None and elapsed >= self.max_time:
-            return True
-        return self.target_error is not None and done >= SMALLEST_PASS_COUNT and (error or np.inf) <= self.target_error
+        accurate = self.target_error is not None and (error or np.inf) <= self.target_error
+        return (
+            (self.passes is not None and done >= self.passes)
+            or (self.max_time is not None and elapsed >= self.max_time)
+            or (accurate and done >= SMALLEST_PASS_COUNT)
+        )
 
     def remaining(self, done: int, elapsed: float, error: float | None) -> float | None:
         """Estimate the remaining time [s]; errors fall with the square root of the passes."""

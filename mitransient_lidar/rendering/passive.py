@@ -21,7 +21,6 @@ from mitransient_lidar.rendering.accuracy import RatioStatistics
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, pass_seed, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
-    Session,
     choose_integrator,
     open_scene,
     pass_attributes,
@@ -102,7 +101,9 @@ def render_passive(
     for frame in range(frames):
         moved = _moved(scene, params, frame * step) if frames > 1 else (scene, params)
         session = open_scene(*moved, variant)
-        chosen = _choose_integrator(session, integrator)
+        own = session.scene.integrator()
+        default = own if getattr(own, "passive", False) else "passive_volpath"
+        chosen = choose_integrator(session.scene, default if integrator is None else integrator, passive=True)
         renderer = chosen.prepare(session.scene, session.sensor)
         if frame == 0:
             described, first = _describe(renderer), session
@@ -157,13 +158,6 @@ def _render_frame(
 
     log = run_passes(render_pass, goal, seed=seed, errors=statistics.relative_errors, progress=progress)
     return statistics, log, log.edge_loss_share(received)
-
-
-def _choose_integrator(session: Session, wanted: str | Mapping[str, Any] | None) -> Any:
-    """Return the requested integrator, that of the scene if it is passive, or the default."""
-    own = session.scene.integrator()
-    default = own if getattr(own, "passive", False) else "passive_volpath"
-    return choose_integrator(session.scene, default if wanted is None else wanted, passive=True)
 
 
 def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[Any, Mapping[str, Any] | None]:

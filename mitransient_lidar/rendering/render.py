@@ -117,13 +117,8 @@ def render(
         accumulator.add(record.histogram)
         return float(record.edge_loss[0])
 
-    log = run_passes(
-        render_pass,
-        Goal.from_options(target_error, max_time, passes, default),
-        seed=seed,
-        errors=accumulator.errors,
-        progress=progress,
-    )
+    goal = Goal.from_options(target_error, max_time, passes, default)
+    log = run_passes(render_pass, goal, seed=seed, errors=accumulator.errors, progress=progress)
     if lidar.surfaces and probe.missed_beam > TOLERATED_LOSS:
         logger.warning(
             "the surface is smaller than the footprint: %.2g %% of the beam in the field of view passes outside it; "

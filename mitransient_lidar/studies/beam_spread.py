@@ -161,13 +161,10 @@ def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
     transmitter = system.transmitter
     spot = transmitter.pose.ground_point()
     reach = 3 * transmitter.widest_angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
-    bottoms = []
-    for solid in system.solids:
-        box = solid.bbox()
-        low, high = np.array(box.min), np.array(box.max)
-        # Light passes around a solid smaller than the footprint.
-        if np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach) and low[2] < 0:
-            bottoms.append(-float(low[2]))
+    boxes = [(np.array(solid.bbox().min), np.array(solid.bbox().max)) for solid in system.solids]
+    # Light passes around a solid smaller than the footprint.
+    wide = [np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach) for low, high in boxes]
+    bottoms = [-float(low[2]) for (low, _), covers in zip(boxes, wide, strict=True) if covers and low[2] < 0]
     deepest = max(bottoms, default=np.inf)
     if depths[-1] > deepest:
         raise UserError(f"depths = {depths[-1]:g} m must not lie below the bottom, at {deepest:g} m")

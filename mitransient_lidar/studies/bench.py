@@ -79,21 +79,8 @@ _COLUMNS = {
 def run(*, quick: bool = False, json: bool = False, case: str | None = None, target_error: float | None = None) -> None:
     """Measure every case with every integrator; print a table or one JSON object to stdout.
 
-    Parameters
-    ----------
-    quick
-        Only the cases ``flat`` and ``clear``, with few passes.
-    json
-        Print one JSON object instead of a table.
-    case
-        Only this case.
-    target_error
-        Render until the 95th percentile of the relative standard error is this, greater than 0.
-
-    Raises
-    ------
-    UserError
-        When the case is unknown or the target is not positive.
+    With `quick` only the cases ``flat`` and ``clear``, with few passes; with `case` only this one. With `target_error`,
+    above 0, renders end when the 95th percentile of the relative standard errors has reached it.
     """
     if case is not None and case not in CASES:
         raise UserError(f"case = {case!r} must be one of {', '.join(CASES)}")

@@ -127,8 +127,7 @@ def detect(
     lidar: LidarScene = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
     if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
-    for depth in depths:
-        # Before anything is rendered.
+    for depth in depths:  # before the first render
         find_target(open_scene(scene, {**(params or {}), "target_depth": depth}).scene, target_id)
     experiments: list[Experiment] = []
     first: list[xr.Dataset] = []

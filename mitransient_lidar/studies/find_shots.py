@@ -57,14 +57,9 @@ class Shot:
 
 @dataclass(frozen=True)
 class SeaMap:
-    """Elevation of a sea, and its slopes averaged over the beam's footprint, on a grid.
+    """Elevation of a sea [m] on grid lines [m], shape (len(y), len(x)), and its slopes averaged over the footprint.
 
-    Attributes
-    ----------
-    x, y
-        Grid lines [m].
-    heights, along, across
-        Elevation [m] and mean slopes along the lidar's azimuth and to its left [1], shape (len(y), len(x)).
+    Slopes are along the lidar's azimuth and to its left [1], as in `Shot`.
     """
 
     x: FloatArray
@@ -119,16 +114,10 @@ class SeaMap:
 
 @dataclass(frozen=True)
 class RenderedShots:
-    """Shots with their results, the sea around them, and the footprints of beam and pixels on the mean sea level.
+    """Shots of a scene, their results, the sea, and the footprints of beam and pixels on the mean sea level.
 
     Attributes
     ----------
-    scene
-        Name of the scene.
-    shots, results
-        The shots and their results; no results if they were not rendered.
-    sea
-        Elevation and slopes of the sea.
     azimuth, beam_spread
         Azimuth of the beam [rad], and standard deviations of its footprint along and across it [m].
     pixel_lines, pixel_map, pixel_count

@@ -168,11 +168,20 @@ def find_target(scene: mi.Scene, target_id: str) -> mi.Shape:
     names = [shape.id() for shape in shapes]
     if target_id not in names:
         raise UserError(f"target_id = {target_id!r} must be the id of a shape of the scene: {', '.join(names)}")
-    found = shapes[names.index(target_id)]
-    if found.is_medium_transition():
+    target = shapes[names.index(target_id)]
+    if target.is_medium_transition():
         raise UserError(f"target_id = {target_id!r} must not be the sea surface")
-    _check_place(found, [shape for shape in shapes if shape is not found])
-    return found
+    low, high = float(target.bbox().min.z), float(target.bbox().max.z)
+    others = [shape for shape in shapes if shape is not target]
+    seas = [float(shape.bbox().max.z) for shape in others if shape.is_medium_transition()]
+    bottoms = [float(shape.bbox().min.z) for shape in others if not shape.is_medium_transition()]
+    if seas and low >= max(seas):
+        raise UserError(f"target {target_id!r} lies above the sea, from z = {low:.3g} m: it must lie in the water")
+    if bottoms and high <= (bottom := min(bottoms)):
+        raise UserError(
+            f"target {target_id!r} lies below the bottom, up to z = {high:.3g} m: it must lie above {bottom:.3g} m"
+        )
+    return target
 
 
 def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
@@ -182,22 +191,7 @@ def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
     parts |= {f"sensor_{i}": sensor for i, sensor in enumerate(scene.sensors())}
     parts |= {f"emitter_{i}": emitter for i, emitter in enumerate(scene.emitters())}
     parts |= {f"shape_{i}": shape for i, shape in enumerate(shapes) if shape is not gone}
-    found: mi.Scene = mi.load_dict(parts)
-    return found
-
-
-def _check_place(target: mi.Shape, others: list[mi.Shape]) -> None:
-    """Reject a target that is completely above the sea or below the bottom."""
-    low, high = float(target.bbox().min.z), float(target.bbox().max.z)
-    seas = [float(shape.bbox().max.z) for shape in others if shape.is_medium_transition()]
-    bottoms = [float(shape.bbox().min.z) for shape in others if not shape.is_medium_transition()]
-    if seas and low >= max(seas):
-        raise UserError(f"target {target.id()!r} lies above the sea, from z = {low:.3g} m: it must lie in the water")
-    if bottoms and high <= min(bottoms):
-        raise UserError(
-            f"target {target.id()!r} lies below the bottom, up to z = {high:.3g} m: "
-            f"it must lie above {min(bottoms):.3g} m"
-        )
+    return mi.load_dict(parts)
 
 
 def _quantities(own: FloatArray, backscatter: FloatArray, shadow: FloatArray) -> dict[str, FloatArray]:

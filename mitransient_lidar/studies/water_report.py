@@ -16,13 +16,13 @@ from mitransient_lidar.physics.water.phase import fournier_forand, fournier_fora
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import Profile, read_profile
 
+#: Maps angles [rad] to p [1/sr].
 PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
-"""Maps angles [rad] to p [1/sr]."""
 
 KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
 
+#: Default of ``profile_tolerance`` of the medium ``layered_water``.
 DEFAULT_TOLERANCE = 0.01
-"""Default of ``profile_tolerance`` of the medium ``layered_water``."""
 
 #: Uncertainty of the properties of each kind.
 _CAUTION = {
@@ -133,13 +133,8 @@ def describe_water(
         "refractive index": index,
         "group index": group,
     }
-    parameters = {
-        "attenuation": found.attenuation,
-        "scattering": found.scattering,
-        "backscattering": found.backscattering,
-        "refractive_index": index,
-        "group_index": group,
-    }
+    parameters = {name: getattr(found, name) for name in ("attenuation", "scattering", "backscattering")}
+    parameters |= {"refractive_index": index, "group_index": group}
     if kind == "pure":
         parameters["water_scattering"] = found.scattering
     options = " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items())

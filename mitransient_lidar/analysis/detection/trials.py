@@ -123,7 +123,7 @@ class Experiment:
             width = detectors * samples
             found += [mean.reshape(count, width), joint.reshape(count, width, width)]
         matrix = self.matrix(name)
-        return Cases(*found, detectors=detectors).combined(matrix, len(matrix) // samples)
+        return Cases(found[0], found[1], found[2], found[3], detectors).combined(matrix, len(matrix) // samples)
 
     def matrix(self, name: str) -> FloatArray:
         """Return the matrix from the samples of all detectors to those of a combination."""

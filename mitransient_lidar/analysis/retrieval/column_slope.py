@@ -23,16 +23,9 @@ BEAM_EDGE = 3.0
 
 @dataclass(frozen=True)
 class ColumnBins:
-    """The bins of a record between two depths.
+    """Bins of a record between two depths, shape (bins,) each.
 
-    Attributes
-    ----------
-    inside
-        Indices of the bins, shape (bins,).
-    path
-        One-way path in the water of their centres [m], shape (bins,).
-    gain
-        Solid angle of the aperture per area from there [sr/m^2], shape (bins,).
+    Indices, one-way paths in the water to their centres [m], and solid angles of the aperture per area [sr/m^2].
     """
 
     inside: npt.NDArray[np.intp]

@@ -1,8 +1,7 @@
 """Slope of the sea surface from the arrival times of its echo in the pixels of one shot.
 
-On the ray of tangent-plane angles (angle_x, angle_y), a plane is at the distance rho along the receiver's axis, with
-exactly 1/rho = A + B angle_x + C angle_y. Slopes are rises over runs, positive `along` the lidar's azimuth for a face
-towards the lidar, and `across` for a rise to the left of it (+angle_y). Angles are in rad.
+A plane is at the distance rho along the receiver's axis, with 1/rho = A + B angle_x + C angle_y. Slopes are rises over
+runs, positive `along` the lidar's azimuth for a face towards the lidar, and `across` for a rise to the left (+angle_y).
 """
 
 from __future__ import annotations
@@ -28,15 +27,7 @@ _LIKELY = 0.5  # expected fraction of an estimated slope that is not error
 
 @dataclass(frozen=True)
 class PixelLight:
-    """Distribution of the light in each pixel from a uniformly reflecting surface; shape (pixels,) each.
-
-    Attributes
-    ----------
-    angle_x, angle_y
-        Centroid of the beam's irradiance inside the pixel [rad].
-    spread
-        Its standard deviation in angle_x [rad].
-    """
+    """Centroid of the beam's irradiance in each pixel, and its standard deviation in angle_x [rad]; shape (pixels,)."""
 
     angle_x: FloatArray
     angle_y: FloatArray
@@ -251,10 +242,6 @@ def with_prior(slope: npt.ArrayLike, stderr: npt.ArrayLike, deviation: float) ->
 
 
 def steepest(along: npt.ArrayLike, across: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the angle of a slope from the horizontal, 0 to pi/2, and the direction of its rise, -pi to pi [rad].
-
-    The slopes `along` and `across` [1] broadcast. The direction is from the lidar's azimuth to the left, 0 for a face
-    towards the lidar.
-    """
+    """Return the angle of a slope from the horizontal, and the direction of its rise from the azimuth [rad]."""
     x, y = np.asarray(along, dtype=np.float64), np.asarray(across, dtype=np.float64)
     return np.asarray(np.arctan(np.hypot(x, y))), np.asarray(np.arctan2(y, x))

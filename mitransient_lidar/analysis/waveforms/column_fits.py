@@ -20,14 +20,8 @@ _RUN = 7  # bins of the running mean from which a logarithm is weighted
 class ColumnFit:
     """Exponential signals of water columns; shape (n,) each, NaN without a column.
 
-    Attributes
-    ----------
-    level, level_stderr
-        Signal extrapolated to the surface [unit of the record].
-    decay, decay_stderr, correlation
-        Rate of decay with the delay [1/ns], and the correlation of its error with that of the level.
-    chi2, bins
-        Squared residuals in units of the noise, per degree of freedom, and number of bins.
+    Signal extrapolated to the surface [unit of the record], rate of decay [1/ns], correlation of their errors, squared
+    residuals in units of the noise per degree of freedom, and number of bins.
     """
 
     level: FloatArray
@@ -121,13 +115,8 @@ def _log_line(
 class ChangePoints:
     """Changes of the exponentials of columns, the strongest first; shape (n, layers).
 
-    Attributes
-    ----------
-    time_ns, p_value
-        Times of the changes [ns], NaN where no bins are left to search, and upper bounds of the probability that noise
-        alone causes as strong a change in any of the bins searched.
-    step, decay_before, decay_after
-        Logarithm of the signal behind the change over that before it, and decay rates on both sides [1/ns].
+    Times of the changes [ns], NaN without further bins, upper bounds of the probability that noise alone causes as
+    strong a change in any bin, logarithm of the signal behind the change over that before it, and decay rates [1/ns].
     """
 
     time_ns: FloatArray

@@ -47,7 +47,9 @@ def save_csv(table: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write or replace a CSV file of a table of `echo_table.extract`, with empty cells for unknown values."""
     names, lines = rows(table)
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([names, *([_cell(value) for value in line] for line in lines)])
+        writer = csv.writer(file)
+        writer.writerow(names)
+        writer.writerows([_cell(value) for value in line] for line in lines)
 
 
 def _cell(value: Any) -> Any:

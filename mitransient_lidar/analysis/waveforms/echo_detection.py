@@ -51,7 +51,7 @@ class Records:
     Attributes
     ----------
     power
-        Samples less the baseline, shape (n, time); any unit, W where energies are to be J.
+        Samples less the baseline, shape (n, time); any unit, W for energies in J.
     time_ns
         Centres of the bins [ns], evenly spaced, shape (time,).
     noise
@@ -111,15 +111,7 @@ class Records:
 
 @dataclass(frozen=True)
 class Template:
-    """Shape of an ideal echo in the record, with its arrival at time 0.
-
-    Attributes
-    ----------
-    time_ns, power
-        Points of the shape [ns], 15 per bin, and its height there, 1 at the peak; shape (points,).
-    fwhm_ns
-        Full width at half maximum [ns].
-    """
+    """Shape of an ideal echo that arrives at 0: times [ns], 15 per bin, height, 1 at the peak, and full width [ns]."""
 
     time_ns: FloatArray
     power: FloatArray
@@ -166,15 +158,8 @@ class DetectedEchoes:
 class Echoes:
     """Measured quantities of one echo of each record, NaN without an echo; shape (n,) each.
 
-    Attributes
-    ----------
-    time_ns, amplitude, energy, width_ns
-        Arrival [ns], height above the surrounding signal [unit of the record], integral over time [unit times s] and
-        full width at half maximum [ns].
-    time_stderr, amplitude_stderr, energy_stderr, width_stderr
-        Their standard errors from the noise of the records.
-    flags
-        Sums of `EchoFlag`.
+    Arrival [ns], height above the surrounding signal [unit of the record], integral over time [unit times s], full
+    width at half maximum [ns], their standard errors from the noise of the records, and sums of `EchoFlag`.
     """
 
     time_ns: FloatArray
