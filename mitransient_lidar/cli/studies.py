@@ -14,9 +14,9 @@ from mitransient_lidar.cli.options import Define, DrawingOnly, Quiet, Scene, See
 
 TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
 Passes = Annotated[int, typer.Option(help="Number of independent passes of each render.")]
-Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; the data go to .nc beside it.")]
+Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
 OptionalFigure = Annotated[
-    Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write; the data go to .nc beside it.")
+    Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write, and the data as .nc.")
 ]
 
 
@@ -29,7 +29,7 @@ def find_shots(
     slope_sigmas: Annotated[float, typer.Option(help="Slopes to find, in standard deviations.")] = 2.0,
     count: Annotated[int, typer.Option(help="Places of each kind.")] = 1,
     output: DrawingOnly = None,
-    waveforms: Annotated[bool, typer.Option("--waveforms/--no-waveforms", help="Render the shots, too.")] = True,
+    waveforms: Annotated[bool, typer.Option("--waveforms/--no-waveforms", help="Also render the shots.")] = True,
 ) -> None:
     """Find places of the sea where the beam meets given slopes.
 

@@ -47,7 +47,7 @@ def waveforms(
     if output is not None:
         check_suffix("--csv", output, ".csv")
     elif not table:
-        raise UserError("--no-table leaves nothing to do: give --csv OUT, too.")
+        raise UserError("--no-table leaves nothing to do: give --csv OUT as well.")
     from mitransient_lidar.analysis.waveforms import csv_tables, records
     from mitransient_lidar.analysis.waveforms import echo_table as measuring
 

@@ -55,7 +55,7 @@ def run(*, json: bool = False) -> None:
 def measure(layout: str) -> dict[str, float]:
     """Measure one layout in this process.
 
-    ``wall_s`` is the time of the whole render, with compilation, and ``render_s`` that of the passes after the first
+    ``wall_s`` is the time of the render with compilation, and ``render_s`` that of the passes after the first
     two.
     """
     from mitransient_lidar.loading.catalogue import scene_text

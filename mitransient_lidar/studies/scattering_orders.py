@@ -86,7 +86,7 @@ def scattering_orders(
         "impulse_response_stderr": (dims, energy.stderr.reshape(shape), {"units": "J"}),
         "waveform": (dims, power.mean.reshape(shape), {"units": "W", "long_name": "received power"}),
         "waveform_stderr": (dims, power.stderr.reshape(shape), {"units": "W"}),
-        # Bins of a pass share paths: the errors of sums over them come from the passes, not from the bins' errors.
+        # Errors of sums are estimated from the passes, since bins of a pass share paths.
         "energy": (dims[1:3], totals.mean, {"units": "J", "long_name": "received energy"}),
         "energy_stderr": (dims[1:3], totals.stderr, {"units": "J"}),
     }

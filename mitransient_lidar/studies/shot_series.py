@@ -64,7 +64,7 @@ def render_shots(
         Over ``shot``, pixel and ``time``: ``waveform`` and ``waveform_stderr`` [W]. Over ``shot``: ``aim_x``,
         ``aim_y`` [m], ``true_slope_along`` (positive for a face towards the lidar) and ``true_slope_across``, means
         over the beam's footprint [1]. Attributes: those of the last render; ``slope_deviation``, the standard
-        deviations of the two slopes over the whole sea.
+        deviations of the two slopes of the sea.
 
     Raises
     ------

@@ -254,7 +254,7 @@ def find_echoes(
     excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
     peaks = np.zeros(power.shape, dtype=bool)
     peaks[:, 1:-1] = (stands_out[:, 1:-1] > stands_out[:, :-2]) & (stands_out[:, 1:-1] >= stands_out[:, 2:])
-    # 1.5: the samples of the column are noisy, too.
+    # The factor accounts for the noise of the samples of the column.
     peaks &= (excess > 1.5 * threshold * noise) & (excess > contrast * power)
     # Much weaker peaks are in the tail of a strong echo.
     peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
