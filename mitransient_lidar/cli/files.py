@@ -68,15 +68,9 @@ def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Data
 
 @dataclass(frozen=True)
 class GateFiles:
-    """Files of a gate stack.
+    """Files of a gate stack in a folder, with the beginning of their names.
 
-    Parameters
-    ----------
-    folder, stem
-        Folder of the files, and beginning of their names.
-    wanted
-        Files in addition to the EXR stack: ``drawings`` (gates, and their depths), ``sequence``, ``gif``, ``mp4`` and
-        ``html``.
+    Kinds in addition to the EXR stack: ``drawings`` (of gates and depths), ``sequence``, ``gif``, ``mp4``, ``html``.
     """
 
     folder: Path

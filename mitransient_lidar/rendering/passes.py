@@ -20,16 +20,8 @@ SMALLEST_PASS_COUNT = 8
 class Progress:
     """Progress of a render or a study.
 
-    Attributes
-    ----------
-    done, planned
-        Numbers of completed and, if known, planned units.
-    unit
-        ``pass``, ``shot``, ``place`` or ``render``.
-    elapsed_s, remaining_s
-        Elapsed and estimated remaining time [s].
-    error_median, error_p95, target_error
-        Median and 95th percentile of the relative standard errors, and the requested error.
+    Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place`` or ``render``), elapsed and
+    estimated remaining time [s], median and 95th percentile of the relative standard errors, and the requested error.
     """
 
     done: int
@@ -92,18 +84,10 @@ class Goal:
 
 @dataclass(frozen=True)
 class PassLog:
-    """Outcome of a loop over passes.
+    """Outcome of a loop over passes, which Ctrl-C may have interrupted.
 
-    Attributes
-    ----------
-    count, elapsed_s
-        Number of complete passes, and their time [s].
-    interrupted
-        Whether Ctrl-C ended the loop.
-    edge_loss
-        Energy lost at the edge of the surface mesh [J].
-    error_median, error_p95
-        Median and 95th percentile of the relative standard errors, NaN without any.
+    `edge_loss` is the energy lost at the edge of the surface mesh [J]; `error_median` and `error_p95` are the median
+    and the 95th percentile of the relative standard errors, NaN without any.
     """
 
     count: int

@@ -37,15 +37,8 @@ _PASSES = 12
 class Shot:
     """Intersection of the beam's axis with the mean sea level.
 
-    Attributes
-    ----------
-    kind
-        ``towards``, ``level``, ``away``, ``sideways``, or another label.
-    x, y
-        Place [m], the values of ``aim_x`` and ``aim_y``.
-    along, across
-        Mean slopes over the beam's footprint along the lidar's azimuth and to its left [1]; positive along for a face
-        towards the lidar.
+    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m], `along` and `across` the mean slopes over the beam's
+    footprint along the lidar's azimuth, positive for a face towards the lidar, and to its left [1].
     """
 
     kind: str

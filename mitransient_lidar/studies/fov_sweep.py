@@ -84,8 +84,7 @@ def fov_sweep(
     with the mean-square radius of the correlation; R_b is twice the root-mean-square angle of the beam per axis times
     the slant range. The diameter in the fit is 2 R. K approaches c only if c R_b is also far below 1.
 
-    ``kd`` is the depth-averaged Kd of daylight by Lee (`water_types`). bb is that of the phase function in use. K may
-    depend on depth: the result is the mean of the fit.
+    ``kd`` is the depth-averaged Kd of daylight by Lee (`water_types`), bb that of the phase function in use.
 
     For the default water and a narrow beam on a level sea, K falls as Gordon's until c R_s = 3, but to the absorption
     coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 14 % below

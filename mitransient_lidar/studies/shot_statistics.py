@@ -119,16 +119,7 @@ def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArr
 def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refractive_index: float) -> FloatArray:
     """Return the error of the depth [m] of a bottom by refraction at a slope, positive for too deep a bottom.
 
-    Parameters
-    ----------
-    slope_along
-        Slope of the surface along the lidar's azimuth [1].
-    depth
-        Depth of the bottom [m].
-    off_nadir
-        Angle of the ray in air from the vertical [rad].
-    refractive_index
-        Refractive index of the water.
+    Slopes are along the lidar's azimuth [1], and the ray in air has an angle from the vertical [rad].
 
     Notes
     -----

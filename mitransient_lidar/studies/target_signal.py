@@ -146,7 +146,8 @@ def target_map(
         if progress is not None:
             progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]
-    maps = xr.combine_nested(rows, ["target_x", "target_y"], combine_attrs="drop_conflicts")
+    lines = [xr.concat(row, "target_y", combine_attrs="drop_conflicts") for row in rows]
+    maps = xr.concat(lines, "target_x", combine_attrs="drop_conflicts")
     return maps.assign_coords(target_x=places[0], target_y=places[1])
 
 

@@ -99,12 +99,8 @@ def within_range(
 class Statistic(NamedTuple):
     """A weighted sum of samples, and its distribution without and with the target.
 
-    Attributes
-    ----------
-    weights, offsets : ndarray, shape (cases, samples) and (cases,)
-        Weights of the samples of each case, and the offset that is subtracted from their sum.
-    null_mean, null_sd, target_mean, target_sd : float
-        Mean and standard deviation over shots and cases; the weighted sum is assumed normally distributed.
+    Weights of the samples, shape (cases, samples), offsets that are subtracted from their sums, shape (cases,), and
+    means and standard deviations over shots and cases; the weighted sum is assumed normally distributed.
     """
 
     weights: FloatArray

@@ -57,18 +57,9 @@ class Level:
 class Experiment:
     """Mean light of a scene on its pixels, and the receiver that records it.
 
-    Attributes
-    ----------
-    background, difference
-        Power without the target, and power added by the target [W], shape (renders, pixels, time).
-    seas
-        Whether the renders are of different seas.
-    chain, bin_width_ns, sky
-        The receiver, the width of the bins [ns] and the steady power on each pixel [W].
-    samples
-        Samples about the target's echo.
-    brightest
-        Index of the pixel with the strongest echo.
+    `background` and `difference` are the power without the target, and that added by the target [W], shape (renders,
+    pixels, time), from different `seas` or one. `sky` is the steady power on each pixel [W], `samples` are those about
+    the target's echo, and `brightest` is the index of the pixel with the strongest echo.
     """
 
     background: FloatArray

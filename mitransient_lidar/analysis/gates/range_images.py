@@ -25,15 +25,10 @@ class Contrast(NamedTuple):
 
 
 class RangeImage(NamedTuple):
-    """Depth of the echo in every pixel.
+    """Depth of the echo in every pixel: centroid and standard error, in the unit of the gates' middles.
 
-    Attributes
-    ----------
-    depth, sigma : ndarray
-        Centroid of the echo and its standard error, in the unit of the gates' middles; NaN where no gate exceeds the
-        column.
-    confidence : ndarray
-        Probability, 0 to 1, that noise alone would not exceed the column as much.
+    They are NaN where no gate exceeds the column. `confidence` is the probability, 0 to 1, that noise alone would not
+    exceed the column as much.
     """
 
     depth: FloatArray

@@ -31,14 +31,10 @@ class Window:
 
     Attributes
     ----------
-    u
-        Times from the echo's middle bin [ns], shape (bins,).
-    middle
-        Times of the middle bins [ns], shape (n,).
+    u, middle
+        Times from the middle bin of the echo [ns], shape (bins,), and times of the middle bins [ns], shape (n,).
     power, noise, inside
         Samples, their standard deviations, and whether they are inside the record; shape (n, bins).
-    bin_ns
-        Width of the bins [ns].
     ramps, level_noise
         Weights of the levels before and after the echo in each sample, shape (2, bins), and their errors, shape (n, 2).
     """
