@@ -37,9 +37,9 @@ def test_outlines_enclose_the_areas_of_the_pixels(lidar_scene):
     assert abs(enclosed_area(second[0])) == pytest.approx(3 * ring / 4, rel=3e-3)
     assert first[0].min() > -0.02  # from +angle_x to +angle_y
     assert abs(enclosed_area(triangle[0])) == pytest.approx(18, rel=3e-3)
-    whole = lines(described(lidar_scene(rx={"a": SECTOR | {"shape": "ring"}}))["pixel_outlines"])[0]
-    assert len(whole) == 2
-    assert abs(sum(enclosed_area(line) for line in whole)) == pytest.approx(ring, rel=3e-3)
+    outlines = lines(described(lidar_scene(rx={"a": SECTOR | {"shape": "ring"}}))["pixel_outlines"])[0]
+    assert len(outlines) == 2
+    assert abs(sum(enclosed_area(line) for line in outlines)) == pytest.approx(ring, rel=3e-3)
 
 
 def test_arcs_are_smooth_and_texts_short(lidar_scene):

@@ -24,7 +24,7 @@ def spread():
 
 
 @pytest.mark.parametrize(
-    ("depths", "told"),
+    ("depths", "message"),
     [
         (0.0, "depths = 0 m must be greater than 0"),
         ([3, -2], "depths = -2 m must be greater than 0"),
@@ -34,13 +34,13 @@ def spread():
         ([3, 8.5], "depths = 8.5 m must not lie below the bottom, at 8 m"),
     ],
 )
-def test_depths_that_are_refused(lidar_scene, depths, told):
-    with pytest.raises(UserError, match=f"^{re.escape(told)}$"):
+def test_depths_that_are_refused(lidar_scene, depths, message):
+    with pytest.raises(UserError, match=f"^{re.escape(message)}$"):
         beam_spread(lidar_scene(), depths, **QUICK)
 
 
 @pytest.mark.parametrize(
-    ("option", "told"),
+    ("option", "message"),
     [
         ({"passes": 1}, "passes = 1 must lie between 2 and 10000"),
         ({"photons": 10}, "photons = 10 must lie between 1024 and 1.67772e+07"),
@@ -48,8 +48,8 @@ def test_depths_that_are_refused(lidar_scene, depths, told):
         ({"params": {"bottom_depth": 3}}, "params = ['bottom_depth'] need an XML scene"),
     ],
 )
-def test_options_that_are_refused(lidar_scene, option, told):
-    with pytest.raises(UserError, match=re.escape(told)):
+def test_options_that_are_refused(lidar_scene, option, message):
+    with pytest.raises(UserError, match=re.escape(message)):
         beam_spread(lidar_scene(), 2.0, **{**QUICK, **option})
 
 
@@ -89,11 +89,16 @@ def test_result(spread):
     slant = np.array([2, 8]) / np.cos(np.radians(14.788))
     np.testing.assert_allclose(spread["unscattered"], 0.9787 * np.exp(-0.3 * slant), rtol=0.05)
     np.testing.assert_allclose(spread["centroid_x"], slant * np.sin(np.radians(14.788)), atol=0.15)
-    told = spread.attrs
-    assert (told["scene"], told["seed"], told["passes"], told["photons_per_pass"]) == ("fig09_1x1", 0, 2, 4096)
-    assert told["scene.bottom_depth"] == "8"
-    assert told["mitsuba_version"] == mi.__version__
-    assert told["uniform_down_to"] == np.inf
+    attributes = spread.attrs
+    assert (attributes["scene"], attributes["seed"], attributes["passes"], attributes["photons_per_pass"]) == (
+        "fig09_1x1",
+        0,
+        2,
+        4096,
+    )
+    assert attributes["scene.bottom_depth"] == "8"
+    assert attributes["mitsuba_version"] == mi.__version__
+    assert attributes["uniform_down_to"] == np.inf
 
 
 def test_light_at_the_bottom_is_light_just_above_it(lidar_scene):
@@ -141,7 +146,7 @@ def test_depths_without_light_are_unknown(lidar_scene):
     assert texts[1] == "4 m: no light"
 
 
-def test_beam_beside_the_surface_is_told(lidar_scene, caplog):
+def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
     scene = lidar_scene(sea={"spectrum": "flat", "size": 2.0}, bottom=4.0)
     found = beam_spread(scene, 2.0, **QUICK)
     # Standard deviations of the footprint are 1.064 m across and 1.132 m along, erf(1/(sqrt(2) sigma)) in the patch.
@@ -222,7 +227,7 @@ def test_quiet_command(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--depths", "2;5"], "--depths 2;5 is not of the form 2,5,8."),
         (["--depths", "2,nan"], "depths holds nan"),
@@ -233,12 +238,12 @@ def test_quiet_command(tmp_path):
         (["--depths", "2", "-D", "wind=3"], "parameter 'wind' is not one of scene fig09_1x1"),
     ],
 )
-def test_command_refuses(arguments, told, tmp_path, monkeypatch):
+def test_command_refuses(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = run("beam-spread", "fig09_1x1", *arguments)
     assert result.exit_code == 2
     assert result.stdout == ""
     # A progress bar may have come and gone before.
-    assert told in result.stderr.replace("\n", " ")
+    assert message in result.stderr.replace("\n", " ")
     assert "Traceback" not in result.stderr
     assert not any(tmp_path.iterdir())

@@ -108,7 +108,7 @@ def test_drawn_shots_have_the_expected_rates():
             error = np.sqrt(expected * (1 - expected) / shots)
             assert abs(found[name][1][row, at] - expected) < largest_z(shots, 8) * error
     assert found["expected_detection"][1][-1][at] == pytest.approx(0.9, abs=1e-3)
-    # Rates and area tell the same: the best weighting beats one pixel far beyond the intervals.
+    # Rates and area agree: the best weighting beats one pixel far beyond the intervals.
     assert found["area_low"][1][3] > found["area_high"][1][0]
     assert np.all(np.abs(found["area"][1] - found["expected_area"][1]) < 0.03)
 
@@ -168,7 +168,7 @@ def result():
     return made_up()
 
 
-def test_table_tells_all(result):
+def test_table_lists_all(result):
     lines = detection.describe_detection(result)
     rows = [line.split()[0] for line in lines]
     assert [rows.count(name) for name in COMBINATIONS] == [3, 3, 3, 3]
@@ -255,7 +255,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     assert "noise and 4 seas" in detection.describe_detection(found)[0]
 
 
-def test_blind_receiver_is_told(monkeypatch):
+def test_blind_receiver_is_reported(monkeypatch):
     """A counter with a dead time of 30 ns, which the first of a million photons starts, counts no echo at 20 ns."""
     light = experiment()
     data = {"background": light.background[0], "difference": light.difference[0]}
@@ -265,7 +265,7 @@ def test_blind_receiver_is_told(monkeypatch):
         detection.detect("fig13_2x2", renders=3, receiver="spad")
 
 
-def test_echo_outside_the_record_is_told(monkeypatch):
+def test_echo_outside_the_record_is_reported(monkeypatch):
     light = experiment()
     data = {"background": light.background[0], "difference": np.roll(light.difference[0], 15, axis=-1)}
     late = xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, {"time": 0.5 + T})
@@ -304,12 +304,12 @@ def test_mistakes_end_with_one_sentence(arguments, message):
         ({}, None, {"clutter": 4}, "depths and clutter need an XML scene"),
     ],
 )
-def test_mistakes_are_told_before_rendering(scene, params, options, message):
+def test_mistakes_are_reported_before_rendering(scene, params, options, message):
     with pytest.raises(UserError, match=message):
         detection.detect(scene, params, **options)
 
 
 @pytest.mark.parametrize("options", [{"pfa": 0}, {"pfa": 0.1, "pd": 0.1}, {"clutter": 3}, {"shots": 1}, {"seed": -1}])
-def test_numbers_out_of_range_are_told(options):
+def test_numbers_out_of_range_are_reported(options):
     with pytest.raises(ValueError, match=f"{list(options)[-1]} = "):
         detection.detect("fig13_2x2", **options)

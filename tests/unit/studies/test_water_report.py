@@ -1,4 +1,4 @@
-"""The command that tells what a way of knowing a water stands for."""
+"""Properties of waters, their scene parameters, and the command."""
 
 import re
 from xml.etree import ElementTree
@@ -122,7 +122,7 @@ def test_profile_is_described(station):
 
 
 def test_profile_line_is_xml_for_a_medium(station):
-    """The path stands in the XML whole, with its spaces and signs, and is good from every folder."""
+    """The path in the XML is absolute and complete, with its spaces and signs, and valid in every folder."""
     done = run("water", "profile", str(station), "--tolerance", "0.05")
     medium = ElementTree.fromstring(f"<medium>{done.stdout.splitlines()[-1]}</medium>")
     given = {child.get("name"): child.get("value") for child in medium}

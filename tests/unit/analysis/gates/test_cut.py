@@ -89,8 +89,8 @@ def test_contiguous_sharp_gates_sum_to_the_record():
     dataset = record()
     # 24 gates of 5 ns from 1400 to 1520 ns, and 160 of 0.75 ns, which cut bins
     for train in (GateTrain(1400.0, 5.0, 5.0, 24), GateTrain(1400.0, 0.75, 0.75, 160)):
-        whole = dataset["waveform"].sum("time") * WIDTH * 1e-9
-        np.testing.assert_allclose(gating.cut_gates(dataset, train)["gate_energy"].sum("gate"), whole, rtol=1e-12)
+        total = dataset["waveform"].sum("time") * WIDTH * 1e-9
+        np.testing.assert_allclose(gating.cut_gates(dataset, train)["gate_energy"].sum("gate"), total, rtol=1e-12)
 
 
 def test_pulses_add_up():

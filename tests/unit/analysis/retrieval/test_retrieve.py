@@ -140,7 +140,7 @@ def test_prior_weighs_slopes():
     # Squares of 6 mrad in a beam of 5 mrad: Gaussians cut at 0 and 6.
     light = truncnorm(0, 1.2, scale=5e-3)
     assert retrieve.pixel_light(shot).angle_x == pytest.approx(np.sign(ANGLE_X) * light.mean(), rel=1e-3)
-    # Far and near pair with two facets each, alike by 0.4; the time tells tan(theta - tilt).
+    # Far and near pair with two facets each, alike by 0.4; the time determines tan(theta - tilt).
     slope = float(raw["slope_along"])
     tilt = math.atan(slope)
     lever = light.std() * math.sqrt(1.4) / (2 * light.mean()) * (math.cos(THETA - tilt) / math.cos(tilt)) ** 2
@@ -195,8 +195,8 @@ def test_depth_follows_height_and_slope():
 
 
 def test_estimate_has_all_known_quantities():
-    whole = retrieve.retrieve(result())
-    assert {"slope_along", "reflectance", "kd"} <= set(whole)
+    found = retrieve.retrieve(result())
+    assert {"slope_along", "reflectance", "kd"} <= set(found)
     narrow = retrieve.retrieve(result(field_of_view_mrad=20.0))
     assert "kd" not in narrow
     dark = result(np.stack([waveform(delay, depth=30.0) for delay in plane_delays(0, 0)]))
