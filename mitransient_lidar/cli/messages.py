@@ -16,11 +16,8 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.rendering.passes import Progress
 
-_WRONG_USE = 2
-_INTERRUPTED = 130  # what shells report after Ctrl-C
-
-#: Largest number of pixels listed in the summary.
-_LISTED_PIXELS = 12
+_INVALID_INPUT, _INTERRUPTED = 2, 130  # exit codes; 130 is that of shells after Ctrl-C
+_MOST_PIXELS = 12  # listed in the summary
 
 
 @contextlib.contextmanager
@@ -30,13 +27,13 @@ def exit_on_error() -> Iterator[None]:
         yield
     except UserError as error:
         typer.echo(str(error), err=True)
-        raise typer.Exit(_WRONG_USE) from error
+        raise typer.Exit(_INVALID_INPUT) from error
     except BrokenPipeError:
         raise  # stdout is closed; Typer exits without a message
     except OSError as error:
         place = f" {error.filename}" if error.filename else ""
         typer.echo(f"cannot use{place}: {error.strerror or error}.", err=True)
-        raise typer.Exit(_WRONG_USE) from error
+        raise typer.Exit(_INVALID_INPUT) from error
     except KeyboardInterrupt as error:
         typer.echo("interrupted.", err=True)
         raise typer.Exit(_INTERRUPTED) from error
@@ -115,7 +112,7 @@ def summarise(dataset: xr.Dataset) -> None:
         table.add_row("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}")
     else:
         peaks = dataset["waveform"].max("time")
-        if "pixel" in peaks.dims and peaks.size <= _LISTED_PIXELS:
+        if "pixel" in peaks.dims and peaks.size <= _MOST_PIXELS:
             for name, peak in zip(peaks["pixel"].values, peaks.values, strict=True):
                 table.add_row(f"peak power, {name} (W)", f"{peak:.4g}")
         else:

@@ -34,7 +34,6 @@ class Progress:
     target_error: float | None = None
 
 
-#: Called after every unit.
 ProgressCallback = Callable[[Progress], None]
 
 
