@@ -11,6 +11,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
+from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
@@ -127,8 +128,8 @@ class EmitterWithoutExtent(mi.Emitter):
 def fill_mesh(shape: mi.Mesh, mesh: SeaMesh) -> None:
     """Set the buffers of a new Mitsuba mesh."""
     buffers = mi.traverse(shape)
-    buffers["vertex_positions"] = mi.Float(mesh.vertices.ravel())
-    buffers["vertex_texcoords"] = mi.Float(mesh.texcoords.ravel())
-    buffers["faces"] = mi.UInt32(mesh.faces.ravel())
+    buffers["vertex_positions"] = aligned(mi.Float, mesh.vertices)
+    buffers["vertex_texcoords"] = aligned(mi.Float, mesh.texcoords)
+    buffers["faces"] = aligned(mi.UInt32, mesh.faces)
     buffers.update()
     shape.initialize()

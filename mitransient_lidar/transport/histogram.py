@@ -109,8 +109,8 @@ class TransientHistogram:
         #: Shape of `energy`: pixels, then time bins or gates.
         self.shape = (*shape, self.record_length)
         self._count = pixels * self.record_length
-        self._start = axis.start_ns * 1e-9 * C0
-        self._per_metre = 1 / (axis.bin_width_ns * 1e-9 * C0)
+        self._start = opaque(axis.start_ns * 1e-9 * C0)
+        self._per_metre = opaque(1 / (axis.bin_width_ns * 1e-9 * C0))
         self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
         self.clear()
 

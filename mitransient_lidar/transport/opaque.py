@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,3 +29,16 @@ def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
         wanted = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
         found |= number == dr.opaque(mi.UInt32, int(wanted[0]))
     return found
+
+
+def aligned(array_type: Any, values: NDArray[Any]) -> Any:
+    """Return values as a flat Dr.Jit array that starts at a multiple of 64 bytes.
+
+    Dr.Jit leaves arrays of NumPy where they are, and compiles another kernel for an array that is not aligned.
+    """
+    dtype = np.array(array_type(0)).dtype
+    buffer = np.empty(values.size * dtype.itemsize + 64, np.uint8)
+    start = -buffer.ctypes.data % 64
+    copy = buffer[start : start + values.size * dtype.itemsize].view(dtype)
+    copy[:] = values.ravel()
+    return array_type(copy)

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.transport.opaque import aligned
 
 #: Exponents are kept this far from 1 when sampled; the density within a segment changes by 1e-5.
 _SMALLEST_EXPONENT = 1e-3
@@ -43,7 +44,7 @@ class TabulatedPhase:
         records = [_records(table, self._short) for table in tables]
         # For each cell: threshold and alias, the power law for sampling, and for evaluation.
         self._choice, self._law, self._value = (
-            mi.Float(np.concatenate([record[i] for record in records]).ravel()) for i in range(3)
+            aligned(mi.Float, np.concatenate([record[i] for record in records])) for i in range(3)
         )
 
     def eval(self, s: mi.Float, number: mi.UInt32 | int = 0) -> mi.Float:
