@@ -126,11 +126,11 @@ def beam_spread(
     from mitransient_lidar.transport.plane_crossings import CrossingTracer
     from mitransient_lidar.transport.scene import LidarScene
 
-    system = LidarScene.from_scene(session.scene, session.sensor)
-    if system.water is None:
+    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    if lidar.water is None:
         raise UserError("the scene has no water: give its surface a layered_water as interior medium")
-    planes = _planes(system, wanted)
-    tracer = CrossingTracer(system, planes, photons)
+    planes = _planes(lidar, wanted)
+    tracer = CrossingTracer(lidar, planes, photons)
     measured: list[list[dict[str, Any]]] = []
     axes: dict[str, FloatArray] = {}
     outside: list[float] = []
@@ -141,7 +141,7 @@ def beam_spread(
         light = [crossings.select(crossings.downward & (crossings.plane == plane)) for plane in range(len(planes))]
         if not axes:
             axes.update(_axes(light))
-        measured.append([_measure(system, *pair, axes) for pair in zip(light, planes, strict=True)])
+        measured.append([_measure(lidar, *pair, axes) for pair in zip(light, planes, strict=True)])
         return 0.0
 
     log = run_passes(render_pass, Goal(passes=passes), seed=seed, progress=progress)
@@ -152,16 +152,16 @@ def beam_spread(
             "enlarge the surface's size",
             100 * missed,
         )
-    described = {"photons_per_pass": photons, "beam_outside_surface": missed, **_describe(system)}
+    described = {"photons_per_pass": photons, "beam_outside_surface": missed, **_describe(lidar)}
     return _dataset(measured, wanted, axes, session.attributes(**pass_attributes(log, seed), **described))
 
 
-def _planes(system: LidarScene, depths: FloatArray) -> FloatArray:
+def _planes(lidar: LidarScene, depths: FloatArray) -> FloatArray:
     """Return the depths of the planes [m]; reject those below a bottom."""
-    transmitter = system.transmitter
+    transmitter = lidar.transmitter
     spot = transmitter.pose.ground_point()
     reach = 3 * transmitter.widest_angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
-    boxes = [(np.array(solid.bbox().min), np.array(solid.bbox().max)) for solid in system.solids]
+    boxes = [(np.array(solid.bbox().min), np.array(solid.bbox().max)) for solid in lidar.solids]
     # Light passes around a solid smaller than the footprint.
     wide = [np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach) for low, high in boxes]
     bottoms = [-float(low[2]) for (low, _), covers in zip(boxes, wide, strict=True) if covers and low[2] < 0]
@@ -192,9 +192,9 @@ def _quantile(values: FloatArray, weight: FloatArray, share: float) -> float:
     return float(values[order[min(place, len(values) - 1)]])
 
 
-def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict[str, FloatArray]) -> dict[str, Any]:
+def _measure(lidar: LidarScene, light: PlaneCrossings, depth: float, axes: dict[str, FloatArray]) -> dict[str, Any]:
     """Return the variables of one plane in one pass."""
-    weight, energy = light.weight, system.transmitter.energy
+    weight, energy = light.weight, lidar.transmitter.energy
     shares = {"transmitted": weight.sum() / energy, "unscattered": weight[light.scatterings == 0].sum() / energy}
     if len(weight) == 0:
         unknown = {name: np.full(len(axes[_CURVES[name]]), np.nan) if name in _CURVES else np.nan for name in _MEANING}
@@ -211,7 +211,7 @@ def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict
     radius, shift, delay = _spreads(light)
     return {
         **shares,
-        "in_view": mean(_in_view(system, light, depth)),
+        "in_view": mean(_in_view(lidar, light, depth)),
         "centroid_x": mean(light.x),
         "centroid_y": mean(light.y),
         "radius_rms": np.sqrt(mean(radius**2)),
@@ -226,14 +226,14 @@ def _measure(system: LidarScene, light: PlaneCrossings, depth: float, axes: dict
     }
 
 
-def _in_view(system: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDArray[np.bool_]:
+def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDArray[np.bool_]:
     """Return whether the line of sight from the receiver to the light through a level sea is in a pixel."""
     import mitsuba as mi
 
-    pose, pixels = system.receiver.pose, system.receiver.pixels
+    pose, pixels = lidar.receiver.pose, lidar.receiver.pixels
     x, y = light.x - pose.origin[0], light.y - pose.origin[1]
     distance = np.hypot(x, y)
-    theta, _ = refracted_path(distance, pose.origin[2], depth, system.refractive_index)
+    theta, _ = refracted_path(distance, pose.origin[2], depth, lidar.refractive_index)
     across = np.sin(theta) / np.maximum(distance, 1e-9)
     direction = np.stack([across * x, across * y, -np.cos(theta)], axis=1)
     along = direction @ pose.axis
@@ -242,11 +242,11 @@ def _in_view(system: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDA
     return (along > 0) & (np.array(count) > 0)
 
 
-def _describe(system: LidarScene) -> dict[str, Any]:
+def _describe(lidar: LidarScene) -> dict[str, Any]:
     """Return the attributes of the lidar and the water."""
     from mitransient_lidar.transport.medium.water_phases import table_of
 
-    water: Any = system.water
+    water: Any = lidar.water
     column, boundaries = water.column, water.index_layers.boundaries
     first = 0.0 if water.plume is not None else np.inf
     for layer in range(1, column.count):
@@ -256,11 +256,11 @@ def _describe(system: LidarScene) -> dict[str, Any]:
     if len(boundaries):
         first = min(first, float(boundaries[0]))
     return {
-        "pulse_energy_mj": 1e3 * system.transmitter.pulse_energy,
-        "field_of_view_mrad": 1e3 * system.receiver.pixels.field_of_view,
-        "off_nadir_deg": system.transmitter.pose.off_nadir_deg,
-        "refractive_index": system.refractive_index,
-        "group_index": system.group_index,
+        "pulse_energy_mj": 1e3 * lidar.transmitter.pulse_energy,
+        "field_of_view_mrad": 1e3 * lidar.receiver.pixels.field_of_view,
+        "off_nadir_deg": lidar.transmitter.pose.off_nadir_deg,
+        "refractive_index": lidar.refractive_index,
+        "group_index": lidar.group_index,
         "absorption": float(column.absorption[0]),
         "scattering": float(column.scattering[0]),
         "mean_cosine": table_of(water.phases.phases[0]).mean_cosine,

@@ -102,18 +102,18 @@ def fov_sweep(
     session = open_scene(scene, _with_widest(scene, params, float(fields[-1])))
     from mitransient_lidar.transport.scene import LidarScene
 
-    system = LidarScene.from_scene(session.scene, session.sensor)
-    geometry, edge = _geometry(system, 0.5e-3 * float(fields[-1]))
-    column = ColumnBins.between(geometry, edge, system.axis, min_depth, max_depth)
-    water = _water(system, float(min_depth), float(max_depth))
-    _check_solids(system, geometry, edge, float(max_depth))
+    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    geometry, edge = _geometry(lidar, 0.5e-3 * float(fields[-1]))
+    column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
+    water = _water(lidar, float(min_depth), float(max_depth))
+    _check_solids(lidar, geometry, edge, float(max_depth))
     energy, log = _render(session, fields, passes, seed, progress)
     fields = fields[: len(energy)]
 
     mean, stderr = energy.mean(axis=1), energy.std(axis=1, ddof=1) / math.sqrt(passes)
     slopes = [slope_and_error(column, energy[field][:, column.inside]) for field in range(fields.size)]
     radius = 0.5e-3 * fields * geometry.slant_range
-    beam = 2 * system.transmitter.widest_angular_spread * geometry.slant_range
+    beam = 2 * lidar.transmitter.widest_angular_spread * geometry.slant_range
     # Kd is above c for nearly isotropic scattering, where the fit is not defined.
     fit = system_attenuation(water.attenuation, min(water.kd, water.attenuation), 2 * np.hypot(radius, beam))
     per_field = {
@@ -132,7 +132,7 @@ def fov_sweep(
     data["impulse_response_stderr"] = (over_time, stderr, {"units": "J", "long_name": "its standard error"})
     coords = {
         "field_of_view": ("field_of_view", fields, {"units": "mrad", "long_name": "full angle of the field of view"}),
-        "time": ("time", system.axis.centres_ns, {"units": "ns"}),
+        "time": ("time", lidar.axis.centres_ns, {"units": "ns"}),
     }
     attributes = session.attributes(
         seed=seed,
@@ -170,22 +170,22 @@ def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) ->
     return {**(params or {}), "field_of_view_mrad": widest} if "field_of_view_mrad" in known else params
 
 
-def _geometry(system: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:
+def _geometry(lidar: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:
     """Return the geometry, and the edge of the beam within a half angle [rad]; reject a view of the horizon."""
-    pose = system.receiver.pose
+    pose = lidar.receiver.pose
     off_nadir = math.acos(min(1.0, -float(pose.axis[2])))
     widest = 2e3 * math.tan(0.5 * math.pi - off_nadir)
     if 2e3 * half_view >= widest:
         raise UserError(f"fov_mrad = {2e3 * half_view:g} must be less than {widest:.4g}: it would reach the horizon")
-    edge = min(BEAM_EDGE * system.transmitter.widest_angular_spread, half_view)
-    return LidarGeometry.level(float(pose.origin[2]), off_nadir, system.refractive_index, system.group_index), edge
+    edge = min(BEAM_EDGE * lidar.transmitter.widest_angular_spread, half_view)
+    return LidarGeometry.level(float(pose.origin[2]), off_nadir, lidar.refractive_index, lidar.group_index), edge
 
 
-def _water(system: LidarScene, min_depth: float, max_depth: float) -> InherentProperties:
+def _water(lidar: LidarScene, min_depth: float, max_depth: float) -> InherentProperties:
     """Return the water between two depths [m]; reject several layers."""
     from mitransient_lidar.transport.medium.water_phases import table_of
 
-    water = system.water
+    water = lidar.water
     if water is None:
         raise UserError("the scene has no water: give its surface a layered_water as interior medium")
     if water.plume is not None:
@@ -201,10 +201,10 @@ def _water(system: LidarScene, min_depth: float, max_depth: float) -> InherentPr
     return InherentProperties(float(water.column.absorption[layer]), scattering, ratio * scattering)
 
 
-def _check_solids(system: LidarScene, geometry: LidarGeometry, edge: float, max_depth: float) -> None:
+def _check_solids(lidar: LidarScene, geometry: LidarGeometry, edge: float, max_depth: float) -> None:
     """Reject a bottom or target whose echo can begin above a depth [m]."""
     # The shortest path to a level bottom is shorter by cos^2 than that along the axis.
-    for solid in system.solids:
+    for solid in lidar.solids:
         begin = -float(solid.bbox().max.z) * geometry.cos_water**2 - geometry.surface_depth(edge)
         if max_depth > begin:
             raise UserError(

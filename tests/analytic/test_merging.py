@@ -248,45 +248,45 @@ def test_standard_errors_are_honest():
 
 
 @pytest.fixture
-def wavy_system(lidar_scene):
+def wavy_sea(lidar_scene):
     scene = lidar_scene(integrator=MERGING, sea=WAVES)
-    system = LidarScene.from_scene(scene, scene.sensors()[0])
-    region = Region.of_scene(system, SensorSampler(system.receiver, system.transmitter))
-    return system, region
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    return lidar, region
 
 
-def test_region_holds_beam_and_view_and_no_more_than_half_as_much_again(wavy_system):
+def test_region_holds_beam_and_view_and_no_more_than_half_as_much_again(wavy_sea):
     """Field of view of 30 mrad at 212.8 m: 6.4 m across, and 1 / cos(20 deg) of that along x."""
-    _, region = wavy_system
+    _, region = wavy_sea
     for size, seen in zip(region.size, (6.39 / np.cos(np.radians(20)), 6.39), strict=True):
         assert seen < size < 1.6 * seen
 
 
-def test_track_length_is_the_slanted_way_to_the_bottom(wavy_system):
-    system, region = wavy_system
+def test_track_length_is_the_slanted_way_to_the_bottom(wavy_sea):
+    lidar, region = wavy_sea
     slanted = 8.0 / np.cos(np.arcsin(np.sin(np.radians(20)) / 1.34))
-    assert region.track_length(system) == pytest.approx(slanted, rel=0.05)
+    assert region.track_length(lidar) == pytest.approx(slanted, rel=0.05)
 
 
-def test_heights_are_those_of_the_mesh(wavy_system):
-    system, region = wavy_system
-    heights = SurfaceHeights(system, region)
+def test_heights_are_those_of_the_mesh(wavy_sea):
+    lidar, region = wavy_sea
+    heights = SurfaceHeights(lidar, region)
     rng = np.random.default_rng(2)
     x, y = (rng.uniform(region.low[axis], region.high[axis], 4096) for axis in (0, 1))
     down = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5), mi.Vector3f(0, 0, -1))
-    true = np.array(system.scene.ray_intersect(down).p.z)
+    true = np.array(lidar.mitsuba_scene.ray_intersect(down).p.z)
     assert true.std() > 0.03
     assert np.abs(np.array(heights.at(mi.Float(x), mi.Float(y))) - true).max() < 0.01
 
 
 @pytest.mark.parametrize("shift", [[0.0, 0.0, 0.0], [0.3, 0.9, 0.99]])
-def test_points_fall_into_cells_by_their_volume(wavy_system, shift):
+def test_points_fall_into_cells_by_their_volume(wavy_sea, shift):
     """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included."""
-    system, region = wavy_system
-    heights = SurfaceHeights(system, region)
-    cells = WaterCells(WaterGrid(system, heights, 0.5, 0.2, 0.25, 4.0), mi.Point3f(shift))
+    lidar, region = wavy_sea
+    heights = SurfaceHeights(lidar, region)
+    cells = WaterCells(WaterGrid(lidar, heights, 0.5, 0.2, 0.25, 4.0), mi.Point3f(shift))
     rng, count, depth = np.random.default_rng(7), 2**21, 1.5
-    lean = system.transmitter.pose.axis[0] / 1.34
+    lean = lidar.transmitter.pose.axis[0] / 1.34
     lean /= np.sqrt(1 - lean**2)
     below, y = rng.uniform(0, depth, count), rng.uniform(-2.0, 2.0, count)
     x = rng.uniform(-2.0, 2.0, count)
@@ -313,10 +313,10 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     """Points uniform on a plate: the sum of (inverse share / patch area) is the number of patches it touches."""
     half = 0.31
     scene = lidar_scene(integrator=MERGING, extra={"target": plate(0.1, 0.05, -4.0, half)})
-    system = LidarScene.from_scene(scene, scene.sensors()[0])
-    region = Region.of_scene(system, SensorSampler(system.receiver, system.transmitter))
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     width, count = 0.1, 2**18
-    patches = SolidPatches(system, region, width, mi.Point2f(0.37, 0.61))
+    patches = SolidPatches(lidar, region, width, mi.Point2f(0.37, 0.61))
     rng = pass_streams(3, 0, count)
     x, y = (half * (2 * rng.next_float32() - 1) for _ in range(2))
     ray = mi.Ray3f(mi.Point3f(x + 0.1, y + 0.05, -3), mi.Vector3f(0, 0, -1))
@@ -377,9 +377,9 @@ def two_levels(tmp_path):
 def test_levels_of_one_mesh_are_told_apart(lidar_scene, two_levels):
     flat = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(500)}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"levels": two_levels, "flat": flat})
-    system = LidarScene.from_scene(scene, scene.sensors()[0])
-    region = Region.of_scene(system, SensorSampler(system.receiver, system.transmitter))
-    assert [shape.id() for shape in solids_of_several_levels(system, region)] == ["levels"]
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    assert [shape.id() for shape in solids_of_several_levels(lidar, region)] == ["levels"]
 
 
 def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, two_levels):

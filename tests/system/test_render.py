@@ -190,7 +190,7 @@ def test_ctrl_c_that_mitsuba_wraps_while_loading_is_no_mistake_of_the_users():
         raise RuntimeError("while_loop(): encountered an exception") from KeyboardInterrupt()
 
 
-#: The command line, with Ctrl-C pressed when the third pass has been added.
+#: The command line, with one Ctrl-C when the third pass is added to the first of its statistics.
 INTERRUPTED_COMMAND = """
 import os, signal
 from mitransient_lidar.rendering import accuracy
@@ -199,6 +199,7 @@ add = accuracy.PassStatistics.add
 def add_and_interrupt(statistics, values):
     add(statistics, values)
     if statistics.count == 3:
+        accuracy.PassStatistics.add = add
         os.kill(os.getpid(), signal.SIGINT)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 accuracy.PassStatistics.add = add_and_interrupt
