@@ -3,7 +3,7 @@
 Importing the package finds LLVM, chooses a Mitsuba variant when none is set, and registers the plugins, so
 that plain Mitsuba loads and renders lidar scenes::
 
-    import mitransient_lidar  # before mitsuba: it tells Dr.Jit where LLVM is
+    import mitransient_lidar  # before mitsuba: it finds LLVM for Dr.Jit
     import mitsuba as mi
 
     scene = mi.load_file("scene.xml")

@@ -1,6 +1,6 @@
 """Fixtures that every kind of test shares."""
 
-# First of all: it tells Dr.Jit where LLVM is.
+# Before Mitsuba: the package sets the path of LLVM for Dr.Jit.
 import mitransient_lidar  # noqa: F401, I001
 
 import drjit as dr

@@ -193,7 +193,7 @@ WATERS = {
 
 @pytest.mark.parametrize("name", WATERS)
 def test_realistic_water_where_the_closed_form_holds(lidar_scene, name):
-    """Rationale: the closed form is drawn beside the result of every uniform water.
+    """The closed form is drawn with the result of every uniform water.
 
     Expectation: its transmittance and the energy within half the depth of the axis hold while b z (1 - g) < 0.25. Its
     moments and its core do not: few scatterings by large angles make them, see `physics.lidar.small_angle.BeamSpread`.

@@ -374,7 +374,7 @@ def two_levels(tmp_path):
     return {"type": "obj", "filename": str(path), "bsdf": {"type": "twosided", "inner": {"type": "diffuse"}}}
 
 
-def test_levels_of_one_mesh_are_told_apart(lidar_scene, two_levels):
+def test_levels_of_one_mesh_are_distinguished(lidar_scene, two_levels):
     flat = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(500)}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"levels": two_levels, "flat": flat})
     lidar = LidarScene.from_scene(scene, scene.sensors()[0])

@@ -182,7 +182,7 @@ WATER = {"attenuation": 1.0, "scattering": 0.9, "backscattering": 0.9 * 0.0183}
 
 @pytest.mark.parametrize(("zenith", "view"), [(30.0, 0.0), (50.0, 25.0)])
 def test_light_scattered_once(zenith, view):
-    """L = E T cos / mu_s b p / (c (1/mu_s + 1/mu_v) mu_v) T / n^2 of uniform water, with sines bent by n."""
+    """L = E T cos / mu_s b p / (c (1/mu_s + 1/mu_v) mu_v) T / n^2 of uniform water, with directions refracted by n."""
     scene = build(
         sun={"zenith_deg": zenith, "azimuth_deg": 0.0},
         rx={"off_nadir_deg": view},

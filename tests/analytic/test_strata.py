@@ -36,7 +36,7 @@ def bottom_echo(attenuation, reflectance):
 
 
 @pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
-def test_bottom_echo_comes_in_time_and_strength_of_the_bent_path(lidar_scene, passes, z_score, integrator):
+def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scene, passes, z_score, integrator):
     """With one group index for all the echo would come 5 ns late; without bending it would have a fifth less energy."""
     arrival, expected = bottom_echo(attenuation=0.1, reflectance=0.1)
     narrow = {"divergence_mrad": 0.2}

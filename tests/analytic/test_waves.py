@@ -59,7 +59,7 @@ def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle
         gaussian = echo_energies(lidar, 5e-3, water, 1e-3, 8.0, 0.1, total).surface
         ratio, error = energy.mean() / gaussian, energy.std(ddof=1) / np.sqrt(SEAS) / gaussian
         expected = two_scale_ratio(facets, ripples, np.radians(angle))
-        # Averaging the ratio over the beam of 5 mrad and masking are worth a percent.
+        # Averaging the ratio over the beam of 5 mrad and masking change it by a percent.
         assert abs(ratio - expected) < 4 * error + 0.015, (ratio, expected, error)
         if not (wind == 3.0 and angle == 20.0):
             assert abs(ratio - 1) < 0.05 + 4 * error

@@ -202,7 +202,7 @@ def test_images_that_are_no_beam_are_refused(image, message, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
-def test_damaged_files_are_told_in_one_sentence(suffix, tmp_path, capfd):
+def test_damaged_files_are_refused_in_one_sentence(suffix, tmp_path, capfd):
     path = tmp_path / f"beam{suffix}"
     image_file(tmp_path, np.random.default_rng(1).uniform(0, 10, (64, 64)), suffix)
     half = path.stat().st_size // 2

@@ -59,12 +59,12 @@ def test_samples_are_uniform_inside_and_the_area_is_right(name):
     area = area_by_cells(field, *edges)
     assert area.sum() == pytest.approx(field.area, rel=3e-3)
     whole = area > 0.999 * area.max()
-    # Cells that the border cuts are known to the fineness of their count; whole ones exactly.
+    # Areas of cells that the border cuts have the resolution of the count; others are exact.
     counts = np.histogram2d(np.array(angle_x), np.array(angle_y), bins=edges)[0]
     expected = COUNT * area / field.area
     statistic = np.sum((counts - expected)[whole] ** 2 / expected[whole])
     assert chi2.sf(statistic, whole.sum()) > 1e-4
-    # A wrong normalisation shows in the level of the whole cells together.
+    # A wrong normalisation would change the level of all complete cells.
     total = expected[whole].sum()
     assert abs(counts[whole].sum() - total) < 4 * np.sqrt(total)
 

@@ -56,7 +56,7 @@ def assert_same_light(first, second):
     ],
 )
 def test_volpath_sees_homogeneous_water_as_mitsubas_medium(change, phase):
-    """Albedo for scattering would be 1.7 times the light; water that told no phase function 3 to 10 times."""
+    """Albedo for scattering would be 1.7 times the light; water without a phase function 3 to 10 times."""
     reference = {"type": "homogeneous", "sigma_t": 0.6, "albedo": 0.5 / 0.6, "phase": phase}
     assert_same_light(radiance({"type": "layered_water", **WATER, **change}), radiance(reference))
 

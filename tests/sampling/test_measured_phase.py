@@ -60,7 +60,7 @@ def test_water_takes_it(table, lidar_scene, passes):
     assert np.all(error[:3] < 0.03 * mean[1][:3])
 
 
-def test_mistakes_are_told(tmp_path):
+def test_invalid_input_is_refused(tmp_path):
     with pytest.raises(RuntimeError, match="filename is missing"):
         mi.load_dict({"type": "measured_phase"})
     path = tmp_path / "short.csv"

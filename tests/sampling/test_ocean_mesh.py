@@ -123,7 +123,7 @@ def test_waves_and_ripples_add_up_to_the_variance_that_was_asked_for(asked, tota
 
 
 def test_a_mesh_rougher_than_asked_says_so():
-    """All slopes are resolved at 1e-4: the ripples stop at their smallest, and the total is told as it is."""
+    """All slopes are resolved at 1e-4: the ripples stop at their smallest, and the total is reported."""
     _, shape = surface(wind_speed=6.0, slope_variance="1e-4", **PATCH)
     assert shape.ripple_variance == (1e-5, 1e-5)
     assert shape.slope_variance == pytest.approx(sum(shape.sea.resolved_variance) + 2e-5)

@@ -48,7 +48,7 @@ def test_normalised_over_the_sphere(description):
     theta = np.exp(edges[:-1, None] + half * (1 + nodes))
     p = value(plugin, theta.ravel()).reshape(theta.shape)
     total = np.sum(2 * np.pi * p * np.sin(theta) * theta * half * weights)
-    # Below, p goes on as theta^-m; float32 directions no longer tell such angles.
+    # Below, p goes on as theta^-m; float32 directions do not resolve such angles.
     ends = value(plugin, np.array([low, 2 * low]))
     slope = np.log(ends[0] / ends[1]) / np.log(2)
     total += 2 * np.pi * ends[0] * low**2 / (2 - slope)

@@ -96,6 +96,6 @@ def test_bubbles_brighten_the_water_that_they_fill_and_darken_the_bottom(lidar_s
         ({"plume_backscatter_ratio": 0.9}, "plume_backscatter_ratio = 0.9 must lie between"),
     ],
 )
-def test_mistakes_are_told(change, message):
+def test_invalid_input_is_refused(change, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({"type": "layered_water", **change})

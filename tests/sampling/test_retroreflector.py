@@ -38,7 +38,7 @@ def test_samples_follow_the_density(wi, width, share):
     assert test.run()
 
 
-def test_chi_squared_can_tell_a_wrong_width():
+def test_chi_squared_detects_a_wrong_width():
     sample, _ = BSDFAdapter("retroreflector", {"type": "retroreflector", "width_deg": 20.0}, wi=OBLIQUE.tolist())
     _, pdf = BSDFAdapter("retroreflector", {"type": "retroreflector", "width_deg": 20.5}, wi=OBLIQUE.tolist())
     test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=181, ires=16, seed=4)
@@ -127,6 +127,6 @@ def test_components_can_be_asked_for_alone():
         ({"diffuse_share": -0.1}, "diffuse_share = -0.1 must lie between 0 and 1"),
     ],
 )
-def test_mistakes_are_told(parameters, message):
+def test_invalid_input_is_refused(parameters, message):
     with pytest.raises(RuntimeError, match=message):
         surface(**parameters)

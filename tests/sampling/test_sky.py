@@ -120,6 +120,6 @@ def test_mitsubas_path_tracer_sees_a_plate_in_sun_and_sky():
         ({"type": "sky", "sun_zenith_deg": float("nan")}, "sun_zenith_deg = nan must be finite"),
     ],
 )
-def test_mistakes(plugin, message):
+def test_invalid_input_is_refused(plugin, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict(plugin)

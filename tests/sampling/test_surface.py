@@ -60,7 +60,7 @@ def test_lobe_samples_follow_its_density(angle, depth):
     assert lobe_p_value(lobe, lobe, lobe.direction_from(mi.Point3f(0.5, -0.2, -depth))) > 1e-3
 
 
-def test_lobe_of_another_variance_is_told_apart():
+def test_lobe_of_another_variance_is_distinguished():
     """Negative control: 1 % of slope variance is seen."""
     lobe = lobe_at(20.0)
     assert lobe_p_value(lobe, lobe_at(20.0, 0.0202), lobe.direction_from(mi.Point3f(0, 0, -4))) < 1e-6

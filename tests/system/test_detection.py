@@ -50,5 +50,5 @@ def test_drawn_shots_are_detected_as_wanted(squares):
     assert at["drawn_false_alarm"] < 0.006
 
 
-def test_table_tells_the_scene(squares):
+def test_table_describes_the_scene(squares):
     assert describe_detection(squares)[0].startswith("fig13_2x2, receiver apd, noise;")

@@ -197,7 +197,7 @@ class Page:
         return np.array(colours).reshape(rows, columns, 3)
 
     def peaks(self):
-        """Return the largest value of every line drawn, read from the value axis beside it."""
+        """Return the largest value of every line drawn, read from its value axis."""
         ticks = self.run(
             "return [...document.querySelectorAll('#curve-plot .value-tick')]"
             ".map((tick) => [Number(tick.getAttribute('y')) - 4, tick.textContent])"

@@ -1,4 +1,4 @@
-"""Rendering as a user does it: shipped scenes, options, files, warnings and mistakes."""
+"""Rendering: shipped scenes, options, files, warnings and invalid input."""
 
 import os
 import signal
@@ -153,7 +153,7 @@ def default_ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
-def test_ctrl_c_in_the_midst_of_a_pass_keeps_what_was_rendered(default_ctrl_c, monkeypatch):
+def test_ctrl_c_during_a_pass_keeps_what_was_rendered(default_ctrl_c, monkeypatch):
     """Dr.Jit turns an exception inside a loop that it records into a RuntimeError."""
     original, calls = LightPath.ray, []
 
@@ -183,7 +183,7 @@ def test_second_ctrl_c_acts_at_once(default_ctrl_c):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_ctrl_c_that_mitsuba_wraps_while_loading_is_no_mistake_of_the_users():
+def test_ctrl_c_that_mitsuba_wraps_while_loading_is_no_user_error():
     with pytest.raises(KeyboardInterrupt), loading.as_user_error():
         raise RuntimeError("could not instantiate plugin: KeyboardInterrupt: ")
     with pytest.raises(KeyboardInterrupt), loading.as_user_error():
@@ -267,7 +267,7 @@ def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, fastest):
     assert np.log(8) - limit < ratios.mean() < np.log(fastest) + limit
 
 
-MISTAKES = [
+INVALID_INPUT = [
     ({"scene": "tabel1"}, "did you mean table1"),
     ({"params": {"wind_sped": 3}}, "wind_sped.*did you mean wind_speed"),
     ({"params": {"wind_speed": -3}}, "wind_speed = -3"),
@@ -293,8 +293,8 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("options", "message"), MISTAKES)
-def test_mistakes_are_told_in_one_sentence(options, message):
+@pytest.mark.parametrize(("options", "message"), INVALID_INPUT)
+def test_invalid_input_is_refused_in_one_sentence(options, message):
     options = {"scene": "table1", "passes": 2, **options}
     with pytest.raises(UserError, match=message) as caught:
         mitransient_lidar.render(options.pop("scene"), **options)
@@ -316,7 +316,7 @@ def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
             small(tmp_path / "wrong.xml")
 
 
-def test_command_line_mistake_is_exit_code_2_without_files(tmp_path):
+def test_invalid_option_is_exit_code_2_without_files(tmp_path):
     command = [sys.executable, "-m", "mitransient_lidar", "render", "table1", "-D", "wind_speed=40", "-o"]
     done = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -326,7 +326,7 @@ def test_command_line_mistake_is_exit_code_2_without_files(tmp_path):
     assert not list(tmp_path.rglob("*.*"))
 
 
-def test_bottom_through_the_waves_is_refused_and_a_target_is_told(caplog):
+def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     """Wind 6 m/s has waves of half a metre; a pile of 0.6 m across stands in the beam."""
     with pytest.raises(UserError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
         small(params={"wind_speed": 6, "bottom_depth": 0.1})
@@ -389,7 +389,7 @@ def test_target_below_the_bottom_is_refused():
         rendering.render("fig13_2x2", params={"target_depth": 13}, passes=2)
 
 
-def test_target_above_the_sea_is_told(lidar_scene, caplog):
+def test_target_above_the_sea_is_reported(lidar_scene, caplog):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([5, 0, 3])}
     rendering.render(lidar_scene(extra={"plate": plate}), passes=2)
     assert "shape 'plate' lies above the sea, from z = 3 m" in caplog.text

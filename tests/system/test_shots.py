@@ -109,7 +109,7 @@ def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
         np.testing.assert_allclose(found.surface_peak[2].values[known], peak.values[known], rtol=0.02)
 
 
-def test_mistakes_are_told():
+def test_invalid_input_is_refused():
     with pytest.raises(UserError, match="every shot on a flat sea is the same"):
         shots.find_shots("fig09_2x2", {"spectrum": "flat"})
     with pytest.raises(UserError, match="must hold 14"):

@@ -82,7 +82,7 @@ def test_slopes_on_a_sea(sea):
     truth, guess = sea["true_slope_along"].values, found["slope_along"].values
     correlation = float(np.corrcoef(truth, guess)[0, 1])
     assert math.atanh(correlation) > math.atanh(0.83) - 4.3 / math.sqrt(20 - 3)
-    # The whole sea's slopes are 3.1 degrees; knowing none of them errs by as much.
+    # The slopes of the sea are 3.1 degrees RMS, which is the error of an estimate of 0.
     assert np.sqrt(np.mean((guess - truth) ** 2)) < np.sqrt(np.mean(truth**2))
     assert np.isfinite(guess).all()
     assert np.allclose(found["slope_across"], 0)

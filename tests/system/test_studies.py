@@ -1,4 +1,4 @@
-"""The commands that tell of orders of scattering and of a target, as their user runs them."""
+"""The commands scattering-orders and target-signal."""
 
 import re
 
@@ -56,5 +56,5 @@ def test_target_on_a_grid(tmp_path):
         ),
     ],
 )
-def test_mistakes_end_with_one_sentence(arguments, message):
+def test_invalid_options_end_with_one_sentence(arguments, message):
     assert_refused(run(*arguments), message)

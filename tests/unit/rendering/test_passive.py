@@ -221,7 +221,7 @@ def test_the_shipped_scene_by_the_command(tmp_path):
         (["passive_sea", "-q", "-D", "sun=3"], "parameter 'sun' is not one of scene passive_sea"),
     ],
 )
-def test_mistakes_end_with_one_sentence(arguments, message):
+def test_invalid_options_end_with_one_sentence(arguments, message):
     assert_refused(run("passive", *arguments), message)
 
 

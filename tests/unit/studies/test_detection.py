@@ -290,7 +290,7 @@ def test_echo_outside_the_record_is_reported(monkeypatch):
         ),
     ],
 )
-def test_mistakes_end_with_one_sentence(arguments, message):
+def test_invalid_options_end_with_one_sentence(arguments, message):
     assert_refused(run("detect", *arguments), message)
 
 
