@@ -165,9 +165,12 @@ def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]
 
 
 def slope_correlations(shots: xr.Dataset) -> dict[str, float]:
-    """Return the correlation of each of the `slope_effects` with its slope, without NaN; raises as `slope_effects`."""
+    """Return the correlation of each of the `slope_effects` with its slope; raises as `slope_effects`.
+
+    Shots without the effect, of value NaN, are left out; the correlation of fewer than two is NaN.
+    """
     found = {}
     for name, (slope, value) in slope_effects(shots).items():
         known = np.isfinite(value)
-        found[name] = float(np.corrcoef(slope[known], value[known])[0, 1])
+        found[name] = float(np.corrcoef(slope[known], value[known])[0, 1]) if known.sum() > 1 else np.nan
     return found

@@ -44,6 +44,7 @@ def shoot(lidar_scene, passes, start_ns, *, altitude, angle, water, bottom, slop
     return centroid_ns(passes(scene, 8), start_ns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("altitude", [10.0, 200.0, 3000.0])
 @pytest.mark.parametrize("angle", [0.0, 20.0, 40.0])
 @pytest.mark.parametrize("group_index", [1.34, 1.364])
@@ -56,6 +57,7 @@ def test_bottom_arrives_when_geometry_says(lidar_scene, passes, altitude, angle,
     assert abs(mean - expected) < BIN_NS / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("altitude", [10.0, 200.0, 3000.0])
 @pytest.mark.parametrize("angle", [0.0, 20.0, 40.0])
 def test_surface_arrives_when_geometry_says(lidar_scene, passes, altitude, angle):
@@ -69,6 +71,7 @@ def test_surface_arrives_when_geometry_says(lidar_scene, passes, altitude, angle
     assert abs(mean - expected) < BIN_NS / 2
 
 
+@pytest.mark.slow
 def test_bottom_under_layers_arrives_at_the_same_time(lidar_scene, passes):
     """Layers of one index differ in attenuation, not in time."""
     expected = float(bottom_time_ns(200.0, 8.0, np.radians(20.0), 1.34, 1.364))
@@ -80,6 +83,7 @@ def test_bottom_under_layers_arrives_at_the_same_time(lidar_scene, passes):
     assert abs(mean - expected) < BIN_NS / 2
 
 
+@pytest.mark.slow
 def test_layer_seen_by_its_scattering_begins_at_its_slanted_depth(lidar_scene, passes):
     """Clear water above 3 m and a scattering layer below: nothing before the edge's time, light right after it."""
     edge = float(bottom_time_ns(200.0, 3.0, np.radians(20.0), 1.34, 1.34))
@@ -156,6 +160,7 @@ def test_bins_are_half_open_and_their_sum_is_the_energy():
     assert histogram.energy().tolist() == [[0, 0, 0, 0], [2 + 3, 4, 5, 6]]
 
 
+@pytest.mark.slow
 def test_bins_sum_to_a_film_of_one_bin(lidar_scene, passes):
     """The same paths, sorted by time or not: a bin's edge that belonged to two bins or none would show."""
     films = ({"bin_width_ns": 0.25, "bin_count": 640}, {"bin_width_ns": 160.0, "bin_count": 1})

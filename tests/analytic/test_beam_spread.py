@@ -55,6 +55,7 @@ def fluxes(system, depths, photons, passes):
     return down / system.transmitter.energy, up / system.transmitter.energy
 
 
+@pytest.mark.slow
 def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
     # Van de Hulst (1980): Henyey-Greenstein g = 0.75, albedo 0.9, optical thickness 2, matched index, normal incidence.
     # Below the slab is clear water and a black bottom. Here the thickness is 20 m, and reflected light crosses a plane
@@ -81,6 +82,7 @@ def test_light_that_leaves_for_ever_is_counted(system):
     assert np.all(up == 0)
 
 
+@pytest.mark.slow
 def test_moments_of_an_infinite_medium(system, z_score):
     # Exact at every path length s (derivation: the directions' correlations decay as exp(-b (1 - g_l) s)).
     b, g, start, step = 1.0, 0.924, 150.0, 10.0
@@ -153,6 +155,7 @@ def within_small_angle(radius, depth, scattering):
     return np.exp(-scattering * depth) + radius * trapezoid(j1(k * radius) * values, k)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("absorption", "scattering"), [(0.05, 0.8), (0.3, 1.5)])
 def test_many_weak_scatterings(lidar_scene, narrow, absorption, scattering):
     """Rationale: the theory of McLean, Freeman and Walker assumes what this phase function is.
@@ -191,6 +194,7 @@ WATERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WATERS)
 def test_realistic_water_where_the_closed_form_holds(lidar_scene, name):
     """The closed form is drawn with the result of every uniform water.
@@ -218,6 +222,7 @@ def test_realistic_water_where_the_closed_form_holds(lidar_scene, name):
         assert row["delay_std"] > 1.5e9 * np.sqrt(theory.delay_variance)
 
 
+@pytest.mark.slow
 def test_white_bottom_returns_all_light(system):
     # Water that does not absorb: what leaves upwards and what the surface reflects at once is what was sent.
     water = {"attenuation": 0.3, "scattering": 0.3, "phase_function": "hg", "phase_g": 0.9}
@@ -243,6 +248,7 @@ def test_white_bottom_returns_all_light(system):
     assert first.mean() == pytest.approx(float(fresnel(0.0, 1.34)[0]), abs=0.001)
 
 
+@pytest.mark.slow
 def test_no_crossing_is_lost_or_counted_twice(system):
     # Without absorption each path crosses every plane once more downwards than upwards if it ends on the black bottom,
     # and as often if it leaves through the surface: net fluxes agree pass by pass.

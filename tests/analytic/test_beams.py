@@ -10,6 +10,8 @@ from mitransient_lidar.analysis import comparison
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
+pytestmark = pytest.mark.slow
+
 ENERGY = 5e-3 * 0.81 * 0.9
 DEPTH = 1.0
 CLEAR = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0}

@@ -26,6 +26,7 @@ def compare(first, second, largest):
     assert np.all(np.abs(z) < largest_z(min(len(first), len(second)), z.size)), z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["2x2", "1x4", "8x8"])
 def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes, layout):
     """Same seed: the same paths, given to other pixels. A pixel counted twice or left out at an edge would show."""
@@ -36,6 +37,7 @@ def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes, layout
     np.testing.assert_allclose(energies[0], energies[1], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_pixels_sum_to_the_single_pixel_with_other_seeds(lidar_scene, passes):
     """A share of the light given to two pixels or none would show."""
     pixels = lidar_scene(rx={"layout": "2x2"}, sea=WAVY)
@@ -44,6 +46,7 @@ def test_pixels_sum_to_the_single_pixel_with_other_seeds(lidar_scene, passes):
     compare(first, second, 0.02)
 
 
+@pytest.mark.slow
 def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
     """Quadrants as sectors of a circle, drawn pixel by pixel, against the layout that cuts the circle."""
     quadrants = {"red": 270.0, "green": 0.0, "blue": 180.0, "black": 90.0}
@@ -78,25 +81,28 @@ def connected(lidar_scene, passes, sea, count, **integrator):
     return passes(scene, count)[:, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_connections_by_emitter_by_phase_and_mis_have_one_mean(lidar_scene, passes, sea):
     """Each alone is complete; weights that do not sum to one would lose or double what both can find."""
     combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:6])
-    for other, count in (("emitter", 48), ("phase", 96)):
+    for other, count in (("emitter", 32), ("phase", 64)):
         alone = with_total(connected(lidar_scene, passes, sea, count, connection=other)[:, 1:6])
         compare(combined, alone, 0.045)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
     """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
-    combined = connected(lidar_scene, passes, sea, 48)
-    walk = connected(lidar_scene, passes, sea, 96, connection="phase", guiding_probability=0.0)
+    combined = connected(lidar_scene, passes, sea, 24)
+    walk = connected(lidar_scene, passes, sea, 48, connection="phase", guiding_probability=0.0)
     assert walk.sum(axis=1).var(ddof=1) > 50 * combined.sum(axis=1).var(ddof=1)
     # The gate of the bottom echo, where every walk has turned.
     assert walk[:, 5].var(ddof=1) > 50 * combined[:, 5].var(ddof=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
     """A uniform beam seen by a uniform field of view, and the two exchanged, per solid angle of the field of view.
@@ -115,6 +121,7 @@ def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
     compare(*signals, 0.02)
 
 
+@pytest.mark.slow
 def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
     """One metre apart across the axis, looking at one point, exchanged: equal beams and views see the same signal."""
     energies = []
@@ -134,6 +141,7 @@ def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
     compare(*energies, 0.02)
 
 
+@pytest.mark.slow
 def test_roulette_changes_no_mean(lidar_scene, passes):
     """Without it, and with much of it: survivors that did not carry the share of the dead would lose most light."""
     reference = echoes(passes(lidar_scene(sea=ROUGH), 24))
@@ -142,6 +150,7 @@ def test_roulette_changes_no_mean(lidar_scene, passes):
         compare(reference, echoes(passes(scene, count, 500)), 0.02)
 
 
+@pytest.mark.slow
 def test_seeds_repeat_and_differ(lidar_scene, passes):
     scene = lidar_scene(sea=WAVY, integrator={"paths_per_pass": 2**12})
     first, again, other = passes(scene, 1, 7), passes(scene, 1, 7), passes(scene, 1, 8)
@@ -150,6 +159,7 @@ def test_seeds_repeat_and_differ(lidar_scene, passes):
     assert np.mean(first == other) < 0.5
 
 
+@pytest.mark.slow
 def test_orders_of_scattering_add_up(lidar_scene, passes):
     """Same seed: paths are only cut shorter, so each order adds light, and a high limit is none."""
     energies = [
@@ -165,6 +175,7 @@ def test_orders_of_scattering_add_up(lidar_scene, passes):
     assert totals[2] - totals[1] > 0.1 * totals[-1]
 
 
+@pytest.mark.slow
 def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     energies = []
     for symbolic in (True, False):
@@ -175,6 +186,7 @@ def test_symbolic_and_evaluated_loops_agree(lidar_scene, passes):
     assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.95
 
 
+@pytest.mark.slow
 def test_identical_layers_are_homogeneous_water(lidar_scene, passes):
     energies = [
         passes(lidar_scene(sea=ROUGH, water=water, integrator={"paths_per_pass": 2**15}), 4)
@@ -188,6 +200,7 @@ def test_identical_layers_are_homogeneous_water(lidar_scene, passes):
     assert np.mean(np.isclose(*energies, rtol=1e-3, atol=1e-24)) > 0.9
 
 
+@pytest.mark.slow
 def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, passes):
     """Absorption alone, without scattering, leaves the surface echo and dims the bottom by exp(-2 da L)."""
     bottoms = []
@@ -205,6 +218,7 @@ def test_absorption_multiplies_every_bin_by_its_path_in_the_water(lidar_scene, p
     assert abs(mean[1] / mean[0] / np.exp(-0.2 * path) - 1) < largest_z(32) * relative + 1e-3
 
 
+@pytest.mark.slow
 def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
     """White bottom, no absorption, and a receiver that would see it all: still less than what a white plate returns."""
     scene = lidar_scene(
@@ -218,6 +232,7 @@ def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
     assert 0.3 * plate < energy < plate
 
 
+@pytest.mark.slow
 def test_sample_count_per_pixel_and_default(lidar_scene):
     scene = lidar_scene(integrator={"paths_per_pass": 2**12})
     few, many = (np.array(mi.render(scene, spp=spp, seed=1)).sum() for spp in (0, 2**14))

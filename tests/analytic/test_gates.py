@@ -30,6 +30,7 @@ def render(scene, gigabytes=2.0, passes=4, **options):
     return mitransient_lidar.render(scene, passes=passes, seed=3, max_memory=gigabytes, **options)
 
 
+@pytest.mark.slow
 def test_gates_are_the_waveform_behind_a_shutter(lidar_scene):
     """The integral of power times transmission; a gate shifted by half a bin would differ by per cents at its edges."""
     result = render(gated(lidar_scene))
@@ -43,6 +44,7 @@ def test_gates_are_the_waveform_behind_a_shutter(lidar_scene):
         np.testing.assert_allclose(result["gate_energy"].values[:, gate], energy, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_recut_gates_are_those_of_the_render(lidar_scene):
     result = render(gated(lidar_scene), passes=16)
     options = {"start_ns": 1425.0, "width_ns": 8.0, "step_ns": 5.0, "count": 20, "rise_ns": 2.0}
@@ -53,6 +55,7 @@ def test_recut_gates_are_those_of_the_render(lidar_scene):
     assert 0.7 < float(ratio.median()) < 1.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
 def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
     """The same paths: cut from each pass in 32 bits, or summed where they arrive, exact to the bin's width."""
@@ -72,6 +75,7 @@ def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
     np.testing.assert_allclose(10 * render(ten)["gate_energy"], whole["gate_energy"], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.5, 0.2])
 def test_non_finite_energy_is_reported(lidar_scene, monkeypatch, caplog, share):
     """The light of pixel green is NaN; the other pixels keep theirs, in both ways of keeping gates alone."""
@@ -88,6 +92,7 @@ def test_non_finite_energy_is_reported(lidar_scene, monkeypatch, caplog, share):
     assert "gates of 1 of 4 pixels hold values that are not finite" in caplog.text
 
 
+@pytest.mark.slow
 def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene):
     gates = {"gate_start_depth": 3.0, "gate_width_ns": 8.0, "gate_count": 6}
     result = render(lidar_scene(film={"bin_width_ns": 0.5, "bin_count": 300, **gates}), passes=2)
@@ -142,6 +147,7 @@ def image(lidar_scene, layout, film=None, **integrator):
     )
 
 
+@pytest.mark.slow
 def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
     """256 x 256 pixels binned to 2 x 2, and all of them, against receivers of so many pixels with other seeds."""
     sums = {}
@@ -173,6 +179,7 @@ def test_paths_go_with_the_pixels(lidar_scene):
         assert (default.paths, default.photons) == (paths, photons)
 
 
+@pytest.mark.slow
 def test_contrast_of_the_mine_is_greatest_where_geometry_says():
     """The sphere's energy, and its Weber contrast against the water around it, by gate.
 

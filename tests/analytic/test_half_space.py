@@ -15,7 +15,6 @@ from mitransient_lidar.core.constants import C0
 
 HEIGHT = 2e4
 ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # J m^2
-ALBEDOS, DEGREES = [0.5, 0.9, 0.99], [0.0, 20.0, 40.0, 60.0]
 #: What the lowest index that water may have, 1.0001, does (n^2 and refraction, 5e-4 at 60 degrees), and the step of
 #: about 1e-4 m by which rays start off the surface.
 NOT_MATCHED = 1e-3
@@ -66,8 +65,10 @@ def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator
     return passes(scene, count)[:, 0, 0] * (beam / view) ** 2
 
 
-@pytest.mark.parametrize("degrees", DEGREES)
-@pytest.mark.parametrize("albedo", ALBEDOS)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("albedo", "degrees"), [(0.5, 0.0), (0.5, 40.0), (0.9, 20.0), (0.9, 60.0), (0.99, 0.0), (0.99, 60.0)]
+)
 def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
     """Light of up to hundreds of scatterings; at albedo 0.99 it is 3 to 6 times the single scattering."""
     # No direction is drawn towards the laser: each such draw costs variance, and here are hundreds.
@@ -81,25 +82,27 @@ def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degre
     assert abs(energy.mean() / expected - 1) < 5e-3
 
 
-@pytest.mark.parametrize("degrees", [0.0, 60.0])
-@pytest.mark.parametrize("albedo", [0.5, 0.9, pytest.param(0.99, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("albedo", "degrees"), [(0.5, 60.0), (0.9, 0.0), (0.9, 60.0), (0.99, 60.0)])
 def test_merging_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
     """With cells that are small against the mean free path, over which the light falls.
 
     A photon's absorption is carried on to the receiver's point, sideways, too: cells as wide as a mean free path return
     2 % too much at albedo 0.5 and 60 degrees.
     """
-    view, beam, spacing, count = {0.5: (4, 14, 0.3, 8), 0.9: (5, 22, 0.3, 12), 0.99: (10, 45, 0.25, 24)}[albedo]
+    view, beam, spacing, count = {0.5: (4, 14, 0.3, 8), 0.9: (5, 22, 0.3, 12), 0.99: (10, 45, 0.25, 16)}[albedo]
     fine = {"type": "lidar_merging", "paths_per_pass": 2**15, "photons_per_pass": 2**15}
     # Cells are a third as thick as the spacing; slanted light falls faster with depth.
     fine |= {"cell_size": 0.2, "point_spacing": spacing * float(np.cos(np.radians(degrees)))}
     energy = returned(lidar_scene, passes, count, degrees, albedo, view, beam, fine)
     expected = single_scattering(degrees, albedo) * chandrasekhar_h(np.cos(np.radians(degrees)), albedo) ** 2
     _, relative = z_score(energy, expected)
-    assert relative < 2e-3
-    assert abs(energy.mean() / expected - 1) < 5e-3
+    assert relative < 2.5e-3
+    # The blur over cells adds 2e-3.
+    assert abs(energy.mean() / expected - 1) < largest_z(count) * relative + 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.0, 60.0])
 def test_every_order_of_scattering_returns_its_share(lidar_scene, passes, z_score, degrees):
     """Light scattered once, twice, three and four times, each alone: a share given to another order would show."""
@@ -116,7 +119,7 @@ def test_every_order_of_scattering_returns_its_share(lidar_scene, passes, z_scor
     assert np.all(np.abs(z) < largest_z(32, orders) + NOT_MATCHED / relative), z
 
 
-@pytest.mark.parametrize("degrees", DEGREES)
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0, 60.0])
 def test_orders_of_scattering_sum_to_h_squared(degrees):
     """The series by the integral equation against the closed form of H; 40 orders leave 1e-12 at albedo 0.5."""
     mu = np.cos(np.radians(degrees))

@@ -23,6 +23,8 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.studies.shot_statistics import highest_points
 
+pytestmark = pytest.mark.slow
+
 ANGLE, INDEX = np.radians(20.0), 1.34
 BIN_NS = 0.5
 #: What a tenth of a metre of depth takes, there and back.

@@ -59,6 +59,7 @@ def assert_agrees(z_score, samples, expected, error=0.01):
     assert np.all(np.abs(z) < largest_z(len(samples), z.size)), (z, samples.mean(axis=0) / expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sea", "variance"),
     [
@@ -79,6 +80,7 @@ def test_surface_echo_of_gaussian_slopes(lidar_scene, passes, z_score, sea, vari
     assert np.all(np.abs(ratio - 1) < largest_z(16, 5) * relative + 5e-4), (ratio, z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle", "index"), [(0.0, 1.34), (10.0, 1.2), (30.0, 1.34)])
 def test_surface_echo_with_angle_and_index(lidar_scene, passes, angle, index):
     """Fresnel reflectance ((n-1)/(n+1))^2 and the slope density at the tilt that faces the lidar, pencil beam."""
@@ -97,6 +99,7 @@ def test_surface_echo_with_angle_and_index(lidar_scene, passes, angle, index):
     assert totals.mean() == pytest.approx(expected, rel=5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("water", "scatterings"),
     [({"attenuation": 0.15, "scattering": 0.0, "backscattering": 0.0}, -1), ({"attenuation": 0.3}, 0)],
@@ -113,6 +116,7 @@ def test_unscattered_bottom(lidar_scene, passes, z_score, water, scatterings):
     assert_agrees(z_score, pixels_and_sum(passes(scene, 32)), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "factor"),
     [
@@ -134,6 +138,7 @@ def test_efficiencies_scale_the_energy(lidar_scene, passes, change, factor):
     assert changed / reference == pytest.approx(factor, rel=2e-3 if "rho" in change else 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("altitude", "angle", "index"), [(20.0, 35.0, 1.34), (1000.0, 35.0, 1.34), (200.0, 0.0, 1.2), (200.0, 20.0, 1.5)]
 )
@@ -162,6 +167,7 @@ PHASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", PHASES)
 def test_single_scattering_column(lidar_scene, passes, phase):
     """Level and slope in bins of 5 ns: the lidar equation with c both ways and b p(180 deg)."""
@@ -170,6 +176,7 @@ def test_single_scattering_column(lidar_scene, passes, phase):
     )
 
 
+@pytest.mark.slow
 def test_single_scattering_column_in_layers(lidar_scene, passes):
     """The step at the edge is the ratio of b p(180 deg); below it the upper layer's attenuation still counts."""
     layers = {
@@ -207,6 +214,7 @@ def check_column(lidar_scene, passes, water, backward, column):
     assert np.all(np.abs(mean / expected - 1) < largest_z(32, z.size) * error / mean + 5e-4), z
 
 
+@pytest.mark.slow
 def test_bottom_in_bins(lidar_scene, passes):
     """The echo's shape across the beam: earlier in the near pixels, later in the far ones."""
     edges = 1484.0 + 2.0 * np.arange(10)

@@ -67,6 +67,7 @@ def assert_same(first, second, *, floor=0.0, largest=0.1):
 # Closed forms: single scattering and bottom, where the light has no other way.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sea", "water"),
     [({}, CLEAR), ({}, {"layer_tops": "0, 2", "attenuation": "0.3, 0.05", "scattering": "0", "backscattering": "0"})],
@@ -80,6 +81,7 @@ def test_bottom_level(lidar_scene, passes, z_score, sea, water):
     assert np.all(np.abs(z) < largest_z(24, z.size)), z
 
 
+@pytest.mark.slow
 def test_bottom_in_bins(lidar_scene, passes):
     edges = 1484.0 + 2.0 * np.arange(10)
     film = {"time_start_ns": edges[0], "bin_width_ns": 2.0, "bin_count": 9}
@@ -94,6 +96,7 @@ def test_bottom_in_bins(lidar_scene, passes):
     assert np.all(error[strong] < 0.05 * mean[strong])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["fournier_forand", "hg"])
 def test_single_scattering_column(lidar_scene, passes, phase):
     """So little scattering that nothing scatters twice; attenuation 0.3 /m is absorption."""
@@ -102,6 +105,7 @@ def test_single_scattering_column(lidar_scene, passes, phase):
     check_column(lidar_scene, passes, {"phase_function": phase}, 0.3, 1.5e-5, 6e-7, float(backward[phase]))
 
 
+@pytest.mark.slow
 def test_single_scattering_column_in_layers(lidar_scene, passes):
     backward = [float(fournier_forand(np.pi, *fournier_forand_parameters(ratio))) for ratio in (0.02, 0.04)]
     values = "0.5, 0.3", "2e-5, 2e-5", "4e-7, 8e-7"
@@ -124,6 +128,7 @@ def check_column(lidar_scene, passes, water, attenuation, scattering, backscatte
     assert np.all(np.abs(mean / expected - 1) < largest_z(24, mean.size) * error / mean + 1.5e-3), mean / expected
 
 
+@pytest.mark.slow
 def test_phase_function_counts_the_angle_between_the_directions(lidar_scene, passes):
     """Receiver 150 m from the laser: light turns by 145 instead of 180 degrees, where HG 0.9 differs by 9 %."""
     water = {"attenuation": 0.3, "scattering": 1e-5, "backscattering": 1e-6, "phase_function": "hg", "phase_g": 0.9}
@@ -177,6 +182,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_both_integrators_agree(lidar_scene, passes, case):
     """Bins of 2 ns of the four pixels, a few hundred in all; the blur of cells under waves is allowed 0.5 %."""
@@ -210,6 +216,7 @@ def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
     assert bias[2] > -0.006
 
 
+@pytest.mark.slow
 def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
     """Over a level sea without mirrors nothing is left; a mirror under water leaves what it shows."""
     complement_only = {"complement_only": True, "paths_per_pass": 2**16}
@@ -221,6 +228,7 @@ def test_only_what_is_not_merged_is_left_to_the_reference(lidar_scene, passes):
 # Statistics.
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
     four = passes(lidar_scene(integrator=MERGING, sea=WAVES), 2, 5)
     again = passes(lidar_scene(integrator=MERGING, sea=WAVES), 2, 5)
@@ -279,6 +287,7 @@ def test_heights_are_those_of_the_mesh(wavy_sea):
     assert np.abs(np.array(heights.at(mi.Float(x), mi.Float(y))) - true).max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [[0.0, 0.0, 0.0], [0.3, 0.9, 0.99]])
 def test_points_fall_into_cells_by_their_volume(wavy_sea, shift):
     """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included."""
@@ -335,6 +344,7 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     assert np.array(1 / patch.area).mean() * (2 * half) ** 2 < 0.9 * touched
 
 
+@pytest.mark.slow
 def test_narrow_view_in_a_wide_beam_draws_light_where_it_looks(lidar_scene, passes):
     """A tenth of the beam's width in view: the same mean as photons drawn by the beam alone, with less noise."""
     scene = lidar_scene(
@@ -351,6 +361,7 @@ def test_narrow_view_in_a_wide_beam_draws_light_where_it_looks(lidar_scene, pass
     assert energy.std() < 0.7 * plain.std()
 
 
+@pytest.mark.slow
 def test_crowded_passes_make_room_and_lose_nothing(lidar_scene, passes):
     """Room for a tenth of what is needed: the pass is repeated with more, and gives the same bits."""
     scene = lidar_scene(integrator={**MERGING, "paths_per_pass": 2**14, "photons_per_pass": 2**14})
@@ -382,6 +393,7 @@ def test_levels_of_one_mesh_are_distinguished(lidar_scene, two_levels):
     assert [shape.id() for shape in solids_of_several_levels(lidar, region)] == ["levels"]
 
 
+@pytest.mark.slow
 def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, two_levels):
     """Light on the bottom under the plate would be seen on the plate, and late: 28 ns after the plate's echo."""
     water = {"attenuation": 0.1, "scattering": 0.05, "backscattering": 0.002}

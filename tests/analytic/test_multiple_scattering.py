@@ -16,6 +16,8 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
 from mitransient_lidar.physics.water.phase import henyey_greenstein
 
+pytestmark = pytest.mark.slow
+
 HEIGHT, G = 200.0, 0.9
 HALF_VIEW = 0.05  # tangent of the field of view's half angle: 10 m on the surface
 #: The surface echo, across 1.7 ns, falls into the first gate, which is left out.

@@ -8,6 +8,8 @@ import mitransient_lidar
 from mitransient_lidar.studies.scattering_orders import scattering_orders, shares
 from mitransient_lidar.transport.path_classes import PathClasses
 
+pytestmark = pytest.mark.slow
+
 PARAMS = {"bin_width_ns": 2, "bin_count": 75, "surface_size": 200}
 
 

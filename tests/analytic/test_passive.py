@@ -72,6 +72,7 @@ def agrees(samples, expected, comparisons=1, bias=0.0):
 # (a) a white plate just below the surface
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("zenith", "off_nadir", "rho"), [(0.0, 15.0, 0.9), (60.0, 0.0, 0.5), (40.0, 35.0, 0.9)])
 def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
     """E cos(theta) T(theta) rho / pi, raised by what the sea's underside returns, times T(view) / n^2.
@@ -87,6 +88,7 @@ def test_a_plate_just_below_the_surface(zenith, off_nadir, rho):
     assert error < 3e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sea", "layers", "lost"),
     [
@@ -159,6 +161,7 @@ def test_a_level_sea_mirrors_the_sky(view):
     assert agrees(passes(scene, 4), expected, 3, bias=1e-3) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_level_sea_mirrors_the_sky_where_it_is_seen():
     """The clear sky opposite to the view, near the sun's azimuth and away from it."""
     sky = {"distribution": "clear", "irradiance": 1.0, "sun_zenith_deg": 50.0}
@@ -180,6 +183,7 @@ def test_a_level_sea_mirrors_the_sky_where_it_is_seen():
 WATER = {"attenuation": 1.0, "scattering": 0.9, "backscattering": 0.9 * 0.0183}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("zenith", "view"), [(30.0, 0.0), (50.0, 25.0)])
 def test_light_scattered_once(zenith, view):
     """L = E T cos / mu_s b p / (c (1/mu_s + 1/mu_v) mu_v) T / n^2 of uniform water, with directions refracted by n."""
@@ -201,6 +205,7 @@ def test_light_scattered_once(zenith, view):
     assert agrees(passes(scene, 12), float(below * fresnel(seen, N)[1] / N**2), 2, bias=6e-3) < 5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("albedo", "hydrolight", "monte_carlo"), [(0.9, 8.1159e-3, 8.049e-3), (0.6, 1.1462e-3, 1.1533e-3)]
 )
@@ -218,6 +223,7 @@ def test_deep_water_under_an_even_sky(albedo, hydrolight, monte_carlo):
     agrees(leaving, 0.5 * (hydrolight + monte_carlo), 2, bias=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zenith", "azimuth", "view", "coefficients", "spread"),
     [
@@ -269,6 +275,7 @@ def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, v
     assert agrees(leaving, float(expected), 12, bias=spread) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phase", "albedo", "expected", "spread"),
     [
@@ -305,6 +312,7 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
 # (e) waves focus the sun
 
 
+@pytest.mark.slow
 def test_a_sinusoidal_sea_focuses_the_sun(tmp_path):
     """Light on plates at five depths, seen through still water, against rays traced here.
 
@@ -381,6 +389,7 @@ def ray_contrast(depth, amplitude, k, sun, ripple, resolved):
     return light.std() / light.mean()
 
 
+@pytest.mark.slow
 def test_a_wind_sea_focuses_the_sun_most_some_metres_down(tmp_path):
     """Contrast of light on plates below a sea at 5 m/s, lit through its waves and seen through still water.
 

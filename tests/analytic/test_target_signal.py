@@ -7,6 +7,8 @@ import pytest
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.target_signal import describe_map, describe_target, target_map, target_signal
 
+pytestmark = pytest.mark.slow
+
 NEAR = {"surface_size": 200, "bin_count": 170}
 SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 

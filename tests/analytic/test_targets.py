@@ -97,6 +97,7 @@ def test_quadrature_agrees_with_the_closed_form_of_the_bottom():
     assert energy == pytest.approx(echo_energies(LIDAR, SIGMA, column, 0.0, 8.0, 0.3, (1e-5, 1e-5)).bottom, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_plate_that_fills_the_beam_is_a_bottom(lidar_scene, passes, integrator):
     column = WaterColumn.from_text(0, ABSORPTION, 0, 0)
@@ -111,6 +112,7 @@ def test_plate_that_fills_the_beam_is_a_bottom(lidar_scene, passes, integrator):
     assert abs(mean - expected) < largest_z(24) * error + 1e-3 * expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_sphere_in_clear_water(lidar_scene, passes, integrator):
     """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
@@ -132,6 +134,7 @@ def test_sphere_in_clear_water(lidar_scene, passes, integrator):
     assert abs(arrival.mean() - np.sum(time * energy) / energy.sum()) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
     """Straight back: reflectance over 2 pi sigma^2 per steradian, 170 times a Lambertian plate."""
@@ -180,6 +183,7 @@ CASES["cube"]["target"]["to_world"] = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_integrators_agree(lidar_scene, passes, case):
     """Four pixels in bins of 10 ns, and all together."""
@@ -221,6 +225,7 @@ def echo_of_target(passes):
     return measure
 
 
+@pytest.mark.slow
 def test_figure_13_near_pixels_hold_the_target(echo_of_target):
     echo, _ = echo_of_target("fig13_2x2")
     mean, error = mean_and_error(echo)
@@ -229,6 +234,7 @@ def test_figure_13_near_pixels_hold_the_target(echo_of_target):
     assert mean[2:].min() > 5 * mean[:2].max()
 
 
+@pytest.mark.slow
 def test_figure_14_black_is_nearly_as_strong_as_blue_in_less_backscatter(echo_of_target):
     echo, water = echo_of_target("fig14_1x4")
     mean, error = mean_and_error(echo)
@@ -243,6 +249,7 @@ def test_figure_14_black_is_nearly_as_strong_as_blue_in_less_backscatter(echo_of
     assert 0.75 - 2 * ratio_error < ratio < 1.25 + 2 * ratio_error
 
 
+@pytest.mark.slow
 def test_mine_echoes_at_its_depth_and_casts_a_shadow(passes):
     """Echo from 8.5 m, the top of the sphere, on the axis; of the bottom at 12 m a part is in its shadow."""
     bins = {"time_start_ns": 1490.0, "bin_width_ns": 2.0, "bin_count": 30}
@@ -260,6 +267,7 @@ def test_mine_echoes_at_its_depth_and_casts_a_shadow(passes):
     assert shadow.std(ddof=1) / np.sqrt(12) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_shading_normals_decide_what_a_plate_receives(lidar_scene, passes, integrator, tmp_path):
     """A level plate with shading normals 40 degrees from the vertical: what it sends back goes with their cosine.

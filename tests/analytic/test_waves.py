@@ -9,6 +9,8 @@ from oracles.two_scale import two_scale_ratio
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
+pytestmark = pytest.mark.slow
+
 #: So high that one shot takes in a patch of 40 m: the mean over seas needs fewer of them.
 HEIGHT = 2000.0
 SEAS = 10

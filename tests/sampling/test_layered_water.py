@@ -46,6 +46,7 @@ def assert_same_light(first, second):
     assert np.mean(np.isclose(first, second, rtol=1e-4)) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "phase"),
     [
@@ -61,6 +62,7 @@ def test_volpath_sees_homogeneous_water_as_mitsubas_medium(change, phase):
     assert_same_light(radiance({"type": "layered_water", **WATER, **change}), radiance(reference))
 
 
+@pytest.mark.slow
 def test_volpath_sees_layers_as_mitsubas_grid():
     """Depth counts downwards from z = 0: layers upside down would double the light."""
 
@@ -99,6 +101,7 @@ def single_scattering(lidar_scene, passes, water):
 BLEND = {"type": "blendphase", "weight": 0.3, "phase_0": {"type": "hg", "g": 0.5}, "phase_1": {"type": "rayleigh"}}
 
 
+@pytest.mark.slow
 def test_every_layer_scatters_by_its_own_phase_function(lidar_scene, passes):
     """Henyey-Greenstein above, a blend with Rayleigh below: 0.0177 and 0.048 /sr backwards; one for all would show."""
     above, below = {"type": "hg", "g": 0.5}, BLEND
@@ -110,6 +113,7 @@ def test_every_layer_scatters_by_its_own_phase_function(lidar_scene, passes):
         assert abs(layered[:, gate].mean() - whole.mean()) < 4 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "phase", [{"type": "rayleigh"}, BLEND, {"type": "isotropic"}, {"type": "two_term_henyey_greenstein"}]
 )
@@ -130,6 +134,7 @@ def test_column_follows_the_phase_function_at_180_degrees(lidar_scene, passes, p
     assert np.all(np.abs(ratio / (backward * 4 * np.pi * 1.5**2 / 0.5) - 1) < 4 * error)
 
 
+@pytest.mark.slow
 def test_profile_file_is_its_layers(lidar_scene, passes, tmp_path):
     """Two nodes of one water: the same bits as that water; a gradient: the energies of many thin layers by hand."""
     path = tmp_path / "even.csv"

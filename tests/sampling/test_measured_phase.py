@@ -46,6 +46,7 @@ def test_samples_and_values_are_those_of_the_function_in_the_table(table, caplog
     np.testing.assert_allclose(np.array(value)[0], np.array(density))
 
 
+@pytest.mark.slow
 def test_water_takes_it(table, lidar_scene, passes):
     """The same scene with Mitsuba's hg: mean energies agree."""
     film = {"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 4}

@@ -89,6 +89,7 @@ def test_ripples_lie_along_the_wind(direction):
     assert np.all(np.abs((angle - direction + 180) % 360 - 180) < 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [0.0, 30.0, 90.0])
 @pytest.mark.parametrize("wind", [3.0, 6.0])
 def test_facet_slopes_have_the_stated_variance_along_and_across_the_wind(wind, direction):
@@ -144,6 +145,7 @@ def heights_by_position(shape):
     return {(round(4 * x), round(4 * y)): z for x, y, z in vertices}
 
 
+@pytest.mark.slow
 def test_the_sea_is_the_same_wherever_the_patch_lies():
     """Sea of 64 m period: patches 20 m apart agree where they overlap, and a whole period apart everywhere."""
     here, there, far = (
@@ -189,6 +191,7 @@ def test_far_rays_meet_the_sea_from_above_and_below():
             assert met[np.abs(points[:, 0]) < 380].mean() > 1 - 5e-5
 
 
+@pytest.mark.slow
 def test_cells_are_chosen_by_footprint_and_range():
     """A quarter of the beam's standard deviation: 1.06 m at 200 m and 20 degrees."""
     lidar = {"altitude": 200.0, "off_nadir_deg": 20.0, "divergence_mrad": 10.0, "field_of_view_mrad": 30.0}
@@ -242,6 +245,7 @@ def test_time_moves_the_sea_downwind():
     assert 1.0 < moved < 2.2
 
 
+@pytest.mark.slow
 def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
     """The sea written to a PLY file and read by Mitsuba's plugin: the same paths, the same energies."""
     sea = {

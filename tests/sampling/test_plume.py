@@ -55,6 +55,7 @@ def test_flight_inverts_the_optical_depth():
     assert ends.sum() > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
 def test_plume_that_fills_the_water_is_water_that_scatters_more(lidar_scene, passes, integrator):
     """Half of the scattering from bubbles: mean energies by gate agree with all of it from the water."""
@@ -77,6 +78,7 @@ def test_plume_that_fills_the_water_is_water_that_scatters_more(lidar_scene, pas
     assert np.all(error[:4] < 0.02 * mean[1][:4])
 
 
+@pytest.mark.slow
 def test_bubbles_brighten_the_water_that_they_fill_and_darken_the_bottom(lidar_scene, passes):
     """A plume across the beam, 2 m deep: more backscatter down to 2 m (18.5 ns), less light from below."""
     engine = {"type": "lidar_merging"}

@@ -93,6 +93,7 @@ def test_functions_without_a_common_table_are_called_by_pointer():
     np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_layers_with_many_ratios_share_functions_within_two_percent():
     ratios = np.geomspace(0.005, 0.05, 500)
     text = ", ".join(f"{0.15 * ratio:.8f}" for ratio in ratios)

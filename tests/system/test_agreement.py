@@ -7,6 +7,8 @@ import mitransient_lidar
 from mitransient_lidar.analysis import comparison
 from mitransient_lidar.loading import catalogue
 
+pytestmark = pytest.mark.slow
+
 #: Parameters that say what is recorded, not what is there.
 RECORD = {"time_start_ns", "bin_width_ns", "bin_count"}
 

@@ -13,6 +13,8 @@ from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.studies.detection import describe_detection, detect
 
+pytestmark = pytest.mark.slow
+
 NEAR = {"surface_size": 60, "time_start_ns": 1410, "bin_count": 120}
 FEW = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 OPTIONS = {"renders": 3, "shots": 2000, "integrator": FEW}

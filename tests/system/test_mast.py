@@ -10,6 +10,8 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import scenes
 
+pytestmark = pytest.mark.slow
+
 GRAZING = math.radians(5.4)
 IN_WATER = math.asin(math.cos(GRAZING) / 1.34)
 

@@ -28,6 +28,7 @@ def wheel(tmp_path_factory):
     return set(zipfile.ZipFile(path).namelist())
 
 
+@pytest.mark.slow
 def test_wheel_holds_every_module_plugin_scene_and_data_file(wheel):
     expected = set()
     for folder, package in (("mitransient_lidar", ""), ("plugins", "plugins/"), ("scenes", "scenes/")):
@@ -46,6 +47,7 @@ def test_every_plugin_file_is_registered():
     assert {".".join(file.parts) for file in files if file.name != "__init__"} == set(variants._PLUGIN_MODULES)
 
 
+@pytest.mark.slow
 def test_import_loads_nothing_heavy():
     """Import stays under a second because these load when they are needed."""
     heavy = "('xarray', 'pandas', 'matplotlib', 'scipy', 'h5py')"

@@ -9,6 +9,8 @@ from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.studies import find_shots
 from mitransient_lidar.studies.shot_statistics import highest_points
 
+pytestmark = pytest.mark.slow
+
 #: Depth that a nanosecond stands for on the depth axis, at 20 degrees and index 1.34.
 METRES_PER_NS = 1e-9 * C0 / (2 * 1.34) * np.sqrt(1 - (np.sin(np.radians(20)) / 1.34) ** 2)
 

@@ -30,6 +30,7 @@ def small(scene="table1", **options):
     return mitransient_lidar.render(scene, integrator=SMALL, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", catalogue.scene_names())
 def test_every_shipped_scene_renders_and_its_files_read_back(name, tmp_path):
     # Files of images in full are a matter of the gates' tests.
@@ -83,6 +84,7 @@ def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(p
     assert parameters["layer_tops"] == "0, 3"
 
 
+@pytest.mark.slow
 def test_result_says_how_it_was_made():
     shot = small(params={"wind_speed": 4.5}, seed=11)
     assert shot.attrs["scene.wind_speed"] == "4.5"
@@ -94,12 +96,14 @@ def test_result_says_how_it_was_made():
     assert shot.attrs["surface_time_ns"] == pytest.approx(1419.886, abs=1.0)
 
 
+@pytest.mark.slow
 def test_same_seed_same_result_other_seed_another():
     first, again, other = small(seed=3), small(seed=3), small(seed=4)
     np.testing.assert_allclose(first.impulse_response, again.impulse_response, rtol=1e-10)
     assert not np.allclose(first.impulse_response, other.impulse_response, rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_dict_and_loaded_scenes_render_like_the_file():
     scene, _, _ = loading.load_scene("table1")
     from_file, loaded = small(seed=2), small(scene, seed=2)
@@ -108,18 +112,21 @@ def test_dict_and_loaded_scenes_render_like_the_file():
         small(scene, params={"wind_speed": 1})
 
 
+@pytest.mark.slow
 def test_plain_mitsuba_renders_the_scene():
     energy = np.array(mi.render(mi.load_file(str(catalogue.scene_path("table1"))), spp=2**12, seed=1))
     assert energy.shape == (4, 150)
     assert 3e-12 < energy.sum() < 7e-12  # closed forms of PHYSICS G bracket it: 2.1e-12 (K = c) to 5.4e-12 J
 
 
+@pytest.mark.slow
 def test_imager_keeps_rows_and_columns():
     shot = small(params={"layout": "6x5", "bin_width_ns": 10, "bin_count": 15})
     assert shot.waveform.dims == ("row", "column", "time")
     assert shot.waveform.shape == (6, 5, 15)
 
 
+@pytest.mark.slow
 def test_stops_at_the_target_and_reports_progress():
     reports = []
     shot = mitransient_lidar.render("table1", target_error=0.2, max_time=60, progress=reports.append)
@@ -129,6 +136,7 @@ def test_stops_at_the_target_and_reports_progress():
     assert reports[-1].target_error == 0.2
 
 
+@pytest.mark.slow
 def test_max_time_ends_the_passes():
     start = time.perf_counter()
     shot = mitransient_lidar.render("table1", max_time=0.5)
@@ -136,6 +144,7 @@ def test_max_time_ends_the_passes():
     assert time.perf_counter() - start < 30
 
 
+@pytest.mark.slow
 def test_interruption_keeps_what_was_rendered():
     def stop(progress):
         if progress.done == 4:
@@ -207,6 +216,7 @@ app.main()
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_command_line_writes_the_files(tmp_path):
     command = [sys.executable, "-c", INTERRUPTED_COMMAND, "render", "table1", "--passes", "100000", "-o", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -241,8 +251,8 @@ def test_error_window_leaves_out_dark_pixels_and_counts_empty_bins_as_infinite()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("integrator", "fastest"), [("lidar_volpath", 8), ("lidar_merging", 64)])
-def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, fastest):
+@pytest.mark.parametrize(("integrator", "count", "fastest"), [("lidar_volpath", 8, 8), ("lidar_merging", 3, 64)])
+def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, count, fastest):
     """Logarithm of the ratio of variances, averaged over gates of late light, with its jackknife error.
 
     Merging counts pairs of a photon and a point, of which there are 64 times as many: where pairs are rare, its
@@ -255,14 +265,13 @@ def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, fastest):
         scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
         renderer = engine.prepare(scene, scene.sensors()[0])
         # Late light only: surface echo and early column are stratified and fall faster.
-        energy = np.array([renderer.render_pass(seed).histogram.energy()[:, 60:140] for seed in range(8 * groups)])
-        gates = energy.reshape(groups, 8, 32, 10).sum(axis=-1)
+        energy = np.array([renderer.render_pass(seed).histogram.energy()[:, 60:140] for seed in range(count * groups)])
+        gates = energy.reshape(groups, count, 32, 10).sum(axis=-1)
         left_out = [np.delete(gates, group, axis=0).reshape(-1, 32) for group in range(groups)]
         variances.append([sample.var(axis=0, ddof=1) for sample in left_out])
     ratios = np.log(np.divide(*variances)).mean(axis=1)
     error = np.sqrt((groups - 1) * ratios.var())
-    print("RATIO", np.exp(ratios.mean()), error)
-    assert error < 0.06
+    assert error < 0.12
     limit = largest_z(groups) * error
     assert np.log(8) - limit < ratios.mean() < np.log(fastest) + limit
 
@@ -341,6 +350,7 @@ def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     assert "shape 'pile' rises through the sea surface" in caplog.text
 
 
+@pytest.mark.slow
 def test_small_patch_warns_of_the_light_that_it_loses(caplog):
     small(params={"surface_size": 4, "surface_cell_size": 0.25})
     assert "smaller than the footprint" in caplog.text
@@ -355,6 +365,7 @@ def test_small_patch_warns_of_the_light_that_it_loses(caplog):
     assert caplog.text == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
 def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, integrator):
     """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %."""
@@ -384,6 +395,7 @@ def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lid
     assert lost / (lost + received) == pytest.approx(missing.mean(), abs=0.25 * missing.mean() + 4 * error)
 
 
+@pytest.mark.slow
 def test_target_below_the_bottom_is_refused():
     with pytest.raises(UserError, match="shape 'target' lies below the bottom 'bottom', up to z = -13 m"):
         rendering.render("fig13_2x2", params={"target_depth": 13}, passes=2)

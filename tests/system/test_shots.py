@@ -14,6 +14,8 @@ from mitransient_lidar.plots.find_shots import plot_found_shots
 from mitransient_lidar.studies import find_shots as shots
 from mitransient_lidar.studies import shot_statistics
 
+pytestmark = pytest.mark.slow
+
 WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}
 
 

@@ -19,6 +19,8 @@ from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.results.geometry import LidarGeometry
 from mitransient_lidar.studies import shot_series
 
+pytestmark = pytest.mark.slow
+
 TILTS = ((-0.15, 0.0), (-0.075, 0.07), (0.0, 0.0), (0.075, -0.07), (0.15, 0.0))
 
 

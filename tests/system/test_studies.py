@@ -14,6 +14,7 @@ def texts(plot):
     return set(re.findall(r"<!-- (.*?) -->", plot.read_text(encoding="utf-8")))
 
 
+@pytest.mark.slow
 def test_orders(tmp_path):
     plot = tmp_path / "new" / "orders.svg"
     done = run("scattering-orders", "fig09_2x2", *NEAR, "--orders", 3, "--passes", 2, "-o", plot, "-q")
@@ -27,6 +28,7 @@ def test_orders(tmp_path):
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
 
 
+@pytest.mark.slow
 def test_target(tmp_path):
     plot = tmp_path / "target.svg"
     done = run("target-signal", "fig13_2x2", *NEAR, "--passes", 16, "-o", plot, "-q")
@@ -35,6 +37,7 @@ def test_target(tmp_path):
     assert texts(plot) >= {"red", "green", "blue", "black", "without the target", "signal of the target (µW)"}
 
 
+@pytest.mark.slow
 def test_target_on_a_grid(tmp_path):
     plot = tmp_path / "map.svg"
     done = run("target-signal", "fig13_2x2", *NEAR, "--passes", 16, "--grid", 2, "--max-offset", 1, "-o", plot, "-q")

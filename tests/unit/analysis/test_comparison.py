@@ -28,6 +28,7 @@ def result(seed, passes=6, factor=1.0, relative=0.05, bins=100, **attributes):
     )
 
 
+@pytest.mark.slow
 def test_false_alarm_rate_of_differences():
     """Over 400 pairs of few passes: taken for normal, Student's t would exceed the limit in a third of them."""
     pairs = [comparison.compare(result(2 * seed), result(2 * seed + 1)) for seed in range(400)]
@@ -82,6 +83,7 @@ def test_results_that_cannot_be_compared_are_rejected():
         comparison.compare(unknown, result(2))
 
 
+@pytest.mark.slow
 def test_command_draws_and_answers(tmp_path):
     for name, factor, seed in (("a", 1.0, 1), ("b", 1.0, 2), ("c", 1.2, 3)):
         results.save(result(seed, factor=factor), tmp_path / f"{name}.nc")

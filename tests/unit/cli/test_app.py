@@ -80,6 +80,7 @@ def test_a_scene_without_gates_has_none_to_show(scene, calls, tmp_path, kind):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
     out = tmp_path / "new" / "folder"
     result = run("render", scene, "-o", out, "-D", "wind_speed=3", "-D", "file=a=b", "--passes", 4, "--seed", 7)
@@ -115,6 +116,7 @@ def test_render_quiet_without_plot(scene, calls, tmp_path):
     assert calls.seen[0][1]["max_time"] == 5.0
 
 
+@pytest.mark.slow
 def test_interrupted_render_is_kept(scene, calls, tmp_path):
     calls.extra["interrupted"] = 1
     result = run("render", scene, "-o", tmp_path, "--quiet")
@@ -177,6 +179,7 @@ def test_bug_is_not_taken_for_a_mistake(scene, calls, tmp_path):
     assert not isinstance(result.exception, UserError)
 
 
+@pytest.mark.slow
 def test_plot(scene, calls, tmp_path):
     run("render", scene, "-o", tmp_path, "--no-plot", "--quiet")
     result = run("plot", tmp_path / "fig09.exr")
@@ -202,6 +205,7 @@ def test_scenes(scene, tmp_path):
     assert_refused(run("scenes", "copy", "fig09", tmp_path), "exists already")
 
 
+@pytest.mark.slow
 def test_water(tmp_path):
     plain = run("water", "secchi", 6)
     assert plain.exit_code == 0, plain.output
@@ -233,6 +237,7 @@ def test_version_and_help():
     assert "render" in run("--help").stdout
 
 
+@pytest.mark.slow
 def test_command_line_imports_nothing_slow():
     code = (
         "import sys, mitransient_lidar; before = set(sys.modules); import mitransient_lidar.cli.app;"

@@ -48,6 +48,7 @@ def run(*arguments):
     return command_line.run("gates", *arguments)
 
 
+@pytest.mark.slow
 def test_files_beside_the_result(stored):
     path, dataset = stored
     result = run(path, *TRAIN)
@@ -63,6 +64,7 @@ def test_files_beside_the_result(stored):
     np.testing.assert_allclose(stack["gate_energy"][:, :, 0], expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
     path, _ = stored
     folder = tmp_path / "new" / "folder"
@@ -83,6 +85,7 @@ def test_gates_from_a_depth(stored):
     np.testing.assert_allclose(np.diff(stack["gate_start"]), 2)
 
 
+@pytest.mark.slow
 def test_few_gates_have_no_depths(stored):
     path, _ = stored
     result = run(path, "--start-ns", 1412, "--width-ns", 10, "--count", 2)
@@ -124,6 +127,7 @@ def test_missing_files(tmp_path):
     assert "cannot read" in result.stderr
 
 
+@pytest.mark.slow
 def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
     path, _ = stored
     assert run(path, *TRAIN, "--no-plot").exit_code == 0

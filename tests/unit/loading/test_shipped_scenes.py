@@ -135,6 +135,7 @@ def test_text_equals_the_file_with_its_includes(name):
     assert text.count("<default") == len(catalogue.scene_parameters(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OWN)
 def test_copy_loads_to_the_same_scene(name, tmp_path):
     image = {"layout": "2x2", "surface_cell_size": "0.5"} if OWN[name].get("layout") == "128x128" else {}

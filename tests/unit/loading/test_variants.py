@@ -71,6 +71,7 @@ def test_importing_without_a_usable_llvm_is_a_readable_error(tmp_path):
         assert "is not a file: install LLVM" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_users_own_llvm_wins():
     llvm = os.environ.get("DRJIT_LIBLLVM_PATH")
     assert llvm, "importing the package sets the path where the wheel is installed"

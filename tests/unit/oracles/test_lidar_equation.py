@@ -111,6 +111,7 @@ def edges():
     return T_SURFACE - 30.025 + 0.05 * np.arange(3001)
 
 
+@pytest.mark.slow
 def test_bins_add_up_to_the_echoes(edges):
     total = echo_energies(SYSTEM, SIGMA, WATER, P_BACK, 8, 0.1, SLOPES, square)
     binned = (

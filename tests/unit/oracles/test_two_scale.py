@@ -7,6 +7,7 @@ from oracles.two_scale import two_scale_ratio
 FACETS, RIPPLES = (0.012, 0.007), (0.008, 0.0075)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("azimuth", [0.0, 1.1, 3.0])
 @pytest.mark.parametrize("theta", [0.0, 0.18, 0.35])
 def test_ratio_against_normals_drawn_at_random(theta, azimuth):

@@ -107,6 +107,7 @@ def test_results_without_outlines_are_dots_and_the_field_of_view():
     assert figure.axes[0].lines[0].get_xdata().max() == pytest.approx(3.2, abs=0.05)
 
 
+@pytest.mark.slow
 def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     attributes = described(lidar_scene(extra={"ball": {"type": "sphere", "center": [0, 0, -6], "radius": 0.5}}))
     drawn = []
@@ -118,6 +119,7 @@ def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     assert drawn[0] == drawn[1]
 
 
+@pytest.mark.slow
 def test_long_texts_are_left_out(lidar_scene, tmp_path):
     """256 pixels of a circle have outlines that NetCDF could not keep together with other attributes."""
     attributes = described(lidar_scene(rx={"layout": "16x16", "imager": False}))

@@ -97,6 +97,7 @@ def test_phase_functions_of_layers_cover_the_range_and_are_marked():
     assert np.all(np.diff([line.get_ydata()[-1] for line in by_ratio]) > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("b", [[0, 0, 0, 0], [0.1, 0, 0, 0.2]])
 def test_water_without_scattering_is_drawn(tmp_path, b):
     profile = Profile(DEPTH, A, b, [0.02 * value for value in b])
@@ -114,6 +115,7 @@ def test_vacuum_is_drawn(tmp_path):
     assert all(not line.get_xdata().any() for line in left.lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
 def test_files_are_complete_and_no_others_are_left(tmp_path, suffix):
     path = tmp_path / f"a.{suffix}"

@@ -76,6 +76,7 @@ def test_pixels_are_red_green_blue_black_with_bands_of_one_standard_error():
     assert band.max() == pytest.approx(axes.lines[3].get_ydata().max() * 1.01, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_depth_axis():
     figure = waveforms.plot_waveforms(make())
     axes = figure.axes[0]
@@ -124,6 +125,7 @@ def test_imager_shows_energy_with_the_far_row_on_top_and_the_summed_waveform():
     assert image.get_array()[0, 0] == pytest.approx(2.1e-5 * 3e-9 * math.sqrt(math.pi) / 1e-15, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [1, 3, 4, 11, 40])
 def test_missing_attributes_leave_out_what_needs_them(pixels, tmp_path):
     dataset = make(pixels)
@@ -133,6 +135,7 @@ def test_missing_attributes_leave_out_what_needs_them(pixels, tmp_path):
     assert figure.axes[0].get_xlim() == (1404.75, 1555.25) or figure.axes[0].get_xlim() == (1405.0, 1555.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.0, np.nan, -1.0])
 def test_signals_without_positive_values_are_drawn(level, tmp_path):
     linear, log = waveforms.plot_waveforms(make(2, scale=level), tmp_path / "a.png").axes[:2]
@@ -144,6 +147,7 @@ def test_signals_without_positive_values_are_drawn(level, tmp_path):
     np.testing.assert_allclose(linear.lines[1].get_ydata(), 2 * linear.lines[0].get_ydata())
 
 
+@pytest.mark.slow
 def test_odd_names_are_plain_text(tmp_path):
     dataset = make(2).assign_coords(pixel=["$x", "_å\\"])
     dataset.attrs["scene"] = "a$b_{"
@@ -153,6 +157,7 @@ def test_odd_names_are_plain_text(tmp_path):
     assert figure.get_suptitle() == "a$b_{  ·  median standard error 0.98 %"
 
 
+@pytest.mark.slow
 def test_png_is_complete_or_absent(tmp_path):
     waveforms.plot_waveforms(make(), tmp_path / "a.png")
     data = (tmp_path / "a.png").read_bytes()

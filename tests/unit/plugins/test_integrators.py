@@ -20,6 +20,7 @@ def scene_with(lidar_scene, name, depth=8.0):
     return lidar_scene(integrator={"type": name, **INTEGRATORS[name]}, bottom=depth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
     """A bottom moved from 8 m to 6 m gives the energies of a scene that was built with it at 6 m, in every bit."""
@@ -53,6 +54,7 @@ def living():
     return sum(isinstance(one, LidarScene | DaylightScene) for one in gc.get_objects())
 
 
+@pytest.mark.slow
 def test_refused_and_finished_renders_keep_no_scene():
     """Scenes that stay in memory are part of every later kernel."""
     before = living()

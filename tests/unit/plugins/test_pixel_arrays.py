@@ -59,6 +59,7 @@ class OnePixel:
         return mi.UInt32(0), self._pixels.pixel_at(angle_x, angle_y, u)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "receiver", [{"layout": "hex37"}, {"layout": "hex7", "fill_factor": 0.5}, {"layout": "3x5", "fill_factor": 0.5}]
 )
@@ -75,6 +76,7 @@ def test_pixels_of_a_layout_share_its_light_without_loss(receiver, lidar_scene, 
     assert np.count_nonzero(together) == together.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["2x2", "4x1", "8x8"])
 def test_cells_sum_to_the_whole_square(layout, lidar_scene, passes):
     whole = passes(lidar_scene(rx={**SQUARE, "layout": "1x1"}, **BRIGHT), 2)
@@ -82,6 +84,7 @@ def test_cells_sum_to_the_whole_square(layout, lidar_scene, passes):
     np.testing.assert_allclose(parts.sum(axis=1), whole[:, 0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_labels_sum_to_the_map_with_one_label(png, lidar_scene, passes):
     labels = np.random.default_rng(2).integers(0, 6, (9, 12)).astype(np.uint8)
     maps = [png(labels, "parts.png"), png((labels > 0).astype(np.uint8), "whole.png")]
@@ -90,6 +93,7 @@ def test_labels_sum_to_the_map_with_one_label(png, lidar_scene, passes):
     np.testing.assert_allclose(parts.sum(axis=1), whole[:, 0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
     """Seven hexagons of side s: 18 corners."""
     side = 10.0 / np.sqrt(7)
@@ -107,6 +111,7 @@ def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
     assert_alike(passes(hexagons, 12).sum(axis=1), passes(outline, 12, 50).sum(axis=1))
 
 
+@pytest.mark.slow
 def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
     """With gaps, away from the centre: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
     layout = lidar_scene(rx={**SQUARE, "layout": "4x3", "fill_factor": 0.64}, **MERGING)
@@ -118,6 +123,7 @@ def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
     assert_alike(passes(layout, 12)[:, 5], passes(alone, 12, 50)[:, 0])
 
 
+@pytest.mark.slow
 def test_a_nested_pixel_sees_the_same_alone_and_among_others(lidar_scene, passes):
     """Others overlap it, contain it, or are far away."""
     ring = {"type": "pixel_fov", "shape": "ring", "field_of_view_mrad": 16.0, "inner_mrad": 8.0, "pixel_name": "ring"}
@@ -164,6 +170,7 @@ MAPS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("values", "name", "message"), MAPS)
 def test_images_that_are_no_maps_are_refused(png, values, name, message):
     assert message in refused({"pixel_map": png(values, name)})
@@ -192,6 +199,7 @@ def test_numbers_of_hexagons(rings):
     assert hexagon_count(f"hex{1 + 3 * rings * (rings + 1)}") == 1 + sum(6 * ring for ring in range(rings + 1))
 
 
+@pytest.mark.slow
 def test_the_largest_arrays_load():
     """590 rings; the next one would be above 2^20 pixels."""
     pixels = mi.load_dict({"type": "multipixel_receiver", "layout": "hex1046071"}).receiver.pixels

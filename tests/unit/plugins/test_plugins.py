@@ -304,6 +304,7 @@ def test_other_integrators_see_the_layers():
     np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_pixel_alone_is_a_receiver():
     alone = scene(rx={**CIRCLE, "film": {"type": "time_gated_film"}}, integrator={"type": "lidar_volpath"})
     energy = np.array(mi.render(alone, seed=1, spp=2**14))

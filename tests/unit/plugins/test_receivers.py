@@ -134,6 +134,7 @@ def test_stratified_points_are_uniform_in_their_strata():
         assert kstest(coordinate, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_imager_rows_go_from_far_to_near_and_columns_from_right_to_left(lidar_scene, passes):
     """A beam aimed 1.5 m towards +y, as seen 200 m away, lights the columns of +angle_y, near rows first."""
     scene = lidar_scene(

@@ -50,6 +50,7 @@ def test_bowl_rises_with_the_square_of_the_distance_and_ends_with_the_fine_squar
     np.testing.assert_allclose(mound, -8 - 0.02 * 9, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_ripples_have_their_height_length_and_bearing():
     shape = load(ripple_height=0.1, ripple_length=0.5, ripple_bearing_deg=90.0)
     y = np.arange(-2, 2, 0.0625)
@@ -76,6 +77,7 @@ def test_height_map_about_the_sea_level(tmp_path):
     np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 2.0])[0], -7.25)
 
 
+@pytest.mark.slow
 def test_patches_have_their_reflectance_and_area():
     shape = load(patches="0 0 1 0.4; 3, -1, 0.5, 0; 0.5 0 0.3 0.9", reflectance=0.2)
     _, reflectance, _ = look_down(shape, [-0.5, 0.5, 3.0, 5.0, 0.0], [0.0, 0.0, -1.0, 5.0, 1.2])
@@ -140,6 +142,7 @@ def test_invalid_parameters_are_named(parameters, message):
         load(**parameters)
 
 
+@pytest.mark.slow
 def test_bottom_that_rises_through_the_sea_is_refused_only_where_the_receiver_looks(lidar_scene):
     def render(depth):
         seabed = {"type": "seabed", "id": "bottom", "depth": depth, "slope_x_deg": 15.0}

@@ -77,6 +77,7 @@ def test_ratio_statistics():
     assert nothing.relative_errors() == pytest.approx([0.0])
 
 
+@pytest.mark.slow
 def test_non_finite_radiance_is_kept_and_reported(monkeypatch, caplog):
     """One pixel of sixteen receives a value that is not finite."""
     original = DaylightLight._add
@@ -102,6 +103,7 @@ def test_solid_angles():
     np.testing.assert_allclose(pixel_solid_angles(pixels), pixels.area / 7, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_still_picture():
     picture = render(filter_width_nm=2.0, passes=4)
     assert picture["radiance"].dims == ("row", "column")
@@ -124,6 +126,7 @@ def test_same_seed_same_picture_other_seed_another_one():
     assert np.all(first != other)
 
 
+@pytest.mark.slow
 def test_standard_errors_and_connections():
     """Both samplings and their combination have one mean, within the stated errors."""
     found = {}
@@ -137,6 +140,7 @@ def test_standard_errors_and_connections():
     assert error["mis"] < 0.02 * mean["mis"]
 
 
+@pytest.mark.slow
 def test_blur_leaves_the_mean_and_evens_the_edges():
     """A bright plate in the air on half of the view: blurred, its neighbours get light."""
     half = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 50, 1]).scale([50, 50, 1]),
@@ -152,6 +156,7 @@ def test_blur_leaves_the_mean_and_evens_the_edges():
     assert blurred[2] < 0.95 * sharp[2]
 
 
+@pytest.mark.slow
 def test_frames_move_the_sea():
     pictures = render(frames=2, frame_step_s=0.5)
     assert pictures["radiance"].dims == ("frame", "row", "column")
@@ -183,6 +188,7 @@ def test_files(tmp_path):
         save_radiance(picture, tmp_path / "a.txt")
 
 
+@pytest.mark.slow
 def test_daylight_does_not_touch_the_laser():
     """The lidar integrators render a scene with sun and sky as they do without."""
     laser = {"tx": {"type": "lidar_transmitter"}, "integrator": {"type": "lidar_volpath", "paths_per_pass": 4096}}
@@ -197,6 +203,7 @@ def test_daylight_does_not_touch_the_laser():
     np.testing.assert_allclose(dark["radiance"], render(scene("2x2"))["radiance"], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_shipped_scene_by_the_command(tmp_path):
     assert "passive_sea" in catalogue.scene_names()
     small = ["-D", "layout=8x8", "-D", "surface_refined_size=8", "-D", "surface_cell_size=0.5"]

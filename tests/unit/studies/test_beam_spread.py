@@ -63,6 +63,7 @@ def test_scenes_that_are_refused():
         beam_spread(dry, 2.0, **QUICK)
 
 
+@pytest.mark.slow
 def test_only_what_is_wider_than_the_beam_is_a_bottom(lidar_scene):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([2, 0, -4]).scale(0.75)}
     scene = lidar_scene(bottom=None, extra={"target": plate})
@@ -114,6 +115,7 @@ def test_seed_decides(lidar_scene):
     assert first != pytest.approx(other, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off_nadir", [0.0, 30.0])
 def test_share_in_view(lidar_scene, off_nadir):
     # Receiver and laser at one point, no scattering, no ripples to speak of: at every depth the view holds of the
@@ -168,6 +170,7 @@ def dashed(figure):
     return sum(line.is_dashed() for ax in figure.axes for line in ax.get_lines())
 
 
+@pytest.mark.slow
 def test_figure(spread, tmp_path, lidar_scene):
     path = tmp_path / "spread.png"
     figure = plot_beam_spread(spread, path)
@@ -193,6 +196,7 @@ def test_figure(spread, tmp_path, lidar_scene):
         plot_beam_spread(spread, tmp_path / "spread.txt")
 
 
+@pytest.mark.slow
 def test_closed_form_is_drawn_for_no_other_water(lidar_scene):
     for water in (
         {"scattering": 0.0, "backscattering": 0.0},
@@ -203,6 +207,7 @@ def test_closed_form_is_drawn_for_no_other_water(lidar_scene):
         assert dashed(plot_beam_spread(beam_spread(lidar_scene(water=water), 5.0, **QUICK))) == 0
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     target = tmp_path / "new" / "spread.png"
     result = run(
@@ -219,6 +224,7 @@ def test_command(tmp_path):
     assert f"{100 * kept['in_view'].values[0]:.1f}" in lines[3]
 
 
+@pytest.mark.slow
 def test_quiet_command(tmp_path):
     result = run("beam-spread", "fig09_1x1", "--depths", "2", "--passes", 2, "-q", "-o", tmp_path / "s.svg")
     assert result.exit_code == 0, result.output

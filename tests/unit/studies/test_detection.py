@@ -113,6 +113,7 @@ def test_drawn_shots_have_the_expected_rates():
     assert np.all(np.abs(found["area"][1] - found["expected_area"][1]) < 0.03)
 
 
+@pytest.mark.slow
 def test_clutter_that_all_pixels_share_is_weighted_away():
     """Backscatter that differs by 20 % from sea to sea, alike in all pixels, hides the target from one pixel alone."""
     random = np.random.default_rng(2)
@@ -176,6 +177,7 @@ def test_table_lists_all(result):
     assert f"{100 * float(result['needed_target'][3]):.3g} (" in best
 
 
+@pytest.mark.slow
 def test_command_writes_and_prints(result, tmp_path, monkeypatch):
     asked = {}
     monkeypatch.setattr(detection, "detect", lambda scene, params, **options: asked.update(options) or result)
@@ -226,6 +228,7 @@ def test_figure_without_depths_and_with_infinite_values(result):
     assert {round(container.lines[0].get_xdata()[0]) for container in required.containers} == {0}
 
 
+@pytest.mark.slow
 def test_seas_and_depths_are_asked_for(monkeypatch):
     """Four other seas than the scene's, surface_seed 8, at its own depth of 8 m and at the one asked for."""
     asked = []

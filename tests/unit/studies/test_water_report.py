@@ -62,6 +62,7 @@ def test_every_kind_is_printed_and_can_be_rendered(arguments, wanted):
     assert options["group_index"] == pytest.approx(1.363796, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -121,6 +122,7 @@ def test_profile_is_described(station):
     assert count == read_profile(station).layers(0.05).count
 
 
+@pytest.mark.slow
 def test_profile_line_is_xml_for_a_medium(station):
     """The path in the XML is absolute and complete, with its spaces and signs, and valid in every folder."""
     done = run("water", "profile", str(station), "--tolerance", "0.05")
@@ -193,6 +195,7 @@ def test_every_kind_draws_its_function(monkeypatch, kind, value, label, share, a
     assert phase(np.radians(1.0)) == pytest.approx(at_1_degree, rel=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["jerlov", "II"], ["petzold", "turbid"], ["pure"], ["profile"]])
 def test_plots_are_written_and_their_paths_come_last(station, tmp_path, arguments):
     path = tmp_path / "a.png"

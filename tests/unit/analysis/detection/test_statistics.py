@@ -33,6 +33,7 @@ SAMPLED = ReceiverChain(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("chain", "gate", "scale"),
     [

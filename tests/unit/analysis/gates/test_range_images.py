@@ -125,6 +125,7 @@ def test_range_refuses_bad_input(arguments, options, message):
         range_from_gates(*arguments, **options)
 
 
+@pytest.mark.slow
 def test_range_of_a_large_image_is_fast():
     depth = np.random.default_rng(6).uniform(4, 12, (256, 256))
     energy = echoes(depth)

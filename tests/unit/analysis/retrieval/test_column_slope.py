@@ -101,6 +101,7 @@ def test_a_column_without_signal():
 SCENE = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 1e-4, "time_start_ns": 1330, "bin_count": 80}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fields", "options", "params", "message"),
     [
@@ -150,6 +151,7 @@ def test_command_says_one_sentence(tmp_path, arguments, message):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_command_writes_table_plot_and_file(tmp_path):
     target = tmp_path / "new" / "views.svg"
     define = [part for name, value in SCENE.items() for part in ("-D", f"{name}={value}")]
@@ -183,6 +185,7 @@ def test_command_writes_table_plot_and_file(tmp_path):
     assert "<!-- field of view (mrad) -->" in target.read_text()  # matplotlib adds texts as comments
 
 
+@pytest.mark.slow
 def test_a_small_surface_is_warned_of(caplog):
     turbid = {**SCENE, "off_nadir_deg": 20, "time_start_ns": 1400, "attenuation": 1, "scattering": 0.9}
     patch = {"surface_size": 4, "surface_cell_size": 0.25}

@@ -235,6 +235,7 @@ def test_no_estimate():
         retrieve.retrieve(result(np.full((4, BINS), 1e-12)))
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     results.save(result(), tmp_path / "shot.nc")
     written = tmp_path / "out" / "found.nc"

@@ -166,6 +166,7 @@ def test_shots_of_a_receiver_have_true_errors():
     assert float(energy.mean()) == pytest.approx(6e-13 * 1e5, rel=0.01)
 
 
+@pytest.mark.slow
 def test_signals_behind_a_logarithm_are_expanded():
     """Echoes of a tenth of the light have a tenth of the energy, as behind the same photomultiplier without logarithm.
 
@@ -364,6 +365,7 @@ def test_invalid_input(dataset, options, sentence):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_thousands_of_shots_take_seconds():
     """10 000 shots of 4 pixels and 512 bins must take less than 30 s with a receiver's simulation: a tenth of them."""
     clean = np.stack([waveform(SURFACE + shift) for shift in (2.3, 2.1, -1.8, -2.2)])
@@ -373,6 +375,7 @@ def test_thousands_of_shots_take_seconds():
     assert time.perf_counter() - start < 4.0
 
 
+@pytest.mark.slow
 def test_published_biases_of_depth_appear_in_rendered_results():
     """Turbid water: depths too large at nadir, too small far off it, by undercutting (Guenther and Thomas 1984)."""
     depths = {}
@@ -396,6 +399,7 @@ def test_published_biases_of_depth_appear_in_rendered_results():
     assert float(depths[50.0, 0.02].sel(estimator="peak")) == pytest.approx(8.0, abs=0.06)
 
 
+@pytest.mark.slow
 def test_shot_at_a_slope_facing_away_is_shallower():
     """Published (2006): about 0.1 m, the path in the water being steeper; times of the red pixel's bottom echo."""
     times = []

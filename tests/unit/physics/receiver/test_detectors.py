@@ -111,6 +111,7 @@ def varying_light(bins=90, peak=0.8):
     return peak * np.exp(-0.5 * ((t - 20) / 6) ** 2) + 0.1 + 0.2 * (t > 50)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "detector",
     [

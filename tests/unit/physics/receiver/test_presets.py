@@ -73,6 +73,7 @@ STAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STAGES)
 def test_stages_alone_and_together(name):
     chain, scale = STAGES[name]
@@ -81,6 +82,7 @@ def test_stages_alone_and_together(name):
     assert_expected(chain.apply(light, 1.0, SHOTS, 11, 3e-10), chain.expected(light, 1.0, 3e-10), fewest=fewest)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(RECEIVERS) - {"pmt_log"}))
 def test_receivers_in_use(name):
     chain = RECEIVERS[name]

@@ -112,6 +112,7 @@ def test_realised_waves_have_the_variances_of_their_kind():
             assert abs(np.mean(amplitudes)) < 4 * error, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["elfouhaily", "single"])
 def test_slopes_are_gaussian(kind):
     """One slope of each of 2000 seas. With fixed amplitudes, a single wave would have an arcsine distribution."""
@@ -298,6 +299,7 @@ def test_fine_mesh_resolves_the_spectrum_and_a_sea_the_sum_of_its_components():
     assert mesh_slope_variance(SeaState((table, table)), 64, 128) == pytest.approx((2 * expected[0], 2 * expected[1]))
 
 
+@pytest.mark.slow
 def test_physics_of_the_sea_imports_no_scipy():
     """SciPy's FFT takes longer to import than a sea to compute, and is only needed when there is one."""
     code = (

@@ -74,6 +74,7 @@ def test_contact_sheet_shows_every_gate_at_its_position():
     assert figure.axes[-1].get_xlabel() == "energy in the gate (fJ)"  # of the colour bar
 
 
+@pytest.mark.slow
 def test_far_row_is_on_top_and_the_first_column_left():
     energy = np.full((ROWS, COLUMNS, 4), 1e-18)
     energy[0, 0] = 1e-15
@@ -114,6 +115,7 @@ def test_bright_spot_of_less_than_a_hundredth_of_the_image_is_clipped():
     assert scale.extend == "max"
 
 
+@pytest.mark.slow
 def test_logarithmic_colours():
     energy = np.full((ROWS, COLUMNS, 6), 1e-15)
     energy[..., 3], energy[..., 4] = 1e-20, 0.0
@@ -163,6 +165,7 @@ def test_pixels_are_lines_over_depth():
         assert ax.get_ylabel() == "energy in the gate (fJ)"
 
 
+@pytest.mark.slow
 def test_gif_has_one_frame_a_gate(tmp_path):
     energy = np.full((ROWS, COLUMNS, 5), 1e-18)
     for k in range(5):
@@ -204,12 +207,14 @@ def fake_ffmpeg(tmp_path):
     return install
 
 
+@pytest.mark.slow
 def test_mp4_passes_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
     with fake_ffmpeg(status=0):
         animate_gates(make(3), tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").stat().st_size == 3 * 840 * 540 * 4  # raw frames
 
 
+@pytest.mark.slow
 def test_failing_or_missing_ffmpeg(tmp_path, fake_ffmpeg):
     with fake_ffmpeg(status=3), pytest.raises(UserError, match=r"a\.mp4: ffmpeg ended with the error 3"):
         animate_gates(make(3), tmp_path / "a.mp4")

@@ -1,0 +1,94 @@
+"""Every command once, with files, on a scene of few paths; scenes, options and results have tests of their own."""
+
+import pytest
+from command_line import run
+
+from mitransient_lidar.cli.app import app
+from mitransient_lidar.loading import catalogue
+
+FEW = '<integer name="paths_per_pass" value="1024"/><integer name="photons_per_pass" value="1024"/>'
+PARAMETERS = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
+
+#: Arguments of each command after the scene or the result; the commands after them need no scene.
+SCENE_COMMANDS = {
+    "find-shots": [],
+    "shot-statistics": ["--count", 2],
+    "target-signal": ["--passes", 16],
+    "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
+    "beam-spread": ["--depths", "2,5", "--passes", 4],
+    "fov-sweep": ["--fov-mrad", "20,35", "--passes", 4],
+    "scattering-orders": ["--passes", 2, "--orders", 2],
+}
+RESULT_COMMANDS = {
+    "plot": [],
+    "waveforms": ["--table"],
+    "retrieve": [],
+    "gates": ["--start-depth", 5, "--width-ns", 5, "--step-ns", 5, "--count", 4],
+}
+OTHER_COMMANDS = {
+    "water": ["jerlov", "II"],
+    "info": [],
+    "scenes": ["list"],
+    "passive": ["passive_sea", "-D", "layout=4x4", "-D", "surface_cell_size=2", "--passes", 2],
+}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A level sea, a target and a bottom: file of the scene."""
+    path = tmp_path_factory.mktemp("scene") / "small.xml"
+    text = catalogue.scene_text("fig13_2x2")
+    integrator = '<integrator type="lidar_merging"/>'
+    assert integrator in text
+    path.write_text(text.replace(integrator, f"{integrator[:-2]}>{FEW}</integrator>"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(scene, tmp_path_factory):
+    """A rendered file of the scene."""
+    folder = tmp_path_factory.mktemp("result")
+    done = run("render", scene, *PARAMETERS, "--passes", 4, "-o", folder, "-q")
+    assert done.exit_code == 0, done.stderr
+    assert sorted(path.suffix for path in folder.iterdir()) == [".exr", ".nc", ".png", ".png"]
+    return folder / "small.nc"
+
+
+def check(done, tmp_path):
+    """Check that a command has succeeded, and that the files that it names are there."""
+    assert done.exit_code == 0, done.stderr
+    named = [line for line in done.stdout.splitlines() if line.startswith(str(tmp_path))]
+    assert all((tmp_path / name).stat().st_size > 0 for name in named)
+    assert done.stdout
+
+
+@pytest.mark.parametrize("command", SCENE_COMMANDS)
+def test_command_of_a_scene(command, scene, tmp_path):
+    options = SCENE_COMMANDS[command]
+    done = run(command, scene, *PARAMETERS, *options, "-o", tmp_path / "figure.png")
+    check(done, tmp_path)
+    assert (tmp_path / "figure.png").is_file()
+
+
+@pytest.mark.parametrize("command", RESULT_COMMANDS)
+def test_command_of_a_result(command, result, tmp_path):
+    check(run(command, result, *RESULT_COMMANDS[command]), tmp_path)
+
+
+def test_comparison_of_a_result_with_itself(result):
+    done = run("compare", result, result)
+    assert done.exit_code == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", OTHER_COMMANDS)
+def test_command_without_a_result(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    check(run(command, *OTHER_COMMANDS[command]), tmp_path)
+
+
+def test_every_command_is_run():
+    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "compare"}
+    commands = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
+    groups = {group.name for group in app.registered_groups}
+    # The benchmark measures for minutes; its tests replace the renders.
+    assert commands | groups == tested | {"bench"}
