@@ -118,6 +118,7 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, l
 # (c) sun glint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zenith", "azimuth", "view", "wind", "wind_azimuth"),
     [(30.0, 180.0, 20.0, 6.0, 0.0), (10.0, 60.0, 25.0, 10.0, 30.0), (35.0, 10.0, 30.0, 4.0, 90.0)],

@@ -11,6 +11,8 @@ from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.sensor.point_spread import GaussianPointSpread, MeasuredPointSpread
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
+pytestmark = pytest.mark.slow
+
 MRAD = 1e-3
 COUNT = 2**20
 COLLECTION = 0.025 * 0.9 * 0.9

@@ -18,6 +18,8 @@ from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels, ShapedPixels
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
+pytestmark = pytest.mark.slow
+
 MRAD = 1e-3
 SHAPES = {
     "circle": Sector(15 * MRAD, centre=(2 * MRAD, -3 * MRAD)),

@@ -12,6 +12,8 @@ from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
+pytestmark = pytest.mark.slow
+
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
     transmitter = SimpleNamespace(pose=Pose.from_angles(altitude, angle))
@@ -96,7 +98,6 @@ def interaction(scene, direction):
     return si
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("wi", [[0.34, 0.1, 0.93], [0.2, -0.15, -0.95]])
 def test_ripples_sample_their_density_and_keep_the_energy(wi):
     scene, shape = surface(spectrum="flat", slope_variance="0.03")
@@ -136,7 +137,6 @@ def test_ripples_are_rougher_along_the_wind(direction, along_x):
     assert ratio == pytest.approx(np.exp(-0.5 * tilt**2 * (1 / 0.0316 - 1 / 0.0222)), rel=2e-3)
 
 
-@pytest.mark.slow
 def test_mesh_has_the_slopes_that_it_says():
     """Facet slopes over 24 seas at 6 m/s: their variance is what the ripples are reduced by."""
     along, across = [], []

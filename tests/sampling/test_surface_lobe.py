@@ -12,6 +12,8 @@ from scipy.stats import norm
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
+pytestmark = pytest.mark.slow
+
 COUNT = 2**20
 
 

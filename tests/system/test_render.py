@@ -325,6 +325,7 @@ def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
             small(tmp_path / "wrong.xml")
 
 
+@pytest.mark.slow
 def test_invalid_option_is_exit_code_2_without_files(tmp_path):
     command = [sys.executable, "-m", "mitransient_lidar", "render", "table1", "-D", "wind_speed=40", "-o"]
     done = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True, check=False)
@@ -335,6 +336,7 @@ def test_invalid_option_is_exit_code_2_without_files(tmp_path):
     assert not list(tmp_path.rglob("*.*"))
 
 
+@pytest.mark.slow
 def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     """Wind 6 m/s has waves of half a metre; a pile of 0.6 m across stands in the beam."""
     with pytest.raises(UserError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
@@ -401,6 +403,7 @@ def test_target_below_the_bottom_is_refused():
         rendering.render("fig13_2x2", params={"target_depth": 13}, passes=2)
 
 
+@pytest.mark.slow
 def test_target_above_the_sea_is_reported(lidar_scene, caplog):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([5, 0, 3])}
     rendering.render(lidar_scene(extra={"plate": plate}), passes=2)

@@ -6,12 +6,13 @@ from command_line import run
 from mitransient_lidar.cli.app import app
 from mitransient_lidar.loading import catalogue
 
-FEW = '<integer name="paths_per_pass" value="1024"/><integer name="photons_per_pass" value="1024"/>'
+#: The reference compiles one kernel, merging three.
+FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
 PARAMETERS = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
 
 #: Arguments of each command after the scene or the result; the commands after them need no scene.
 SCENE_COMMANDS = {
-    "find-shots": [],
+    "find-shots": ["--no-waveforms"],
     "shot-statistics": ["--count", 2],
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
@@ -40,7 +41,7 @@ def scene(tmp_path_factory):
     text = catalogue.scene_text("fig13_2x2")
     integrator = '<integrator type="lidar_merging"/>'
     assert integrator in text
-    path.write_text(text.replace(integrator, f"{integrator[:-2]}>{FEW}</integrator>"))
+    path.write_text(text.replace(integrator, FAST))
     return path
 
 
@@ -62,7 +63,9 @@ def check(done, tmp_path):
     assert done.stdout
 
 
-@pytest.mark.parametrize("command", SCENE_COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=[pytest.mark.slow] * (name == "detect")) for name in SCENE_COMMANDS]
+)
 def test_command_of_a_scene(command, scene, tmp_path):
     options = SCENE_COMMANDS[command]
     done = run(command, scene, *PARAMETERS, *options, "-o", tmp_path / "figure.png")

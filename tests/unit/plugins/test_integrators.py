@@ -34,6 +34,7 @@ def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
     assert not np.array_equal(after, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_derivatives_are_refused(lidar_scene, name):
     scene = scene_with(lidar_scene, name)

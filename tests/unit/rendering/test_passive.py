@@ -119,6 +119,7 @@ def test_a_still_picture():
     assert {"sun_zenith_deg", "sky_irradiance", "passes", "seed", "integrator", "title"} <= set(picture.attrs)
 
 
+@pytest.mark.slow
 def test_same_seed_same_picture_other_seed_another_one():
     first, again, other = (render(seed=seed)["radiance"].values for seed in (5, 5, 6))
     # Sums of 64 bits, in any order.
@@ -170,6 +171,7 @@ def test_frames_move_the_sea():
     assert np.abs(z).max() < largest_z(16, 16)
 
 
+@pytest.mark.slow
 def test_files(tmp_path):
     picture = render(filter_width_nm=1.0, frames=2)
     for suffix in (".nc", ".exr"):

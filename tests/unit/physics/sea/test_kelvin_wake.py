@@ -115,6 +115,7 @@ def test_heights_agree_with_direct_quadrature():
     assert at_points(x, y, speed, 0.0, length, beam, draught) == pytest.approx(direct * share, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("froude", [0.3, 0.45])
 def test_wave_resistance_is_michells(froude):
     length, density = 16.0, 1025.0
