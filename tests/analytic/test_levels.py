@@ -53,7 +53,8 @@ def system(off_nadir_deg=20.0, height=200.0, index=1.34, energy=ENERGY, area=0.0
     return LidarSystem(height, np.radians(off_nadir_deg), energy, area, index, index)
 
 
-def assert_agrees(z_score, samples, expected, error=0.01):
+def assert_agrees(z_score, samples, expected, error):
+    """Compare with a closed form; `error` is the largest relative standard error, of each value or of all."""
     z, relative = z_score(samples, np.asarray(expected))
     assert np.all(relative < error), relative
     assert np.all(np.abs(z) < largest_z(len(samples), z.size)), (z, samples.mean(axis=0) / expected)
@@ -101,10 +102,10 @@ def test_surface_echo_with_angle_and_index(lidar_scene, passes, angle, index):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("water", "scatterings"),
-    [({"attenuation": 0.15, "scattering": 0.0, "backscattering": 0.0}, -1), ({"attenuation": 0.3}, 0)],
+    ("water", "scatterings", "error"),
+    [({"attenuation": 0.15, "scattering": 0.0, "backscattering": 0.0}, -1, 0.0024), ({"attenuation": 0.3}, 0, 0.0057)],
 )
-def test_unscattered_bottom(lidar_scene, passes, z_score, water, scatterings):
+def test_unscattered_bottom(lidar_scene, passes, z_score, water, scatterings, error):
     """Water with b = 0, and the unscattered part in water with b > 0, which decays with the full attenuation c."""
     scene = lidar_scene(
         integrator={"max_scatterings": scatterings, "paths_per_pass": 2**17},
@@ -113,7 +114,8 @@ def test_unscattered_bottom(lidar_scene, passes, z_score, water, scatterings):
     )
     column = WaterColumn.from_text(0, water["attenuation"], 0, 0)
     expected = [echo_energies(system(), 5e-3, column, 0.0, 8.0, 0.1, (1e-4, 1e-4), f).bottom for f in FIELDS]
-    assert_agrees(z_score, pixels_and_sum(passes(scene, 32)), expected)
+    # Four pixels, and their sum.
+    assert_agrees(z_score, pixels_and_sum(passes(scene, 32)), expected, error * np.array([1, 1, 1, 1, 0.57]))
 
 
 @pytest.mark.slow
@@ -157,7 +159,7 @@ def test_bottom_at_other_altitudes_angles_and_indices(lidar_scene, passes, z_sco
     column = WaterColumn.from_text(0, 0.1, 0, 0)
     lidar = system(angle, altitude, index)
     expected = echo_energies(lidar, 1e-3, column, 0.0, 8.0, 0.1, (1e-4, 1e-4)).bottom
-    assert_agrees(z_score, passes(scene, 24).sum(axis=(1, 2)), expected)
+    assert_agrees(z_score, passes(scene, 24).sum(axis=(1, 2)), expected, 0.0042)
 
 
 PHASES = {

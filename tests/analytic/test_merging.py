@@ -180,6 +180,8 @@ CASES = {
     },
     "turbid": {"water": {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016}, "bottom": 4.0},
 }
+#: Largest relative standard error of the reference's energy, 1.3 times the measured one.
+TOTAL_ERROR = {"mirror": 0.041, "partly transparent": 0.014, "bubbles": 0.009, "turbid": 0.012}
 
 
 @pytest.mark.slow
@@ -189,14 +191,14 @@ def test_both_integrators_agree(lidar_scene, passes, case):
     film = {"time_start_ns": 1400.0, "bin_width_ns": 2.0, "bin_count": 70, **CASES[case].get("film", {})}
     scenes = [
         lidar_scene(integrator=integrator, **{"sea": {"slope_variance": "0.01"}, **CASES[case], "film": film})
-        for integrator in (MERGING, {"paths_per_pass": 2**18})
+        for integrator in (MERGING, {"paths_per_pass": 2**17})
     ]
-    merged, reference = passes(scenes[0], 24), passes(scenes[1], 16, first_seed=1000)
+    merged, reference = passes(scenes[0], 16), passes(scenes[1], 16, first_seed=1000)
     assert_same(merged, reference, floor=0.005)
     gates = merged.sum(axis=2), reference.sum(axis=2)
     assert_same(*gates, floor=0.005)
     total = reference.sum(axis=(1, 2))
-    assert mean_and_error(total)[1] < 0.05 * total.mean()
+    assert mean_and_error(total)[1] < TOTAL_ERROR.get(case, 0.006) * total.mean()
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The fast integrator against the unbiased one, in every scene that ships."""
+"""The fast integrator against the unbiased one, in the shipped scenes."""
 
 import pytest
 from significance import FALSE_ALARM, largest_z
@@ -30,9 +30,19 @@ IMAGES = {"gated_mine", "gated_waves"}
 #: Rendered by an integrator of its own.
 PASSIVE = {"passive_sea"}
 
+#: As another scene, but for the layout of the pixels or the place of the shot.
+ALIKE = {"fig09_1x1", "fig09_2x2", "fig11_shot2", "fig11_shot3", "fig13_2x2", "fig15_1x1"}
 
-@pytest.mark.parametrize("name", [name for name in catalogue.scene_names() if name not in {*ZOOMS, *PASSIVE}])
-def test_integrators_agree_in_every_shipped_scene(name):
+#: Largest relative standard error of the energy, 1.3 times the measured one. At grazing incidence the connection of the
+#: reference takes the sea as level, and in thin layers few paths carry much.
+ENERGY_ERROR = {
+    **{"fig04_mast": 0.026, "thin_layer": 0.0135, "nepheloid_layer": 0.0096, "gated_mine": 0.008, "ship_wake": 0.0066},
+    **{"fresh_water_lens": 0.006},
+}
+
+
+@pytest.mark.parametrize("name", [name for name in catalogue.scene_names() if name not in {*ZOOMS, *PASSIVE, *ALIKE}])
+def test_integrators_agree_in_shipped_scenes(name):
     bins = dict(SHORT_BINS if name in ZOOMS.values() else BINS)
     if name in IMAGES:
         bins["layout"] = "2x2"
@@ -47,7 +57,7 @@ def test_integrators_agree_in_every_shipped_scene(name):
     assert 0.7 < outcome.rms < 1.1
     # Cells blur the first metre of water by 0.5 %, a fifth of which is in the whole.
     assert abs(outcome.energy_ratio - 1) < 0.002 + largest_z(64) * outcome.energy_ratio_stderr
-    assert outcome.energy_ratio_stderr < (0.04 if grazing else 0.012 if name in TURBID | IMAGES else 0.006)
+    assert outcome.energy_ratio_stderr < ENERGY_ERROR.get(name, 0.004)
 
 
 @pytest.mark.parametrize(("zoom", "whole"), ZOOMS.items())
