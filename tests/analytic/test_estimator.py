@@ -62,7 +62,7 @@ def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
     first = passes(nested_scene, 32)[:, order]
     second = passes(lidar_scene(sea=ROUGH), 32, 1000)
     for pixel in range(4):
-        compare(echoes(first[:, [pixel]]), echoes(second[:, [pixel]]), 0.02)
+        compare(echoes(first[:, [pixel]]), echoes(second[:, [pixel]]), 0.03)
 
 
 def with_total(energy):
@@ -147,7 +147,7 @@ def test_roulette_changes_no_mean(lidar_scene, passes):
     reference = echoes(passes(lidar_scene(sea=ROUGH), 24))
     for threshold, count in ((0.0, 12), (0.05, 32), (0.5, 48)):
         scene = lidar_scene(sea=ROUGH, integrator={"roulette_threshold": threshold})
-        compare(reference, echoes(passes(scene, count, 500)), 0.02)
+        compare(reference, echoes(passes(scene, count, 500)), 0.045)
 
 
 @pytest.mark.slow
