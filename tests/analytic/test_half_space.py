@@ -91,13 +91,14 @@ def test_merging_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees
     2 % too much at albedo 0.5 and 60 degrees.
     """
     view, beam, spacing, count = {0.5: (4, 14, 0.3, 8), 0.9: (5, 22, 0.3, 12), 0.99: (10, 45, 0.25, 16)}[albedo]
-    fine = {"type": "lidar_merging", "paths_per_pass": 2**15, "photons_per_pass": 2**15}
+    paths, largest = (2**13, 5e-3) if albedo == 0.99 else (2**15, 2e-3)
+    fine = {"type": "lidar_merging", "paths_per_pass": paths, "photons_per_pass": paths}
     # Cells are a third as thick as the spacing; slanted light falls faster with depth.
     fine |= {"cell_size": 0.2, "point_spacing": spacing * float(np.cos(np.radians(degrees)))}
     energy = returned(lidar_scene, passes, count, degrees, albedo, view, beam, fine)
     expected = single_scattering(degrees, albedo) * chandrasekhar_h(np.cos(np.radians(degrees)), albedo) ** 2
     _, relative = z_score(energy, expected)
-    assert relative < 2.5e-3
+    assert relative < largest
     # The blur over cells adds 2e-3.
     assert abs(energy.mean() / expected - 1) < largest_z(count) * relative + 2e-3
 
