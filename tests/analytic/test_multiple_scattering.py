@@ -95,7 +95,7 @@ def scatter(rng, direction):
     return turned, phase / ((1 - UPWARD_SHARE) * phase + UPWARD_SHARE * about_vertical)
 
 
-@pytest.fixture(scope="module", params=[(0.3, 0.15, 1.34), (0.8, 0.64, 1.34)], ids=str)
+@pytest.fixture(scope="module", params=[(0.3, 0.15, 1.34), (0.8, 0.64, 1.34), (0.8, 0.64, 1.0001)], ids=str)
 def walks(request):
     """Return attenuation, scattering and index, and the energies of independent walks."""
     return request.param, np.array([random_walk(*request.param, 20_000, seed) for seed in range(20)])

@@ -10,7 +10,7 @@ from mitransient_lidar.loading import catalogue
 FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
 PARAMETERS = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
 
-#: Arguments of each command after the scene or the result; the commands after them need no scene.
+#: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
     "find-shots": ["--no-waveforms"],
     "shot-statistics": ["--count", 2],
@@ -36,7 +36,7 @@ OTHER_COMMANDS = {
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A level sea, a target and a bottom: file of the scene."""
+    """File of a scene with waves, a target and a bottom."""
     path = tmp_path_factory.mktemp("scene") / "small.xml"
     text = catalogue.scene_text("fig13_2x2")
     integrator = '<integrator type="lidar_merging"/>'
