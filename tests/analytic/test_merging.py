@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, echo_energies
 from scipy.stats import norm, t
-from significance import FALSE_ALARM, largest_z
+from significance import FALSE_ALARM, largest_error, largest_z
 
 from mitransient_lidar.analysis.comparison import pooled_relative_variance
 from mitransient_lidar.loading.scenes import load_scene
@@ -180,8 +180,8 @@ CASES = {
     },
     "turbid": {"water": {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016}, "bottom": 4.0},
 }
-#: Largest relative standard error of the reference's energy, 1.3 times the measured one.
-TOTAL_ERROR = {"mirror": 0.041, "partly transparent": 0.014, "bubbles": 0.009, "turbid": 0.012}
+#: Relative standard error of the reference's energy where it is above 0.5 %.
+TOTAL_ERROR = {"layers": 0.0104, "mirror": 0.03, "partly transparent": 0.0093, "bubbles": 0.0075, "turbid": 0.0113}
 
 
 @pytest.mark.slow
@@ -191,31 +191,30 @@ def test_both_integrators_agree(lidar_scene, passes, case):
     film = {"time_start_ns": 1400.0, "bin_width_ns": 2.0, "bin_count": 70, **CASES[case].get("film", {})}
     scenes = [
         lidar_scene(integrator=integrator, **{"sea": {"slope_variance": "0.01"}, **CASES[case], "film": film})
-        for integrator in (MERGING, {"paths_per_pass": 2**17})
+        for integrator in (MERGING, {"paths_per_pass": 2**16})
     ]
-    merged, reference = passes(scenes[0], 12), passes(scenes[1], 16, first_seed=1000)
+    merged, reference = passes(scenes[0], 10), passes(scenes[1], 16, first_seed=1000)
     assert_same(merged, reference, floor=0.005)
     gates = merged.sum(axis=2), reference.sum(axis=2)
     assert_same(*gates, floor=0.005)
     total = reference.sum(axis=(1, 2))
-    assert mean_and_error(total)[1] < TOTAL_ERROR.get(case, 0.006) * total.mean()
+    assert mean_and_error(total)[1] < largest_error(16, TOTAL_ERROR.get(case, 0.005)) * total.mean()
 
 
 @pytest.mark.slow
 def test_bias_under_waves_falls_with_the_cells(lidar_scene, passes):
     """Waves focus beam and view alike, and wide cells blur both: a deficit that small cells do not have."""
     film = {"time_start_ns": 1420.0, "bin_width_ns": 30.0, "bin_count": 1}
-    reference = passes(lidar_scene(integrator={"paths_per_pass": 2**20}, sea=WAVES, film=film, bottom=None), 24)
+    reference = passes(lidar_scene(integrator={"paths_per_pass": 2**20}, sea=WAVES, film=film, bottom=None), 12)
     level, error = mean_and_error(reference.sum(axis=(1, 2)))
     bias = []
-    for width in (0.1, 0.03, 0.0125):
-        merged = passes(lidar_scene(integrator={**MERGING, "cell_size": width}, sea=WAVES, film=film, bottom=None), 20)
+    for width in (0.1, 0.0125):
+        merged = passes(lidar_scene(integrator={**MERGING, "cell_size": width}, sea=WAVES, film=film, bottom=None), 10)
         mean, merged_error = mean_and_error(merged.sum(axis=(1, 2)))
         bias.append(mean / level - 1)
-        assert np.hypot(error, merged_error) < 0.002 * level
-    assert bias[0] < bias[1] < bias[2] < 0.006
+        assert np.hypot(error, merged_error) < 0.0025 * level
     assert bias[0] < -0.012
-    assert bias[2] > -0.006
+    assert abs(bias[1]) < 0.006
 
 
 @pytest.mark.slow
@@ -242,12 +241,12 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
 
 @pytest.mark.slow
 def test_standard_errors_are_honest():
-    """Over 100 seeds, 95 % intervals of four passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
+    """Over 64 seeds, 95 % intervals of four passes (Student's t) cover the long-run mean in 93 to 97 % of bins."""
     scene, _, _ = load_scene("fig09_2x2", {"attenuation": "1.0", "scattering": "0.8", "backscattering": "0.016"})
     engine = mi.load_dict({"type": "lidar_merging", "paths_per_pass": 2**12, "photons_per_pass": 2**12})
     renderer = engine.prepare(scene, scene.sensors()[0])
-    energy = [renderer.render_pass(seed).histogram.energy()[:, 40:110] for seed in range(400)]
-    energy = np.array(energy).reshape(100, 4, 4, 14, 5).sum(axis=-1)
+    energy = [renderer.render_pass(seed).histogram.energy()[:, 40:110] for seed in range(256)]
+    energy = np.array(energy).reshape(64, 4, 4, 14, 5).sum(axis=-1)
     mean, error = energy.mean(axis=1), energy.std(axis=1, ddof=1) / np.sqrt(4)
     # The long-run mean holds the run itself: its own error is a tenth of a run's.
     covered = np.abs(mean - energy.mean(axis=(0, 1))) < t.ppf(0.975, 3) * error

@@ -267,7 +267,7 @@ def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, v
             sea={"spectrum": "flat", "wind_speed": 5.0},
             rx={"off_nadir_deg": view},
             water=water,
-            integrator={"paths_per_pass": 2**15, **limit},
+            integrator={"paths_per_pass": 2**14, **limit},
         )
         for limit in ({}, {"max_scatterings": 0})
     ]

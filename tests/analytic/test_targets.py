@@ -199,7 +199,7 @@ def test_integrators_agree(lidar_scene, passes, case):
         )
         for integrator, paths in zip(INTEGRATORS, (2**15, 2**16), strict=True)
     ]
-    merged, reference = passes(scenes[0], 12), passes(scenes[1], 16, first_seed=500)
+    merged, reference = passes(scenes[0], 10), passes(scenes[1], 10, first_seed=500)
     assert_agree(merged, reference, floor=0.005)
     assert_agree(merged.sum((1, 2))[:, None], reference.sum((1, 2))[:, None], floor=0.005)
     total, error = mean_and_error(reference.sum((1, 2)))

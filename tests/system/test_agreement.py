@@ -1,7 +1,7 @@
 """The fast integrator against the unbiased one, in the shipped scenes."""
 
 import pytest
-from significance import FALSE_ALARM, largest_z
+from significance import FALSE_ALARM, largest_error, largest_z
 
 import mitransient_lidar
 from mitransient_lidar.analysis import comparison
@@ -33,11 +33,11 @@ PASSIVE = {"passive_sea"}
 #: As another scene, but for the layout of the pixels or the place of the shot.
 ALIKE = {"fig09_1x1", "fig09_2x2", "fig11_shot2", "fig11_shot3", "fig13_2x2", "fig15_1x1"}
 
-#: Largest relative standard error of the energy, 1.3 times the measured one. At grazing incidence the connection of the
-#: reference takes the sea as level, and in thin layers few paths carry much.
+#: Relative standard error of the energy where it is above 0.3 %. At grazing incidence the connection of the reference
+#: takes the sea as level, and in thin layers few paths carry much.
 ENERGY_ERROR = {
-    **{"fig04_mast": 0.026, "thin_layer": 0.0135, "nepheloid_layer": 0.0096, "gated_mine": 0.008, "ship_wake": 0.0066},
-    **{"fresh_water_lens": 0.006},
+    **{"fig04_mast": 0.02, "thin_layer": 0.0104, "nepheloid_layer": 0.0074, "gated_mine": 0.0067, "ship_wake": 0.0051},
+    **{"fresh_water_lens": 0.0046},
 }
 
 
@@ -46,7 +46,7 @@ def test_integrators_agree_in_shipped_scenes(name):
     bins = dict(SHORT_BINS if name in ZOOMS.values() else BINS)
     if name in IMAGES:
         bins["layout"] = "2x2"
-    merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=16, seed=1)
+    merged = mitransient_lidar.render(name, params=bins, integrator="lidar_merging", passes=12, seed=1)
     count = 16 if name in TURBID else 8
     reference = mitransient_lidar.render(name, params=bins, integrator="lidar_volpath", passes=count, seed=2)
     outcome = comparison.compare(reference, merged)
@@ -57,7 +57,7 @@ def test_integrators_agree_in_shipped_scenes(name):
     assert 0.7 < outcome.rms < 1.1
     # Cells blur the first metre of water by 0.5 %, a fifth of which is in the whole.
     assert abs(outcome.energy_ratio - 1) < 0.002 + largest_z(64) * outcome.energy_ratio_stderr
-    assert outcome.energy_ratio_stderr < ENERGY_ERROR.get(name, 0.004)
+    assert outcome.energy_ratio_stderr < largest_error(count, ENERGY_ERROR.get(name, 0.003))
 
 
 @pytest.mark.parametrize(("zoom", "whole"), ZOOMS.items())

@@ -16,7 +16,7 @@ GRAZING = math.radians(5.4)
 IN_WATER = math.asin(math.cos(GRAZING) / 1.34)
 
 
-@pytest.mark.parametrize("height", [5.0, 15.0, 30.0])
+@pytest.mark.parametrize("height", [5.0, 30.0])
 def test_target_echoes_at_its_distance_and_no_light_leaks_past_the_sea(height):
     """A level sea tells when: 2 H / sin(5.4 deg) of air and 1 m / cos(48 deg) of water, there and back."""
     due = 2e9 / C0 * (height / math.sin(GRAZING) + 1.34 / math.cos(IN_WATER))

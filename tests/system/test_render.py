@@ -266,12 +266,13 @@ def test_eight_times_the_paths_an_eighth_of_the_variance(integrator, count, fast
         renderer = engine.prepare(scene, scene.sensors()[0])
         # Late light only: surface echo and early column are stratified and fall faster.
         energy = np.array([renderer.render_pass(seed).histogram.energy()[:, 60:140] for seed in range(count * groups)])
-        gates = energy.reshape(groups, count, 32, 10).sum(axis=-1)
-        left_out = [np.delete(gates, group, axis=0).reshape(-1, 32) for group in range(groups)]
+        gates = energy.reshape(groups, count, 8, 40).sum(axis=-1)
+        left_out = [np.delete(gates, group, axis=0).reshape(-1, 8) for group in range(groups)]
         variances.append([sample.var(axis=0, ddof=1) for sample in left_out])
     ratios = np.log(np.divide(*variances)).mean(axis=1)
     error = np.sqrt((groups - 1) * ratios.var())
-    assert error < 0.12
+    # Four draws gave 0.06 to 0.11.
+    assert error < 0.15
     limit = largest_z(groups) * error
     assert np.log(8) - limit < ratios.mean() < np.log(fastest) + limit
 
@@ -384,7 +385,7 @@ def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lid
         )
         totals = []
         renderer = scene.integrator().prepare(scene, scene.sensors()[0])
-        for seed in range(12 if integrator == "lidar_merging" else 24):
+        for seed in range(8 if integrator == "lidar_merging" else 16):
             record = renderer.render_pass(seed)
             totals.append(record.histogram.energy().sum())
             if size == 4.0:
