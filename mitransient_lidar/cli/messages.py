@@ -60,18 +60,21 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
     from rich.logging import RichHandler
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as ProgressBar
+    from rich.table import Column
 
     console = _console()
     handler = RichHandler(console=console, show_path=False, show_time=False)
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
-        columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        description = TextColumn("{task.description}", table_column=Column(no_wrap=False, ratio=1))
+        columns = (SpinnerColumn(), description, BarColumn(bar_width=16), TimeElapsedColumn())
         with ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("preparing", total=None)
 
             def show(state: Progress) -> None:
-                bar.update(task, description=_describe(state), completed=state.done, total=state.planned)
+                expected = state.planned or (None if state.needed_passes is None else state.done + state.needed_passes)
+                bar.update(task, description=_describe(state), completed=state.done, total=expected)
 
             yield show
     finally:
@@ -80,15 +83,17 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
 def _describe(state: Progress) -> str:
     """Describe the progress in one line."""
+    from mitransient_lidar.rendering.passes import describe_quantile
+
     planned = f"/{state.planned}" if state.planned is not None else ""
     parts = [f"{state.unit} {state.done}{planned}"]
-    if state.error_median is not None:
-        goal = f" of {100 * state.target_error:.3g} %" if state.target_error is not None else ""
-        parts.append(f"error {100 * state.error_median:.3g} %{goal}")
-    if state.error_p95 is not None:
-        parts.append(f"p95 {100 * state.error_p95:.3g} %")
-    if state.remaining_s is not None:
-        parts.append(f"{state.remaining_s:.0f} s left")
+    if state.error is not None:
+        parts.append(f"{describe_quantile(state.target_quantile, state.errors_of)} within {100 * state.error:.3g} %")
+    if state.target_error is not None:
+        needed = "" if state.needed_s is None else f" in {state.needed_passes} more passes, {state.needed_s:.0f} s"
+        parts.append(f"target {100 * state.target_error:.3g} %{needed}")
+    if state.remaining_s is not None and state.remaining_s != state.needed_s:
+        parts.append(f"ends in {state.remaining_s:.0f} s")
     return ", ".join(parts)
 
 
@@ -107,6 +112,9 @@ def summarise(dataset: xr.Dataset) -> None:
     add("time (s)", "elapsed_s", ".2f")
     add("median error (%)", "error_median", ".3g", 100.0)
     add("95th percentile error (%)", "error_p95", ".3g", 100.0)
+    add("target error (%)", "target_error", ".3g", 100.0)
+    if dataset.attrs.get("target_quantile") not in (None, 0.95):
+        add(f"{100 * dataset.attrs['target_quantile']:g}th percentile error (%)", "error_at_quantile", ".3g", 100.0)
     if "waveform" not in dataset:
         table.add_row("gates", str(dataset.sizes["gate"]))
         table.add_row("highest energy in a gate (J)", f"{float(dataset['gate_energy'].max()):.4g}")

@@ -16,8 +16,17 @@ from mitransient_lidar.core.errors import UserError
 if TYPE_CHECKING:
     import xarray as xr
 
-TargetError = Annotated[float | None, typer.Option(help="Stop at this relative standard error, e.g. 0.01.")]
-MaxTime = Annotated[float | None, typer.Option(help="Stop after this many seconds.")]
+TargetError = Annotated[
+    float | None,
+    typer.Option(
+        help="Stop when 95 % of the bins of lit pixels, from the surface echo to the end of the bottom echo, have "
+        "reached this relative standard error, e.g. 0.03; of gates, 95 % of them; of images, 95 % of the lit pixels."
+    ),
+]
+TargetQuantile = Annotated[
+    float | None, typer.Option(help="Share that must reach the target error instead of 0.95; 0.5 is the median.")
+]
+MaxTime = Annotated[float | None, typer.Option(help="Stop before this many seconds, after at least two passes.")]
 GoalPasses = Annotated[int | None, typer.Option("--passes", help="Stop after this many independent passes.")]
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant, e.g. llvm_ad_mono.")]
 Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
@@ -29,6 +38,7 @@ def render(
     output: Folder = Path("."),
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     target_error: TargetError = None,
+    target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
     passes: GoalPasses = None,
     seed: Seed = 0,
@@ -65,6 +75,7 @@ def render(
             params=params,
             integrator=integrator,
             target_error=target_error,
+            target_quantile=target_quantile,
             max_time=max_time,
             passes=passes,
             seed=seed,
@@ -119,6 +130,7 @@ def passive(
         float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")
     ] = None,
     target_error: TargetError = None,
+    target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
     passes: GoalPasses = None,
     seed: Seed = 0,
@@ -147,6 +159,7 @@ def passive(
             scene,
             params,
             target_error=target_error,
+            target_quantile=target_quantile,
             max_time=max_time,
             passes=passes,
             seed=seed,

@@ -52,9 +52,23 @@ class PassAccumulator(ABC):
     def received(self) -> float:
         """Energy received in all passes [J]."""
 
+    @property
+    @abstractmethod
+    def is_empty(self) -> bool:
+        """Whether no light was received in any pass; values that are not finite count as light."""
+
     @abstractmethod
     def add(self, histogram: TransientHistogram) -> None:
         """Add the histogram of a pass."""
+
+    def require_light(self, passes: int) -> None:
+        """Raise UserError if the record of all passes is empty."""
+        if self.is_empty:
+            axis = self.scene.axis
+            raise UserError(
+                f"no light returned between {axis.start_ns:g} and {axis.end_ns:g} ns in {passes} passes: beam and "
+                "field of view must meet on the sea or below it, and the record and its gates must include the echoes"
+            )
 
     def errors(self) -> FloatArray:
         """Return the relative standard errors of which the 95th percentile is compared with the target.
@@ -109,6 +123,11 @@ class WaveformAccumulator(PassAccumulator):
         """Energy received in all passes [J]."""
         return float(np.nansum(self._energy.mean)) * self._energy.count
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no light was received in any pass."""
+        return not np.any(self._energy.mean)
+
     def add(self, histogram: TransientHistogram) -> None:
         """Add the histogram of a pass."""
         energy = histogram.energy().reshape(self.scene.receiver.pixels.count, -1)
@@ -162,6 +181,11 @@ class GateAccumulator(PassAccumulator):
     def received(self) -> float:
         """Energy in the gates of all passes [J], added up where gates overlap."""
         return float(np.nansum(self.gates.mean)) * self.gates.count
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no light was received in the gates."""
+        return not np.any(self.gates.mean)
 
     def add(self, histogram: TransientHistogram) -> None:
         """Add the histogram of a pass."""

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption
-from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.core.validation import FloatArray, in_range, positive
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
+
+logger = logging.getLogger(__name__)
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
+
+
+#: Quantile of the relative standard errors that is compared with the target, unless another one is requested.
+DEFAULT_QUANTILE = 0.95
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,10 @@ class Progress:
 
     Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place`` or ``render``), elapsed and
     estimated remaining time [s], median and 95th percentile of the relative standard errors, and the requested error.
+
+    With a requested error: the quantile of the relative standard errors that must reach it, its value, what the errors
+    are those of (``bins``, ``gates`` or ``pixels``), and estimates of the passes and the time [s] still needed, None
+    while they are unknown.
     """
 
     done: int
@@ -32,6 +43,11 @@ class Progress:
     error_median: float | None = None
     error_p95: float | None = None
     target_error: float | None = None
+    target_quantile: float = DEFAULT_QUANTILE
+    error: float | None = None
+    errors_of: str = "bins"
+    needed_passes: int | None = None
+    needed_s: float | None = None
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -39,15 +55,24 @@ ProgressCallback = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class Goal:
-    """End of a render: a number of passes, an accuracy, or a time, whichever comes first."""
+    """End of a render: a number of passes, an accuracy, or a time [s], whichever comes first.
+
+    The accuracy is reached when `target_quantile` of the relative standard errors are at most `target_error`.
+    """
 
     target_error: float | None = None
     max_time: float | None = None
     passes: int | None = None
+    target_quantile: float = DEFAULT_QUANTILE
 
     @classmethod
     def from_options(
-        cls, target_error: float | None, max_time: float | None, passes: int | None, default: Goal
+        cls,
+        target_error: float | None,
+        max_time: float | None,
+        passes: int | None,
+        default: Goal,
+        target_quantile: float | None = None,
     ) -> Goal:
         """Check the options of a render; without any of them, return the default."""
         for name, value in (("target_error", target_error), ("max_time", max_time)):
@@ -55,29 +80,44 @@ class Goal:
                 positive(name, value)
         if passes is not None and passes < 2:
             raise UserError(f"passes = {passes} must be at least 2: their spread gives the standard error")
-        return default if target_error is max_time is passes is None else cls(target_error, max_time, passes)
+        given = not target_error is max_time is passes is None
+        goal = cls(target_error, max_time, passes) if given else default
+        if target_quantile is None:
+            return goal
+        quantile = in_range("target_quantile", target_quantile, 0.01, 1)
+        if goal.target_error is None:
+            raise UserError(f"target_quantile = {quantile:g} needs a target_error: the error that it must reach")
+        return replace(goal, target_quantile=quantile)
 
-    def reached(self, done: int, elapsed: float, error: float | None) -> bool:
-        """Return whether to stop after `done` passes."""
+    def reached(self, done: int, elapsed: float, last: float, error: float | None) -> bool:
+        """Return whether to stop after `done` passes: another one, as long as the last [s], would exceed the time."""
         if done < 2:
             return False
-        accurate = self.target_error is not None and (error or np.inf) <= self.target_error
         return (
             (self.passes is not None and done >= self.passes)
-            or (self.max_time is not None and elapsed >= self.max_time)
-            or (accurate and done >= SMALLEST_PASS_COUNT)
+            or (self.max_time is not None and elapsed + last > self.max_time)
+            or (done >= SMALLEST_PASS_COUNT and self.is_accurate(error))
         )
 
-    def remaining(self, done: int, elapsed: float, error: float | None) -> float | None:
-        """Estimate the remaining time [s]; errors fall with the square root of the passes."""
+    def is_accurate(self, error: float | None) -> bool:
+        """Return whether the quantile of the errors is at most the requested error."""
+        return self.target_error is not None and (error or np.inf) <= self.target_error
+
+    def needed_passes(self, done: int, error: float | None) -> int | None:
+        """Estimate the passes still needed for the requested error, which falls with the square root of the passes."""
+        if self.target_error is None or error is None or not np.isfinite(error):
+            return None
+        return max(round(max(done * (error / self.target_error) ** 2, SMALLEST_PASS_COUNT)) - done, 0)
+
+    def remaining(self, done: int, elapsed: float, pace: float, error: float | None) -> float | None:
+        """Estimate the remaining time [s] from the time of a pass [s]."""
         estimates = []
         if self.passes is not None:
-            estimates.append(elapsed * (self.passes / done - 1))
+            estimates.append(pace * (self.passes - done))
         if self.max_time is not None:
             estimates.append(self.max_time - elapsed)
-        if self.target_error is not None and error is not None and np.isfinite(error):
-            needed = max(done * (error / self.target_error) ** 2, SMALLEST_PASS_COUNT)
-            estimates.append(elapsed * (needed / done - 1))
+        if (needed := self.needed_passes(done, error)) is not None:
+            estimates.append(pace * needed)
         return max(0.0, min(estimates)) if estimates else None
 
 
@@ -85,16 +125,20 @@ class Goal:
 class PassLog:
     """Outcome of a loop over passes, which Ctrl-C may have interrupted.
 
-    `edge_loss` is the energy lost at the edge of the surface mesh [J]; `error_median` and `error_p95` are the median
-    and the 95th percentile of the relative standard errors, NaN without any.
+    `edge_loss` is the energy lost at the edge of the surface mesh [J]; `error_median`, `error_p95` and `error` are the
+    median, the 95th percentile and the goal's quantile of the relative standard errors, NaN without any; `needed_s` is
+    the time still needed for the requested error [s], 0 if it was reached and NaN if it is unknown.
     """
 
     count: int
     elapsed_s: float
     interrupted: bool
     edge_loss: float
+    goal: Goal
+    needed_s: float
     error_median: float
     error_p95: float
+    error: float
 
     def edge_loss_share(self, received: float) -> float:
         """Return the share of the energy lost at the edge of the surface mesh; `received` by all passes [J]."""
@@ -107,10 +151,14 @@ def run_passes(
     *,
     seed: int,
     errors: Callable[[], FloatArray] | None = None,
+    errors_of: str = "bins",
+    verify: Callable[[int], None] | None = None,
     smallest: int = 2,
     progress: ProgressCallback | None = None,
 ) -> PassLog:
     """Render independent passes until the goal is reached.
+
+    Warns when the passes or the time end before the requested error is reached.
 
     Parameters
     ----------
@@ -122,6 +170,10 @@ def run_passes(
         Seed of the render, any integer.
     errors
         Returns the relative standard errors, an array of any size; called from the second pass on.
+    errors_of
+        What the errors are those of: ``bins``, ``gates`` or ``pixels``.
+    verify
+        Called with the number of passes when there are 8, and at the end; raises UserError if the result is of no use.
     smallest
         Number of passes from which a Ctrl-C keeps the result, at least 2; before, it is raised.
     progress
@@ -131,31 +183,84 @@ def run_passes(
     ------
     KeyboardInterrupt
         On a Ctrl-C during the first passes.
+    UserError
+        That of `verify`.
     """
     count, lost, interrupted = 0, 0.0, False
-    median = p95 = None
-    start = time.perf_counter()
+    median = p95 = error = None
+    ends = [time.perf_counter()]
     try:
         with DeferredInterrupt() as interruption:
-            while not goal.reached(count, time.perf_counter() - start, p95):
+            while not goal.reached(count, time.perf_counter() - ends[0], ends[-1] - ends[-2:][0], error):
                 lost += render_pass(count, pass_seed(seed, count))
                 count += 1
                 if errors is not None and count > 1:
-                    median, p95 = _percentiles(errors())
+                    median, p95, error = _quantiles(errors(), goal.target_quantile)
+                if verify is not None and count == SMALLEST_PASS_COUNT:
+                    verify(count)
+                ends.append(time.perf_counter())
                 if progress is not None:
-                    elapsed = time.perf_counter() - start
-                    left = goal.remaining(count, elapsed, p95)
-                    progress(Progress(count, goal.passes, "pass", elapsed, left, median, p95, goal.target_error))
+                    elapsed, pace, needed = ends[-1] - ends[0], _pace(ends), goal.needed_passes(count, error)
+                    state = Progress(
+                        done=count,
+                        planned=goal.passes,
+                        elapsed_s=elapsed,
+                        remaining_s=goal.remaining(count, elapsed, pace, error),
+                        error_median=median,
+                        error_p95=p95,
+                        target_error=goal.target_error,
+                        target_quantile=goal.target_quantile,
+                        error=error,
+                        errors_of=errors_of,
+                        needed_passes=needed,
+                        needed_s=None if needed is None else pace * needed,
+                    )
+                    progress(state)
                 if count >= smallest:
                     interruption.check()
-    except (KeyboardInterrupt, RuntimeError) as error:
-        if not is_interruption(error):
+    except (KeyboardInterrupt, RuntimeError) as raised:
+        if not is_interruption(raised):
             raise
         if count < smallest:
-            raise KeyboardInterrupt from error
+            raise KeyboardInterrupt from raised
         interrupted = True
-    known = (np.nan if value is None else value for value in (median, p95))
-    return PassLog(count, time.perf_counter() - start, interrupted, lost, *known)
+    if verify is not None and not interrupted:
+        verify(count)
+    accurate, needed = goal.is_accurate(error), goal.needed_passes(count, error)
+    needed_s = 0.0 if accurate else np.nan if needed is None else _pace(ends) * needed
+    known = [np.nan if value is None else value for value in (median, p95, error)]
+    log = PassLog(count, time.perf_counter() - ends[0], interrupted, lost, goal, needed_s, *known)
+    if error is not None and goal.target_error is not None and not accurate:
+        logger.warning(_shortfall(log, errors_of, needed))
+    return log
+
+
+def describe_quantile(quantile: float, errors_of: str) -> str:
+    """Return what must reach the requested error, e.g. "95 % of the bins of lit pixels"."""
+    what = {"bins": "bins of lit pixels", "gates": "gates (medians over lit pixels)", "pixels": "lit pixels"}
+    return f"{100 * quantile:g} % of the {what[errors_of]}"
+
+
+def _shortfall(log: PassLog, errors_of: str, needed: int | None) -> str:
+    """Return the error that was reached instead of the requested one, and what that one would have taken."""
+    share, target = (
+        describe_quantile(log.goal.target_quantile, errors_of),
+        f"target_error = {log.goal.target_error:.3g}",
+    )
+    ended = f"ended after {log.count} passes and {log.elapsed_s:.3g} s, before {target}"
+    if needed is None:
+        return f"{ended}: fewer than {share} have received light, so that the time for it is unknown"
+    total = f"about {log.count + needed} passes and {log.elapsed_s + log.needed_s:.3g} s"
+    return f"{ended}: {share} reached {log.error:.3g}; the target takes {total}"
+
+
+def _pace(ends: list[float]) -> float:
+    """Return the time of a pass [s] from the start and the ends of passes.
+
+    The first pass includes the compilation of the kernels and is left out where there are others.
+    """
+    first = 1 if len(ends) > 2 else 0
+    return (ends[-1] - ends[first]) / (len(ends) - 1 - first)
 
 
 def pass_seed(seed: int, number: int) -> int:
@@ -164,10 +269,10 @@ def pass_seed(seed: int, number: int) -> int:
     return int(sequence.generate_state(1, np.uint64)[0])
 
 
-def _percentiles(errors: FloatArray) -> tuple[float | None, float | None]:
-    """Return median and 95th percentile, None without errors."""
+def _quantiles(errors: FloatArray, quantile: float) -> tuple[float | None, float | None, float | None]:
+    """Return median, 95th percentile and another quantile, None without errors."""
     if errors.size == 0:
-        return None, None
+        return None, None, None
     # Interpolation ("linear") would turn infinite errors, of bins without light, into NaN.
-    median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
-    return float(median), float(p95)
+    median, p95, wanted = np.quantile(errors, [0.5, 0.95, quantile], method="higher")
+    return float(median), float(p95), float(wanted)

@@ -47,6 +47,7 @@ def render_passive(
     *,
     integrator: str | Mapping[str, Any] | None = None,
     target_error: float | None = None,
+    target_quantile: float | None = None,
     max_time: float | None = None,
     passes: int | None = None,
     seed: int = 0,
@@ -64,7 +65,7 @@ def render_passive(
         As for `render.render`, with a ``sun``, a ``sky``, or both. A laser in it is ignored.
     integrator
         Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
-    target_error, max_time, passes
+    target_error, target_quantile, max_time, passes
         End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s.
     params, variant
         As for `render.render`.
@@ -95,7 +96,7 @@ def render_passive(
     """
     frames, step = integer("frames", frames, 1, 10_000), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
-    goal = Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL)
+    goal = Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
     images: list[tuple[FloatArray, FloatArray]] = []
     start, lost = time.perf_counter(), 0.0
     for frame in range(frames):
@@ -156,7 +157,22 @@ def _render_frame(
         received += float(np.sum(found))
         return float(record.edge_loss[0])
 
-    log = run_passes(render_pass, goal, seed=seed, errors=statistics.relative_errors, progress=progress)
+    def require_light(passes: int) -> None:
+        # A sum that is not finite is reported with the image.
+        if received == 0:
+            raise UserError(
+                f"no daylight reached the receiver in {passes} passes: its field of view must see sea or sky"
+            )
+
+    log = run_passes(
+        render_pass,
+        goal,
+        seed=seed,
+        errors=statistics.relative_errors,
+        errors_of="pixels",
+        verify=require_light,
+        progress=progress,
+    )
     return statistics, log, log.edge_loss_share(received)
 
 

@@ -44,6 +44,7 @@ def render(
     params: Mapping[str, Any] | None = None,
     integrator: str | Mapping[str, Any] | mi.Integrator | None = None,
     target_error: float | None = None,
+    target_quantile: float | None = None,
     max_time: float | None = None,
     passes: int | None = None,
     seed: int = 0,
@@ -65,8 +66,10 @@ def render(
         Relative standard error, greater than 0, that ends the render (after at least 8 passes) when 95 % of the bins of
         lit pixels from the surface echo to the end of the bottom echo have reached it; with gates, 95 % of the gates,
         in the median over their lit pixels.
+    target_quantile
+        Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time
-        Longest time for the passes [s], greater than 0.
+        Longest time for the passes [s], greater than 0. At least two passes are rendered.
     passes
         Number of passes, at least 2. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
         or after 60 s.
@@ -91,9 +94,9 @@ def render(
     Raises
     ------
     UserError
-        If the scene, a parameter or an option is invalid.
+        If the scene, a parameter or an option is invalid, or no light returns.
     """
-    Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL)
+    Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
     max_memory = _DEFAULT_MAX_MEMORY_GB if max_memory is None else positive("max_memory", max_memory)
     session = open_scene(scene, params, variant)
     chosen = choose_integrator(session.scene, integrator)
@@ -117,8 +120,16 @@ def render(
         accumulator.add(record.histogram)
         return float(record.edge_loss[0])
 
-    goal = Goal.from_options(target_error, max_time, passes, default)
-    log = run_passes(render_pass, goal, seed=seed, errors=accumulator.errors, progress=progress)
+    goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
+    log = run_passes(
+        render_pass,
+        goal,
+        seed=seed,
+        errors=accumulator.errors,
+        errors_of="bins" if accumulator.train is None else "gates",
+        verify=accumulator.require_light,
+        progress=progress,
+    )
     if lidar.surfaces and probe.missed_beam > TOLERATED_LOSS:
         logger.warning(
             "the surface is smaller than the footprint: %.2g %% of the beam in the field of view passes outside it; "

@@ -79,8 +79,20 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
 
 
 def pass_attributes(log: PassLog, seed: int) -> dict[str, Any]:
-    """Return the attributes of a result that describe its passes."""
-    return {"seed": int(seed), "passes": log.count, "interrupted": int(log.interrupted)}
+    """Return the attributes of a result that describe its passes.
+
+    With a requested error: the error and its quantile, the error that was reached, and an estimate of the time that was
+    still needed [s], 0 if the request was met and NaN if unknown.
+    """
+    attributes = {"seed": int(seed), "passes": log.count, "interrupted": int(log.interrupted)}
+    if log.goal.target_error is None:
+        return attributes
+    return attributes | {
+        "target_error": log.goal.target_error,
+        "target_quantile": log.goal.target_quantile,
+        "error_at_quantile": log.error,
+        "target_missing_s": log.needed_s,
+    }
 
 
 def warn_of_edge_loss(share: float) -> None:

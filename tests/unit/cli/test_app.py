@@ -1,6 +1,5 @@
 """The command line: output, sentences and exit codes."""
 
-import dataclasses
 import subprocess
 import sys
 from types import ModuleType
@@ -13,19 +12,8 @@ from mitransient_lidar import __version__, results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, variants
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.passes import Progress
 from mitransient_lidar.studies import bench
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    done: int = 1
-    planned: int | None = 2
-    unit: str = "pass"
-    elapsed_s: float = 0.1
-    error_median: float | None = 0.02
-    error_p95: float | None = 0.03
-    target_error: float | None = 0.01
-    remaining_s: float | None = 3.0
 
 
 @pytest.fixture
@@ -46,8 +34,8 @@ def calls(monkeypatch):
     def render(scene, **options):
         seen.append((scene, options))
         if options["progress"] is not None:
-            options["progress"](Progress())
-            options["progress"](Progress(2, None, "pass", 0.2, None, None, None, None))
+            options["progress"](Progress(1, 2, "pass", 0.1, 3.0, 0.02, 0.03, 0.01, error=0.03))
+            options["progress"](Progress(2, None, "pass", 0.2))
         if "error" in extra:
             raise extra["error"]
         waveform = np.array([[1e-6, 3e-6, 2e-6], [1e-6, 5e-6, 2e-6]])
@@ -96,6 +84,7 @@ def test_render_writes_files_and_prints_their_paths(scene, calls, tmp_path):
         "params": {"wind_speed": "3", "file": "a=b"},
         "integrator": None,
         "target_error": None,
+        "target_quantile": None,
         "max_time": None,
         "passes": 4,
         "seed": 7,
@@ -138,6 +127,7 @@ def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
     ("arguments", "sentence"),
     [
         (["--target-error", "0"], "target_error = 0 must be greater than 0"),
+        (["--target-quantile", "2"], "target_quantile = 2 must lie between 0.01 and 1"),
         (["--target-error", "nan"], "target_error = nan must be finite"),
         (["--max-time", "-1"], "max_time = -1 must be greater than 0"),
         (["--max-time", "inf"], "max_time = inf must be finite"),

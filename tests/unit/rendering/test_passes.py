@@ -1,0 +1,110 @@
+"""The loop over passes: goals, forecasts, empty records and time limits, with passes that render nothing."""
+
+import re
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.cli import messages
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.rendering import passes
+from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT, Goal, Progress, run_passes
+
+
+class Clock:
+    """Replaces the time; each pass takes the next of some times [s], the last one for ever."""
+
+    def __init__(self, monkeypatch, *times):
+        self.now, self.times, self.passes = 0.0, times, 0
+        monkeypatch.setattr(passes.time, "perf_counter", lambda: self.now)
+
+    def render_pass(self, number, seed):
+        self.now += self.times[min(number, len(self.times) - 1)]
+        self.passes = number + 1
+        return 0.0
+
+    def errors(self):
+        """One bin of twenty has ten times the error, which falls with the square root of the passes."""
+        return np.array([0.1] * 18 + [1.0] * 2) / np.sqrt(self.passes)
+
+
+@pytest.mark.parametrize(("quantile", "expected"), [(None, 100), (0.5, SMALLEST_PASS_COUNT), (0.95, 100)])
+def test_the_quantile_of_the_errors_ends_the_render(monkeypatch, quantile, expected):
+    clock = Clock(monkeypatch, 1.0)
+    goal = Goal.from_options(0.1, None, None, Goal(), quantile)
+    log = run_passes(clock.render_pass, goal, seed=0, errors=clock.errors)
+    assert log.count == expected
+    assert log.error <= 0.1
+    assert log.needed_s == 0
+
+
+def test_the_forecast_is_that_of_the_passes_that_follow(monkeypatch, caplog):
+    """The first pass compiles the kernels and takes 20 s, the others 2 s: 100 passes take 218 s."""
+    clock, reports = Clock(monkeypatch, 20.0, 2.0), []
+    goal = Goal.from_options(0.1, 60.0, None, Goal())
+    log = run_passes(clock.render_pass, goal, seed=0, errors=clock.errors, progress=reports.append)
+    assert [report.needed_passes for report in reports[1:3]] == [98, 97]
+    assert [report.needed_s for report in reports[1:3]] == [196, 194]
+    assert (log.count, log.elapsed_s, log.needed_s) == (21, 60, 158)
+    assert "ended after 21 passes and 60 s, before target_error = 0.1" in caplog.text
+    assert "95 % of the bins of lit pixels reached 0.218; the target takes about 100 passes and 218 s" in caplog.text
+
+
+def test_bins_without_light_leave_the_forecast_open(monkeypatch, caplog):
+    clock, reports = Clock(monkeypatch, 1.0), []
+    goal = Goal.from_options(0.1, None, 3, Goal())
+    errors = np.array([0.01, np.inf])
+    log = run_passes(clock.render_pass, goal, seed=0, errors=lambda: errors, progress=reports.append)
+    assert reports[-1].needed_passes is None
+    assert np.isnan(log.needed_s)
+    assert "fewer than 95 % of the bins of lit pixels have received light" in caplog.text
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(1.0, 2), (8.0, 2), (9.0, 3), (10.9, 3), (40.0, 18)])
+def test_no_pass_begins_that_would_end_after_the_time(monkeypatch, limit, expected):
+    """The first pass takes 5 s and the others 2 s; two passes are the least."""
+    clock = Clock(monkeypatch, 5.0, 2.0)
+    log = run_passes(clock.render_pass, Goal(max_time=limit), seed=0)
+    assert log.count == expected
+    assert log.elapsed_s <= max(limit, 7.0)
+
+
+@pytest.mark.parametrize(("goal", "ended"), [(Goal(max_time=1e6), 8), (Goal(passes=3), 3)])
+def test_empty_passes_end_with_an_error(monkeypatch, goal, ended):
+    clock = Clock(monkeypatch, 1.0)
+
+    def verify(count):
+        raise UserError(f"no light in {count} passes")
+
+    with pytest.raises(UserError, match=f"no light in {ended} passes"):
+        run_passes(clock.render_pass, goal, seed=0, verify=verify)
+    assert clock.passes == ended
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ((None, None, 4, Goal(), 0.5), "target_quantile = 0.5 needs a target_error"),
+        ((0.1, None, None, Goal(), 1.5), "target_quantile = 1.5 must lie between 0.01 and 1"),
+        ((0.1, None, None, Goal(), 0), "target_quantile = 0 must lie between 0.01 and 1"),
+        ((0.1, None, None, Goal(), float("nan")), "target_quantile = nan must be finite"),
+    ],
+)
+def test_quantiles_out_of_range_are_refused(options, sentence):
+    with pytest.raises(UserError, match=re.escape(sentence)):
+        Goal.from_options(*options)
+
+
+def test_a_quantile_alone_applies_to_the_default_goal():
+    default = Goal(target_error=0.03, max_time=300.0)
+    assert Goal.from_options(None, None, None, default, 0.5) == Goal(0.03, 300.0, None, 0.5)
+    assert Goal.from_options(None, None, None, default) is default
+
+
+def test_the_progress_line_names_the_request_and_its_forecast():
+    state = Progress(12, None, target_error=0.03, error=0.041, needed_passes=24, needed_s=12.0, remaining_s=12.0)
+    assert messages._describe(state) == (
+        "pass 12, 95 % of the bins of lit pixels within 4.1 %, target 3 % in 24 more passes, 12 s"
+    )
+    state = Progress(2, 9, errors_of="gates", error=0.2, target_quantile=0.5, remaining_s=4.0)
+    assert messages._describe(state) == "pass 2/9, 50 % of the gates (medians over lit pixels) within 20 %, ends in 4 s"
