@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.files import replacing, together
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,21 +50,29 @@ def check_suffix(option: str, path: Path, suffix: str) -> None:
     check_writable(path.parent, [path])
 
 
+@contextlib.contextmanager
+def announced() -> Iterator[None]:
+    """Let the files that are written in this context appear together at its end, and print their paths."""
+    with together() as written:
+        yield
+    for path in written:
+        typer.echo(path)
+
+
 def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
     """Write a dataset to a NetCDF file and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with announced(), replacing(path) as temporary:
         dataset.to_netcdf(temporary, engine="h5netcdf")
-    typer.echo(path)
 
 
 def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Dataset, Path], Any]) -> None:
     """Write a figure and a NetCDF file of its data, and print both paths; without a path do nothing."""
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        plot(dataset, path)
-        typer.echo(path)
-        write_netcdf(dataset, path.with_suffix(".nc"))
+        with announced():
+            plot(dataset, path)
+            write_netcdf(dataset, path.with_suffix(".nc"))
 
 
 @dataclass(frozen=True)
@@ -98,25 +107,24 @@ class GateFiles:
             if path.suffix in (".gif", ".mp4"):
                 images.check_animation(stack, path)
         self.folder.mkdir(parents=True, exist_ok=True)
-        for path in self.names():
-            if path.suffix == ".exr":
-                gate_files.save_stack(stack, path)
-            elif path.suffix == ".html":
-                gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
-            elif path.suffix != ".png":
-                images.animate_gates(stack, path)
-            elif path.name.endswith("_gates.png"):
-                images.plot_gates(stack, path)
-            elif not _draw_depths(stack, path, quiet):
-                continue
-            typer.echo(path)
-        if "sequence" in self.wanted:
-            for path in gate_files.save_sequence(stack, self.folder, self.stem):
-                typer.echo(path)
+        with announced():
+            for path in self.names():
+                if path.suffix == ".exr":
+                    gate_files.save_stack(stack, path)
+                elif path.suffix == ".html":
+                    gate_page.write_page(stack, path, result if result is not None and "waveform" in result else None)
+                elif path.suffix != ".png":
+                    images.animate_gates(stack, path)
+                elif path.name.endswith("_gates.png"):
+                    images.plot_gates(stack, path)
+                else:
+                    _draw_depths(stack, path, quiet)
+            if "sequence" in self.wanted:
+                gate_files.save_sequence(stack, self.folder, self.stem)
 
 
-def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> bool:
-    """Draw the depths of the echoes in the gates; return False if too few gates are below the surface."""
+def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:
+    """Draw the depths of the echoes in the gates, if enough gates are below the surface."""
     from mitransient_lidar.plots.gates.echoes import plot_depths
 
     try:
@@ -124,5 +132,3 @@ def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> bool:
     except UserError as error:
         if not quiet:
             typer.echo(f"no drawing of depths: {error}", err=True)
-        return False
-    return True

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.rendering.interruption import TerminationAsInterrupt
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -16,34 +17,37 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.rendering.passes import Progress
 
-_INVALID_INPUT, _INTERRUPTED = 2, 130  # exit codes; 130 is that of shells after Ctrl-C
+_INVALID_INPUT = 2  # exit code
 _MOST_PIXELS = 12  # listed in the summary
 
 
 @contextlib.contextmanager
 def exit_on_error() -> Iterator[None]:
-    """Exit with one sentence and code 2 on invalid input and files that cannot be used, with 130 on Ctrl-C."""
-    try:
-        yield
-    except UserError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(_INVALID_INPUT) from error
-    except BrokenPipeError:
-        raise  # stdout is closed; Typer exits without a message
-    except OSError as error:
-        place = f" {error.filename}" if error.filename else ""
-        typer.echo(f"cannot use{place}: {error.strerror or error}.", err=True)
-        raise typer.Exit(_INVALID_INPUT) from error
-    except KeyboardInterrupt as error:
-        typer.echo("interrupted.", err=True)
-        raise typer.Exit(_INTERRUPTED) from error
+    """Exit with one sentence and code 2 on invalid input and files that cannot be used.
+
+    Ctrl-C, SIGTERM and SIGHUP give the codes 130, 143 and 129.
+    """
+    with TerminationAsInterrupt() as signals:
+        try:
+            yield
+        except UserError as error:
+            typer.echo(str(error), err=True)
+            raise typer.Exit(_INVALID_INPUT) from error
+        except BrokenPipeError:
+            raise  # stdout is closed; Typer exits without a message
+        except OSError as error:
+            place = f" {error.filename}" if error.filename else ""
+            typer.echo(f"cannot use{place}: {error.strerror or error}.", err=True)
+            raise typer.Exit(_INVALID_INPUT) from error
+        except KeyboardInterrupt as error:
+            typer.echo(str(error) or "interrupted.", err=True)
+            raise typer.Exit(signals.exit_code) from error
 
 
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
-    """Exit with code 130 if Ctrl-C ended the render of a result."""
+    """Exit as after an interruption if one ended the render of a result."""
     if dataset.attrs.get("interrupted"):
-        typer.echo(f"interrupted after {dataset.attrs['passes']} passes; their result is kept.", err=True)
-        raise typer.Exit(_INTERRUPTED)
+        raise KeyboardInterrupt(f"interrupted after {dataset.attrs['passes']} passes; their result is kept.")
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import GateFiles, check_writable
+from mitransient_lidar.cli.files import GateFiles, announced, check_writable
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
 from mitransient_lidar.cli.options import Define, Quiet, Scene, Seed, parameters
 from mitransient_lidar.core.errors import UserError
@@ -55,7 +55,8 @@ def render(
     """Render the waveforms and gates of a scene.
 
     Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with gates
-    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short.
+    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. The files appear
+    together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second one on.
     """
     params = parameters(define)
     from mitransient_lidar.loading.catalogue import scene_path, scene_text
@@ -86,18 +87,18 @@ def render(
     output.mkdir(parents=True, exist_ok=True)
     if "waveform" not in dataset:
         targets = [output / f"{name}.nc"]
-    for target in targets:
-        if _write(dataset, target):
-            typer.echo(target)
-    if "gate_energy" in dataset:
-        gates.write(dataset, dataset, quiet)
+    with announced():
+        for target in targets:
+            _write(dataset, target)
+        if "gate_energy" in dataset:
+            gates.write(dataset, dataset, quiet)
     if not quiet:
         summarise(dataset)
     exit_if_interrupted(dataset)
 
 
-def _write(dataset: xr.Dataset, target: Path) -> bool:
-    """Write a result or a figure of it; return False for the layout of pixels that do not see the sea."""
+def _write(dataset: xr.Dataset, target: Path) -> None:
+    """Write a result or a figure of it, except the layout of pixels that do not see the sea."""
     from mitransient_lidar import results
     from mitransient_lidar.results import gate_files
 
@@ -116,8 +117,6 @@ def _write(dataset: xr.Dataset, target: Path) -> bool:
             plot_layout(dataset, target)
         except UserError as error:
             typer.echo(f"no drawing of the pixels: {error}", err=True)
-            return False
-    return True
 
 
 def passive(
@@ -174,10 +173,10 @@ def passive(
         ".gif": passive_plots.animate_passive,
         ".png": passive_plots.plot_passive,
     }
-    for target in targets:
-        if target.suffix != ".gif" or "row" in image.dims:
-            writers.get(target.suffix, save_radiance)(image, target)
-            typer.echo(target)
+    with announced():
+        for target in targets:
+            if target.suffix != ".gif" or "row" in image.dims:
+                writers.get(target.suffix, save_radiance)(image, target)
     if not quiet:
         typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
         if "background_power" in image:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.files import replacing, together
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format
 
@@ -111,9 +111,10 @@ def save_sequence(dataset: xr.Dataset, folder: str | os.PathLike[str], stem: str
         raise UserError(f"cannot write {folder}: {error.strerror}.") from error
     parts = _parts(stack, is_sequence=True)
     paths = [folder / f"{stem}_{part.name}.exr" for part in parts]
-    for path, part in reversed(list(zip(paths, parts, strict=True))):
-        with replacing(path) as temporary:
-            exr.write_parts(temporary, [part])
+    with together():
+        for path, part in zip(paths, parts, strict=True):
+            with replacing(path) as temporary:
+                exr.write_parts(temporary, [part])
     similar = {path for path in folder.iterdir() if (number := _NUMBERED.fullmatch(path.name)) and number[1] == stem}
     if stale := sorted(similar - set(paths)):
         _LOG.warning("%s does not belong to this sequence of %d gates, but has a similar name", stale[0], len(paths))
