@@ -100,13 +100,13 @@ def _move(moves: list[tuple[Path, Path]]) -> None:
     except BaseException as error:
         # From here on, the next run must not move the rest.
         _remove(journal)
-        for path, former in reversed(moved):
+        for changed, former in reversed(moved):
             if former is not None:
-                os.replace(former, path)
+                os.replace(former, changed)
             else:
-                _remove(path)
+                _remove(changed)
         if isinstance(error, OSError):
-            raise UserError(f"cannot write {path}: {error.strerror or error}.") from error
+            raise UserError(f"cannot write {path}: {_reason(error, path, path)}.") from error
         raise
     finally:
         _remove(journal)
@@ -174,7 +174,7 @@ def _remove(path: Path) -> None:
 
 
 def _reason(error: OSError, temporary: Path, path: Path) -> str:
-    """Return the reason of an error, with the name of the file instead of the temporary one."""
-    # HDF5 puts the reason into its message.
-    stated = re.search(r"error message = '([^']+)'", str(error))
-    return error.strerror or (stated[1] if stated else str(error).replace(str(temporary), str(path)).rstrip("."))
+    """Return the reason of an error in one line, with the name of the file instead of the temporary one."""
+    # HDF5 gives a number and a long text with the state of its file.
+    text = os.strerror(error.errno) if error.errno else str(error).replace(str(temporary), str(path)).rstrip(".")
+    return text.partition("\n")[0]

@@ -199,38 +199,6 @@ def test_ctrl_c_that_mitsuba_wraps_while_loading_is_no_user_error():
         raise RuntimeError("while_loop(): encountered an exception") from KeyboardInterrupt()
 
 
-#: The command line, with one Ctrl-C when the third pass is added to the first of its statistics.
-INTERRUPTED_COMMAND = """
-import os, signal
-from mitransient_lidar.rendering import accuracy
-from mitransient_lidar.cli import app
-add = accuracy.PassStatistics.add
-def add_and_interrupt(statistics, values):
-    add(statistics, values)
-    if statistics.count == 3:
-        accuracy.PassStatistics.add = add
-        os.kill(os.getpid(), signal.SIGINT)
-signal.signal(signal.SIGINT, signal.default_int_handler)
-accuracy.PassStatistics.add = add_and_interrupt
-app.main()
-"""
-
-
-@pytest.mark.slow
-def test_ctrl_c_on_the_command_line_writes_the_files(tmp_path):
-    command = [sys.executable, "-c", INTERRUPTED_COMMAND, "render", "table1", "--passes", "100000", "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 130, done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "table1.exr",
-        "table1.nc",
-        "table1.png",
-        "table1_layout.png",
-    ]
-    attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
-    assert (attributes["interrupted"], attributes["passes"]) == (1, 3)
-
-
 def test_standard_error_is_that_of_the_mean():
     """Against NumPy on the passes themselves: a missing square root or factor of n - 1 would show."""
     rng = np.random.default_rng(1)

@@ -1,0 +1,131 @@
+"""Commands that are interrupted, killed, or run out of disk space: exit codes, and the files that remain."""
+
+import os
+import pty
+import resource
+import signal
+import subprocess
+import sys
+
+import pytest
+
+import mitransient_lidar
+
+FILES = ["table1.exr", "table1.nc", "table1.png", "table1_layout.png"]
+
+#: The command line, with a signal when the third pass is added to the first of its statistics.
+INTERRUPTED = """
+import os, signal, sys
+from mitransient_lidar.rendering import accuracy
+from mitransient_lidar.cli import app
+number = int(sys.argv.pop(1))
+add = accuracy.PassStatistics.add
+def add_and_interrupt(statistics, values):
+    add(statistics, values)
+    if statistics.count == 3:
+        accuracy.PassStatistics.add = add
+        if number == signal.SIGHUP:
+            sys.stdin.readline()  # until the terminal is closed
+        else:
+            os.kill(os.getpid(), number)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+accuracy.PassStatistics.add = add_and_interrupt
+app.main()
+"""
+
+#: The command line, killed when it has drawn the waveforms but not the layout.
+KILLED = """
+import os, signal
+from mitransient_lidar.plots import layout
+from mitransient_lidar.cli import app
+layout.plot_layout = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+app.main()
+"""
+
+#: The command line, with files of at most 60 000 bytes after the render: EXR and NetCDF files fit, the drawing does not.
+DISK_FULL = """
+import resource
+from mitransient_lidar.rendering import render
+from mitransient_lidar.cli import app
+original = render.render
+def and_fill_the_disk(*arguments, **options):
+    dataset = original(*arguments, **options)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
+    return dataset
+render.render = and_fill_the_disk
+app.main()
+"""
+
+
+def start(script, *arguments, **options):
+    return subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], text=True, **options)
+
+
+def render(script, folder, *, passes=2, before=(), **options):
+    arguments = [*before, "render", "table1", "--passes", passes, "-o", folder]
+    process = start(script, *arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+    return process, *process.communicate(timeout=240)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_on_the_command_line_keeps_the_passes(tmp_path, number, code):
+    process, stdout, stderr = render(INTERRUPTED, tmp_path, passes=100_000, before=[int(number)])
+    assert process.returncode == code, stderr
+    assert "interrupted after 3 passes; their result is kept." in stderr
+    assert names(tmp_path) == FILES
+    assert stdout.splitlines() == [str(tmp_path / name) for name in FILES]
+    attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
+    assert (attributes["interrupted"], attributes["passes"]) == (1, 3)
+
+
+@pytest.mark.slow
+def test_a_closed_terminal_keeps_the_passes(tmp_path):
+    """The terminal is closed, which sends SIGHUP, and every later output to it fails."""
+    leader, follower = pty.openpty()
+
+    def take_terminal():
+        os.setsid()
+        os.close(os.open(os.ttyname(follower), os.O_RDWR))
+
+    arguments = [int(signal.SIGHUP), "render", "table1", "--passes", 100_000, "-o", tmp_path]
+    process = start(INTERRUPTED, *arguments, stdin=follower, stdout=follower, stderr=follower, preexec_fn=take_terminal)
+    os.close(follower)
+    shown = b""
+    while b"pass 2" not in shown:
+        shown += os.read(leader, 4096)
+    os.close(leader)
+    assert process.wait(timeout=240) == 129
+    assert names(tmp_path) == FILES
+    attributes = mitransient_lidar.open(tmp_path / "table1.nc").attrs
+    assert attributes["interrupted"] == 1
+    assert attributes["passes"] >= 2
+
+
+@pytest.mark.slow
+def test_files_of_a_killed_command_do_not_appear_and_the_next_one_sweeps_them(tmp_path):
+    (tmp_path / "table1.exr").write_text("old")
+    process, stdout, _ = render(KILLED, tmp_path)
+    assert (process.returncode, stdout) == (-signal.SIGKILL, "")
+    assert (tmp_path / "table1.exr").read_text() == "old"
+    assert [name for name in names(tmp_path) if not name.startswith(".")] == ["table1.exr"]
+    assert len(names(tmp_path)) == 4  # three files were written
+    process, _, stderr = render("from mitransient_lidar.cli import app; app.main()", tmp_path)
+    assert process.returncode == 0, stderr
+    assert names(tmp_path) == FILES
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(resource.getrlimit(resource.RLIMIT_FSIZE)[1] != resource.RLIM_INFINITY, reason="files are limited")
+def test_a_full_disk_leaves_the_former_files(tmp_path):
+    (tmp_path / "table1.exr").write_text("old")
+    process, stdout, stderr = render(DISK_FULL, tmp_path)
+    assert (process.returncode, stdout) == (2, ""), stderr
+    assert stderr.splitlines()[-1] == f"cannot write {tmp_path / 'table1.png'}: File too large."
+    assert "Traceback" not in stderr
+    assert names(tmp_path) == ["table1.exr"]
+    assert (tmp_path / "table1.exr").read_text() == "old"
