@@ -24,20 +24,23 @@ def plot(
 ) -> None:
     """Draw the waveforms or the layout of a result.
 
-    Writes a PNG file, by default in the folder of FILE, and prints its path.
+    Writes a PNG file, by default in the folder of FILE, and prints its path. With --layout it also prints where the
+    axes of receiver and laser, refracted by a level sea, meet the sea level, targets' depths and the bottom: x, y, z.
     """
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
     from mitransient_lidar import results
-    from mitransient_lidar.plots.layout import plot_layout
+    from mitransient_lidar.plots.layout import axis_points, plot_layout
     from mitransient_lidar.plots.waveforms import plot_waveforms
 
     if layout:
         target = output or file.with_name(f"{file.stem}_layout.png")
-        plot_layout(results.open(file), target)
-    else:
-        target = output or file.with_suffix(".png")
-        plot_waveforms(results.open(file), target, "both" if log == linear else "log" if log else "linear")
+        dataset = results.open(file)
+        plot_layout(dataset, target)
+        typer.echo("\n".join([str(target), *axis_points(dataset)]))
+        return
+    target = output or file.with_suffix(".png")
+    plot_waveforms(results.open(file), target, "both" if log == linear else "log" if log else "linear")
     typer.echo(target)
 
 

@@ -1,11 +1,11 @@
-"""Figure of the layout of a result: pixels, beam and targets on the mean sea level."""
+"""Figure of the layout of a result: pixels, beam and targets on the mean sea level and under water."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from matplotlib.patheffects import withStroke
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.lines_of_sight import LevelSea
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.geometry import optional_number
 
@@ -28,18 +29,48 @@ _EDGED_CELLS = 16
 #: Largest ratio of length and width of a footprint that is drawn to scale.
 _LARGEST_ASPECT = 4.0
 
+#: Most planes through targets, and planes side by side.
+_MOST_TARGET_PLANES, _MOST_COLUMNS = 3, 3
+
+#: Heights of targets that differ by less are drawn on one plane [m], and axes that differ by less as one [m].
+_SAME_PLANE, _SAME_POINT = 0.05, 1e-3
+
+#: Longest list of names of targets in a title.
+_LONGEST_NAME = 32
+
 _BEAM_COLOUR = "#e07b00"
 _TARGET_COLOUR = "#7a3fb0"
+_SHADOW_COLOUR = "#00000055"
 _LEVELS = {0.6065: "e$^{-1/2}$", 0.1353: "e$^{-2}$", 1.0: "rim"}
 
 #: White outline that separates lines from pixels of any colour.
 _HALO = [withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
 
 
-def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the pixels, the beam and the targets of a result on the mean sea level, away from the lidar upwards.
+@dataclass(frozen=True)
+class _Plane:
+    """Horizontal plane on which pixels and beam are drawn.
 
-    Targets are drawn at their true positions, without refraction. The cells of an imager show the received energy.
+    `targets` are the targets at about its height; `outline` is the kind of line that is drawn of each target of the
+    result: ``seen``, ``line`` or ``shadow``.
+    """
+
+    z: float
+    name: str
+    outline: str
+    targets: list[dict[str, Any]]
+
+
+def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw pixels, beam and targets of a result on horizontal planes, away from the lidar upwards.
+
+    The planes are the mean sea level, the mean heights of the targets (of three at most; others are drawn on the
+    nearest of them), and the height of the bottom on the receiver's axis. Lines of sight and the beam are refracted by
+    a level sea. On the sea level, targets are drawn where the receiver sees them; on their planes, at their true
+    positions; on the bottom, their shadows in the laser's light are drawn. Each plane's title gives the point of the
+    receiver's axis. The cells of an imager show the received energy.
+
+    Results without refractive index, targets or bottom in their attributes have fewer planes.
 
     Raises
     ------
@@ -47,28 +78,106 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
         If the attributes of the result hold no pose of the lidar or no field of view, or the receiver looks above the
         horizon.
     """
-    figure = drawing.new_figure(path, 6.8, 6.4)
     attributes = dataset.attrs
     ground = _Ground.of_result(attributes)
-    ax = figure.add_subplot()
+    targets = json.loads(attributes.get("target_outlines", "[]"))
+    planes = _planes(attributes, targets)
+    columns = math.ceil(len(planes) / math.ceil(len(planes) / _MOST_COLUMNS))
+    rows = math.ceil(len(planes) / columns)
+    figure = drawing.new_figure(path, 2.2 + 4.6 * columns, 6.4 * rows)
     handles: list[Any] = []
-    has_pixels = "pixel" in dataset.dims
-    seen = _draw_pixels(ax, dataset, ground, handles) if has_pixels else _draw_image(ax, dataset, ground)
-    lit = _draw_beam(ax, attributes, ground)
-    _draw_targets(ax, attributes, ground)
-    _set_limits(figure, ax, seen, lit)
-    names = ("y (m)", "x (m)") if abs(ground.azimuth) < 1e-6 else ("across (m)", "along (m)")
-    ax.set_xlabel(names[0] if ax.get_aspect() == 1 else f"{names[0]}, not to scale")
-    ax.set_ylabel(f"{names[1]}, away from the lidar")
-    handles += ax.get_legend_handles_labels()[0]
-    ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.01), frameon=False, handlelength=1.8)
-    ax.set_title(_title(attributes), fontsize="medium")
+    heights = []
+    for index, plane in enumerate(planes):
+        ax = figure.add_subplot(rows, columns, index + 1)
+        heights.append(_draw_plane(ax, dataset, ground.at(plane.z), plane, handles if index == 0 else []))
+        title = "\n".join([plane.name, *ground.axis_points(plane.z)])
+        ax.set_title(f"{_title(attributes)}\n{title}" if len(planes) == 1 else title, fontsize="medium")
+        names = ("y (m)", "x (m)") if abs(ground.azimuth) < 1e-6 else ("across (m)", "along (m)")
+        ax.set_xlabel(names[0] if ax.get_aspect() == 1 else f"{names[0]}, not to scale")
+        ax.set_ylabel("" if index % columns else f"{names[1]}, away from the lidar")
+    figure.set_figheight(sum(max(heights[row * columns : (row + 1) * columns]) for row in range(rows)))
+    labelled = {
+        label: handle for ax in figure.axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles=[*handles, *labelled.values()], loc="outside right upper", frameon=False, handlelength=1.8)
+    if len(planes) > 1:
+        figure.suptitle(_title(attributes), fontsize="medium")
     return drawing.save(figure, path)
+
+
+def axis_points(dataset: xr.Dataset) -> list[str]:
+    """Return, for each plane of `plot_layout`, its name and the points where receiver's axis and laser's axis meet it.
+
+    Raises
+    ------
+    UserError
+        If the attributes of the result hold no pose of the lidar.
+    """
+    ground = _Ground.of_result(dataset.attrs)
+    planes = _planes(dataset.attrs, json.loads(dataset.attrs.get("target_outlines", "[]")))
+    return [f"{plane.name}: {', '.join(ground.axis_points(plane.z))}" for plane in planes]
+
+
+def _planes(attributes: dict[str, Any], targets: list[dict[str, Any]]) -> list[_Plane]:
+    """Return the planes to draw, from the sea level down."""
+    surface = _Plane(0.0, "mean sea level", "seen", targets)
+    if _sea(attributes) is None:
+        return [surface]
+    groups = [[target] for target in sorted(targets, key=lambda target: -_middle(target))]
+    while len(groups) > _MOST_TARGET_PLANES or (len(groups) > 1 and min(_gaps(groups)) < _SAME_PLANE):
+        nearest = int(np.argmin(_gaps(groups)))
+        groups[nearest] += groups.pop(nearest + 1)
+    planes = [surface]
+    for group in groups:
+        z = float(np.mean([_middle(target) for target in group]))
+        names = ", ".join(dict.fromkeys(str(target.get("id", "target")) for target in group))
+        names = names if len(names) <= _LONGEST_NAME else f"{len(group)} targets"
+        planes.append(_Plane(z, f"{'depth' if z < 0 else 'height'} of {names}", "line", group))
+    bottom = np.atleast_1d(attributes.get("bottom_point", ()))
+    if bottom.size == 3:
+        planes.append(_Plane(float(bottom[2]), "bottom", "shadow", targets))
+    return planes
+
+
+def _gaps(groups: list[list[dict[str, Any]]]) -> FloatArray:
+    """Return the distances between the heights of neighbouring groups of targets [m]."""
+    return -np.diff([np.mean([_middle(target) for target in group]) for group in groups])
+
+
+def _middle(target: dict[str, Any]) -> float:
+    return 0.5 * float(target["z"][0] + target["z"][1])
+
+
+def _sea(attributes: dict[str, Any]) -> LevelSea | None:
+    """Return the water of a result, or None if its refractive index is unknown."""
+    index = optional_number(attributes, "refractive_index")
+    layers = np.atleast_1d(attributes.get("index_layers", () if index is None else index))
+    boundaries = np.atleast_1d(attributes.get("index_boundaries", ()))
+    return LevelSea(tuple(layers.tolist()), tuple(boundaries.tolist())) if index is not None else None
+
+
+def _draw_plane(ax: Axes, dataset: xr.Dataset, ground: _Ground, plane: _Plane, handles: list[Any]) -> float:
+    """Draw pixels, beam, targets and axes on a plane; return a height in inches."""
+    attributes = dataset.attrs
+    if "pixel" in dataset.dims:
+        seen = _draw_pixels(ax, dataset, ground, handles)
+    elif plane.outline == "seen":
+        seen = _draw_image(ax, dataset, ground)
+    else:
+        seen = _draw_field(ax, attributes, ground)
+    lit = _draw_beam(ax, attributes, ground)
+    height = _set_limits(ax, seen, lit)
+    _draw_targets(ax, ground, plane)
+    for pose, marker, label in ((ground.receiver, "+", "receiver's axis"), (ground.transmitter, "x", "laser's axis")):
+        if pose is ground.receiver or ground.axes_differ(plane.z):
+            point = ground.project(pose, np.zeros((1, 2)))
+            ax.plot(*point.T, marker, color="black", markersize=9, label=label, path_effects=_HALO, zorder=6)
+    return height
 
 
 @dataclass(frozen=True)
 class _Ground:
-    """Map of angles and positions to distances across and along the lidar's azimuth on the mean sea level [m].
+    """Map of angles and positions to distances across and along the lidar's azimuth on a horizontal plane [m].
 
     A pose has origin, axis, far and left, shape (4, 3).
     """
@@ -76,13 +185,19 @@ class _Ground:
     receiver: FloatArray
     transmitter: FloatArray
     azimuth: float  #: Direction of the receiver's axis, from +x towards +y [rad].
+    sea: LevelSea
+    z: float = 0.0  #: Height of the plane [m].
 
     @classmethod
     def of_result(cls, attributes: dict[str, Any]) -> _Ground:
         receiver, transmitter = (_pose(attributes, f"{name}_pose") for name in ("receiver", "transmitter"))
         # A vertical axis has no azimuth; its far direction has one.
         x, y = receiver[1 if math.hypot(*receiver[1, :2]) > 1e-6 else 2, :2]
-        return cls(receiver, transmitter, math.atan2(y, x))
+        return cls(receiver, transmitter, math.atan2(y, x), _sea(attributes) or LevelSea((1.0,)))
+
+    def at(self, z: float) -> _Ground:
+        """Return the map to the plane at another height [m]."""
+        return replace(self, z=z)
 
     def place(self, points: FloatArray) -> FloatArray:
         """Return (across, along) of positions (x, y), shape (..., 2)."""
@@ -93,8 +208,18 @@ class _Ground:
     def project(self, pose: FloatArray, angles: FloatArray) -> FloatArray:
         """Return (across, along) of rays (angle_x, angle_y) [mrad], shape (..., 2); NaN for rays above the horizon."""
         rays = pose[1] + 1e-3 * (angles[..., :1] * pose[2] + angles[..., 1:] * pose[3])
-        down = np.where(rays[..., 2:] < -1e-9, rays[..., 2:], np.nan)
-        return self.place(pose[0] - pose[0, 2] * rays / down)
+        return self.place(self.sea.at_height(pose[0], rays, self.z))
+
+    def axis_points(self, z: float) -> list[str]:
+        """Return the points where the receiver's axis, and the laser's where it differs, meet a height, as text."""
+        drawn = [("axis", self.receiver), *([("laser", self.transmitter)] if self.axes_differ(z) else [])]
+        places = [(name, self.sea.at_height(pose[0], pose[1], z)) for name, pose in drawn]
+        return [f"{name} at ({x:.3f}, {y:.3f}, {z:.3f}) m" for name, (x, y) in places]
+
+    def axes_differ(self, z: float) -> bool:
+        """Return whether the laser's axis meets a height more than a millimetre away from the receiver's."""
+        points = [self.sea.at_height(pose[0], pose[1], z) for pose in (self.receiver, self.transmitter)]
+        return float(np.linalg.norm(points[0] - points[1])) > _SAME_POINT
 
 
 def _pose(attributes: dict[str, Any], name: str) -> FloatArray:
@@ -160,7 +285,7 @@ def _draw_field(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatA
     width, shape = optional_number(attributes, "field_of_view_mrad"), attributes.get("field_of_view_shape")
     if width is None or shape not in ("circle", "square", "rectangle"):
         return np.zeros((0, 2))
-    azimuth = np.linspace(0, 2 * np.pi, 181)
+    azimuth = np.linspace(0, 2 * np.pi, 185)  # with the corners of a square
     angles = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
     if shape != "circle":
         angles /= np.abs(angles).max(axis=1, keepdims=True)
@@ -183,21 +308,55 @@ def _draw_beam(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> FloatAr
     return np.concatenate(drawn)
 
 
-def _draw_targets(ax: Axes, attributes: dict[str, Any], ground: _Ground) -> None:
-    """Draw the outlines of the targets with the depths of their highest points."""
-    label = "target"
-    for target in json.loads(attributes.get("target_outlines", "[]")):
-        points = ground.place(_points(target["line"]))
-        marks: dict[str, Any] = {"color": _TARGET_COLOUR, "path_effects": _HALO, "zorder": 5}
-        ax.plot(*points.T, linewidth=1.6, linestyle=(0, (4, 1.2)), label=label, **marks)
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        depth = f"{-target['z'][1]:.3g} m"
-        ax.annotate(depth, middle, ha="center", va="center", fontsize="small", annotation_clip=True, **marks)
-        label = "_"
+def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
+    """Draw the outlines of the targets, with the depths of their highest points, or of their shadows."""
+    marks: dict[str, Any] = {"color": _TARGET_COLOUR, "path_effects": _HALO, "zorder": 5}
+    for target in plane.targets:
+        line = _target_line(target, plane.outline, ground)
+        if len(line) == 0:
+            continue
+        points = ground.place(line)
+        if plane.outline == "shadow":
+            ax.fill(*points.T, facecolor=_SHADOW_COLOUR, edgecolor="none", label=_once(ax, "shadow of target"))
+            continue
+        label = _once(ax, "target" if plane.outline == "line" else "target as seen, refracted")
+        style = (0, (4, 1.2)) if plane.outline == "line" else (0, (1.5, 1.2))
+        ax.plot(*points.T, linewidth=1.6, linestyle=style, label=label, **marks)
+        first, last = np.transpose([ax.get_xlim(), ax.get_ylim()])
+        low, high = np.maximum(points.min(axis=0), first), np.minimum(points.max(axis=0), last)
+        if np.any(low > high):
+            continue
+        ax.annotate(
+            f"{-target['z'][1]:.3g} m",
+            # At the upper edge of the visible part: the middle may be hidden by the axis.
+            (0.5 * (low[0] + high[0]), high[1]),
+            xytext=(0, -3),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize="small",
+            **marks,
+        )
 
 
-def _set_limits(figure: Figure, ax: Axes, seen: FloatArray, lit: FloatArray) -> None:
-    """Show the footprints of all pixels, and the beam up to one footprint beyond them."""
+def _target_line(target: dict[str, Any], outline: str, ground: _Ground) -> FloatArray:
+    """Return an outline (x, y) of a target, empty without one.
+
+    In a result of an earlier version, the outline seen is that of the vertical projection at the mean height.
+    """
+    if outline == "seen" and outline not in target:
+        line = _points(target["line"])
+        return ground.sea.crossing(ground.receiver[0], np.insert(line, 2, _middle(target), axis=1))
+    return _points(target.get(outline, []))
+
+
+def _once(ax: Axes, label: str) -> str:
+    """Return a label, or one that legends leave out if the axes have it already."""
+    return "_" if label in ax.get_legend_handles_labels()[1] else label
+
+
+def _set_limits(ax: Axes, seen: FloatArray, lit: FloatArray) -> float:
+    """Show the footprints of all pixels, and the beam up to one footprint beyond them; return a height in inches."""
     seen, lit = (points[np.isfinite(points).all(axis=1)] for points in (seen, lit))
     if len(seen) == 0:
         raise UserError("the result has no pixels that look at the sea: it has no layout to draw.")
@@ -210,7 +369,7 @@ def _set_limits(figure: Figure, ax: Axes, seen: FloatArray, lit: FloatArray) -> 
     to_scale = 1 / _LARGEST_ASPECT <= aspect <= _LARGEST_ASPECT
     ax.set_aspect("equal" if to_scale else "auto")
     drawing.add_grid(ax)
-    figure.set_figheight(min(max(5.0 * aspect, 3.6), 8.0) if to_scale else 6.4)
+    return min(max(5.0 * aspect, 3.6), 8.0) if to_scale else 6.4
 
 
 def _title(attributes: dict[str, Any]) -> str:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.transport.opaque import is_one_of, opaque_point
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
 
@@ -21,6 +24,12 @@ _LONGEST_TEXT = 60_000
 
 #: Largest distance of simplified outlines from their points, relative to the size.
 _TOLERANCE = 5e-4
+
+#: Rays along each side of the view that tell targets from bottoms.
+_VIEW_TICKS = 9
+
+#: Most shapes that the receiver's axis passes on its way to the bottom.
+_MOST_HITS = 64
 
 
 def describe_lidar(scene: LidarScene) -> dict[str, Any]:
@@ -54,13 +63,25 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
 def describe_layout(scene: LidarScene) -> dict[str, Any]:
     """Return the attributes of a result that `plot_layout` draws.
 
-    ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. JSON texts are
-    ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of imagers) and
-    ``target_outlines`` (lowest and highest point [m], and line of each). A line is closed, with the coordinates
-    angle_x, angle_y [mrad] of its points, or x, y [m] for targets. Texts above the limit are omitted.
+    ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. ``bottom_point`` is
+    the point x, y, z [m] where the receiver's axis, refracted by a level sea, meets a solid that is not a target;
+    missing without one. Water of several index layers has ``index_layers``, their refractive indices, and
+    ``index_boundaries``, the depths between them [m].
+
+    JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of
+    imagers) and ``target_outlines``, for each solid smaller than the view at its depth: ``id``, ``z`` (lowest and
+    highest point [m]), ``line`` (its vertical projection), ``seen`` (its outline on the sea level along the receiver's
+    refracted lines of sight) and, with a ``bottom_point``, ``shadow`` (that of its shadow in the laser's light at the
+    height of this point). A line is closed, with the coordinates angle_x, angle_y [mrad] of its points, or x, y [m] for
+    targets. Texts above the limit are omitted.
     """
     transmitter, receiver = scene.transmitter, scene.receiver
-    texts: dict[str, list[Any]] = {"target_outlines": _target_outlines(scene), "beam_outlines": []}
+    targets = [solid for solid in scene.solids if _is_target(scene, solid)]
+    bottom = _axis_on_bottom(scene, targets)
+    texts: dict[str, list[Any]] = {
+        "target_outlines": [_describe_target(scene, target, bottom) for target in targets],
+        "beam_outlines": [],
+    }
     for share, lines in transmitter.profile.outlines():
         short = [_flat(simplified(1e3 * line, 1e3 * _TOLERANCE * float(np.ptp(line)))) for line in lines]
         texts["beam_outlines"].append({"share": round(share, 4), "lines": short})
@@ -70,6 +91,11 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
         f"{name}_pose": np.concatenate([pose.origin, pose.axis, pose.far, pose.left]).tolist()
         for name, pose in (("transmitter", transmitter.pose), ("receiver", receiver.pose))
     }
+    if bottom is not None:
+        described["bottom_point"] = bottom.tolist()
+    if scene.level_sea.boundaries:
+        described["index_layers"] = list(scene.level_sea.refractive_index)
+        described["index_boundaries"] = list(scene.level_sea.boundaries)
     for name, value in texts.items():
         text = json.dumps(value, separators=(",", ":"))
         if value and len(text) <= _LONGEST_TEXT:
@@ -77,44 +103,93 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     return described
 
 
-def _target_outlines(scene: LidarScene) -> list[dict[str, Any]]:
-    """Return heights and outlines of the solids smaller than the field of view."""
-    pose = scene.receiver.pose
-    spot = pose.ground_point()
-    reach = 0.5 * scene.receiver.pixels.field_of_view * float(np.linalg.norm(spot - pose.origin))
-    reach /= max(-float(pose.axis[2]), 1e-3)
-    found = []
-    for solid in scene.solids:
-        box = solid.bbox()
-        low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-        covers = np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach)
-        outside = np.any(low[:2] > spot[:2] + 2 * reach) or np.any(high[:2] < spot[:2] - 2 * reach)
-        if not (covers or outside):
-            found.append({"z": [round(float(z), 4) for z in (low[2], high[2])], "line": _flat(_projection(solid))})
+def _is_target(scene: LidarScene, solid: mi.Shape) -> bool:
+    """Return whether a solid is smaller than the square about the view at its mean height, and in or near it."""
+    pose, box = scene.receiver.pose, solid.bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    ticks = 0.5 * scene.receiver.pixels.field_of_view * np.linspace(-1, 1, _VIEW_TICKS)
+    angle_x, angle_y = (g.reshape(-1, 1) for g in np.meshgrid(ticks, ticks))
+    height = min(0.5 * (low[2] + high[2]), 0.5 * float(pose.origin[2]))
+    seen = scene.level_sea.at_height(pose.origin, pose.axis + angle_x * pose.far + angle_y * pose.left, height)
+    seen = seen[np.isfinite(seen).all(axis=1)]
+    if len(seen) == 0:
+        return False
+    first, last = seen.min(axis=0), seen.max(axis=0)
+    near = 0.5 * (last - first)
+    covers = np.all(low[:2] < first) and np.all(high[:2] > last)
+    return not (covers or np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
+
+
+def _axis_on_bottom(scene: LidarScene, targets: list[mi.Shape]) -> FloatArray | None:
+    """Return where the receiver's axis, refracted by a level sea, meets a solid that is not a target [m]."""
+    bottoms = [solid for solid in scene.solids if not any(solid is target for target in targets)]
+    pose, sea = scene.receiver.pose, scene.level_sea
+    if not bottoms or pose.axis[2] >= 0:
+        return None
+    # Corners of the axis: receiver, sea level, boundaries of the index layers, and a point below everything.
+    lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
+    heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
+    corners = [pose.origin, *(np.append(sea.at_height(pose.origin, pose.axis, z), z) for z in heights)]
+    for start, end in itertools.pairwise(corners):
+        ray = mi.Ray3f(opaque_point(start), dr.normalize(opaque_point(end) - opaque_point(start)))
+        length = float(np.linalg.norm(end - start))
+        for _ in range(_MOST_HITS):
+            hit = scene.ray_intersect(ray)
+            point = np.array(hit.p, dtype=np.float64).ravel()
+            if not hit.is_valid()[0] or float(np.linalg.norm(point - start)) > length:
+                break
+            if is_one_of(hit.shape, bottoms)[0]:
+                return point
+            ray = hit.spawn_ray(ray.d)
+    return None
+
+
+def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:
+    """Return name, heights and outlines of a target."""
+    sea, points = scene.level_sea, _surface_points(target)
+    seen = sea.crossing(scene.receiver.pose.origin, points)
+    found = {
+        "id": target.id(),
+        "z": [round(float(z), 4) for z in (target.bbox().min.z, target.bbox().max.z)],
+        "line": _outline(points[:, :2]),
+        "seen": _outline(seen),
+    }
+    if bottom is not None and (points[:, 2] > bottom[2]).any():
+        laser = scene.transmitter.pose.origin
+        above = points[points[:, 2] > bottom[2]]
+        entries = np.pad(sea.crossing(laser, above), ((0, 0), (0, 1)))
+        found["shadow"] = _outline(sea.at_height(laser, entries - laser, bottom[2]))
     return found
 
 
-def _projection(solid: mi.Shape) -> FloatArray:
-    """Return the convex outline (x, y) of the vertical projection of a solid."""
-    from scipy.spatial import ConvexHull, QhullError
-
+def _surface_points(solid: mi.Shape) -> FloatArray:
+    """Return the corners of a mesh, or points all over another shape [m], shape (n, 3)."""
     known = mi.traverse(solid)
     if "vertex_positions" in known:
-        points = np.array(known["vertex_positions"]).reshape(-1, 3)
-    else:
-        ticks = np.linspace(0, 1, 65)
-        u, v = (mi.Float(g.ravel()) for g in np.meshgrid(ticks, ticks))
-        points = np.array(solid.sample_position(0.0, mi.Point2f(u, v)).p).T
-    flat = np.unique(points[:, :2].astype(np.float64), axis=0)
+        return np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    ticks = np.linspace(0, 1, 65)
+    u, v = (mi.Float(g.ravel()) for g in np.meshgrid(ticks, ticks))
+    return np.array(solid.sample_position(0.0, mi.Point2f(u, v)).p, dtype=np.float64).T
+
+
+def _outline(points: FloatArray) -> list[float]:
+    """Return the convex outline of points (x, y), a closed line, as rounded coordinates."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    flat = np.unique(points[np.isfinite(points).all(axis=1)], axis=0)
+    if len(flat) == 0:
+        return []
     try:
         hull = flat[ConvexHull(flat).vertices]
     except QhullError:
-        hull = flat[[0, -1]]  # the projection is a line
+        hull = flat[[0, -1]]  # the points lie on a line
     closed = np.concatenate([hull, hull[:1]])
-    return simplified(closed, _TOLERANCE * float(np.ptp(closed)))
+    size = float(np.ptp(closed, axis=0).max())
+    return _flat(simplified(closed, _TOLERANCE * size), size)
 
 
-def _flat(line: FloatArray) -> list[float]:
-    """Return the rounded coordinates of a line, with errors of about 1/5000 of the largest."""
-    digits = max(0, 3 - math.floor(math.log10(max(float(np.abs(line).max()), 1e-6))))
+def _flat(line: FloatArray, size: float | None = None) -> list[float]:
+    """Return the rounded coordinates of a line, with errors of about 1/5000 of a size, by default of the largest."""
+    size = float(np.abs(line).max()) if size is None else size
+    digits = max(0, 3 - math.floor(math.log10(max(size, 1e-6))))
     return np.round(line, digits).ravel().tolist()

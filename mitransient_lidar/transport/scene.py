@@ -11,6 +11,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
+from mitransient_lidar.physics.lidar.lines_of_sight import LevelSea
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque
@@ -80,6 +81,14 @@ class WaterScene:
     def index_layers(self) -> IndexLayers | None:
         """Index layers of the water, None without water."""
         return self.water.index_layers if self.water is not None else None
+
+    @property
+    def level_sea(self) -> LevelSea:
+        """The water with its mean sea level, without waves; as air without water."""
+        layers = self.index_layers
+        if layers is None:
+            return LevelSea((1.0,))
+        return LevelSea(tuple(map(float, layers.refractive_index)), tuple(map(float, layers.boundaries)))
 
     def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
         """Return the first intersections of rays."""

@@ -1,5 +1,7 @@
 """Figure of a layout: positions on the sea, colours and labels."""
 
+import json
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from matplotlib.patches import PathPatch
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.plots.layout import plot_layout
+from mitransient_lidar.plots.layout import axis_points, plot_layout
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -33,7 +35,7 @@ def result(attributes, pixels=4, grid=None, energy=None):
         pixel_names=[f"p{index}" for index in range(pixels)],
         pixel_centres_mrad=[(index, -index) for index in range(pixels)],
         grid=grid,
-        attributes={"altitude": 200.0, "off_nadir_deg": 20.0, **attributes},
+        attributes={"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": 1.34, **attributes},
     )
 
 
@@ -60,8 +62,8 @@ def test_pixels_are_drawn_on_the_sea_in_their_colours(lidar_scene):
     assert on_sea(HALF) == pytest.approx(3.416, abs=1e-3)
     ax = figure.axes[0]
     assert ax.get_aspect() == 1
-    texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert texts == ["p0", "p1", "p2", "p3", "beam, e$^{-1/2}$", "beam, e$^{-2}$"]
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts == ["p0", "p1", "p2", "p3", "beam, e$^{-1/2}$", "beam, e$^{-2}$", "receiver's axis"]
 
 
 def test_azimuth_points_up_for_every_direction_of_the_lidar(lidar_scene):
@@ -86,7 +88,7 @@ def test_imager_cells_lie_on_the_sea_with_their_energy(lidar_scene):
     assert corners[0, 0, 0] < 0 < corners[0, 0, 1]
     np.testing.assert_allclose(corners[1, :, 1], 0, atol=1e-9)
     np.testing.assert_allclose(mesh.get_array().ravel(), np.arange(6), atol=1e-12)
-    assert figure.axes[1].get_xlabel() == "received energy (fJ)"
+    assert "received energy (fJ)" in [ax.get_xlabel() for ax in figure.axes]
 
 
 def test_grazing_views_are_not_to_scale():
@@ -107,6 +109,67 @@ def test_results_without_outlines_are_dots_and_the_field_of_view():
     assert figure.axes[0].lines[0].get_xdata().max() == pytest.approx(3.2, abs=0.05)
 
 
+def under_water(angle_x_mrad, z):
+    """Distance along the azimuth [m] of a ray in the plane of incidence at a height, by Snell's law."""
+    theta = np.radians(20) + np.arctan(1e-3 * np.asarray(angle_x_mrad))
+    return on_sea(angle_x_mrad) - z * np.tan(np.arcsin(np.sin(theta) / 1.34))
+
+
+def test_pixels_and_beam_are_drawn_at_the_depths_of_target_and_bottom(lidar_scene):
+    extra = {"ball": {"type": "sphere", "center": [1.5, 0.4, -6], "radius": 0.5}}
+    figure = plot_layout(result(described(lidar_scene(extra=extra))))
+    assert [ax.get_title().splitlines()[0] for ax in figure.axes] == ["mean sea level", "depth of ball", "bottom"]
+    for ax, z in zip(figure.axes, (0, -6, -8), strict=True):
+        pixels = np.concatenate([patch.get_path().vertices for patch in ax.patches if isinstance(patch, PathPatch)])
+        lines = {line.get_label(): np.transpose(line.get_data()) for line in ax.lines}
+        assert pixels[:, 1].max() == pytest.approx(under_water(HALF, z), abs=4e-3)
+        assert pixels[:, 1].min() == pytest.approx(under_water(-HALF, z), abs=4e-3)
+        beam = lines["beam, e$^{-2}$"]
+        assert beam[:, 1].max() == pytest.approx(under_water(10, z), abs=4e-3)
+        np.testing.assert_allclose(lines["receiver's axis"], [[0, under_water(0, z)]], atol=1e-6)
+    seen, true = (figure.axes[index].lines for index in (0, 1))
+    (outline,) = (line for line in true if line.get_label() == "target")
+    np.testing.assert_allclose(np.hypot(outline.get_xdata() - 0.4, outline.get_ydata() - 1.5), 0.5, rtol=5e-3)
+    # From 200 m, the ball appears 1.58 m nearer than it is: its middle lies on the axis to 0.09 m.
+    (outline,) = (line for line in seen if line.get_label().startswith("target"))
+    middle = [0.5 * (np.min(values) + np.max(values)) for values in outline.get_data()]
+    np.testing.assert_allclose(middle, [0.4, -0.084], atol=0.02)
+    assert [text.get_text() for ax in figure.axes for text in ax.texts] == ["5.5 m", "5.5 m"]
+    (shadow,) = (patch for patch in figure.axes[2].patches if patch.get_label() == "shadow of target")
+    vertices = shadow.get_path().vertices
+    assert 0.5 * (vertices[:, 1].min() + vertices[:, 1].max()) == pytest.approx(1.5 + 2.112 * 2 / 8, abs=0.05)
+
+
+def test_axes_of_receiver_and_laser_are_printed(lidar_scene):
+    """A laser that looks 0.5 m beside the receiver's axis has a point of its own on every plane."""
+    attributes = described(lidar_scene(tx={"aim_y": 0.5}))
+    assert axis_points(result(attributes)) == [
+        "mean sea level: axis at (0.000, 0.000, 0.000) m, laser at (0.000, 0.500, 0.000) m",
+        "bottom: axis at (2.112, 0.000, -8.000) m, laser at (2.112, 0.500, -8.000) m",
+    ]
+    assert len(axis_points(result(described(lidar_scene())))[0].split(",")) == 3
+
+
+def test_many_targets_share_three_planes(lidar_scene):
+    heights = (-1.0, -1.02, -2.0, -5.0, -5.5, -7.0)
+    extra = {f"b{i}": {"type": "sphere", "center": [0, 0, z], "radius": 0.2} for i, z in enumerate(heights)}
+    names = [line.split(":")[0] for line in axis_points(result(described(lidar_scene(extra=extra))))]
+    assert names == ["mean sea level", "depth of b0, b1, b2", "depth of b3, b4", "depth of b5", "bottom"]
+
+
+def test_targets_of_earlier_versions_are_refracted_as_well():
+    """Results without outlines as seen: the projection at the target's mean height, and no plane of the bottom."""
+    line = [1.084, -0.5, 2.084, -0.5, 2.084, 0.5, 1.084, 0.5, 1.084, -0.5]
+    targets = json.dumps([{"z": [-6.0, -6.0], "line": line}])
+    figure = plot_layout(
+        result({"target_outlines": targets, "field_of_view_mrad": 30.0, "field_of_view_shape": "circle"})
+    )
+    assert [ax.get_title().splitlines()[0] for ax in figure.axes] == ["mean sea level", "depth of target"]
+    (outline,) = (line for line in figure.axes[0].lines if line.get_label().startswith("target"))
+    middle = [0.5 * (np.min(values) + np.max(values)) for values in outline.get_data()]
+    np.testing.assert_allclose(middle, [0, 0], atol=0.01)
+
+
 @pytest.mark.slow
 def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     attributes = described(lidar_scene(extra={"ball": {"type": "sphere", "center": [0, 0, -6], "radius": 0.5}}))
@@ -114,7 +177,13 @@ def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     for suffix in (".nc", ".exr"):
         results.save(result(attributes), tmp_path / f"a{suffix}")
         done = run("plot", tmp_path / f"a{suffix}", "--layout")
-        assert (done.exit_code, done.stdout) == (0, f"{tmp_path / 'a_layout.png'}\n")
+        assert done.exit_code == 0
+        assert done.stdout.splitlines() == [
+            str(tmp_path / "a_layout.png"),
+            "mean sea level: axis at (0.000, 0.000, 0.000) m",
+            "depth of ball: axis at (1.584, 0.000, -6.000) m",
+            "bottom: axis at (2.112, 0.000, -8.000) m",
+        ]
         drawn.append((tmp_path / "a_layout.png").read_bytes())
     assert drawn[0] == drawn[1]
 

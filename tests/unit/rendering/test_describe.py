@@ -2,13 +2,16 @@
 
 import json
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.rendering.describe import describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
 from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.snell import refract
 
 HALF = 15.0  # mrad
 SECTOR = {"type": "pixel_fov", "shape": "sector", "field_of_view_mrad": 30.0, "inner_mrad": 12.0}
@@ -87,3 +90,82 @@ def test_upright_plate_is_a_line(lidar_scene):
     (target,) = json.loads(described(lidar_scene(extra=extra))["target_outlines"])
     np.testing.assert_allclose(np.sort(np.unique(np.reshape(target["line"], (-1, 2))[:, 0])), [-1, 1], atol=1e-3)
     np.testing.assert_allclose(target["z"], [-7, -5], atol=1e-3)
+
+
+def traced_axis(scene):
+    """Return where the receiver's axis meets the sea and then a solid, with the scene's own facets and normals [m]."""
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    pose = lidar.receiver.pose
+    down = mi.Vector3f(pose.axis.tolist())
+    first = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose.origin.tolist()), down))
+    below = -dr.normalize(refract(-down, first.n, 1 / lidar.refractive_index))
+    second = scene.ray_intersect(first.spawn_ray(below))
+    return np.array(first.p).ravel(), np.array(second.p).ravel()
+
+
+ROTATED = {"to_world": mi.ScalarTransform4f().look_at([40, 72.794, 200], [3, 1, 0], [0, 0, 1])}
+
+
+@pytest.mark.parametrize("pose", [{}, {"off_nadir_deg": 45.0, "aim_x": 3.0}, ROTATED], ids=["20", "45", "any"])
+@pytest.mark.parametrize("bottom", ["level", "tilted"])
+def test_bottom_point_is_where_a_ray_through_the_scene_ends(lidar_scene, pose, bottom):
+    """To a millimetre, through the mesh of a flat sea."""
+    seabed = {"bottom": {"type": "seabed", "depth": 9.0, "slope_x_deg": 8.0, "slope_y_deg": -5.0}}
+    scene = lidar_scene(tx=pose, rx=pose, **({"bottom": None, "extra": seabed} if bottom == "tilted" else {}))
+    _, expected = traced_axis(scene)
+    assert expected[2] < -5
+    np.testing.assert_allclose(described(scene)["bottom_point"], expected, atol=1e-3)
+
+
+def test_axis_passes_targets_on_its_way_to_the_bottom(lidar_scene):
+    extra = {"ball": {"type": "sphere", "center": [1.5, 0, -6], "radius": 0.5}}
+    scene = lidar_scene(extra=extra)
+    assert traced_axis(scene)[1][2] > -6
+    np.testing.assert_allclose(described(scene)["bottom_point"], [2.1119, 0, -8], atol=1e-3)
+    assert "bottom_point" not in described(lidar_scene(bottom=None))
+
+
+def test_index_layers_bend_the_axis(lidar_scene):
+    """tan of asin(sin(20 deg) / n) over 3 m and 5 m."""
+    layers = {"layer_tops": "0, 3", "attenuation": "0.3, 0.3", "scattering": "0.15, 0.15"}
+    layers |= {"backscattering": "0.006, 0.006", "refractive_index": "1.334, 1.6"}
+    attributes = described(lidar_scene(water=layers))
+    np.testing.assert_allclose(attributes["index_layers"], [1.334, 1.6])
+    np.testing.assert_allclose(attributes["index_boundaries"], [3.0])
+    sines = np.sin(np.radians(20)) / np.array([1.334, 1.6])
+    expected = float(np.array([3.0, 5.0]) @ np.tan(np.arcsin(sines)))
+    np.testing.assert_allclose(attributes["bottom_point"], [expected, 0, -8], atol=1e-3)
+
+
+def test_targets_are_seen_and_shadowed_along_refracted_rays(lidar_scene):
+    """A level plate: its corners cross the sea and end on the bottom as single rays do."""
+    low, high = np.array([1.0, -0.5]), np.array([2.0, 0.5])
+    plate = mi.ScalarTransform4f().translate([1.5, 0, -6]).scale(0.5)
+    laser = {"aim_x": 1.0}
+    extra = {"plate": {"type": "rectangle", "to_world": plate}}
+    (target,) = json.loads(described(lidar_scene(tx=laser, extra=extra))["target_outlines"])
+    corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    for name, aim in (("seen", 0.0), ("shadow", 1.0)):
+        offset = corners - [aim - 200 * np.tan(np.radians(20)), 0]
+        distance = np.linalg.norm(offset, axis=1)
+        theta, phi = refracted_path(distance, 200.0, 6.0, 1.34)
+        reach = 200 * np.tan(theta) + (0 if name == "seen" else 8) * np.tan(phi)
+        expected = [aim - 200 * np.tan(np.radians(20)), 0] + offset * (reach / distance)[:, None]
+        line = np.reshape(target[name], (-1, 2))
+        for corner in expected:
+            assert np.hypot(*(line - corner).T).min() < 1e-3
+    assert target["id"] == "plate"
+
+
+def test_targets_belong_to_the_view_at_their_depth(lidar_scene):
+    """At 60 degrees off nadir and 30 m depth the view lies 25.4 m beyond its place on the sea."""
+    pose = {"off_nadir_deg": 60.0}
+    extra = {
+        "in_view": {"type": "sphere", "center": [25.4, 0, -30]},
+        "below_the_footprint": {"type": "sphere", "center": [0, 0, -30]},
+    }
+    scene = lidar_scene(tx=pose, rx=pose | {"field_of_view_mrad": 10.0}, bottom=40.0, extra=extra)
+    targets = json.loads(described(scene)["target_outlines"])
+    assert [target["id"] for target in targets] == ["in_view"]
+    seen = np.reshape(targets[0]["seen"], (-1, 2))
+    np.testing.assert_allclose(0.5 * (seen.min(axis=0) + seen.max(axis=0)), [0, 0], atol=0.2)

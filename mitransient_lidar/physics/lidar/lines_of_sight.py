@@ -1,0 +1,104 @@
+"""Lines of sight refracted by a level sea: where they meet a depth, and where they cross the sea level."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.validation import FloatArray, finite_array
+
+#: Directions nearer to the horizon than this sine are taken as horizontal.
+_SMALLEST_DESCENT = 1e-9
+
+#: Steps of Newton's method, and the relative change at which it ends.
+_STEPS, _CHANGE = 60, 1e-14
+
+
+@dataclass(frozen=True)
+class LevelSea:
+    """Water below the mean sea level z = 0, in layers of one refractive index each.
+
+    Parameters
+    ----------
+    refractive_index
+        Indices relative to air from the top down, at least 1, shape (layers,).
+    boundaries
+        Depths of the boundaries between the layers [m], increasing, shape (layers - 1,).
+    """
+
+    refractive_index: tuple[float, ...]
+    boundaries: tuple[float, ...] = ()
+
+    def at_height(self, origin: FloatArray, directions: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
+        """Return where rays from a point in the air meet a height, in the air or in the water.
+
+        Parameters
+        ----------
+        origin
+            Point in the air, x, y, z [m].
+        directions
+            Directions of the rays in the air, of any length, shape (..., 3).
+        z
+            Heights [m], below that of the origin, shape (...).
+
+        Returns
+        -------
+        ndarray
+            x, y [m], shape (..., 2); NaN for rays that do not go down.
+        """
+        rays = finite_array("directions", directions)
+        level = np.broadcast_to(finite_array("z", z), rays.shape[:-1])
+        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        sine = np.hypot(rays[..., 0], rays[..., 1])
+        down = np.where(rays[..., 2] < -_SMALLEST_DESCENT, -rays[..., 2], np.nan)
+        distance = (origin[2] - np.maximum(level, 0)) / down
+        for index, thickness in zip(self.refractive_index, self._thickness(-level), strict=True):
+            # Horizontal distance over the sine in the air.
+            distance = distance + thickness / np.sqrt(index**2 - sine**2)
+        return np.asarray(origin[:2] + rays[..., :2] * distance[..., None])
+
+    def crossing(self, origin: FloatArray, points: npt.ArrayLike) -> FloatArray:
+        """Return where lines of sight from a point in the air to points cross the sea level.
+
+        Lines to points in the air are prolonged straight to the sea level.
+
+        Parameters
+        ----------
+        origin
+            Point in the air, x, y, z [m].
+        points
+            Points x, y, z [m], shape (..., 3).
+
+        Returns
+        -------
+        ndarray
+            x, y [m], shape (..., 2); NaN for points in the air that are not below the origin.
+        """
+        points = finite_array("points", points)
+        offset, height = points[..., :2] - origin[:2], float(origin[2])
+        target = np.linalg.norm(offset, axis=-1)
+        layers = list(zip(self.refractive_index, self._thickness(-points[..., 2]), strict=True))
+        # The horizontal distance is a concave, increasing function of the tangent of the angle in the air: Newton's
+        # method from 0 cannot overshoot.
+        tangent = np.zeros_like(target)
+        for _ in range(_STEPS):
+            reached, rise = height * tangent, np.full_like(target, height)
+            for n, thickness in layers:
+                root = np.sqrt(n**2 + (n**2 - 1) * tangent**2)
+                reached, rise = reached + thickness * tangent / root, rise + thickness * n**2 / root**3
+            change = (target - reached) / rise
+            tangent = tangent + change
+            if np.all(np.abs(change) <= _CHANGE * tangent):
+                break
+        in_water = height * tangent / np.where(target > 0, target, 1)
+        drop = np.where(points[..., 2] < height, height - points[..., 2], np.nan)
+        share = np.where(points[..., 2] > 0, height / drop, np.where(target > 0, in_water, 0))
+        return np.asarray(origin[:2] + offset * share[..., None])
+
+    def _thickness(self, depth: FloatArray) -> list[FloatArray]:
+        """Return the thickness of each layer above depths [m]."""
+        edges = [0.0, *self.boundaries, np.inf]
+        return [np.clip(depth - top, 0, bottom - top) for top, bottom in itertools.pairwise(edges)]

@@ -1,0 +1,56 @@
+"""Lines of sight through a level sea."""
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.physics.lidar.lines_of_sight import LevelSea
+from mitransient_lidar.physics.lidar.refraction import refracted_path, snell
+
+HEIGHT, N = 200.0, 1.34
+ORIGIN = np.array([3.0, -2.0, HEIGHT])
+LAYERED = LevelSea((1.33, 1.34, 1.36), (2.0, 5.0))
+
+
+def rays(theta, azimuth):
+    """Return directions at angles from the vertical and azimuths [rad]."""
+    return np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), -np.cos(theta)], axis=-1)
+
+
+@pytest.mark.parametrize("z", [-8.0, -0.5, 0.0, 3.0])
+def test_points_at_a_height(z):
+    """Tangents of Snell's angles, in the plane of incidence."""
+    theta, azimuth = np.radians([0, 5, 20, 60, 84.6]), np.radians([0, 30, 120, 200, 300])
+    distance = (HEIGHT - max(z, 0)) * np.tan(theta) + max(-z, 0) * np.tan(snell(theta, N))
+    expected = ORIGIN[:2] + distance[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+    np.testing.assert_allclose(LevelSea((N,)).at_height(ORIGIN, 7 * rays(theta, azimuth), z), expected, rtol=1e-12)
+
+
+def test_index_layers_refract_in_turn():
+    theta = np.radians(40)
+    thicknesses = {1.33: 2.0, 1.34: 3.0, 1.36: 4.0}
+    expected = HEIGHT * np.tan(theta) + sum(d * np.tan(snell(theta, n)) for n, d in thicknesses.items())
+    (found,) = LAYERED.at_height(ORIGIN, rays(np.array([theta]), 0.0), -9.0)
+    np.testing.assert_allclose(found - ORIGIN[:2], [expected, 0], rtol=1e-12, atol=1e-12)
+
+
+def test_rays_above_the_horizon_meet_nothing():
+    assert np.isnan(LAYERED.at_height(ORIGIN, [[1.0, 0, 0], [1, 0, 0.1]], -1.0)).all()
+    assert np.isnan(LAYERED.crossing(ORIGIN, [[1.0, 0, HEIGHT]])).all()
+
+
+def test_crossing_of_one_layer_is_the_refracted_path():
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-500, 500, (50, 2)), -rng.uniform(0, 40, 50)])
+    offset = points[:, :2] - ORIGIN[:2]
+    distance = np.linalg.norm(offset, axis=1)
+    theta, _ = refracted_path(distance, HEIGHT, -points[:, 2], N)
+    expected = ORIGIN[:2] + offset * (HEIGHT * np.tan(theta) / distance)[:, None]
+    np.testing.assert_allclose(LevelSea((N,)).crossing(ORIGIN, points), expected, rtol=0, atol=1e-9)
+
+
+def test_crossing_inverts_points_at_a_height():
+    """Also straight below, far away, on the sea and in the air."""
+    z = np.array([-9.0, -3.0, -1.0, -30.0, 0.0, 5.0, -4.0])
+    directions = rays(np.radians([0, 1, 20, 60, 45, 30, 89]), np.radians([0, 10, 100, 190, 280, 300, 20]))
+    points = np.column_stack([LAYERED.at_height(ORIGIN, directions, z), z])
+    np.testing.assert_allclose(LAYERED.crossing(ORIGIN, points), LAYERED.at_height(ORIGIN, directions, 0.0), atol=1e-6)
