@@ -19,7 +19,7 @@ from matplotlib.patheffects import withStroke
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.lines_of_sight import LevelSea
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.geometry import optional_number
 

@@ -25,6 +25,15 @@ _MOST_PIXELS = 1024
 
 
 @dataclass(frozen=True)
+class SolidEcho:
+    """Mean and latest arrival of the direct echo of a solid over all pixels [ns]."""
+
+    shape: mi.Shape
+    mean_ns: float
+    latest_ns: float
+
+
+@dataclass(frozen=True)
 class EchoProbe:
     """Expected arrival of echoes, weighted by the laser's beam.
 
@@ -37,12 +46,15 @@ class EchoProbe:
         Share of the beam inside the field of view that passes outside the surface mesh.
     pierced
         Solids visible both in the air and through the sea, and whether each is larger than the field of view.
+    solids
+        Echoes of the solids that rays of beam and view meet, in the air and under water.
     """
 
     surface_ns: NDArray[np.float64]
     bottom_ns: NDArray[np.float64]
     missed_beam: float
     pierced: list[tuple[mi.Shape, bool]]
+    solids: list[SolidEcho]
 
 
 def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
@@ -60,6 +72,8 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     below = scene.ray_intersect(first.spawn_ray(down), at_sea)
     solid = at_sea & below.is_valid() & ~scene.is_surface(below.shape)
     water = 2 * below.t * scene.group_index
+    # At once: each array that is read alone would trace all rays again.
+    dr.eval(start, beam, first, below, at_sea, solid, air, water)
 
     pixel, weight = np.array(start.pixel), np.array(beam, dtype=np.float64)
     surface, pixels = np.array(at_sea), scene.receiver.pixels.count
@@ -73,7 +87,24 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     outside = ~surface if scene.surfaces else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
     surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
-    return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, at_sea, solid))
+    met = dr.select(solid, below.shape, first.shape)
+    length = air + dr.select(solid, water, 0)
+    of_solid = solid | (first.is_valid() & ~at_sea)
+    solids = _solid_echoes(scene, met, np.array(length) * per_ns, weight * np.array(of_solid))
+    return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, at_sea, solid), solids)
+
+
+def _solid_echoes(
+    scene: LidarScene, met: mi.ShapePtr, times_ns: NDArray[np.floating], weight: NDArray[np.float64]
+) -> list[SolidEcho]:
+    """Return the echoes of the solids that rays of some weight meet."""
+    numbers, echoes = np.array(dr.reinterpret_array(mi.UInt32, met)), []
+    for solid in scene.solids:
+        own = weight * (numbers == np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))))
+        mean, latest = _quantiles(times_ns, own, np.zeros(len(own), dtype=np.int64), 1, (None, 1 - _TAIL))[0]
+        if np.isfinite(mean):
+            echoes.append(SolidEcho(solid, float(mean), float(latest)))
+    return echoes
 
 
 def _pierced(

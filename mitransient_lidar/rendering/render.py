@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import positive
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow
@@ -104,11 +103,11 @@ def render(
     lidar: LidarScene = renderer.scene
     from mitransient_lidar.rendering.describe import describe_lidar
     from mitransient_lidar.rendering.echo_window import probe_echoes
+    from mitransient_lidar.rendering.scene_checks import check_scene
 
     probe = probe_echoes(lidar, renderer.sampler)
     window = _error_window(lidar, probe)
-    _check_record(lidar, probe)
-    _check_solids(lidar, probe)
+    check_scene(lidar, renderer.sampler, probe)
     # Depths are relative to the mean arrival of the surface echo over all pixels.
     arrivals = probe.surface_ns[:, 1]
     surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
@@ -161,35 +160,3 @@ def _error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
     # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
     start = np.where(np.isnan(start), time_ns[0], start)
     return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
-
-
-def _check_record(lidar: LidarScene, probe: EchoProbe) -> None:
-    """Reject a record that ends before the surface echo."""
-    axis, arrivals = lidar.axis, probe.surface_ns[:, 0]
-    if np.isfinite(arrivals).any() and axis.end_ns <= (first := float(np.nanmin(arrivals))):
-        raise UserError(
-            f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns "
-            f"end the record at {axis.end_ns:g} ns: it must end after the surface echo, which comes at {first:.1f} ns"
-        )
-
-
-def _check_solids(lidar: LidarScene, probe: EchoProbe) -> None:
-    """Reject a bottom above the sea in the field of view and a target below the bottom; warn of a target in the air."""
-    bottom: Any = max(lidar.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
-    highest = max((float(surface.bbox().max.z) for surface in lidar.surfaces), default=np.inf)
-    for solid in lidar.solids:
-        low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
-        if solid is not bottom and high < float(bottom.bbox().min.z):
-            raise UserError(
-                f"shape {solid.id()!r} lies below the bottom {bottom.id()!r}, up to z = {high:.3g} m: "
-                f"it must lie above {float(bottom.bbox().min.z):.3g} m"
-            )
-        if low > highest:
-            logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
-    for solid, is_bottom in probe.pierced:
-        if is_bottom:
-            raise UserError(
-                f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
-                "receiver looks: a bottom must lie below the waves"
-            )
-        logger.warning("shape %r rises through the sea surface: part of it is seen in the air", solid.id())

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams, unit_points
@@ -40,7 +41,7 @@ class Region:
 
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
-        """Find the region with rays of the beam and of the field of view."""
+        """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
         seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
         tangent = scene.transmitter.sample_tangent(unit_points(PROBE_RAYS))
         beam = scene.transmitter.pose.direction(*tangent)
@@ -49,6 +50,8 @@ class Region:
             _at_sea_level(scene.transmitter.pose, np.array(beam).T),
         ]
         ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
+        if not ends:
+            raise UserError("laser and receiver look above the horizon: at least one must look down at the sea")
         low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
         margin = _REGION_MARGIN * (high - low)
         x, y = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.physics.lidar.lines_of_sight import LevelSea
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.refraction import refracted_path, snell
 
 HEIGHT, N = 200.0, 1.34

@@ -1,0 +1,315 @@
+"""Checks of a scene before it is rendered: whether light can return, from which shapes, and when."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.rendering.echo_window import EchoProbe, SolidEcho
+from mitransient_lidar.transport.opaque import is_one_of, opaque_point
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.snell import refract
+
+logger = logging.getLogger(__name__)
+
+#: Rays of the view and of the beam; those of a Gaussian beam reach 4.2 standard deviations.
+_RAYS = 4096
+
+#: Distance outside view or beam within which waves and scattering still light a shape, over its depth.
+_REACH_PER_DEPTH = 0.3
+
+#: Distance of the axes that is told, over the radii of beam and view, whichever is larger.
+_APART_PER_BEAM, _APART_PER_VIEW = 0.5, 0.15
+
+#: Heights at which the distance of the axes is compared.
+_HEIGHTS = 64
+
+#: Widths of the pulse and of the receiver's response that an echo lasts at most.
+_PULSES = 5.0
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays of the view or of the beam: pose, and unit directions of shape (n, 3)."""
+
+    scene: LidarScene
+    pose: Pose
+    directions: FloatArray
+
+    @classmethod
+    def of_view(cls, scene: LidarScene, sampler: SensorSampler) -> _Rays:
+        """Return rays that pixels see."""
+        sample = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
+        seen = np.array(sample.weight) > 0
+        return cls(scene, scene.receiver.pose, np.array(sample.direction, dtype=np.float64).T[seen])
+
+    @classmethod
+    def of_beam(cls, scene: LidarScene) -> _Rays:
+        """Return rays of the laser."""
+        transmitter = scene.transmitter
+        directions = transmitter.pose.direction(*transmitter.sample_tangent(unit_points(_RAYS)))
+        return cls(scene, transmitter.pose, np.array(directions, dtype=np.float64).T)
+
+    def at_height(self, z: float) -> FloatArray:
+        """Return where the rays meet a height after refraction by a level sea, x, y [m], without those that do not."""
+        places = self.scene.level_sea.at_height(self.pose.origin, self.directions, z)
+        return places[np.isfinite(places).all(axis=1)]
+
+    def axis_at_height(self, z: float) -> FloatArray:
+        """Return where the axis meets a height after refraction by a level sea, x, y [m]; NaN if it does not."""
+        return self.scene.level_sea.at_height(self.pose.origin, self.pose.axis, z)
+
+    def distance_to(self, shape: mi.Shape) -> float:
+        """Return the distance from the rays to the bounding box of a shape at three of its heights [m]."""
+        low, high = _box(shape)
+        heights = np.minimum([low[2], 0.5 * (low[2] + high[2]), high[2]], 0.5 * self.pose.origin[2])
+        return min(
+            (float(_gaps(places, low, high).min()) for z in heights if len(places := self.at_height(z))), default=np.inf
+        )
+
+    def meets(self, shape: mi.Shape) -> bool:
+        """Return whether rays, or light that waves or scattering deflect, may meet a shape."""
+        return self.distance_to(shape) <= _REACH_PER_DEPTH * max(-float(shape.bbox().min.z), 0.0)
+
+
+def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> None:
+    """Refuse a scene that can return no light within its record, and warn of parts that cannot contribute.
+
+    Warnings name shapes whose echo comes before or after the record, which lie out of view or outside the beam, or
+    partly in the air, and a laser and a receiver whose axes do not meet.
+
+    Raises
+    ------
+    UserError
+        If no pixel sees the sea or a solid, the beam misses them, beam and view are too far apart for the record,
+        nothing in view reflects or scatters light, the record holds no echo, a bottom rises above the sea, or a target
+        lies below the bottom.
+    """
+    view, beam = _Rays.of_view(scene, sampler), _Rays.of_beam(scene)
+    _check_rays(view, "no pixel sees the sea or a solid: the receiver")
+    _check_rays(beam, "the beam misses the sea and every solid: the laser")
+    _check_overlap(scene, view, beam)
+    _check_record(scene, probe)
+    _check_reflection(scene, view)
+    _check_solids(scene, probe)
+    _warn_of_axes(scene, view, beam)
+    for solid in scene.solids:
+        _warn_of_place(solid, view, beam)
+    for echo in probe.solids:
+        _warn_of_time(scene, probe, echo)
+
+
+def _box(shape: mi.Shape) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of the bounding box of a shape [m]."""
+    box = shape.bbox()
+    return np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+
+
+def _gaps(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the horizontal distances of places (x, y) from a box [m]."""
+    outside = np.maximum(np.maximum(low[:2] - places, places - high[:2]), 0)
+    return np.asarray(np.hypot(*outside.T))
+
+
+def _place(point: FloatArray) -> str:
+    return f"({point[0]:.6g}, {point[1]:.6g})"
+
+
+def _check_record(scene: LidarScene, probe: EchoProbe) -> None:
+    """Refuse a record that ends before the surface echo, or begins after the last echo of a bottom below all pixels."""
+    axis, surface, bottom = scene.axis, probe.surface_ns[:, 0], probe.bottom_ns[:, 1]
+    if not np.isfinite(surface).any():
+        return
+    first = float(np.nanmin(surface))
+    if axis.end_ns <= first:
+        raise UserError(
+            f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns "
+            f"end the record at {axis.end_ns:g} ns: it must end after the surface echo, which comes at {first:.1f} ns"
+        )
+    if np.isfinite(bottom[np.isfinite(surface)]).all():
+        last = float(np.nanmax(bottom))
+        # Light that was scattered several times comes later than the bottom's echo.
+        if axis.start_ns > last + (last - first) + _echo_length(scene):
+            raise UserError(
+                f"time_start_ns = {axis.start_ns:g} begins the record after every echo: it must be less than "
+                f"{last:.1f} ns, when the bottom's echo ends"
+            )
+
+
+def _check_rays(rays: _Rays, subject: str) -> None:
+    """Refuse rays that meet neither the sea nor a solid."""
+    surfaces = rays.scene.surfaces
+    for surface in surfaces:
+        low, high = _box(surface)
+        for z in (0.0, min(high[2], 0.5 * rays.pose.origin[2])):
+            if len(places := rays.at_height(z)) and _gaps(places, low, high).min() == 0:
+                return
+    if any(rays.meets(solid) for solid in rays.scene.solids):
+        return
+    axis = rays.axis_at_height(0.0)
+    if not np.isfinite(axis).all():
+        x, y, z = rays.pose.axis
+        raise UserError(f"{subject} looks above the horizon, along ({x:.3g}, {y:.3g}, {z:.3g}); it must look down")
+    where = "where no shape is"
+    if surfaces:
+        lows, highs = zip(*map(_box, surfaces), strict=True)
+        where = f"outside the sea from {_place(np.min(lows, axis=0))} to {_place(np.max(highs, axis=0))} m"
+    raise UserError(f"{subject}'s axis meets the sea level at {_place(axis)} m, {where}; change aim_x and aim_y")
+
+
+def _check_overlap(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
+    """Refuse beam and view so far apart that light could not pass from one to the other before the record ends."""
+    seen, lit = view.at_height(0.0), beam.at_height(0.0)
+    if not (len(seen) and len(lit)):
+        return
+    apart = np.maximum(seen.min(axis=0) - lit.max(axis=0), lit.min(axis=0) - seen.max(axis=0))
+    gap = float(np.hypot(*np.maximum(apart, 0)))
+    air = sum(
+        float(np.sqrt(np.sum((places - rays.pose.origin[:2]) ** 2, axis=1).min() + rays.pose.origin[2] ** 2))
+        for rays, places in ((view, seen), (beam, lit))
+    )
+    # Bounds of the path from below: solids in the air may reflect it, which shortens its way through the air.
+    highest = max((_box(solid)[1][2] for solid in scene.solids), default=0.0)
+    if highest <= 0 and gap > 0 and air + gap > scene.axis.path_end:
+        raise UserError(
+            f"beam and field of view do not overlap: they are {gap:.3g} m apart on the sea level, so that scattered "
+            f"light would arrive at {1e9 * (air + gap) / C0:.0f} ns or later, after the end of the record at "
+            f"{scene.axis.end_ns:g} ns; aim laser and receiver at one place by aim_x, aim_y and off_nadir_deg"
+        )
+
+
+def _check_reflection(scene: LidarScene, view: _Rays) -> None:
+    """Refuse black solids in water that does not scatter, below a smooth surface."""
+    rough = mi.BSDFFlags.Glossy.value | mi.BSDFFlags.Diffuse.value
+    if any(int(surface.bsdf().flags()) & rough for surface in scene.surfaces):
+        return
+    water = scene.water
+    if water is not None and (water.plume is not None or water.column.scattering.max() > 0):
+        return
+    ray = mi.Ray3f(opaque_point(view.pose.origin), mi.Vector3f(*view.directions.T))
+    first = scene.ray_intersect(ray)
+    at_sea = first.is_valid() & scene.is_surface(first.shape)
+    down = -dr.normalize(refract(-ray.d, first.n, 1 / scene.refractive_index))
+    below = scene.ray_intersect(first.spawn_ray(down), at_sea)
+    found: list[mi.Shape] = []
+    random = unit_points(len(view.directions))
+    for hit, active in ((first, first.is_valid() & ~at_sea), (below, at_sea & below.is_valid())):
+        _, weight = hit.bsdf().sample(mi.BSDFContext(), hit, random.x, random, active)
+        if dr.any(active & (weight[0] > 0)):
+            return
+        found += [solid for solid in scene.solids if dr.any(active & is_one_of(hit.shape, [solid]))]
+    if any(view.meets(solid) and not any(solid is other for other in found) for solid in scene.solids):
+        return
+    names = ", ".join(repr(solid.id()) for solid in dict.fromkeys(found)) or "no shape"
+    raise UserError(
+        f"nothing in view returns light: scattering = 0 in the water, a smooth surface, and {names} in view with a "
+        "reflectance of 0; raise scattering, reflectance or the surface's roughness"
+    )
+
+
+def _check_solids(scene: LidarScene, probe: EchoProbe) -> None:
+    """Refuse a bottom above the sea in the field of view and a target below the bottom; warn of a target in the air."""
+    bottom: Any = max(scene.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
+    highest = max((float(surface.bbox().max.z) for surface in scene.surfaces), default=np.inf)
+    for solid in scene.solids:
+        low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
+        if solid is not bottom and high < float(bottom.bbox().min.z):
+            raise UserError(
+                f"shape {solid.id()!r} lies below the bottom {bottom.id()!r}, up to z = {high:.3g} m: "
+                f"it must lie above {float(bottom.bbox().min.z):.3g} m"
+            )
+        if low > highest:
+            logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
+    for solid, is_bottom in probe.pierced:
+        if is_bottom:
+            raise UserError(
+                f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
+                "receiver looks: a bottom must lie below the waves"
+            )
+        logger.warning("shape %r rises through the sea surface: part of it is seen in the air", solid.id())
+
+
+def _warn_of_axes(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
+    """Warn of axes of laser and receiver that do not meet in the water or on the surface."""
+    boxes = [_box(solid) for solid in scene.solids]
+    highest = max([0.0, *(min(high[2], 0.5 * view.pose.origin[2]) for _, high in boxes)])
+    # Without a solid, to the depth from which light returns within the record.
+    reach = 0.5 * (scene.axis.path_end - 2 * view.pose.origin[2]) / scene.group_index
+    lowest = min([low[2] for low, _ in boxes] or [-max(reach, 0.0)])
+    heights = np.linspace(highest, min(lowest, highest), _HEIGHTS)
+    apart = [float(np.linalg.norm(view.axis_at_height(z) - beam.axis_at_height(z))) for z in (0.0, *heights)]
+    if not np.isfinite(apart).all():
+        return
+    ranges = [float(np.linalg.norm(pose.ground_point() - pose.origin)) for pose in (beam.pose, view.pose)]
+    beam_radius = 0.5 * min(scene.transmitter.profile.divergence) * ranges[0]
+    view_radius = 0.5 * scene.receiver.pixels.field_of_view * ranges[1]
+    if min(apart) > max(_APART_PER_BEAM * beam_radius, _APART_PER_VIEW * view_radius):
+        logger.warning(
+            "laser and receiver look at different places: on the sea level their axes are %.3g m apart, %.2g times the "
+            "beam's radius of %.3g m there, and nowhere in the water less than %.3g m",
+            apart[0],
+            apart[0] / beam_radius,
+            beam_radius,
+            min(apart),
+        )
+
+
+def _warn_of_place(solid: mi.Shape, view: _Rays, beam: _Rays) -> None:
+    """Warn of a solid that lies out of view or outside the beam."""
+    low, high = _box(solid)
+    z = 0.5 * (low[2] + high[2])
+    for rays, problem, name in ((view, "out of view", "receiver"), (beam, "outside the beam", "laser")):
+        if rays.meets(solid) or not np.isfinite(axis := rays.axis_at_height(min(z, 0.5 * rays.pose.origin[2]))).all():
+            continue
+        logger.warning(
+            "shape %r lies %s: it is %.1f m from the %s's axis, which passes x = %.1f m, y = %.1f m at its height of "
+            "z = %.1f m; move the shape there, or the lidar by aim_x and aim_y",
+            solid.id(),
+            problem,
+            float(_gaps(axis[None], low, high)[0]),
+            name,
+            *axis,
+            z,
+        )
+        return
+
+
+def _warn_of_time(scene: LidarScene, probe: EchoProbe, echo: SolidEcho) -> None:
+    """Warn of the echo of a solid that comes before the record, or after one that is not of the surface echo alone."""
+    axis, fwhm_ns = scene.axis, scene.transmitter.pulse.fwhm_ns
+    name, mean = echo.shape.id(), echo.mean_ns
+    if mean < axis.start_ns:
+        logger.warning(
+            "the echo of shape %r comes at %.1f ns, before the record starts at %g ns: lower time_start_ns",
+            name,
+            mean,
+            axis.start_ns,
+        )
+        return
+    surface = probe.surface_ns[:, 1]
+    of_surface = np.isfinite(surface).any() and axis.end_ns < np.nanmax(surface) + _echo_length(scene)
+    if mean > axis.end_ns and not of_surface:
+        logger.warning(
+            "the echo of shape %r comes at %.1f ns, after the record ends at %g ns: a bin_count of %d would hold it",
+            name,
+            mean,
+            axis.end_ns,
+            math.ceil((echo.latest_ns + fwhm_ns - axis.start_ns) / axis.bin_width_ns),
+        )
+
+
+def _echo_length(scene: LidarScene) -> float:
+    """Return an upper limit of the time that an echo lasts [ns]."""
+    return _PULSES * float(scene.transmitter.pulse.fwhm_ns + scene.receiver.optics.response_time_ns)

@@ -1,0 +1,191 @@
+"""Checks of scenes before they are rendered: refusals, and warnings with their numbers."""
+
+import logging
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from command_line import run
+from oracles.echo_times import bottom_time_ns
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.catalogue import scene_names
+from mitransient_lidar.physics.lidar.refraction import snell, surface_time_ns
+from mitransient_lidar.rendering.echo_window import probe_echoes
+from mitransient_lidar.rendering.scene_checks import check_scene
+from mitransient_lidar.rendering.session import open_scene
+
+THETA, N = np.radians(20), 1.34
+TO_WORLD = mi.ScalarTransform4f()
+UP = {"to_world": TO_WORLD.look_at([0, 0, 200], [10, 0, 400], [0, 1, 0])}
+BALL = {"type": "sphere", "radius": 0.5}
+
+
+def check(scene, caplog, integrator="lidar_merging"):
+    """Return the warnings of the checks of a scene."""
+    renderer = mi.load_dict({"type": integrator}).prepare(scene, scene.sensors()[0])
+    with caplog.at_level(logging.WARNING):
+        check_scene(renderer.scene, renderer.sampler, probe_echoes(renderer.scene, renderer.sampler))
+    return [record.getMessage() for record in caplog.records]
+
+
+def numbers(message):
+    return [float(value) for value in re.findall(r"(?<![\w.])-?\d+\.?\d*", message)]
+
+
+def on_axis(z):
+    """x at which the axis of the default lidar passes a height under water [m]."""
+    return -z * np.tan(snell(THETA, N))
+
+
+def test_echo_after_the_record_is_told_with_its_arrival(lidar_scene, caplog):
+    (message,) = check(lidar_scene(bottom=30.0), caplog)
+    assert "shape 'bottom'" in message
+    arrival, end, bins = numbers(message)
+    assert arrival == pytest.approx(bottom_time_ns(200, 30, THETA, N, N), abs=1)
+    assert end == 1390 + 160
+    assert arrival + 5 < 1390 + bins < arrival + 20
+    caplog.clear()
+    assert check(lidar_scene(bottom=30.0, film={"bin_count": int(bins)}), caplog) == []
+
+
+def test_record_of_the_surface_echo_alone_is_no_mistake(lidar_scene, caplog):
+    surface = surface_time_ns(200, THETA)
+    for length, told in ((15, 0), (40, 1)):
+        caplog.clear()
+        count = int(surface + length - 1390)
+        assert len(check(lidar_scene(film={"bin_count": count}), caplog)) == told
+
+
+def test_echo_before_the_record_is_told(lidar_scene, caplog):
+    """A ball at 2 m, and a record from just above the bottom."""
+    extra = {"ball": BALL | {"center": [on_axis(-2), 0, -2]}}
+    start = float(bottom_time_ns(200, 6, THETA, N, N))
+    (message,) = check(lidar_scene(film={"time_start_ns": start}, extra=extra), caplog)
+    assert "shape 'ball'" in message
+    assert numbers(message)[0] == pytest.approx(bottom_time_ns(200, 1.6, THETA, N, N), abs=2)
+    assert "lower time_start_ns" in message
+
+
+@pytest.mark.parametrize(
+    ("target", "distance"),
+    [([1e6, 0, -6], 1e6 - 0.5 - 1.584), ([0, 9.5, -6], np.hypot(1.584 - 0.5, 9)), ([1.5, -30, -2], 29.5)],
+)
+def test_target_out_of_view_is_told_with_its_distance(lidar_scene, caplog, target, distance):
+    (message,) = check(lidar_scene(extra={"ball": BALL | {"center": target}}), caplog)
+    found, x, y, z = numbers(message)
+    assert "shape 'ball' lies out of view" in message
+    assert found == pytest.approx(distance, rel=1e-6, abs=0.06)
+    assert (x, y, z) == (pytest.approx(on_axis(z), abs=0.06), 0, target[2])
+
+
+def test_seabed_in_map_coordinates_is_told(lidar_scene, caplog):
+    """Its nearest corner is 500 m nearer in x and y than its centre."""
+    seabed = {"bottom": {"type": "seabed", "centre_x": 674000.0, "centre_y": 6580000.0}}
+    (message,) = check(lidar_scene(bottom=None, extra=seabed), caplog)
+    assert "shape 'bottom' lies out of view" in message
+    assert numbers(message)[0] == pytest.approx(np.hypot(673500 - 2.1, 6579500), rel=1e-5)
+
+
+def test_target_in_view_outside_the_beam_is_told(lidar_scene, caplog):
+    extra = {"ball": BALL | {"center": [on_axis(-6) + 8, 0, -6]}}
+    scene = lidar_scene(tx={"divergence_mrad": 0.5}, rx={"field_of_view_mrad": 100.0}, extra=extra)
+    (message,) = check(scene, caplog)
+    assert "shape 'ball' lies outside the beam: it is 7.5 m from the laser's axis" in message
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"extra": {"ball": BALL | {"center": [5.2, 0, -6]}}},
+        {"extra": {"ball": BALL | {"center": [6.5, 0, -6]}}},
+        {"extra": {"ball": BALL | {"center": [3.2, 0, -6]}}, "tx": {"divergence_mrad": 0.5}},
+        {"rx": {"ring": {"type": "pixel_fov", "shape": "sector", "field_of_view_mrad": 40.0, "inner_mrad": 30.0}}},
+        {"tx": {"aim_y": 0.3, "divergence_mrad": 0.5}},
+        {"tx": {"altitude": 210.0}},
+        {"bottom": None},
+    ],
+    ids=["partly seen", "just outside", "beside a narrow beam", "ring", "parallel axes", "apart", "no bottom"],
+)
+def test_legitimate_scenes_pass_in_silence(lidar_scene, caplog, parts):
+    assert check(lidar_scene(**parts), caplog) == []
+
+
+def test_axes_that_do_not_meet_are_told(lidar_scene, caplog):
+    """The beam's radius is half the divergence, over the slant range of 200 m / cos 20."""
+    (message,) = check(lidar_scene(rx={"aim_x": 2.0}), caplog)
+    apart, ratio, radius, least = numbers(message)
+    assert (apart, least) == (2, 2)
+    assert radius == pytest.approx(0.005 * 200 / np.cos(THETA), rel=5e-3)
+    assert ratio == pytest.approx(2 / radius, rel=0.05)
+
+
+def test_axes_may_meet_in_the_water(lidar_scene, caplog):
+    """A receiver that looks down on the beam's axis at 6 m sees the sea 1.58 m from it."""
+    straight_down = {"off_nadir_deg": 0.0, "aim_x": on_axis(-6.0)}
+    assert check(lidar_scene(rx=straight_down, film={"time_start_ns": 1340.0}), caplog) == []
+    straight_down["aim_x"] = on_axis(-12.0)
+    assert "their axes are 3.17 m apart" in check(lidar_scene(rx=straight_down), caplog)[0]
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"rx": UP}, "no pixel sees the sea or a solid: the receiver looks above the horizon"),
+        ({"tx": UP}, "the beam misses the sea and every solid: the laser looks above the horizon"),
+        ({"rx": UP, "tx": UP}, "laser and receiver look above the horizon"),
+        ({"rx": {"aim_x": 900.0}}, r"axis meets the sea level at \(900, 0\) m, outside the sea from \(-500, -500\)"),
+        ({"tx": {"aim_x": 900.0}}, "the beam misses the sea and every solid: the laser's axis"),
+        ({"rx": {"aim_x": 60.0}}, r"beam and field of view do not overlap: they are 5\d\.\d m apart on the sea level"),
+        ({"film": {"bin_count": 20}}, "it must end after the surface echo, which comes at 14"),
+        ({"film": {"time_start_ns": 1700.0}}, "begins the record after every echo: it must be less than 149"),
+    ],
+)
+def test_scenes_that_return_no_light_are_refused(lidar_scene, caplog, parts, message):
+    with pytest.raises(UserError, match=message):
+        check(lidar_scene(**parts), caplog)
+
+
+def smooth_scene(scattering, reflectance):
+    water = {"type": "layered_water", "scattering": scattering, "backscattering": 0.02 * scattering}
+    bsdf = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": reflectance}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "tx": {"type": "lidar_transmitter"},
+            "rx": {"type": "multipixel_receiver", "film": {"type": "time_gated_film", "time_start_ns": 1390.0}},
+            "sea": {
+                "type": "rectangle",
+                "to_world": TO_WORLD.scale(500),
+                "bsdf": {"type": "dielectric", "int_ior": 1.34, "ext_ior": 1.0},
+                "interior": water,
+            },
+            "bottom": {"type": "rectangle", "to_world": TO_WORLD.translate([0, 0, -8]).scale(500), "bsdf": bsdf},
+        }
+    )
+
+
+def test_black_bottom_below_smooth_water_without_scattering_is_refused(caplog):
+    """Any one of scattering and reflectance returns light."""
+    with pytest.raises(UserError, match=r"scattering = 0 in the water, a smooth surface, and 'bottom' in view"):
+        check(smooth_scene(0.0, 0.0), caplog)
+    assert check(smooth_scene(0.0, 0.01), caplog) == []
+    assert check(smooth_scene(0.1, 0.0), caplog) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", scene_names())
+def test_shipped_scenes_pass_in_silence(name, caplog):
+    session = open_scene(name)
+    if getattr(session.scene.integrator(), "passive", False):
+        pytest.skip("has daylight instead of a laser")
+    assert check(session.scene, caplog) == []
+
+
+@pytest.mark.slow
+def test_command_refuses_before_it_writes(tmp_path):
+    done = run("render", "table1", "-D", "time_start_ns=2000", "-o", tmp_path)
+    assert done.exit_code == 2
+    assert "time_start_ns = 2000 begins the record after every echo" in done.output
+    assert list(tmp_path.iterdir()) == []
