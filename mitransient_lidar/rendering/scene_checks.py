@@ -67,9 +67,10 @@ class _Rays:
         places = self.scene.level_sea.at_height(self.pose.origin, self.directions, z)
         return places[np.isfinite(places).all(axis=1)]
 
-    def axis_at_height(self, z: float) -> FloatArray:
-        """Return where the axis meets a height after refraction by a level sea, x, y [m]; NaN if it does not."""
-        return self.scene.level_sea.at_height(self.pose.origin, self.pose.axis, z)
+    def axis_at_height(self, z: float | FloatArray) -> FloatArray:
+        """Return where the axis meets heights after refraction by a level sea, x, y [m]; NaN if it does not."""
+        axes = np.broadcast_to(self.pose.axis, (*np.shape(z), 3))
+        return self.scene.level_sea.at_height(self.pose.origin, axes, z)
 
     def distance_to(self, shape: mi.Shape) -> float:
         """Return the distance from the rays to the bounding box of a shape at three of its heights [m]."""
@@ -78,6 +79,12 @@ class _Rays:
         return min(
             (float(_gaps(places, low, high).min()) for z in heights if len(places := self.at_height(z))), default=np.inf
         )
+
+    def covered_by(self, shape: mi.Shape) -> bool:
+        """Return whether all rays meet the bounding box of a shape at its mean height."""
+        low, high = _box(shape)
+        places = self.at_height(min(0.5 * (low[2] + high[2]), 0.5 * self.pose.origin[2]))
+        return len(places) == len(self.directions) and not _gaps(places, low, high).any()
 
     def meets(self, shape: mi.Shape) -> bool:
         """Return whether rays, or light that waves or scattering deflect, may meet a shape."""
@@ -101,7 +108,7 @@ def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> 
     _check_rays(view, "no pixel sees the sea or a solid: the receiver")
     _check_rays(beam, "the beam misses the sea and every solid: the laser")
     _check_overlap(scene, view, beam)
-    _check_record(scene, probe)
+    _check_record(scene, view, probe)
     _check_reflection(scene, view)
     _check_solids(scene, probe)
     _warn_of_axes(scene, view, beam)
@@ -124,27 +131,26 @@ def _gaps(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
 
 
 def _place(point: FloatArray) -> str:
-    return f"({point[0]:.6g}, {point[1]:.6g})"
+    return f"({point[0]:.1f}, {point[1]:.1f})"
 
 
-def _check_record(scene: LidarScene, probe: EchoProbe) -> None:
-    """Refuse a record that ends before the surface echo, or begins after the last echo of a bottom below all pixels."""
-    axis, surface, bottom = scene.axis, probe.surface_ns[:, 0], probe.bottom_ns[:, 1]
-    if not np.isfinite(surface).any():
-        return
-    first = float(np.nanmin(surface))
+def _check_record(scene: LidarScene, view: _Rays, probe: EchoProbe) -> None:
+    """Refuse a record that ends before the surface echo, or begins after the echo of a bottom below all pixels."""
+    axis, surface = scene.axis, probe.surface_ns[:, 0]
+    first = float(np.nanmin(surface)) if np.isfinite(surface).any() else np.nan
     if axis.end_ns <= first:
         raise UserError(
             f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns "
             f"end the record at {axis.end_ns:g} ns: it must end after the surface echo, which comes at {first:.1f} ns"
         )
-    if np.isfinite(bottom[np.isfinite(surface)]).all():
-        last = float(np.nanmax(bottom))
-        # Light that was scattered several times comes later than the bottom's echo.
-        if axis.start_ns > last + (last - first) + _echo_length(scene):
+    for echo in probe.solids:
+        # Light that was scattered several times comes later.
+        column = max(echo.latest_ns - first, 0.0) if np.isfinite(first) else 0.0
+        late = axis.start_ns > echo.latest_ns + column + _echo_length(scene)
+        if late and view.covered_by(echo.shape):
             raise UserError(
                 f"time_start_ns = {axis.start_ns:g} begins the record after every echo: it must be less than "
-                f"{last:.1f} ns, when the bottom's echo ends"
+                f"{echo.latest_ns:.1f} ns, when the echo of shape {echo.shape.id()!r} ends"
             )
 
 
@@ -158,15 +164,16 @@ def _check_rays(rays: _Rays, subject: str) -> None:
                 return
     if any(rays.meets(solid) for solid in rays.scene.solids):
         return
-    axis = rays.axis_at_height(0.0)
-    if not np.isfinite(axis).all():
+    places = rays.at_height(0.0)
+    if len(places) == 0:
         x, y, z = rays.pose.axis
         raise UserError(f"{subject} looks above the horizon, along ({x:.3g}, {y:.3g}, {z:.3g}); it must look down")
     where = "where no shape is"
     if surfaces:
         lows, highs = zip(*map(_box, surfaces), strict=True)
         where = f"outside the sea from {_place(np.min(lows, axis=0))} to {_place(np.max(highs, axis=0))} m"
-    raise UserError(f"{subject}'s axis meets the sea level at {_place(axis)} m, {where}; change aim_x and aim_y")
+    extent = f"from {_place(places.min(axis=0))} to {_place(places.max(axis=0))} m"
+    raise UserError(f"{subject} looks at the sea level {extent}, {where}; change aim_x and aim_y")
 
 
 def _check_overlap(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
@@ -248,21 +255,21 @@ def _warn_of_axes(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
     # Without a solid, to the depth from which light returns within the record.
     reach = 0.5 * (scene.axis.path_end - 2 * view.pose.origin[2]) / scene.group_index
     lowest = min([low[2] for low, _ in boxes] or [-max(reach, 0.0)])
-    heights = np.linspace(highest, min(lowest, highest), _HEIGHTS)
-    apart = [float(np.linalg.norm(view.axis_at_height(z) - beam.axis_at_height(z))) for z in (0.0, *heights)]
+    heights = np.append(0.0, np.linspace(highest, min(lowest, highest), _HEIGHTS))
+    apart = np.linalg.norm(view.axis_at_height(heights) - beam.axis_at_height(heights), axis=-1)
     if not np.isfinite(apart).all():
         return
     ranges = [float(np.linalg.norm(pose.ground_point() - pose.origin)) for pose in (beam.pose, view.pose)]
     beam_radius = 0.5 * min(scene.transmitter.profile.divergence) * ranges[0]
     view_radius = 0.5 * scene.receiver.pixels.field_of_view * ranges[1]
-    if min(apart) > max(_APART_PER_BEAM * beam_radius, _APART_PER_VIEW * view_radius):
+    if apart.min() > max(_APART_PER_BEAM * beam_radius, _APART_PER_VIEW * view_radius):
         logger.warning(
-            "laser and receiver look at different places: on the sea level their axes are %.3g m apart, %.2g times the "
-            "beam's radius of %.3g m there, and nowhere in the water less than %.3g m",
+            "the axes of laser and receiver do not meet: on the sea level they are %.3g m apart, %.2g times the beam's "
+            "radius of %.3g m there, and nowhere in the water less than %.3g m; aim both at one place",
             apart[0],
             apart[0] / beam_radius,
             beam_radius,
-            min(apart),
+            apart.min(),
         )
 
 
