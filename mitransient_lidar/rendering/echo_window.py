@@ -1,4 +1,4 @@
-"""Expected arrival of the echoes of a scene, estimated with rays."""
+"""Expected arrival of the echoes of a scene, estimated with rays, and lines of sight of the pixels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
@@ -22,6 +26,12 @@ _TAIL = 0.05
 
 #: Largest number of pixels; with more, each would get too few rays, and the receiver is treated as one pixel.
 _MOST_PIXELS = 1024
+
+#: Points of a lattice for lines of sight: the fewest, those per pixel, and the most.
+_POINTS, _POINTS_PER_PIXEL, _MOST_POINTS = 2**14, 8, 2**20
+
+#: Depth at which the scale of depth is taken, relative to the height of the lower instrument, and its limit [m].
+_RELATIVE_DEPTH, _DEEPEST = 0.05, 10.0
 
 
 @dataclass(frozen=True)
@@ -60,11 +70,12 @@ class EchoProbe:
 def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     """Trace rays through the facets of the surface, without ripples and scattering."""
     start = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
-    beam = start.weight * scene.transmitter.intensity(start.direction)
     laser = opaque_point(scene.transmitter.pose.origin)
     ray = mi.Ray3f(opaque_point(scene.receiver.pose.origin), start.direction)
     first = scene.ray_intersect(ray, start.weight > 0)
     at_sea = first.is_valid() & scene.is_surface(first.shape)
+    of_laser = start.direction if _at_one_place(scene) else dr.normalize(first.p - laser)
+    beam = start.weight * scene.transmitter.intensity(of_laser)
     air = first.t + dr.norm(laser - first.p)
 
     # Refract at the facet.
@@ -151,3 +162,141 @@ def _quantiles(
             else:
                 result[index, column] = values[part][np.searchsorted(cumulative, share * cumulative[-1])]
     return result
+
+
+def lines_of_sight(scene: LidarScene) -> LinesOfSight:
+    """Return the lines of sight of the pixels over a level sea at z = 0, weighted with the beam.
+
+    Each pixel uses the better sampled one of two sets of points, those of the beam that are in the pixel, and points in
+    the pixel with the beam's density. A pixel without either has the line of sight of its centre and no share.
+    """
+    pixels = scene.receiver.pixels
+    lowest = min(float(pose.origin[2]) for pose in (scene.receiver.pose, scene.transmitter.pose))
+    depth = min(_RELATIVE_DEPTH * lowest, _DEEPEST)
+    surface, below = (_mean_sight(scene, at) for at in (0.0, depth))
+    centres = pixels.centres()
+    lit = (surface.share > 0) & (below.share > 0)
+    x, y = (np.where(lit, seen, centre) for seen, centre in zip(surface.angles.T, centres.T, strict=True))
+    time, deep = (
+        np.where(lit, sight.time, _by_receiver(scene, centres, at)[0]) for sight, at in ((surface, 0.0), (below, depth))
+    )
+    off_nadir = np.arccos(np.clip(-_directions(scene.receiver.pose, np.stack([x, y], axis=1))[:, 2], -1, 1))
+    spread, share = (np.where(lit, values, 0.0) for values in (surface.spread, surface.share))
+    return LinesOfSight(x, y, off_nadir, time, spread, depth / (deep - time), share)
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """Beam-weighted means of the pixels: time and its spread [ns], angles [rad], and share of the beam; (pixels,)."""
+
+    time: FloatArray
+    spread: FloatArray
+    angles: FloatArray
+    share: FloatArray
+    points: FloatArray  #: Effective number of points.
+
+
+def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
+    """Return the means over the light of the beam that pixels see at a depth [m]."""
+    pixels, transmitter = scene.receiver.pixels, scene.transmitter
+    choice = mi.Float(0.5)
+
+    # Points of the beam, of equal energy.
+    angle_x, angle_y = transmitter.sample_tangent(_lattice(_POINTS))
+    time, angles = _by_transmitter(scene, np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
+    pixel, inside = pixels.pixel_at(*(mi.Float(axis) for axis in angles.T), choice)
+    weight = (np.array(inside) > 0) & np.isfinite(time)
+    by_beam = _means(time, angles, np.array(pixel), weight / _POINTS, pixels.count)
+
+    # Points of the pixels, weighted with the beam's density.
+    count = int(np.clip(_POINTS_PER_PIXEL * pixels.count, _POINTS, _MOST_POINTS))
+    angle_x, angle_y = pixels.sample(_lattice(count))
+    pixel, inside = pixels.pixel_at(angle_x, angle_y, choice)
+    angles = np.stack([np.array(angle_x), np.array(angle_y)], axis=1).astype(np.float64)
+    time, at_laser = _by_receiver(scene, angles, depth)
+    density = np.array(transmitter.tangent_density(*(mi.Float(axis) for axis in at_laser.T)), dtype=np.float64)
+    weight = np.where((np.array(inside) > 0) & np.isfinite(time), density, 0) * (pixels.area / count)
+    by_pixel = _means(time, angles, np.array(pixel), weight, pixels.count)
+
+    better = by_beam.points >= by_pixel.points
+    return _Sight(
+        *(
+            np.where(better if one.ndim == 1 else better[:, np.newaxis], one, other)
+            for one, other in zip(vars(by_beam).values(), vars(by_pixel).values(), strict=True)
+        )
+    )
+
+
+def _means(time: FloatArray, angles: FloatArray, pixel: NDArray[np.integer], weight: FloatArray, count: int) -> _Sight:
+    """Return weighted means over the points of each pixel."""
+    total, squares = (np.bincount(pixel, values, count) for values in (weight, weight**2))
+    safe = np.where(total > 0, total, 1.0)
+    first = float(np.nanmin(time)) if np.isfinite(time).any() else 0.0
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(pixel, weight * np.where(weight > 0, values, 0), count) / safe)
+
+    delay = mean(time - first)
+    spread = np.sqrt(np.maximum(mean((time - first) ** 2) - delay**2, 0))
+    points = np.where(squares > 0, total**2 / np.where(squares > 0, squares, 1.0), 0)
+    return _Sight(first + delay, spread, np.stack([mean(axis) for axis in angles.T], axis=1), total, points)
+
+
+def _lattice(count: int) -> mi.Point2f:
+    """Return the points of a rank-1 lattice in the unit square, computed in 64 bits."""
+    index = np.arange(count)
+    return mi.Point2f(mi.Float((index + 0.5) / count), mi.Float((index * 0.6180339887498949) % 1))
+
+
+def _at_one_place(scene: LidarScene) -> bool:
+    """Return whether transmitter and receiver are at one place."""
+    return bool(np.all(scene.transmitter.pose.origin == scene.receiver.pose.origin))
+
+
+def _by_receiver(scene: LidarScene, angles: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
+    """Return two-way times [ns] to a depth at angles of the receiver [rad], and the angles there of the laser."""
+    return _two_way(scene, scene.receiver.pose, scene.transmitter.pose, angles, depth)
+
+
+def _by_transmitter(scene: LidarScene, angles: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
+    """Return two-way times [ns] to a depth at angles of the laser [rad], and the angles there of the receiver."""
+    return _two_way(scene, scene.transmitter.pose, scene.receiver.pose, angles, depth)
+
+
+def _two_way(
+    scene: LidarScene, start: Pose, end: Pose, angles: FloatArray, depth: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the times [ns] of paths from one pose at angles [rad], shape (n, 2), by a depth to another, and their end.
+
+    The ends are angles about the other pose. Paths that do not meet the sea, or end behind the pose, are NaN.
+    """
+    n, group = scene.refractive_index, scene.group_index
+    direction = _directions(start, angles)
+    down = np.where(direction[:, 2] < 0, -direction[:, 2], np.nan)
+    sine = np.hypot(direction[:, 0], direction[:, 1])
+    cosine = np.sqrt(1 - (sine / n) ** 2)
+    one_way = start.origin[2] / down + group * depth / cosine
+    if np.all(start.origin == end.origin):
+        return 2e9 / C0 * one_way, _tangent(end, direction)
+    reach = start.origin[2] / down + depth / (n * cosine)
+    offset = start.origin[:2] + direction[:, :2] * reach[:, np.newaxis] - end.origin[:2]
+    distance = np.hypot(*offset.T)
+    known = np.isfinite(distance)
+    theta, phi = refracted_path(np.where(known, distance, 0), end.origin[2], depth, n)
+    back = end.origin[2] / np.cos(theta) + group * depth / np.cos(phi)
+    across = offset * (np.sin(theta) / np.where(known & (distance > 0), distance, 1))[:, np.newaxis]
+    arriving = np.column_stack([across, -np.cos(theta)])
+    return 1e9 / C0 * np.where(known, one_way + back, np.nan), _tangent(end, arriving)
+
+
+def _directions(pose: Pose, angles: FloatArray) -> FloatArray:
+    """Return the unit directions of tangent-plane angles [rad], shape (n, 3)."""
+    along = pose.axis + angles[:, :1] * pose.far + angles[:, 1:] * pose.left
+    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
+
+
+def _tangent(pose: Pose, directions: FloatArray) -> FloatArray:
+    """Return the tangent-plane angles [rad] of directions, NaN behind the pose; shape (n, 2)."""
+    along = directions @ pose.axis
+    ahead = np.where(along > 0, along, np.nan)
+    return np.asarray(np.stack([directions @ pose.far, directions @ pose.left], axis=1) / ahead[:, np.newaxis])

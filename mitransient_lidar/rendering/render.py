@@ -102,7 +102,7 @@ def render(
     renderer = chosen.prepare(session.scene, session.sensor)
     lidar: LidarScene = renderer.scene
     from mitransient_lidar.rendering.describe import describe_lidar
-    from mitransient_lidar.rendering.echo_window import probe_echoes
+    from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
     from mitransient_lidar.rendering.scene_checks import check_scene
 
     probe = probe_echoes(lidar, renderer.sampler)
@@ -150,7 +150,12 @@ def render(
         window_start_ns=float(window.start_ns.min()),
         window_end_ns=float(window.end_ns.max()),
     )
-    return accumulator.dataset(attributes)
+    dataset = accumulator.dataset(attributes)
+    if not lidar.surfaces:
+        return dataset
+    pixels = lidar.receiver.pixels
+    dims = ("pixel",) if pixels.grid is None else ("row", "column")
+    return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
 
 
 def _error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:

@@ -1,4 +1,9 @@
-"""Lidar geometry and other numbers, read back from the attributes of a dataset."""
+"""Lidar geometry and other numbers, read back from the coordinates and attributes of a dataset.
+
+A pixel's line of sight is the mean direction of the light that it sees directly, weighted with the beam. A result has,
+over its pixels, the coordinates ``sight_x`` and ``sight_y`` [mrad], ``off_nadir`` [degree], ``surface_time`` and
+``surface_spread`` [ns], ``depth_per_ns`` [m/ns] and ``beam_share``; see `LinesOfSight`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
@@ -19,9 +25,21 @@ from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 Attributes = Mapping[str, Any]
 
 
+#: Unit, description, and decimals kept of the coordinates of `LinesOfSight`.
+_SIGHT = {
+    "sight_x": ("mrad", "angle of the line of sight in the plane of incidence, away from nadir", 6),
+    "sight_y": ("mrad", "angle of the line of sight across the plane of incidence", 6),
+    "off_nadir": ("degree", "angle of the line of sight from the vertical in air", 7),
+    "surface_time": ("ns", "arrival of the echo of the mean sea level along the line of sight", 6),
+    "surface_spread": ("ns", "standard deviation of that arrival over the pixel's direct light", 6),
+    "depth_per_ns": ("m ns-1", "depth per delay along the line of sight", 10),
+    "beam_share": ("1", "share of the beam's energy in the pixel", 9),
+}
+
+
 @dataclass(frozen=True)
 class LidarGeometry:
-    """Co-located lidar over a level sea."""
+    """Co-located lidar over a level sea, along its axis."""
 
     height: float  #: Height above the mean sea level [m].
     off_nadir: float  #: Angle of the axis from the vertical [rad].
@@ -133,6 +151,127 @@ class LidarGeometry:
             self.refractive_index,
             self.group_index,
         )
+
+
+@dataclass(frozen=True)
+class LinesOfSight:
+    """Lines of sight of pixels over a level sea: arrays of one shape, such as (pixels,).
+
+    Attributes
+    ----------
+    sight_x, sight_y
+        Tangent-plane angles about the receiver's axis [rad].
+    off_nadir
+        Angle from the vertical in air [rad].
+    surface_time, surface_spread
+        Arrival of the echo of the mean sea level [ns], the zero of depth, and its standard deviation over the pixel's
+        direct light.
+    depth_per_ns
+        Depth per delay [m/ns]: c0 cos(theta_water)/(2 n_g) with transmitter and receiver at one place.
+    beam_share
+        Share of the beam's energy in the pixel, 0 to 1; NaN if unknown.
+    """
+
+    sight_x: FloatArray
+    sight_y: FloatArray
+    off_nadir: FloatArray
+    surface_time: FloatArray
+    surface_spread: FloatArray
+    depth_per_ns: FloatArray
+    beam_share: FloatArray
+
+    @classmethod
+    def from_dataset(cls, dataset: xr.Dataset, dims: tuple[str, ...] | None = None) -> LinesOfSight:
+        """Read the lines of sight of a result or gate stack.
+
+        Without their coordinates, they are those of the pixels' centres, with the mean arrival of the attribute
+        ``surface_time_ns`` if it is known.
+
+        Parameters
+        ----------
+        dataset
+            A dataset over ``pixel``, or ``row`` and ``column``.
+        dims
+            Dimensions of the arrays, flattened to one; by default those of the pixels.
+
+        Raises
+        ------
+        UserError
+            If coordinates and attributes do not determine the geometry.
+        """
+        if dims is None:
+            dims = ("row", "column") if "row" in dataset.dims else ("pixel",)
+        shape = tuple(dataset.sizes[dim] for dim in dims)
+
+        def coordinate(name: str) -> FloatArray:
+            values = dataset[name]
+            axes = {dim: size for dim, size in zip(dims, shape, strict=True) if dim not in values.dims}
+            return np.asarray(values.expand_dims(axes).transpose(*dims).values, dtype=np.float64).ravel()
+
+        if all(name in dataset.coords for name in _SIGHT):
+            found = {name: coordinate(name) for name in _SIGHT}
+            found["off_nadir"] = np.radians(found["off_nadir"])
+            return cls(**found | {name: 1e-3 * found[name] for name in ("sight_x", "sight_y")})
+        axis = LidarGeometry.from_attributes(dataset.attrs)
+        known = "angle_x" in dataset.coords and "angle_y" in dataset.coords
+        count = math.prod(shape)
+        x, y = (1e-3 * coordinate(name) if known else np.zeros(count) for name in ("angle_x", "angle_y"))
+        down = np.cos(axis.off_nadir) - np.sin(axis.off_nadir) * x
+        if "receiver_pose" in dataset.attrs:
+            _, (_, _, along), (_, _, far), (_, _, left) = np.reshape(dataset.attrs["receiver_pose"], (4, 3))
+            down = -(along + far * x + left * y)
+        if np.any(down <= 0):
+            raise UserError("angle_x and angle_y must point below the horizon: the lines of sight must meet the sea")
+        off_nadir = np.arccos(np.minimum(down / np.sqrt(1 + x**2 + y**2), 1))
+        time = refraction.surface_time_ns(axis.height, off_nadir)
+        measured = optional_number(dataset.attrs, "surface_time_ns")
+        if measured is not None:
+            time = time + measured - time.mean()
+        water = np.cos(refraction.snell(off_nadir, axis.refractive_index))
+        unknown = np.full(count, np.nan)
+        return cls(x, y, off_nadir, time, np.zeros(count), axis.metres_per_ns * water, unknown)
+
+    def coordinates(self, dims: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, Any]:
+        """Return the coordinates of a dataset over dimensions of a shape, rounded so that files stay small."""
+        values = vars(self) | {"off_nadir": np.degrees(self.off_nadir)}
+        values |= {name: 1e3 * values[name] for name in ("sight_x", "sight_y")}
+        return {
+            name: (dims, np.round(values[name], digits).reshape(shape), {"units": unit, "long_name": text})
+            for name, (unit, text, digits) in _SIGHT.items()
+        }
+
+    def at(self, index: slice | npt.NDArray[np.intp]) -> LinesOfSight:
+        """Return some of the lines of sight."""
+        return LinesOfSight(**{name: values[index] for name, values in vars(self).items()})
+
+    def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
+        """Return the depths [m] below the mean sea level of echoes at times [ns], shape (pixels, ...)."""
+        return self.depth_of_delay(np.asarray(time_ns, np.float64) - _columns(self.surface_time, np.ndim(time_ns)))
+
+    def depth_of_delay(self, delay_ns: npt.ArrayLike) -> FloatArray:
+        """Return the depths [m] of delays from the surface [ns], shape (pixels, ...)."""
+        return np.asarray(np.asarray(delay_ns, np.float64) * _columns(self.depth_per_ns, np.ndim(delay_ns)))
+
+    def time_of_depth(self, depth: npt.ArrayLike) -> FloatArray:
+        """Return the arrival times [ns] of echoes from depths [m] below the mean sea level, shape (pixels, ...)."""
+        size = max(np.ndim(depth), 1)
+        delay = np.asarray(depth, np.float64) / _columns(self.depth_per_ns, size)
+        return np.asarray(_columns(self.surface_time, size) + delay)
+
+    def spreading(self, geometry: LidarGeometry, time_ns: FloatArray) -> FloatArray:
+        """Return the solid angle of the aperture at times [ns], shape (time,), over that at the surface; 1 above it.
+
+        The shape is (pixels, time). The geometry provides the height and the refractive index.
+        """
+        depth = np.maximum(self.depth_of_time(np.broadcast_to(time_ns, (self.off_nadir.size, time_ns.size))), 0)
+        theta = self.off_nadir[:, np.newaxis]
+        at, n = refraction.solid_angle_per_area, geometry.refractive_index
+        return np.asarray(at(geometry.height, depth, theta, n) / at(geometry.height, 0.0, theta, n))
+
+
+def _columns(values: FloatArray, dimensions: int) -> FloatArray:
+    """Return values of pixels for arrays of a number of dimensions, the pixels first."""
+    return values.reshape(-1, *(1,) * (dimensions - 1))
 
 
 def _fraction_in_view(attributes: Attributes) -> float:
