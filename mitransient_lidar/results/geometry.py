@@ -244,6 +244,10 @@ class LinesOfSight:
         """Return some of the lines of sight."""
         return LinesOfSight(**{name: values[index] for name, values in vars(self).items()})
 
+    def reshaped(self, shape: tuple[int, ...]) -> LinesOfSight:
+        """Return the lines of sight in arrays of another shape."""
+        return LinesOfSight(**{name: values.reshape(shape) for name, values in vars(self).items()})
+
     def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
         """Return the depths [m] below the mean sea level of echoes at times [ns], shape (pixels, ...)."""
         return self.depth_of_delay(np.asarray(time_ns, np.float64) - _columns(self.surface_time, np.ndim(time_ns)))

@@ -37,6 +37,7 @@ class EchoFlag(IntFlag):
     MERGED = 4  # less than an echo width from another echo
     CUT = 8  # extends beyond an end of the record
     POOR_FIT = 16  # too few usable samples, or a fit that has not converged
+    NO_SURFACE_LIGHT = 32  # the beam does not light the surface in the pixel, or the first echo is not the surface's
 
 
 def has_echo(flags: IntArray) -> BoolArray:

@@ -21,13 +21,17 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     find_echoes,
 )
 from mitransient_lidar.analysis.waveforms.records import Waveforms
+from mitransient_lidar.analysis.waveforms.surface_times import surface_times
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.results.geometry import optional_number
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
 ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
+_TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
+_SIGNIFICANT = 3.0  # standard errors of the amplitude of a surface echo that is distinct from the column
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
     "time_ns": "arrival of the echo",
@@ -135,6 +139,7 @@ def extract(
     starts = range(0, waveforms.count, block)
     parts = [_measure(waveforms, slice(start, min(start + block, waveforms.count)), settings) for start in starts]
     table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    table = _with_depths(dataset, waveforms, table, settings)
     return _label(dataset, waveforms, table, settings, several)
 
 
@@ -150,7 +155,7 @@ class _Settings:
 
 def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str, npt.NDArray[Any]]:
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
-    records, geometry, width = waveforms.records(rows), waveforms.geometry, waveforms.echo_fwhm_ns
+    records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
     found = find_echoes(
         records, width, threshold=settings.threshold, contrast=settings.contrast, earliest_ns=waveforms.quiet_until_ns
     )
@@ -161,7 +166,8 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     # The last bins lack the rising edges of pulses after the end of the record.
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
     reference = time[surface]
-    column = column_fit(records, start, end, reference, waveforms.gain)
+    gain = waveforms.gain(rows)
+    column = column_fit(records, start, end, reference, gain)
     found = replace(found, flags=found.flags | _saturation(waveforms, rows, records, found.bins))
     sharp = None
     if "deconvolution" in settings.estimators:
@@ -174,18 +180,20 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
         body = _column(records, column, start, end, surface_ns - reference)
-        quantities.append(_with_depths([echoes[0], body, *echoes[1:]], waveforms, settings.depth_from))
-    table = {name: np.stack([one[name] for one in quantities], axis=1) for name in quantities[0]}
-    per_metre = 0.5 / geometry.metres_per_ns
+        quantities.append([echoes[0], body, *echoes[1:]])
+    table = {
+        name: np.stack([np.stack([getattr(one, name) for one in echoes], axis=1) for echoes in quantities], axis=1)
+        for name in vars(quantities[0][0])
+    }
+    table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
+    table["peak_ns"] = np.where(surface >= 0, reference, np.nan)
+    per_metre = 0.5 / waveforms.geometry.metres_per_ns
     table |= {"attenuation": column.decay * per_metre, "attenuation_stderr": column.decay_stderr * per_metre}
     table["attenuation_chi2"] = column.chi2
     if settings.layers:
-        changes = change_points(records, start, end, waveforms.gain, layers=settings.layers, blur_ns=width)
-        first = table["time_ns"][:, 0, 0]
-        from_echo = settings.depth_from == "echo"
-        zero = np.where(np.isfinite(first), first, reference) if from_echo else geometry.surface_time_ns
+        changes = change_points(records, start, end, gain, layers=settings.layers, blur_ns=width)
         table |= {
-            "layer_depth_m": (changes.time_ns - np.reshape(zero, (-1, 1))) * geometry.depth_per_ns,
+            "layer_time_ns": changes.time_ns,
             "layer_p_value": changes.p_value,
             "layer_step": changes.step,
             "layer_attenuation_above": changes.decay_before * per_metre,
@@ -224,18 +232,47 @@ def _column(records: Records, column: ColumnFit, start: FloatArray, end: FloatAr
     ).known_only(known)
 
 
-def _with_depths(echoes: list[Echoes], waveforms: Waveforms, depth_from: str) -> dict[str, npt.NDArray[Any]]:
-    """Return the quantities of all echoes of one estimator with their depths, shape (waveforms, echo)."""
-    table = {name: np.stack([getattr(one, name) for one in echoes], axis=1) for name in vars(echoes[0])}
-    time, error = table["time_ns"], table["time_stderr"]
-    table["time_ns_stderr"], table["width_ns_stderr"] = table.pop("time_stderr"), table.pop("width_stderr")
-    if depth_from == "echo":
-        depth, spread = time - time[:, :1], np.hypot(error, error[:, :1])
-        spread[:, 0] = np.where(np.isfinite(time[:, 0]), 0.0, np.nan)
+def _with_depths(
+    dataset: xr.Dataset, waveforms: Waveforms, table: dict[str, npt.NDArray[Any]], settings: _Settings
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the table of all waveforms with their surface and depths, shape (waveforms, estimator, echo)."""
+    lines = waveforms.lines_of(slice(0, waveforms.count))
+    shots = waveforms.count // waveforms.baseline.size
+    variance = optional_number(dataset.attrs, "surface_slope_variance")
+    time, error, peak = table["time_ns"], table["time_ns_stderr"], table.pop("peak_ns")
+    zero, zero_error = np.empty(time.shape[:2]), np.empty(time.shape[:2])
+    for number, estimator in enumerate(settings.estimators):
+        measured = time[:, number, 0]
+        found = surface_times(
+            *(values.reshape(shots, -1) for values in (measured, error[:, number, 0])),
+            lines.reshaped((shots, -1)),
+            slope_variance=_TYPICAL_SLOPE_VARIANCE if variance is None else variance,
+            echo_fwhm_ns=waveforms.echo_fwhm_ns,
+        )
+        own = found.own.ravel()
+        flags = table["flags"][:, number, 0]
+        flags |= np.where(own | np.isnan(measured), 0, int(EchoFlag.NO_SURFACE_LIGHT))
+        absent = ~own
+        if estimator == "gaussian":
+            absent |= table["amplitude"][:, number, 0] < _SIGNIFICANT * table["amplitude_stderr"][:, number, 0]
+        flags |= np.where(absent, int(EchoFlag.NO_ECHO), 0)
+        zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
+        for name in (*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES)):
+            if name in table:
+                table[name][absent, number, 0] = np.nan
+    table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error}
+    if settings.depth_from == "echo":
+        delay, spread = time - zero[..., np.newaxis], np.hypot(error, zero_error[..., np.newaxis])
+        spread[..., 0] = np.where(np.isfinite(time[..., 0]), 0.0, np.nan)
+        first = zero[:, 0]
+        layer_zero = np.where(np.isfinite(first), first, peak)
     else:
-        depth, spread = time - waveforms.geometry.surface_time_ns, error
-    metres = waveforms.geometry.depth_per_ns
-    return table | {"depth_m": depth * metres, "depth_m_stderr": spread * metres}
+        delay, spread = time - lines.surface_time[:, np.newaxis, np.newaxis], error
+        layer_zero = lines.surface_time
+    table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
+    if "layer_time_ns" in table:
+        table["layer_depth_m"] = lines.depth_of_delay(table.pop("layer_time_ns") - layer_zero[:, np.newaxis])
+    return table
 
 
 def _label(
@@ -255,6 +292,15 @@ def _label(
         for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
             described = {"units": units[name], "long_name": of + description}
             data[name + suffix] = of_echoes(table[name + suffix], described)
+    for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
+        values = table["surface_time_ns" + suffix]
+        described = {"units": "ns", "long_name": f"{of}arrival of the surface"}
+        inner = ("estimator",) if several else ()
+        data["surface_time_ns" + suffix] = (
+            (*dims, *inner),
+            values.reshape(*shape, *values.shape[1:][: len(inner)]),
+            described,
+        )
     meanings = {
         "long_name": "problems of the echo",
         "flag_masks": [int(flag) for flag in EchoFlag],

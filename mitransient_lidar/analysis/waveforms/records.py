@@ -20,7 +20,7 @@ from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.formats import input_format
-from mitransient_lidar.results.geometry import LidarGeometry, required_number
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, required_number
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -71,9 +71,9 @@ class Waveforms:
     echo_fwhm_ns, quiet_until_ns
         Expected width of an echo, and end of the part of the record without echoes [ns].
     geometry
-        Lidar geometry.
-    gain
-        Signal over that at the surface by distance and refraction, shape (1, time).
+        Lidar geometry on the axis.
+    lines
+        Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
     """
 
     dims: tuple[str, ...]
@@ -90,7 +90,7 @@ class Waveforms:
     echo_fwhm_ns: float
     quiet_until_ns: float
     geometry: LidarGeometry
-    gain: FloatArray
+    lines: LinesOfSight
 
     @property
     def count(self) -> int:
@@ -154,13 +154,27 @@ class Waveforms:
             width,
             quiet_until,
             geometry,
-            geometry.spreading(geometry.path_of_time(time))[np.newaxis],
+            _lines_of_sight(dataset, dims[:-1]),
         )
+
+    def lines_of(self, rows: slice) -> LinesOfSight:
+        """Return the lines of sight of some of the waveforms."""
+        return self.lines.at(np.arange(rows.start, rows.stop) % self.lines.off_nadir.size)
+
+    def gain(self, rows: slice) -> FloatArray:
+        """Return the signal over that at the surface by distance and refraction, shape (waveforms, time)."""
+        return self.lines_of(rows).spreading(self.geometry, self.time_ns)
 
     def records(self, rows: slice) -> Records:
         """Return some of the waveforms less their baseline."""
         pixel = np.arange(rows.start, rows.stop) % self.baseline.size
         return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, self.noise[pixel])
+
+
+def _lines_of_sight(dataset: xr.Dataset, dims: tuple[str, ...]) -> LinesOfSight:
+    """Return the lines of sight of the waveforms, once for all shots if they share them."""
+    moves = any("shot" in dataset[name].dims for name in ("surface_time", "angle_x") if name in dataset.coords)
+    return LinesOfSight.from_dataset(dataset, dims if moves else tuple(dim for dim in dims if dim != "shot"))
 
 
 def _logarithm(dataset: xr.Dataset) -> LogAmplifier | None:
