@@ -85,19 +85,20 @@ def _print(found: xr.Dataset) -> None:
     for name in csv_tables.NUMBERS:
         table.add_column(heads[name], justify="right")
     table.add_column("flags")
+    table.add_column("depth unknown")
     left_out = 0
     for line in lines:
         cells = dict(zip(names, line, strict=True))
-        # Only a missing surface is listed.
-        if cells["flags"] == "no_echo" and cells["echo"] != "surface":
+        # Of missing echoes, only surface and bottom are listed.
+        if "no_echo" in cells["flags"] and cells["echo"] in ("column", "target"):
             continue
         if table.row_count >= _MOST_LINES:
             left_out += 1
             continue
         numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in csv_tables.NUMBERS]
-        table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"])
+        table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"])
     # A fixed width keeps the lines unfolded.
-    Console(highlight=False, width=200, markup=False).print(table)
+    Console(highlight=False, width=240, markup=False).print(table)
     if left_out:
         typer.echo(f"{left_out} more lines: write them all with --csv OUT.")
     _print_columns(found)

@@ -22,23 +22,44 @@ def flag_names(flags: int) -> str:
     return " ".join(str(flag.name).lower() for flag in EchoFlag if flags & flag)
 
 
+def unknown_depth(echo: str, flags: int, has_surface: bool) -> str:
+    """Return why the depth of an echo is unknown, given its sum of `EchoFlag` and whether its surface is known."""
+    if flags & EchoFlag.NO_SURFACE_LIGHT:
+        return "no surface light"
+    if flags & EchoFlag.NO_ECHO:
+        return "column too short or too noisy" if echo == "column" else f"no {echo} echo"
+    if flags & EchoFlag.POOR_FIT:
+        return "saturated" if flags & EchoFlag.SATURATED else "poor fit"
+    return "no surface echo" if not has_surface else "signal below its own level"
+
+
 def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
     """Return column names and rows of a table of `echo_table.extract`, one row per waveform, estimator and echo.
 
-    The columns are the dimensions, ``angle_x`` and ``angle_y``, the quantities of the echo, ``flags`` as names, and
-    ``attenuation``.
+    The columns are the dimensions, ``angle_x`` and ``angle_y``, the quantities of the echo, ``flags`` as names,
+    ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
     """
     dims = [str(dim) for dim in table["time_ns"].dims]
     extra = [name for name in ("angle_x", "angle_y") if name in table.coords]
     numbers = [name + suffix for name in NUMBERS for suffix in ("", "_stderr")]
-    columns = [*extra, *numbers, "flags", *(name for name in ("attenuation", "attenuation_stderr") if name in table)]
-    wide = {name: table[name].broadcast_like(table["time_ns"]).transpose(*dims).values for name in columns}
+    columns = [
+        *extra,
+        *numbers,
+        "flags",
+        "unknown_depth",
+        *(name for name in ("attenuation", "attenuation_stderr") if name in table),
+    ]
+    kept = [name for name in (*columns, "surface_time_ns") if name in table]
+    wide = {name: table[name].broadcast_like(table["time_ns"]).transpose(*dims).values for name in kept}
 
     def lines() -> Iterator[list[Any]]:
         for place in np.ndindex(*(table.sizes[dim] for dim in dims)):
             labels = [table[dim].values[index] for dim, index in zip(dims, place, strict=True)]
-            values = [flag_names(int(wide[n][place])) if n == "flags" else float(wide[n][place]) for n in wide]
-            yield [*labels, *values]
+            cells: dict[str, Any] = {name: float(values[place]) for name, values in wide.items()}
+            flags, surface = int(cells["flags"]), cells.get("surface_time_ns", math.nan)
+            reason = unknown_depth(str(labels[-1]), flags, math.isfinite(surface))
+            cells |= {"flags": flag_names(flags), "unknown_depth": reason if math.isnan(cells["depth_m"]) else ""}
+            yield [*labels, *(cells[name] for name in columns)]
 
     return [*dims, *columns], lines()
 

@@ -252,14 +252,17 @@ def _with_depths(
         own = found.own.ravel()
         flags = table["flags"][:, number, 0]
         flags |= np.where(own | np.isnan(measured), 0, int(EchoFlag.NO_SURFACE_LIGHT))
-        absent = ~own
+        # Without a distinct echo, the onset of the column gives the time.
+        absent = np.isnan(measured) | ~own
+        faint = absent.copy()
         if estimator == "gaussian":
-            absent |= table["amplitude"][:, number, 0] < _SIGNIFICANT * table["amplitude_stderr"][:, number, 0]
-        flags |= np.where(absent, int(EchoFlag.NO_ECHO), 0)
+            faint |= table["amplitude"][:, number, 0] < _SIGNIFICANT * table["amplitude_stderr"][:, number, 0]
+        flags |= np.where(faint, int(EchoFlag.NO_ECHO), 0)
+        for name in ("amplitude", "energy", "width_ns"):
+            for column in (name, f"{name}_stderr"):
+                table[column][faint, number, 0] = np.nan
+        time[absent, number, 0] = error[absent, number, 0] = np.nan
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
-        for name in (*_QUANTITIES, *(f"{name}_stderr" for name in _QUANTITIES)):
-            if name in table:
-                table[name][absent, number, 0] = np.nan
     table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error}
     if settings.depth_from == "echo":
         delay, spread = time - zero[..., np.newaxis], np.hypot(error, zero_error[..., np.newaxis])

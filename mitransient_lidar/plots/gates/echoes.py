@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from mitransient_lidar.analysis.gates.range_images import RangeImage, contrast, range_from_gates
+from mitransient_lidar.analysis.gates.range_images import RangeImage, contrast, depth_image
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gates.images import SIGNIFICANT, known_depths, reached_by_surface
@@ -24,7 +24,7 @@ _CONTRAST_COLOUR = "#1f5fd6"
 
 
 def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_depth: float | None = None) -> Figure:
-    """Draw the depth of the strongest echo in every pixel, and its confidence, from `range_images.range_from_gates`.
+    """Draw the depth of the strongest echo in every pixel, and its confidence, from `range_images.depth_image`.
 
     Parameters
     ----------
@@ -33,7 +33,8 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
     path : path, optional
         File to write.
     from_depth : float, optional
-        Leave out gates whose middle is shallower [m]; by default those that open before the end of the surface echo.
+        Leave out gates whose middle is shallower on the axis [m]; by default those that open before the end of the
+        surface echo.
 
     Raises
     ------
@@ -51,10 +52,9 @@ def plot_depths(dataset: xr.Dataset, path: drawing.FilePath | None = None, from_
         place = "below the surface echo" if from_depth is None else f"below from_depth = {from_depth:g} m"
         raise UserError(f"{count} of {depths.size} gates lie {place}, but a drawing of depths needs at least 3.")
     stack, depths = stack.isel(gate=used), depths[used]
-    energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
-    found = range_from_gates(energy, stderr, depths, reach=_reach(stack))
+    found = depth_image(stack, reach=_reach(stack))
     (_draw_pixel_depths if "pixel" in stack.dims else _draw_depth_image)(figure, stack, found)
-    text = f"depth of the strongest echo, gates at {depths.min():.2f} to {depths.max():.2f} m"
+    text = f"depth of the strongest echo, gates at {depths.min():.2f} to {depths.max():.2f} m on the axis"
     figure.suptitle(drawing.titled(stack.attrs, text))
     return drawing.save(figure, path)
 
@@ -111,7 +111,7 @@ def plot_contrast(
     depths = known_depths(stack)
     if depths is not None and depths.size > 1:
         slope = (depths[-1] - depths[0]) / (starts[-1] - starts[0])
-        drawing.add_top_axis(ax, depths[0] - slope * starts[0], slope, "depth of the gate's middle (m)")
+        drawing.add_top_axis(ax, depths[0] - slope * starts[0], slope, "depth of the gate's middle on the axis (m)")
     pixels = f"{masks['target'].sum()} pixels against {masks['background'].sum()}"
     figure.suptitle(drawing.titled(stack.attrs, f"contrast of the target, {pixels}"))
     return drawing.save(figure, path)

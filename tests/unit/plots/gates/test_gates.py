@@ -252,7 +252,7 @@ def test_depth_map_shows_the_depth_below_the_surface():
     np.testing.assert_array_equal(images(figure)[0].get_alpha(), confidence)
     assert images(figure)[0].get_extent() == [-7.5, 7.5, -8.0, 8.0]
     # The first gate that opens 7.5 ns after the surface or later is at 8 + 2.5 ns.
-    assert figure.get_suptitle() == "sand: depth of the strongest echo, gates at 1.05 to 5.65 m"
+    assert figure.get_suptitle() == "sand: depth of the strongest echo, gates at 1.05 to 5.65 m on the axis"
     bar = next(ax for ax in figure.axes if ax.get_ylabel() == "depth (m)")
     assert bar.get_ylim()[0] > bar.get_ylim()[1]  # deep below
 
