@@ -18,7 +18,7 @@ from mitransient_lidar.cli.messages import exit_on_error
 
 #: Commands by the headings of the help.
 _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Render": (render.render, render.passive),
+    "Render": (render.render, studies.shots, render.passive),
     "Study": (
         studies.find_shots,
         studies.shot_statistics,

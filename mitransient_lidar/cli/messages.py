@@ -45,9 +45,10 @@ def exit_on_error() -> Iterator[None]:
 
 
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
-    """Exit as after an interruption if one ended the render of a result."""
+    """Exit as after an interruption if one ended the render of a result or of a series of shots."""
     if dataset.attrs.get("interrupted"):
-        raise KeyboardInterrupt(f"interrupted after {dataset.attrs['passes']} passes; their result is kept.")
+        done = f"{dataset.sizes['shot']} shots" if "shot" in dataset.dims else f"{dataset.attrs['passes']} passes"
+        raise KeyboardInterrupt(f"interrupted after {done}; their result is kept.")
 
 
 @contextlib.contextmanager

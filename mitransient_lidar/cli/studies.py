@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_figure, write_figure
-from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.files import check_figure, check_suffix, write_figure
+from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import Define, DrawingOnly, Quiet, Scene, Seed, numbers, pair, parameters
+from mitransient_lidar.core.errors import UserError
 
 TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
 Passes = Annotated[int, typer.Option(help="Number of independent passes of each render.")]
@@ -52,6 +53,59 @@ def find_shots(
     if output is not None:
         plot_found_shots(study.render_found_shots(scene, found, params, waveforms=waveforms), output)
         typer.echo(output)
+
+
+def shots(
+    scene: Scene,
+    define: Define = None,
+    count: Annotated[int, typer.Option(help="Number of shots at random places.")] = 20,
+    at: Annotated[
+        list[str] | None, typer.Option(metavar="X,Y", help="Place of a shot [m], instead of random ones. Repeatable.")
+    ] = None,
+    places: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="CSV file of places, columns x and y [m], instead of random ones."),
+    ] = None,
+    move_target: Annotated[
+        bool, typer.Option("--move-target", help="Keep the target's place relative to the aim of each shot.")
+    ] = False,
+    passes: Passes = 8,
+    seed: Annotated[int, typer.Option(help="Seed of random places.")] = 1,
+    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = Path("shots.nc"),
+    quiet: Quiet = False,
+) -> None:
+    """Render a series of shots over one sea.
+
+    Writes one file of all waveforms, with the true slope, height and depth at each place, which record, waveforms,
+    retrieve and plot read.
+    """
+    if at and places is not None:
+        raise UserError("--at and --places are alternatives: give one of them.")
+    check_suffix("--output", output, ".nc")
+    from mitransient_lidar import results
+    from mitransient_lidar.core.text_tables import read_two_columns
+    from mitransient_lidar.studies import shot_series as study
+
+    given: Any = [pair("--at", text) for text in at] if at else None
+    if places is not None:
+        given = read_two_columns(places, "x and y [m]")[0]
+    with reporting(quiet) as progress:
+        series = study.render_shots(
+            scene,
+            parameters(define),
+            count=count,
+            places=given,
+            move_target=move_target,
+            passes=passes,
+            seed=seed,
+            progress=progress,
+        )
+    output.parent.mkdir(parents=True, exist_ok=True)
+    results.save(series, output)
+    typer.echo(output)
+    if not quiet:
+        _print(study.describe_shots(series))
+    exit_if_interrupted(series)
 
 
 def shot_statistics(

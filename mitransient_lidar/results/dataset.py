@@ -3,7 +3,8 @@
 A result is an `xarray.Dataset` with the variables ``impulse_response`` [J per bin] and ``waveform`` [W] and their
 standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the dimensions (pixel, time), or (row, column,
 time) for an imager. The coordinates are ``time`` [ns] at the centres of the bins, ``pixel`` (names), and the centres of
-the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes.
+the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes. A
+series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates.
 
 EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.
 """
@@ -259,6 +260,8 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:
+    if "shot" in dataset.dims:
+        raise UserError(f"cannot write {path}: an EXR file holds a single shot; use a .nc file.")
     if extra := [str(name) for name in dataset.data_vars if name not in _VARIABLES]:
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
     stacks: dict[str, dict[str, npt.NDArray[Any]]] = {}
