@@ -14,8 +14,6 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.detectors import photons_per_joule
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
-_HEADROOM = 6.0  # standard deviations between the largest sample and the end of the range
-
 
 class SampleMoments(NamedTuple):
     """Mean, shape (..., sample), and covariance, shape (..., sample, sample), of the samples of a shot."""
@@ -76,24 +74,11 @@ def within_range(
 ) -> ReceiverChain:
     """Return the chain with the transimpedance reduced, if necessary, for samples in the range of its electronics.
 
-    The arguments are those of `sample_moments`. Samples with 6 standard deviations of noise are in range; other
-    samples, such as a surface echo, may be clipped.
+    The arguments are those of `sample_moments`, and the range that of `ReceiverChain.fitting_gain`; other samples, such
+    as a surface echo, may be clipped.
     """
-    if chain.amplifier is None:
-        return chain
-    linear = replace(chain, amplifier=replace(chain.amplifier, limit_v=None), logarithm=None)
-    if chain.digitiser is not None:
-        linear = replace(linear, digitiser=replace(chain.digitiser, bits=24, low_v=-1e6, full_scale_v=2e6))
-    found = linear.expected(power, bin_width_ns, background)
-    highest = float(np.max((found.mean + _HEADROOM * np.sqrt(found.variance))[..., samples]))
-    top = np.inf if chain.amplifier.limit_v is None else chain.amplifier.limit_v
-    if chain.digitiser is not None:
-        end = chain.digitiser.top_v
-        top = min(top, float(chain.logarithm.expand(end)) if chain.logarithm is not None else end)
-    if highest <= top:
-        return chain
-    ohm = chain.amplifier.transimpedance_ohm * top / highest
-    return replace(chain, amplifier=replace(chain.amplifier, transimpedance_ohm=ohm))
+    gain = chain.fitting_gain(power, bin_width_ns, background, samples)
+    return chain if gain == 1 else chain.with_gain(gain)
 
 
 class Statistic(NamedTuple):

@@ -36,11 +36,14 @@ def unknown_depth(echo: str, flags: int, has_surface: bool) -> str:
 def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
     """Return column names and rows of a table of `echo_table.extract`, one row per waveform, estimator and echo.
 
-    The columns are the dimensions, ``angle_x`` and ``angle_y``, the quantities of the echo, ``flags`` as names,
-    ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
+    The columns are the dimensions, other coordinates such as ``angle_x``, ``angle_y`` and the truth of each shot, the
+    quantities of the echo, ``flags`` as names, ``unknown_depth``, the reason for a depth of NaN, and ``attenuation``.
     """
     dims = [str(dim) for dim in table["time_ns"].dims]
-    extra = [name for name in ("angle_x", "angle_y") if name in table.coords]
+    known = [
+        str(name) for name, one in table.coords.items() if one.dims and name not in dims and one.dtype.kind in "if"
+    ]
+    extra = sorted(known, key=lambda name: not name.startswith("angle_"))
     numbers = [name + suffix for name in NUMBERS for suffix in ("", "_stderr")]
     columns = [
         *extra,

@@ -63,7 +63,7 @@ class Waveforms:
         Centres of the bins [ns], shape (time,).
     baseline, noise
         Level of each pixel without light, shape (pixels,), and standard deviation of its samples, shape (pixels, time)
-        or (pixels, 1).
+        or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
     saturated, saturation_level
         Samples at a limit, of the shape of `samples`, and the least such sample.
     kernel, template
@@ -168,7 +168,8 @@ class Waveforms:
     def records(self, rows: slice) -> Records:
         """Return some of the waveforms less their baseline."""
         pixel = np.arange(rows.start, rows.stop) % self.baseline.size
-        return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, self.noise[pixel])
+        noise = self.noise[rows] if len(self.noise) == self.count else self.noise[pixel]
+        return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
 
 
 def _lines_of_sight(dataset: xr.Dataset, dims: tuple[str, ...]) -> LinesOfSight:
@@ -214,7 +215,7 @@ def _noise(
     noise: float | npt.ArrayLike | None,
     run: int,
 ) -> FloatArray:
-    """Return the noise of each pixel, shape (pixels, time) or (pixels, 1), for means of `run` samples."""
+    """Return the noise for means of `run` samples, of the shapes of `Waveforms.noise`."""
     pixels, count = baseline.size, samples.shape[1]
     if noise is not None:
         given = np.asarray(noise, dtype=np.float64)
@@ -224,7 +225,7 @@ def _noise(
     if name == "waveform" and "waveform_stderr" in dataset:
         bins, inflation = (dataset.attrs.get(key, 1.0) for key in ("error_inflation_bins", "error_inflation"))
         factor = np.interp(math.log(run), np.log(np.atleast_1d(bins)), np.atleast_1d(inflation))
-        return float(factor) * dataset["waveform_stderr"].values.reshape(-1, count)[-pixels:]
+        return float(factor) * dataset["waveform_stderr"].values.reshape(-1, count)
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
         raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
     rest = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
@@ -232,13 +233,16 @@ def _noise(
     if "signal_deviation" not in dataset:
         return np.asarray(spread * _inflation(rest, run))
     # The scatter of a sample at a limit is smaller than its error.
-    deviation = np.maximum(dataset["signal_deviation"].values.reshape(-1, count), spread)
+    deviation = dataset["signal_deviation"].values.reshape(-1, pixels, count)
+    deviation = np.maximum(deviation, spread)
     shots = samples[: _MOST_SHOTS * pixels].reshape(-1, pixels, count)
     if len(shots) < _FEWEST_SHOTS:
-        return np.asarray(deviation * _inflation(rest, run))
-    # Shots differ only by noise, whose correlation is larger in an echo than in the dark.
-    floored = np.where(deviation > 0, deviation, 1.0)
-    return np.asarray(deviation * _inflation((shots - shots.mean(axis=0)) / floored, run))
+        return np.asarray(deviation.reshape(-1, count) * _inflation(rest, run))
+    # The noise has a larger correlation in an echo than in the dark. Shots of one place differ by noise alone.
+    of_each = "shot" in dataset["signal_deviation"].dims and "signal_mean" in dataset
+    mean = dataset["signal_mean"].values.reshape(-1, pixels, count)[: len(shots)] if of_each else shots.mean(axis=0)
+    floored = np.where(deviation > 0, deviation, 1.0)[: len(shots)]
+    return np.asarray(deviation.reshape(-1, count) * _inflation((shots - mean) / floored, run))
 
 
 def _inflation(rest: FloatArray, run: int) -> float:

@@ -187,6 +187,11 @@ class Readout:
     logarithm: LogAmplifier | None = None
     digitiser: Digitiser | None = None
 
+    @property
+    def top_v(self) -> float:
+        """Highest voltage before the logarithm that is not clipped [V]."""
+        return self._limits()[0][1]
+
     def read(self, volts: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the samples [V] for voltages [V], and where they are saturated."""
         clip, over = self._limits()

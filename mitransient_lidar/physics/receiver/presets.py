@@ -6,9 +6,10 @@ Powers are means over time bins; before and after a record there is only the bac
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -35,6 +36,9 @@ from mitransient_lidar.physics.receiver.electronics import (
 )
 
 _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
+_HEADROOM = 6.0  # standard deviations of noise below the upper limit of samples in range
+_STRONGEST = 16  # records that an attenuation is fitted to
+_DARKEST = math.log(1e12)  # largest attenuation that is tried
 
 
 class Record(NamedTuple):
@@ -134,10 +138,76 @@ class ReceiverChain:
 
         The arguments are those of `apply`.
         """
+        mean, variance = self._unlimited(power, bin_width_ns, background)
+        if self.amplifier is None:
+            return Expected(mean, variance, np.zeros_like(mean))
+        return self._readout().expected(mean, variance)
+
+    def with_gain(self, factor: float) -> ReceiverChain:
+        """Return the chain with the transimpedance of its amplifier times a factor, above 0."""
+        if self.amplifier is None:
+            raise UserError(f"gain = {factor:g} needs an amplifier, which this receiver lacks")
+        ohm = self.amplifier.transimpedance_ohm * positive("gain", factor)
+        return replace(self, amplifier=replace(self.amplifier, transimpedance_ohm=ohm))
+
+    def fitting_gain(
+        self,
+        power: npt.ArrayLike,
+        bin_width_ns: float,
+        background: npt.ArrayLike = 0.0,
+        samples: slice = slice(None),
+    ) -> float:
+        """Return the largest factor of the transimpedance, at most 1, that keeps samples in range.
+
+        Samples are in range with 6 standard deviations of noise below the upper limit of amplifier and digitiser; all
+        voltages and noises are proportional to the transimpedance. Only `samples` count. Other arguments are those of
+        `apply`. The factor is 1 without an amplifier or a limit.
+        """
+        if self.amplifier is None or not math.isfinite(top := self._readout().top_v):
+            return 1.0
+        highest = float(self._highest(power, bin_width_ns, background, samples).max())
+        return 1.0 if highest <= top else top / highest
+
+    def fitting_attenuation(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> float:
+        """Return the least factor, at least 1, by which light must be attenuated for samples in range.
+
+        Signal and background are attenuated alike. In range is as for `fitting_gain`; infinite if the noise alone
+        exceeds the range. The arguments are those of `apply`.
+        """
+        from scipy.optimize import brentq
+
+        if self.amplifier is None or not math.isfinite(top := self._readout().top_v):
+            return 1.0
+        light = np.asarray(power, dtype=np.float64)
+        sky = np.broadcast_to(np.asarray(background, dtype=np.float64), light.shape[:-1]).ravel()
+        light = light.reshape(-1, light.shape[-1])
+        highest = self._highest(light, bin_width_ns, sky)
+        strongest = np.argsort(highest)[-_STRONGEST:]
+        light, sky = light[strongest], sky[strongest]
+
+        def excess(log: float) -> float:
+            least = math.exp(-log)
+            return float(self._highest(least * light, bin_width_ns, least * sky).max()) / top - 1
+
+        if excess(0.0) <= 0:
+            return 1.0
+        return math.inf if excess(_DARKEST) > 0 else math.exp(brentq(excess, 0.0, _DARKEST, xtol=1e-6))
+
+    def _highest(
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike, samples: slice = slice(None)
+    ) -> FloatArray:
+        """Return the highest voltage of each record without limits, with headroom for noise [V], shape (...)."""
+        mean, variance = self._unlimited(power, bin_width_ns, background)
+        return np.asarray((mean + _HEADROOM * np.sqrt(variance))[..., samples].max(axis=-1))
+
+    def _unlimited(
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and variance of the samples before clipping, logarithm and rounding."""
         events = self._events(power, bin_width_ns, background)
         if self.amplifier is None:
             mean, covariances = self.detector.moments(events, bin_width_ns, 1)
-            return Expected(mean, covariances[0], np.zeros_like(mean))
+            return mean, covariances[0]
         _, weights = self.amplifier.kernel(bin_width_ns)
         records = events.reshape(-1, events.shape[-1])
         some = max(1, _BLOCK * 8 // (records.shape[-1] * weights.size))
@@ -148,8 +218,7 @@ class ReceiverChain:
         mean, variance = (
             np.concatenate(part).reshape(*events.shape[:-1], -1)[..., every] for part in zip(*parts, strict=True)
         )
-        variance = variance + self.amplifier.white_noise(bin_width_ns) ** 2 * np.sum(weights**2)
-        return self._readout().expected(mean, variance)
+        return mean, variance + self.amplifier.white_noise(bin_width_ns) ** 2 * np.sum(weights**2)
 
     def snr(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
         """Return the signal-to-noise ratio of the samples of one shot, shape (..., sample).
