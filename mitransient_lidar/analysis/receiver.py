@@ -62,7 +62,7 @@ def detect_waveforms(
         ``saturated_shots`` is the share of shots with saturated samples, ``saturated_samples`` that of the samples
         [1]. ``time`` [ns], ``time_start_ns`` and ``bin_width_ns`` are those of the samples; other coordinates and
         attributes are those of the result, with the parameters of the chain as ``receiver.*``, ``gain`` and
-        ``optical_density`` as used, and ``fitting_gain`` and ``fitting_optical_density``, each of which avoids
+        ``optical_density`` as used, the name of the one that was ``chosen`` by 'auto', and ``fitting_gain`` and ``fitting_optical_density``, each of which avoids
         saturation while the other one is kept (`ReceiverChain.fitting_gain`).
 
     Raises
@@ -160,12 +160,17 @@ def saturation_advice(recorded: xr.Dataset) -> str:
 def describe_recording(recorded: xr.Dataset) -> list[str]:
     """Return lines on a record of `detect_waveforms`: gain and filter as used, and saturation in total and by pixel."""
     attributes = recorded.attrs
-    used = f"gain {attributes['gain']:.4g}, optical density {attributes['optical_density']:.3g}"
+    used = ", ".join(
+        f"{name.replace('_', ' ')} {attributes[name]:.4g}{' (auto)' if attributes['chosen'] == name else ''}"
+        for name in ("gain", "optical_density")
+    )
     lines = [
         f"{recorded.sizes['shot']} shots, receiver {attributes.get('receiver', 'custom')}, {used}",
         saturation_advice(recorded),
     ]
     shots, samples = recorded["saturated_shots"], recorded["saturated_samples"]
+    if not shots.any():
+        return lines
     if shots.dims != ("pixel",) or shots.size > _LISTED_PIXELS:
         most = f"{_percent(float(shots.max()))} of its shots, {_percent(float(samples.max()))} of its samples"
         return [*lines, f"most saturated pixel: {most}"]
@@ -180,7 +185,7 @@ def _percent(share: float) -> str:
 
 def _in_range(
     chain: ReceiverChain, gain: float | str, density: float | str, light: FloatArray, width: float, sky: FloatArray
-) -> tuple[ReceiverChain, float, dict[str, float]]:
+) -> tuple[ReceiverChain, float, dict[str, float | str]]:
     """Return the chain with its gain, the optical density of the filter, and attributes with those that fit."""
     if gain == density == "auto":
         raise UserError("gain = 'auto' and optical_density = 'auto' are alternatives: give one of them")
@@ -198,7 +203,13 @@ def _in_range(
     chosen = fitting if density == "auto" else wanted
     largest = chain.fitting_gain(10**-chosen * light, width, 10**-chosen * background)
     factor = largest if gain == "auto" else float(gain)
-    attributes = {"gain": factor, "optical_density": chosen, "fitting_gain": largest}
+    automatic = "gain" if gain == "auto" else "optical_density" if density == "auto" else ""
+    attributes: dict[str, float | str] = {
+        "gain": factor,
+        "optical_density": chosen,
+        "chosen": automatic,
+        "fitting_gain": largest,
+    }
     if math.isfinite(fitting):
         attributes["fitting_optical_density"] = fitting
     return (chain.with_gain(factor) if gain == "auto" and factor < 1 else used), chosen, attributes

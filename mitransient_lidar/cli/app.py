@@ -29,7 +29,14 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.scattering_orders,
         studies.water,
     ),
-    "Analyse results": (results.plot, results.compare, gates.gates, waveforms.waveforms, retrieve.retrieve),
+    "Analyse results": (
+        results.plot,
+        results.compare,
+        results.record,
+        gates.gates,
+        waveforms.waveforms,
+        retrieve.retrieve,
+    ),
     "Scenes and system": (scenes.info, scenes.bench),
 }
 

@@ -17,6 +17,9 @@ Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
 
+#: Help of an option for the receiver.
+RECEIVERS = "Receiver of every pixel: ideal, photodiode, pmt, pmt_log, apd, sipm or spad."
+
 
 def parameters(definitions: list[str] | None) -> dict[str, str]:
     """Return scene parameters given as ``name=value``."""
@@ -44,3 +47,13 @@ def pair(option: str, text: str) -> tuple[float, float]:
     except ValueError:
         raise UserError(f"{option} {text} is not of the form 2,5.") from None
     return first, second
+
+
+def number_or_auto(option: str, text: str) -> float | str:
+    """Return a number, or the word auto."""
+    if text == "auto":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise UserError(f"{option} {text} must be a number or auto.") from None

@@ -1,14 +1,19 @@
-"""Commands that draw and compare results."""
+"""Commands that draw, record and compare results."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.options import DrawingOnly
+from mitransient_lidar.cli.files import check_suffix, write_netcdf
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.options import RECEIVERS, DrawingOnly, Quiet, Seed, number_or_auto
 from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _DIFFERENT = 1
 
@@ -18,6 +23,7 @@ def plot(
     output: DrawingOnly = None,
     log: Annotated[bool, typer.Option("--log", help="Logarithmic power axis only.")] = False,
     linear: Annotated[bool, typer.Option("--linear", help="Linear power axis only.")] = False,
+    shot: Annotated[int | None, typer.Option(help="Number of a shot of a series; by default the mean of all.")] = None,
     layout: Annotated[
         bool, typer.Option("--layout", help="Draw pixels, beam and targets on the sea instead, to FILE_layout.png.")
     ] = False,
@@ -29,19 +35,65 @@ def plot(
     """
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
-    from mitransient_lidar import results
+    from mitransient_lidar.analysis.waveforms.records import open_waveforms
     from mitransient_lidar.plots.layout import axis_points, plot_layout
     from mitransient_lidar.plots.waveforms import plot_waveforms
 
+    dataset = open_waveforms(file)
+    if shot is not None:
+        dataset = _shot(dataset, shot, file)
     if layout:
         target = output or file.with_name(f"{file.stem}_layout.png")
-        dataset = results.open(file)
         plot_layout(dataset, target)
         typer.echo("\n".join([str(target), *axis_points(dataset)]))
         return
     target = output or file.with_suffix(".png")
-    plot_waveforms(results.open(file), target, "both" if log == linear else "log" if log else "linear")
+    plot_waveforms(dataset, target, "both" if log == linear else "log" if log else "linear")
     typer.echo(target)
+
+
+def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
+    """Return one shot of a series."""
+    if "shot" not in dataset.dims:
+        raise UserError(f"--shot {number} needs a series of shots, but {file} holds a single shot.")
+    if number not in dataset["shot"].values:
+        first, last = (int(end) for end in dataset["shot"].values[[0, -1]])
+        raise UserError(f"--shot {number} must be one of the shots of {file}, {first} to {last}.")
+    return dataset.sel(shot=number)
+
+
+def record(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series.")],
+    receiver: Annotated[str, typer.Option(help=RECEIVERS)] = "apd",
+    gain: Annotated[str, typer.Option(metavar="FACTOR", help="Factor of the amplifier's gain, or auto.")] = "1",
+    optical_density: Annotated[
+        str, typer.Option(metavar="DENSITY", help="Optical density of a filter before the detector, or auto.")
+    ] = "0",
+    shots: Annotated[int, typer.Option(help="Number of records of each waveform, with independent noise.")] = 1,
+    background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
+    seed: Seed = 0,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Record the waveforms of a result with a receiver.
+
+    Writes the signals with the noise of detector and electronics, which waveforms and plot read, and prints how much is
+    saturated. With auto, the gain or the filter is chosen so that nothing is.
+    """
+    target = output or file.with_name(f"{file.stem}_recorded.nc")
+    check_suffix("--output", target, ".nc")
+    chosen: dict[str, Any] = {"gain": number_or_auto("--gain", gain)}
+    chosen["optical_density"] = number_or_auto("--optical-density", optical_density)
+    from mitransient_lidar import results
+    from mitransient_lidar.analysis import receiver as analysis
+
+    with reporting(quiet):
+        recorded = analysis.detect_waveforms(results.open(file), receiver, shots, seed, background_power_w, **chosen)
+    write_netcdf(recorded, target)
+    for line in analysis.describe_recording(recorded):
+        typer.echo(line)
 
 
 def compare(

@@ -7,38 +7,86 @@ from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_suffix, write_netcdf
+from mitransient_lidar.cli.files import check_figure, check_suffix, write_netcdf
 from mitransient_lidar.cli.options import pair
+from mitransient_lidar.core.errors import UserError
 
+_MOST_SHOTS = 200  # of a printed table
 _WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd", "c": "attenuation"}
 
 
 def retrieve(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series of shots.")
+    ],
     slope_deviation: Annotated[
         str | None,
-        typer.Option(metavar="ALONG,ACROSS", help="Standard deviations of the sea's slopes, as prior knowledge."),
+        typer.Option(
+            metavar="ALONG,ACROSS",
+            help="Standard deviations of the sea's slopes, as prior knowledge; by default those of a series.",
+        ),
     ] = None,
     efficiency: Annotated[
         float | None, typer.Option(help="Two-way efficiency of optics and air; by default that of the scene.")
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG, PDF or SVG file of a series: estimates against the truth.")
+    ] = None,
 ) -> None:
     """Retrieve slopes, bottom and water from a result.
 
-    Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of FILE.
+    Estimates the sea's slope, the bottom's depth and reflectance, and the water's attenuation from the echoes of FILE;
+    of a series, those of each shot beside the truth.
     """
     deviations = None if slope_deviation is None else pair("--slope-deviation", slope_deviation)
     if output is not None:
         check_suffix("--output", output, ".nc")
+    check_figure(figure)
     from mitransient_lidar import results
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
 
-    found = retrieve_from(results.open(file), slope_deviation=deviations, efficiency=efficiency)
-    for line in _lines(found):
+    dataset = results.open(file)
+    if figure is not None and "true_slope_along" not in dataset.coords:
+        raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
+    if deviations is None and "slope_deviation" in dataset.attrs:
+        along, across = dataset.attrs["slope_deviation"]
+        deviations = along, across
+    found = retrieve_from(dataset, slope_deviation=deviations, efficiency=efficiency)
+    for line in _table(found) if "shot" in found.dims else _lines(found):
         typer.echo(line)
     if output is not None:
         write_netcdf(found, output)
+    if figure is not None:
+        from mitransient_lidar.plots.retrieval import plot_retrieval
+
+        figure.parent.mkdir(parents=True, exist_ok=True)
+        plot_retrieval(found, figure)
+        typer.echo(figure)
+
+
+def _table(found: Any) -> list[str]:
+    """Return a line for each shot of a series, with the truth if known, and lines that compare both."""
+    from mitransient_lidar.plots.retrieval import estimates, truth_statistics
+
+    columns = estimates(found)
+    reflectance = found["reflectance"].sel(correction="column").values
+    numbers = found["shot"].values if "shot" in found.coords else range(found.sizes["shot"])
+    line = f"{'shot':>5}"
+    for one in columns:
+        line += f"{one.head:>18}" + (f"{'true':>9}" if one.truth is not None else "")
+    lines = [f"{line}{'reflectance':>13}"]
+    for place, number in list(enumerate(numbers))[:_MOST_SHOTS]:
+        line = f"{number:>5}"
+        for one in columns:
+            known = f"{one.values[place]:.3f}"
+            if one.errors is not None:
+                known += f" +- {one.errors[place]:.3f}"
+            line += f"{known:>18}" + (f"{one.truth[place]:>9.3f}" if one.truth is not None else "")
+        lines.append(f"{line}{reflectance[place]:>13.4f}")
+    if len(reflectance) > _MOST_SHOTS:
+        lines.append(f"{len(reflectance) - _MOST_SHOTS} more shots: write them all with -o OUT.nc")
+    return lines + [text for one in columns if (text := truth_statistics(one))]
 
 
 def _lines(found: Any) -> list[str]:

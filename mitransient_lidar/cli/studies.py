@@ -10,7 +10,7 @@ import typer
 
 from mitransient_lidar.cli.files import check_figure, check_suffix, write_figure
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
-from mitransient_lidar.cli.options import Define, DrawingOnly, Quiet, Scene, Seed, numbers, pair, parameters
+from mitransient_lidar.cli.options import RECEIVERS, Define, DrawingOnly, Quiet, Scene, Seed, numbers, pair, parameters
 from mitransient_lidar.core.errors import UserError
 
 TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
@@ -162,9 +162,7 @@ def target_signal(
 def detect(
     scene: Scene,
     define: Define = None,
-    receiver: Annotated[
-        str, typer.Option(help="Receiver of every pixel: ideal, photodiode, pmt, pmt_log, apd, sipm or spad.")
-    ] = "apd",
+    receiver: Annotated[str, typer.Option(help=RECEIVERS)] = "apd",
     pfa: Annotated[float, typer.Option(help="Probability of false alarm.")] = 1e-3,
     pd: Annotated[float, typer.Option(help="Required probability of detection.")] = 0.9,
     depths: Annotated[

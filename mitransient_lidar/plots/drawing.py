@@ -116,9 +116,13 @@ def add_top_axis(ax: Axes, offset: float, slope: float, label: str) -> XAxis:
 def draw_band(
     ax: Axes, x: FloatArray, y: FloatArray, error: FloatArray, *, lowest: float = -np.inf, **style: Any
 ) -> None:
-    """Draw a curve with a band of +-`error`, cut off at `lowest`, since a logarithmic axis has no values below 0."""
+    """Draw a curve with a band of +-`error`, cut off at `lowest`, since a logarithmic axis has no values below 0.
+
+    An error of shape (2, len(x)) is that below and above the curve.
+    """
     (line,) = ax.plot(x, y, **style)
-    ax.fill_between(x, np.maximum(y - error, lowest), y + error, color=line.get_color(), alpha=0.22, linewidth=0)
+    below, above = np.broadcast_to(error, (2, len(y)))
+    ax.fill_between(x, np.maximum(y - below, lowest), y + above, color=line.get_color(), alpha=0.22, linewidth=0)
 
 
 def draw_image(ax: Axes, values: FloatArray, dataset: xr.Dataset, *, label: bool = True, **style: Any) -> AxesImage:

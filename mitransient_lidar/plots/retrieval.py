@@ -1,9 +1,10 @@
-"""Figure of retrieved surface slopes against the true ones."""
+"""Figures of estimates from a series of shots against the truth."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -57,6 +58,81 @@ def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | No
         drawing.add_grid(ax)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize="small", handletextpad=0.2)
     axes[0].set_ylabel("slope retrieved from the surface echoes of one shot (deg)")
+    return drawing.save(figure, path)
+
+
+class Estimate(NamedTuple):
+    """An estimate over the shots of a series: heading with unit, values, standard errors and truth, if known."""
+
+    head: str
+    values: FloatArray
+    errors: FloatArray | None
+    truth: FloatArray | None
+
+
+def estimates(found: xr.Dataset) -> list[Estimate]:
+    """Return slopes, heights and depths of a result of `analysis.retrieval.retrieve.retrieve` over ``shot``.
+
+    Depths are those below the mean sea level through the slope of the shot.
+    """
+    through_slope = found.sel(correction="slope")
+    columns = {
+        "slope along": ("slope_along", "true_slope_along"),
+        "slope across": ("slope_across", "true_slope_across"),
+        "height (m)": ("surface_height", "true_surface_height"),
+        "depth (m)": ("depth_m", "true_bottom_depth"),
+    }
+
+    def values(name: str) -> FloatArray | None:
+        return through_slope[name].values if name in through_slope else None
+
+    return [
+        Estimate(head, through_slope[name].values, values(f"{name}_stderr"), values(truth))
+        for head, (name, truth) in columns.items()
+    ]
+
+
+def truth_statistics(one: Estimate) -> str:
+    """Return a line with bias and scatter of an estimate about the truth; empty for fewer than 2 known shots."""
+    if one.truth is None:
+        return ""
+    known = np.isfinite(one.values) & np.isfinite(one.truth)
+    if np.count_nonzero(known) < 2:
+        return ""
+    error = one.values[known] - one.truth[known]
+    text = f"{one.head}: bias {error.mean():+.3f}, rms error {np.sqrt(np.mean(error**2)):.3f}"
+    if np.ptp(one.truth[known]) > 0 and np.ptp(one.values[known]) > 0:
+        text += f", correlation {np.corrcoef(one.values[known], one.truth[known])[0, 1]:+.2f}"
+    if one.errors is not None:
+        text += f", rms of error / standard error {np.sqrt(np.mean((error / one.errors[known]) ** 2)):.2f}"
+    return f"{text}, {np.count_nonzero(known)} shots"
+
+
+def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the estimates of a series of shots against the truth, with their standard errors if known.
+
+    `found` is a result of `analysis.retrieval.retrieve.retrieve` for a series of `studies.shot_series.render_shots`.
+
+    Raises
+    ------
+    UserError
+        If the shots have no truth.
+    """
+    figure = drawing.new_figure(path, 9.6, 9.0)
+    shown = [one for one in estimates(found) if one.truth is not None]
+    if not shown:
+        raise UserError("found has no truth: it must come from a series of shots with true slopes and depths")
+    for ax, one in zip(figure.subplots(2, 2).flat, shown, strict=False):
+        varied = float(np.nanmax(one.truth) - np.nanmin(one.truth)) > 0
+        x, label = (one.truth, f"true {one.head}") if varied else (np.arange(len(one.values)), "shot")
+        ax.errorbar(x, one.values, one.errors, fmt=".", color=_COLOURS["along"], markersize=5, linewidth=0.7)
+        middle = float(np.nanmean(one.truth))
+        ax.axline((middle if varied else 0.0, middle), slope=float(varied), color="0.5", linewidth=0.9, label="truth")
+        ax.set(xlabel=label, ylabel=f"estimated {one.head}")
+        ax.set_title(truth_statistics(one).partition(": ")[2].replace(", rms of", ",\nrms of"), fontsize="small")
+        ax.legend(frameon=False, fontsize="small")
+        drawing.add_grid(ax)
+    figure.suptitle(drawing.titled(found.attrs, f"{found.sizes['shot']} shots"))
     return drawing.save(figure, path)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
@@ -22,15 +22,17 @@ _DECADES = 7  # at most, on a logarithmic axis
 
 
 def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
-    """Draw the waveforms of a result; of an imager the total energy of each pixel and the summed waveform.
+    """Draw the waveforms or recorded signals of a result; of an imager the total of each pixel and the summed waveform.
 
-    Bands are +-1 standard error. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), on the axis of the receiver.
+    Bands are +-1 standard error; of a series of shots, the curve is the mean of the shots, and the band holds 90 % of
+    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), on the axis of the receiver.
     The depth axis and the layout of the pixels are left out if the result lacks their attributes.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A result of `mitransient_lidar.results.dataset`.
+        A result of `mitransient_lidar.results.dataset`, or a record of `analysis.receiver.detect_waveforms`; one shot
+        or several.
     path : path, optional
         File to write.
     scale : {'both', 'linear', 'log'}
@@ -47,37 +49,69 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
         axes.append(figure.add_subplot(grid[row, 0], sharex=axes[0] if axes else None))
     side = figure.add_subplot(grid[:, 1])
 
+    curves = _curves(dataset)
     if is_image:
-        power = dataset["waveform"].sum(("row", "column")).values[np.newaxis]
-        # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.
-        error = np.zeros_like(power)
         _draw_image(side, dataset)
     else:
-        power, error = dataset["waveform"].values, dataset["waveform_stderr"].values
         _draw_pixels(side, dataset)
     for ax, panel in zip(axes, panels, strict=True):
-        _draw_waveforms(ax, dataset, power, error, log=panel == "log")
+        _draw_waveforms(ax, dataset, curves, log=panel == "log")
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
     axes[-1].set_xlabel(drawing.TIME_LABEL)
     _add_depth_axis(axes[0], dataset.attrs)
-    figure.suptitle(_title(dataset.attrs), fontsize="large")
+    figure.suptitle(_title(dataset), fontsize="large")
     return drawing.save(figure, path)
 
 
-def _draw_waveforms(ax: Axes, dataset: xr.Dataset, power: FloatArray, error: FloatArray, *, log: bool) -> None:
-    """Draw power and error [W], shape (pixel, time), in a suitable unit."""
+class _Curves(NamedTuple):
+    """Curves, their bands below and above, and their errors, in a unit, over (pixel, time) without that of a band."""
+
+    power: FloatArray
+    band: FloatArray
+    error: FloatArray
+    label: str
+    unit: str
+
+
+def _curves(dataset: xr.Dataset) -> _Curves:
+    """Return the curves of a result, or the means of the shots of a series with the band that holds 90 % of them."""
+    recorded = "signal" in dataset
+    values = dataset["signal" if recorded else "waveform"]
+    error = dataset["signal_deviation" if recorded else "waveform_stderr"]
+    if "pixel" not in values.dims:
+        # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.
+        values, error = (one.sum(("row", "column")).expand_dims("pixel", -2) for one in (values, 0 * error))
+    power, spread = values.values, error.values
+    if "shot" in values.dims:
+        power = values.mean("shot").values
+        band = np.abs(np.quantile(values.values, [0.05, 0.95], axis=0) - power)
+        spread = np.sqrt((error.broadcast_like(values) ** 2).sum("shot").values) / values.sizes["shot"]
+    else:
+        band = np.stack([spread, spread])
+    unit = str(values.attrs.get("units", "")) if recorded else "W"
+    return _Curves(power, band, spread, "recorded signal" if recorded else "received power", unit)
+
+
+def _draw_waveforms(ax: Axes, dataset: xr.Dataset, curves: _Curves, *, log: bool) -> None:
+    """Draw curves in a suitable unit."""
+    power, error = curves.power, curves.error
     time, limits = dataset["time"].values, drawing.time_limits(dataset)
     inside = (time >= limits[0]) & (time <= limits[1])
     shown = power[:, inside]
     # A logarithmic axis ends where the signal falls below three standard errors.
     significant = shown[np.isfinite(shown) & (shown > 0) & ~(shown < 3.0 * error[:, inside])]
     top = float(significant.max()) if significant.size else 1.0
+    if "shot" in dataset.dims:
+        top = max(top, float((power + curves.band[1])[:, inside].max()))
     factor, prefix = drawing.si_prefix(top)
     floor = top * 1e-3
+    if curves.unit == "1":
+        factor, prefix = 1.0, ""
     if significant.size:
         floor = max(0.5 * float(np.quantile(significant, 0.01)), top * 10.0**-_DECADES)
-    for values, spread, colour in zip(power / factor, error / factor, drawing.pixel_colours(len(power)), strict=True):
+    bands = np.moveaxis(curves.band / factor, 1, 0)
+    for values, spread, colour in zip(power / factor, bands, drawing.pixel_colours(len(power)), strict=True):
         if len(power) <= drawing.LISTED_PIXELS:
             lowest = 1e-3 * floor / factor if log else -np.inf
             drawing.draw_band(ax, time, values, spread, lowest=lowest, color=colour, linewidth=1.3)
@@ -89,7 +123,7 @@ def _draw_waveforms(ax: Axes, dataset: xr.Dataset, power: FloatArray, error: Flo
         ax.set_ylim(floor / factor, top / factor * 2.0)
     else:
         ax.set_ylim(min(0.0, float(np.nanmin(shown, initial=0.0))) / factor, top / factor * 1.08)
-    ax.set_ylabel(f"received power ({prefix}W)")
+    ax.set_ylabel(f"{curves.label} ({prefix}{curves.unit})" if curves.unit != "1" else f"{curves.label} per bin")
     drawing.add_grid(ax, hide=("right",))
 
 
@@ -172,17 +206,30 @@ def _cells(
 
 
 def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
-    """Draw the energy that each pixel has received."""
-    energy = dataset["impulse_response"].sum("time").values
+    """Draw the energy that each pixel has received, or the sum of its samples, in the mean of the shots."""
+    recorded = "impulse_response" not in dataset
+    total = dataset["signal" if recorded else "impulse_response"].sum("time")
+    energy = total.mean({"shot"} & set(total.dims)).values
     factor, prefix = drawing.si_prefix(float(energy[np.isfinite(energy)].max(initial=0.0)))
     image = drawing.draw_image(ax, energy / factor, dataset, cmap="viridis")
     ax.set_anchor("N")
+    label = f"sum of the samples ({prefix}V)" if recorded else f"total energy ({prefix}J)"
     scale = ax.inset_axes((0.0, -0.24, 1.0, 0.05))
     scale.set_in_layout(False)  # it fits into the space below the square pixels
-    ax.figure.colorbar(image, cax=scale, orientation="horizontal", label=f"total energy ({prefix}J)")
+    ax.figure.colorbar(image, cax=scale, orientation="horizontal", label=label)
 
 
-def _title(attributes: dict[str, Any]) -> str:
-    error = optional_number(attributes, "error_median")
-    accuracy = f"median standard error {100 * error:.2g} %" if error is not None else ""
-    return "  ·  ".join(part for part in (drawing.scene_name(attributes) or "received power", accuracy) if part)
+def _title(dataset: xr.Dataset) -> str:
+    """Return scene, receiver, shots, and for waveforms their accuracy."""
+    attributes = dataset.attrs
+    error = None if "signal" in dataset else optional_number(attributes, "error_median")
+    parts = [drawing.scene_name(attributes) or "received power"]
+    if "signal" in dataset:
+        parts.append(f"receiver {attributes.get('receiver', 'custom')}")
+    if "shot" in dataset.dims:
+        parts.append(f"mean and 90 % of {dataset.sizes['shot']} shots")
+    elif "shot" in dataset.coords:
+        parts.append(f"shot {int(dataset['shot'])}")
+    if error is not None:
+        parts.append(f"median standard error {100 * error:.2g} %")
+    return "  ·  ".join(parts)

@@ -298,4 +298,5 @@ def _bottom_depth(lidar: LidarScene, places: FloatArray) -> FloatArray:
     count = len(places)
     origin = mi.Point3f(*(mi.Float(column.astype(np.float32)) for column in places.T), mi.Float(np.zeros(count)))
     met = mi.load_dict({"type": "scene", "bottom": bottom}).ray_intersect(mi.Ray3f(origin, down))
-    return np.where(np.array(met.is_valid()), -np.array(met.p.z, dtype=np.float64), np.nan)
+    # Rays in single precision are known to a tenth of a millimetre.
+    return np.round(np.where(np.array(met.is_valid()), -np.array(met.p.z, dtype=np.float64), np.nan), 4)

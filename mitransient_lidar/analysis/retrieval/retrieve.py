@@ -299,7 +299,7 @@ def _labelled(dataset: xr.Dataset, table: dict[str, tuple[FloatArray, str, str]]
         name: (dims, np.reshape(values, shape), {"units": unit, "long_name": text})
         for name, (values, unit, text) in table.items()
     }
-    coords: dict[Any, Any] = {"shot": dataset["shot"].values} if shape and "shot" in dataset.coords else {}
+    coords: dict[Any, Any] = {name: one for name, one in dataset.coords.items() if shape and one.dims == ("shot",)}
     return xr.Dataset(data, coords, dataset.attrs)
 
 
