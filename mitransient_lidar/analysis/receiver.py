@@ -62,8 +62,9 @@ def detect_waveforms(
         ``saturated_shots`` is the share of shots with saturated samples, ``saturated_samples`` that of the samples
         [1]. ``time`` [ns], ``time_start_ns`` and ``bin_width_ns`` are those of the samples; other coordinates and
         attributes are those of the result, with the parameters of the chain as ``receiver.*``, ``gain`` and
-        ``optical_density`` as used, the name of the one that was ``chosen`` by 'auto', and ``fitting_gain`` and ``fitting_optical_density``, each of which avoids
-        saturation while the other one is kept (`ReceiverChain.fitting_gain`).
+        ``optical_density`` as used (``chosen`` names the one that was 'auto'), and ``fitting_gain`` and
+        ``fitting_optical_density``, each of which avoids saturation while the other one is kept
+        (`ReceiverChain.fitting_gain`).
 
     Raises
     ------
@@ -97,7 +98,8 @@ def detect_waveforms(
     coords = {name: coordinate for name, coordinate in dataset.coords.items() if "time" not in coordinate.dims}
     if series:
         # The records of a shot follow each other, and its closed forms and coordinates are repeated.
-        signal, saturated = (np.moveaxis(one, 0, 1).reshape(-1, *one.shape[2:]) for one in (signal, saturated))
+        merged = (number * len(light), *signal.shape[2:])
+        signal, saturated = np.moveaxis(signal, 0, 1).reshape(merged), np.moveaxis(saturated, 0, 1).reshape(merged)
         forms = [np.repeat(one, number, axis=0) for one in forms]
         numbers = np.repeat(np.arange(len(light)), number)
         coords = {name: one.isel(shot=numbers, missing_dims="ignore") for name, one in coords.items() if name != "shot"}

@@ -119,14 +119,14 @@ def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
         If the shots have no truth.
     """
     figure = drawing.new_figure(path, 9.6, 9.0)
-    shown = [one for one in estimates(found) if one.truth is not None]
+    shown = [(one, one.truth) for one in estimates(found) if one.truth is not None]
     if not shown:
         raise UserError("found has no truth: it must come from a series of shots with true slopes and depths")
-    for ax, one in zip(figure.subplots(2, 2).flat, shown, strict=False):
-        varied = float(np.nanmax(one.truth) - np.nanmin(one.truth)) > 0
-        x, label = (one.truth, f"true {one.head}") if varied else (np.arange(len(one.values)), "shot")
+    for ax, (one, truth) in zip(figure.subplots(2, 2).flat, shown, strict=False):
+        varied = bool(np.any(truth != truth[0]))
+        x, label = (truth, f"true {one.head}") if varied else (np.arange(len(truth)), "shot")
         ax.errorbar(x, one.values, one.errors, fmt=".", color=_COLOURS["along"], markersize=5, linewidth=0.7)
-        middle = float(np.nanmean(one.truth))
+        middle = float(np.mean(truth[np.isfinite(truth)])) if np.isfinite(truth).any() else 0.0
         ax.axline((middle if varied else 0.0, middle), slope=float(varied), color="0.5", linewidth=0.9, label="truth")
         ax.set(xlabel=label, ylabel=f"estimated {one.head}")
         ax.set_title(truth_statistics(one).partition(": ")[2].replace(", rms of", ",\nrms of"), fontsize="small")

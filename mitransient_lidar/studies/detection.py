@@ -78,15 +78,17 @@ def detect(
     -------
     xarray.Dataset
         Over ``combination`` (`COMBINATIONS`), with ``_low`` and ``_high`` of 95 % confidence intervals:
-        ``needed_target`` and ``needed_energy``, the fractions of the target's signal and of the pulse energy with the
-        required detection (infinite if there is none), ``gain_target`` and ``gain_energy``, those of ``single`` over
-        them; for random shots with the fraction ``drawn_share`` (attribute) of the target's signal, the ``area`` under
-        the ROC curve, and ``drawn_detection`` and ``drawn_false_alarm`` over ``false_alarm``; ``depth_bias`` and
-        ``depth_spread`` [m] of random shots with the full signal, and ``depth_gain``. With `depths`:
-        ``needed_at_depth`` over ``depth``, and ``detectable_depth`` [m] where it is 1. Without intervals:
-        ``expected_detection`` and ``expected_area`` in closed form, ``deflection`` of the full signal, ``depth_bound``
-        [m] (Cramer-Rao, without clutter), and over ``pixel`` and ``time`` [ns] the means of ``background`` and
-        ``difference`` [W] over the renders.
+        ``detection``, the probability of detecting the target as it is at `pfa`, and ``pixel_detection`` over
+        ``pixel``, that of each pixel alone, in closed form; ``needed_target`` and ``needed_energy``, the fractions of
+        the target's signal and of the pulse energy with the required detection (infinite if there is none),
+        ``gain_target`` and ``gain_energy``, those of ``single`` over them; for random shots with the fraction
+        ``drawn_share`` (attribute) of the target's signal, the ``area`` under the ROC curve, and ``drawn_detection``
+        and ``drawn_false_alarm`` over ``false_alarm``; ``depth_bias`` and ``depth_spread`` [m] of random shots with
+        the full signal, and ``depth_gain``. With `depths`: ``needed_at_depth`` over ``depth``, and
+        ``detectable_depth`` [m] where it is 1. Without intervals: ``expected_detection`` and ``expected_area`` in
+        closed form, ``deflection`` of the full signal, ``depth_bound`` [m] (Cramer-Rao, without clutter), and over
+        ``pixel`` and ``time`` [ns] the means of ``background`` and ``difference`` [W] over the renders. Attributes
+        ``gain_pixels`` and ``gain_single``: factors of the transimpedance that keep the echo in range.
 
     Raises
     ------
@@ -160,6 +162,7 @@ def detect(
             f"receiver {called} does not see the target, for example because of the dead time after the surface echo: "
             "reduce the pulse energy"
         ) from error
+    data |= trials.detected(experiments[0], pfa)
     share = float(data["needed_target"][1][-1])
     share = share if math.isfinite(share) else 1.0
     data |= trials.drawn(experiments[0], share, pfa, shots, seed)
@@ -182,6 +185,8 @@ def detect(
         background_power_w=sky,
         confidence=trials.CONFIDENCE,
         drawn_share=share,
+        gain_pixels=experiments[0].gain(False),
+        gain_single=experiments[0].gain(True),
         brightest=str(first[0]["pixel"].values[experiments[0].brightest]),
         pulse_fwhm_ns=pulse_fwhm_ns,
     )
@@ -228,15 +233,36 @@ def _experiment(
     )
 
 
+def describe_detected(found: xr.Dataset) -> str:
+    """Return a sentence on whether the target of the scene is detected, from a result of `detect`."""
+    attributes = found.attrs
+    best = found.sel(combination="best")
+    low, high = float(best["detection_low"]), float(best["detection_high"])
+    verdict = "detected" if low >= attributes["pd"] else "not detected" if high < attributes["pd"] else "undecided"
+    others = {"one pixel for all light": "single", "the sum of the pixels": "sum"}
+    parts = [f"{label} {float(found['detection'].sel(combination=name)):.3g}" for label, name in others.items()]
+    pixels = [f"{name} {float(found['pixel_detection'].sel(pixel=name)):.3g}" for name in found["pixel"].values]
+    return (
+        f"{verdict}: P_d = {float(best['detection']):.3g} ({low:.3g} .. {high:.3g}) with the best weighting of the "
+        f"pixels at P_fa = {attributes['pfa']:g}, P_d = {attributes['pd']:g} is required; {', '.join(parts)}; "
+        f"single pixels: {', '.join(pixels)}"
+    )
+
+
 def describe_detection(found: xr.Dataset) -> list[str]:
-    """Return the lines of the tables of a result of `detect`: required levels, random shots, and depths if any."""
+    """Return the lines on a result of `detect`: whether the target is detected, and tables.
+
+    The tables are those of required levels, random shots, and depths if any.
+    """
     attributes = found.attrs
     noise = f"noise and {attributes['clutter']} seas" if attributes["clutter"] else "noise"
     needed = (("needed_target", 26, 100), ("gain_target", 24), ("needed_energy", 30, 100), ("gain_energy", 24))
     errors = (("depth_bias", 32, 1e3), ("depth_spread", 24, 1e3), ("depth_gain", 24))
     lines = [
+        describe_detected(found),
         f"{attributes['scene']}, receiver {attributes['receiver']}, {noise}; intervals of "
-        f"{100 * attributes['confidence']:g} %",
+        f"{100 * attributes['confidence']:g} %; gain {attributes['gain_pixels']:.3g} of the pixels, "
+        f"{attributes['gain_single']:.3g} of one pixel for all light",
         f"needed for P_d = {attributes['pd']:g} at P_fa = {attributes['pfa']:g}, brightest pixel: "
         f"{attributes['brightest']}",
         f"{'':<11}{'target (%)':>26}{'gain':>24}{'pulse energy (%)':>30}{'gain':>24}",

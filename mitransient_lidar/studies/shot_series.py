@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +30,12 @@ _REACH, _FEWEST_CELLS = 4.5, 4
 _FARTHEST = 1e4
 
 #: Attributes that differ between shots, of which the series keeps the sum, the least or the greatest.
-_MERGED = {"elapsed_s": sum, "window_start_ns": min, "window_end_ns": max, "error_p95": max}
+_MERGED: dict[str, Callable[[list[Any]], Any]] = {
+    "elapsed_s": sum,
+    "window_start_ns": min,
+    "window_end_ns": max,
+    "error_p95": max,
+}
 _MERGED |= {"surface_edge_loss": max, "beam_outside_surface": max}
 
 _TRUTH = {
@@ -141,8 +146,8 @@ def render_shots(
     sea = SeaMap.of_scene(session.scene) if given is None or _has_waves(session.scene) else None
     pairs = given if given is not None or sea is None else random_places(sea, count, seed)
     assert pairs is not None
-    farthest = pairs[np.argmax(np.hypot(*pairs.T))]
-    open_scene(scene, _at(params, *farthest, target))  # before the first render
+    x, y = pairs[np.argmax(np.hypot(*pairs.T))]
+    open_scene(scene, _at(params, x, y, target))  # before the first render
     truth = _truth(session, pairs)
     found: list[xr.Dataset] = []
     try:
@@ -198,16 +203,12 @@ def merged_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
         elif name in _MERGED:
             merged[name] = float(_MERGED[name](values))
         elif name != "seed" and not name.startswith("scene.") and not name.endswith("_pose"):
-            lengths = {np.shape(value) if _is_number(value) else None for value in values}
-            if len(lengths) == 1 and None not in lengths:
-                merged[name] = np.mean(np.array(values, dtype=np.float64), axis=0).tolist()
+            rows = [value if isinstance(value, list) else [value] for value in values]
+            numbers = all(isinstance(item, (int, float)) for row in rows for item in row)
+            if numbers and len({len(row) for row in rows}) == 1:
+                mean = np.array(rows, dtype=np.float64).mean(axis=0).tolist()
+                merged[name] = mean if isinstance(first, list) else mean[0]
     return merged
-
-
-def _is_number(value: Any) -> bool:
-    """Return whether an attribute is a number or a list of numbers."""
-    items = value if isinstance(value, list) else [value]
-    return bool(items) and all(isinstance(item, (int, float)) for item in items)
 
 
 def _checked_places(places: npt.ArrayLike) -> FloatArray:
@@ -298,5 +299,6 @@ def _bottom_depth(lidar: LidarScene, places: FloatArray) -> FloatArray:
     count = len(places)
     origin = mi.Point3f(*(mi.Float(column.astype(np.float32)) for column in places.T), mi.Float(np.zeros(count)))
     met = mi.load_dict({"type": "scene", "bottom": bottom}).ray_intersect(mi.Ray3f(origin, down))
+    depth = -np.array(met.p.z, dtype=np.float64)
     # Rays in single precision are known to a tenth of a millimetre.
-    return np.round(np.where(np.array(met.is_valid()), -np.array(met.p.z, dtype=np.float64), np.nan), 4)
+    return np.where(np.array(met.is_valid()), np.round(depth, 4), np.nan).astype(np.float64)

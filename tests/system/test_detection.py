@@ -53,4 +53,4 @@ def test_drawn_shots_are_detected_as_wanted(squares):
 
 
 def test_table_describes_the_scene(squares):
-    assert describe_detection(squares)[0].startswith("fig13_2x2, receiver apd, noise;")
+    assert describe_detection(squares)[1].startswith("fig13_2x2, receiver apd, noise;")

@@ -98,8 +98,15 @@ class Experiment:
         power, sky = self.on_detectors(single, light)
         return within_range(self.chain, power, self.bin_width_ns, self.samples, sky)
 
-    def cases(self, name: str, share: float, energy: float, left_out: int | None = None) -> Cases:
-        """Return the samples of a combination."""
+    def gain(self, single: bool) -> float:
+        """Return the factor of the transimpedance that keeps the echo in range, on one detector or one per pixel."""
+        chain = self.ranged(single, np.maximum(*self.light(1, 1)))
+        if chain.amplifier is None or self.chain.amplifier is None:
+            return 1.0
+        return chain.amplifier.transimpedance_ohm / self.chain.amplifier.transimpedance_ohm
+
+    def cases(self, name: str | int, share: float, energy: float, left_out: int | None = None) -> Cases:
+        """Return the samples of a combination, or those of the pixel of an index alone."""
         single = name == "single"
         pair = self.light(share, energy, left_out)
         chain = self.ranged(single, np.maximum(*pair))
@@ -116,15 +123,16 @@ class Experiment:
         matrix = self.matrix(name)
         return Cases(found[0], found[1], found[2], found[3], detectors).combined(matrix, len(matrix) // samples)
 
-    def matrix(self, name: str) -> FloatArray:
-        """Return the matrix from the samples of all detectors to those of a combination."""
+    def matrix(self, name: str | int) -> FloatArray:
+        """Return the matrix from the samples of all detectors to those of a combination or of a pixel."""
         pixels, samples = self.background.shape[1], self.samples.stop - self.samples.start
-        weights = {
+        weights: dict[str | int, FloatArray] = {
             "single": np.ones((1, 1)),
             "sum": np.ones((1, pixels)),
-            "brightest": np.eye(pixels)[[self.brightest]],
             "best": np.eye(pixels),
+            **{index: np.eye(pixels)[[index]] for index in range(pixels)},
         }
+        weights["brightest"] = weights[self.brightest]
         return np.kron(weights[name], np.eye(samples))
 
     def draw(self, single: bool, light: FloatArray, chain: ReceiverChain, shots: int, seed: int) -> FloatArray:
@@ -167,6 +175,31 @@ def needs(trial: Experiment, pfa: float, pd: float) -> Variables:
         data |= _with_limits(f"needed_{kind}", [level.limits() for level in levels])
         data |= _with_limits(f"gain_{kind}", [level.limits(levels[0]) for level in levels])
     return data
+
+
+def detected(trial: Experiment, pfa: float) -> Variables:
+    """Return the probability of detecting the full signal at a probability of false alarm, combined and by pixel.
+
+    A detector that does not see the target raises only false alarms.
+    """
+    from scipy.special import ndtr, ndtri
+
+    def quantile(name: str | int, left_out: int | None = None) -> float:
+        try:
+            return float(trial.cases(name, 1, 1, left_out).statistic().quantile(pfa))
+        except ValueError:
+            return float(ndtri(pfa))
+
+    def limits(name: str | int) -> FloatArray:
+        value = quantile(name)
+        changes = np.array([quantile(name, i) for i in range(trial.groups)]) - value
+        return np.asarray(ndtr(_interval(value, changes)))
+
+    pixels = range(trial.background.shape[1])
+    return {
+        **_with_limits("detection", [limits(name) for name in COMBINATIONS]),
+        **_with_limits("pixel_detection", [limits(pixel) for pixel in pixels], dims=("pixel",)),
+    }
 
 
 def drawn(trial: Experiment, share: float, pfa: float, shots: int, seed: int) -> Variables:

@@ -113,6 +113,45 @@ def test_drawn_shots_have_the_expected_rates():
     assert np.all(np.abs(found["area"][1] - found["expected_area"][1]) < 0.03)
 
 
+def test_probability_of_detection_is_the_rate_of_drawn_shots():
+    """Four pixels of noise like that of the echoes: shots with the full signal above the threshold without it."""
+    light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 1, 2, 1.2), chain=NOISY, photons=2e4, scatter=0.0)
+    found = trials.detected(light, 0.02)
+    shots = 20_000
+    random = trials.drawn(light, 1.0, 0.02, shots, 3)
+    at = int(np.flatnonzero(random["false_alarm"][1] == 0.02)[0])
+    combined, alone = found["detection"][1], found["pixel_detection"][1]
+    error = np.sqrt(combined * (1 - combined) / shots)
+    assert np.max(np.abs(random["drawn_detection"][1][:, at] - combined) / error) < largest_z(shots, 4)
+    assert np.all((combined > 0.03) & (combined < 0.97))
+    # The pixel without an echo raises false alarms alone, and the brightest is one of the pixels.
+    assert alone[0] == pytest.approx(0.02)
+    assert alone[2] == pytest.approx(combined[2])
+    assert combined[3] > max(alone)
+
+
+def test_interval_of_detection_is_that_of_the_scatter_of_renders():
+    """In amplifier noise the deflection is proportional to the echo, whose logarithms scatter by 20 %."""
+    light = experiment(echoes=(0, 0, 1, 0), chain=NOISY, renders=6, scatter=0.2, photons=4e4)
+    found = trials.detected(light, 0.02)
+    low, value, high = (norm.ppf(found[f"detection{end}"][1][3]) + norm.isf(0.02) for end in ("_low", "", "_high"))
+    factors = light.difference[:, 2, 20] / light.difference[:, 2, 20].mean()
+    reach = t.ppf(0.975, 5) * factors.std(ddof=1) / np.sqrt(6)
+    np.testing.assert_allclose([low / value, high / value], [1 - reach, 1 + reach], rtol=0.02)
+
+
+@pytest.mark.parametrize(("pd", "verdict"), [(0.1, "detected"), (0.9, "undecided"), (0.99, "not detected")])
+def test_sentence_answers_whether_the_target_is_detected(result, pd, verdict):
+    shown = result.copy().assign_attrs(pd=pd)
+    shown["detection"], shown["detection_low"], shown["detection_high"] = (
+        ("combination", [0.5, 0.4, 0.6, value]) for value in (0.92, 0.85, 0.97)
+    )
+    text = detection.describe_detection(shown)[0]
+    assert text.startswith(f"{verdict}: P_d = 0.92 (0.85 .. 0.97) with the best weighting")
+    assert "one pixel for all light 0.5" in text
+    assert all(f"{name} " in text for name in NAMES)
+
+
 @pytest.mark.slow
 def test_clutter_that_all_pixels_share_is_weighted_away():
     """Backscatter that differs by 20 % from sea to sea, alike in all pixels, hides the target from one pixel alone."""
@@ -152,6 +191,7 @@ def made_up(depths=True):
     """Return a result as of `detect`, from synthetic light."""
     light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 0.2, 1, 0.5))
     data = trials.needs(light, 1e-3, 0.9)
+    data |= trials.detected(light, 1e-3)
     data |= trials.drawn(light, float(data["needed_target"][1][-1]), 1e-3, 200, 1)
     data |= trials.depth_errors(light, 200, 1, PULSE_NS, 0.11)
     if depths:
@@ -161,6 +201,7 @@ def made_up(depths=True):
     coords = {"combination": list(COMBINATIONS), "pixel": NAMES, "time": 0.5 + T}
     attributes = {"scene": "made_up", "receiver": "apd", "pfa": 1e-3, "pd": 0.9, "shots": 200, "clutter": 0}
     attributes |= {"drawn_share": float(data["needed_target"][1][-1]), "confidence": 0.95, "brightest": "blue"}
+    attributes |= {"gain_pixels": 1.0, "gain_single": 0.5}
     return xr.Dataset(data, coords, {**attributes, "pulse_fwhm_ns": PULSE_NS})
 
 
@@ -254,7 +295,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     assert found.attrs["renders"] == found.attrs["clutter"] == 4
     assert found.attrs["scene.surface_seed"] == "8"
     assert np.all(found["needed_at_depth"] > found["needed_target"])
-    assert "noise and 4 seas" in detection.describe_detection(found)[0]
+    assert "noise and 4 seas" in detection.describe_detection(found)[1]
 
 
 def test_blind_receiver_is_reported(monkeypatch):
