@@ -237,16 +237,21 @@ def describe_detected(found: xr.Dataset) -> str:
     """Return a sentence on whether the target of the scene is detected, from a result of `detect`."""
     attributes = found.attrs
     best = found.sel(combination="best")
-    low, high = float(best["detection_low"]), float(best["detection_high"])
+    value, low, high = (float(best[f"detection{end}"]) for end in ("", "_low", "_high"))
     verdict = "detected" if low >= attributes["pd"] else "not detected" if high < attributes["pd"] else "undecided"
     others = {"one pixel for all light": "single", "the sum of the pixels": "sum"}
-    parts = [f"{label} {float(found['detection'].sel(combination=name)):.3g}" for label, name in others.items()]
-    pixels = [f"{name} {float(found['pixel_detection'].sel(pixel=name)):.3g}" for name in found["pixel"].values]
+    parts = [f"{text} {_rate(float(found['detection'].sel(combination=name)))}" for text, name in others.items()]
+    alone = [f"{name} {_rate(float(found['pixel_detection'].sel(pixel=name)))}" for name in found["pixel"].values]
     return (
-        f"{verdict}: P_d = {float(best['detection']):.3g} ({low:.3g} .. {high:.3g}) with the best weighting of the "
-        f"pixels at P_fa = {attributes['pfa']:g}, P_d = {attributes['pd']:g} is required; {', '.join(parts)}; "
-        f"single pixels: {', '.join(pixels)}"
+        f"{verdict}: P_d = {_rate(value)} ({_rate(low)} .. {_rate(high)}) with the best weighting of the pixels at "
+        f"P_fa = {attributes['pfa']:g}, P_d = {attributes['pd']:g} is required; {', '.join(parts)}; "
+        f"single pixels: {', '.join(alone)}"
     )
+
+
+def _rate(probability: float) -> str:
+    """Return a probability of detection with three digits."""
+    return ">0.999" if probability > 0.999 else f"{probability:.3g}"
 
 
 def describe_detection(found: xr.Dataset) -> list[str]:

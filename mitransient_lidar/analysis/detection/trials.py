@@ -133,7 +133,7 @@ class Experiment:
             **{index: np.eye(pixels)[[index]] for index in range(pixels)},
         }
         weights["brightest"] = weights[self.brightest]
-        return np.kron(weights[name], np.eye(samples))
+        return np.asarray(np.kron(weights[name], np.eye(samples)), dtype=np.float64)
 
     def draw(self, single: bool, light: FloatArray, chain: ReceiverChain, shots: int, seed: int) -> FloatArray:
         """Return random samples of shots, shape (shots, cases, detectors * samples)."""

@@ -1,0 +1,220 @@
+"""Series of shots: places, truth, attributes, interruption and files, without renders."""
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.session import Session
+from mitransient_lidar.studies import shot_series
+from mitransient_lidar.transport.pose import Pose
+
+FLAT = {"spectrum": "flat", "surface_size": 60}
+PLACES = [(1.0, 2.0), (-3.0, 4.5), (10.0, -7.0)]
+TRUTH = ("aim_x", "aim_y", "true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth")
+
+
+class Wave:
+    """A plane wave, with the interface of a sea."""
+
+    cell_size = 0.25
+
+    def __init__(self, k_x, k_y):
+        self.k = k_x, k_y
+
+    def heights(self, x, y):
+        return 0.3 * np.cos(self.k[0] * x + self.k[1] * y[:, np.newaxis] + 0.4)
+
+
+class Beam:
+    """A beam of 10 mrad, with the interface of a transmitter."""
+
+    widest_angular_spread = 5e-3
+
+    def __init__(self, azimuth):
+        pose = Pose.from_angles(200.0, 40.0)
+        cos, sin = math.cos(azimuth), math.sin(azimuth)
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        self.pose = Pose(*(turn @ vector for vector in (pose.origin, pose.axis, pose.far, pose.left)))
+
+
+@pytest.mark.parametrize(("k_x", "k_y"), [(0.9, 0.0), (0.3, -0.8), (-0.5, 0.5)])
+@pytest.mark.parametrize("azimuth", [0.0, 0.7])
+def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(k_x, k_y, azimuth):
+    """In closed form the wave is damped by exp(-(k_a^2 s_a^2 + k_c^2 s_c^2)/2); s_c is 5 mrad of 261 m, s_a longer."""
+    x, y, across = 3.17, -8.4, 5e-3 * 200 / math.cos(math.radians(40))
+    along = across / math.cos(math.radians(40))
+    k_along = k_x * math.cos(azimuth) + k_y * math.sin(azimuth)
+    k_across = k_y * math.cos(azimuth) - k_x * math.sin(azimuth)
+    damped = 0.3 * math.exp(-0.5 * ((k_along * along) ** 2 + (k_across * across) ** 2))
+    phase = k_x * x + k_y * y + 0.4
+    expected = [-k_along * damped * math.sin(phase), -k_across * damped * math.sin(phase), damped * math.cos(phase)]
+    # Central differences of the wave's heights are flatter by up to (k h)^2/6 = 0.8 %.
+    found = shot_series.footprint_means(Wave(k_x, k_y), Beam(azimuth), x, y)
+    np.testing.assert_allclose(found, expected, rtol=0.01, atol=1e-4)
+
+
+def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
+    """The axis at 20 degrees, refracted, meets the plane z = -8 + 0.1 x at a distance in closed form."""
+    # The rectangle is turned about y, so that z rises with x, and lowered.
+    turned = mi.ScalarTransform4f().translate([0, 0, -8]).rotate([0, 1, 0], -math.degrees(math.atan(0.1))).scale(100)
+    bottom = {"type": "rectangle", "to_world": turned, "bsdf": {"type": "diffuse"}}
+    small = {"type": "sphere", "center": [0.0, 0.0, -4.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
+    scene = lidar_scene(integrator={"type": "lidar_merging"}, bottom=None, extra={"floor": bottom, "target": small})
+    truth = shot_series._truth(Session(scene, scene.sensors()[0], "made", {}), np.array([*PLACES, (400.0, 0.0)]))
+    sine = math.sin(math.radians(20)) / 1.34
+    tangent = sine / math.sqrt(1 - sine**2)
+    expected = [(8 - 0.1 * x) / (1 + 0.1 * tangent) for x, _ in PLACES]
+    np.testing.assert_allclose(truth[5][:3], expected, atol=2e-4)
+    assert np.isnan(truth[5][3])
+    np.testing.assert_array_equal(np.array(truth[2:5]), 0)
+
+
+def test_attributes_of_a_series():
+    one = {"scene": "a", "passes": 8, "seed": 0, "scene.aim_x": "1", "transmitter_pose": [1.0, 2.0], "scene.aim_y": "2"}
+    one |= {"surface_time_ns": 1420.0, "window_start_ns": 1400.0, "window_end_ns": 1500.0, "elapsed_s": 2.0, "new": "x"}
+    one |= {"error_inflation": [1.0, 2.0], "history": "early"}
+    two = {**one, "seed": 1, "scene.aim_x": "3", "transmitter_pose": [3.0, 2.0], "surface_time_ns": 1422.0, "new": "y"}
+    two |= {"window_start_ns": 1402.0, "window_end_ns": 1503.0, "elapsed_s": 3.0, "error_inflation": [1.0, 4.0]}
+    expected = {"scene": "a", "passes": 8, "scene.aim_y": "2", "surface_time_ns": 1421.0, "window_start_ns": 1400.0}
+    expected |= {"window_end_ns": 1503.0, "elapsed_s": 5.0, "error_inflation": [1.0, 3.0], "history": "late"}
+    assert shot_series.merged_attributes([one, {**two, "history": "late"}]) == expected
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """Replace renders by made-up waveforms; return the parameters of all renders."""
+    asked = []
+
+    def render(scene, *, params, passes, seed):
+        asked.append({**params, "passes": passes, "seed": seed})
+        power = np.full((2, 5), 1.0 + seed)
+        attributes = {
+            "scene": scene,
+            "interrupted": 0,
+            "surface_time_ns": 2.0 + seed,
+            "scene.aim_x": str(params["aim_x"]),
+        }
+        return results.build(
+            power, power, power, power,
+            time=TimeAxis(0.0, 1.0, 5),
+            pixel_names=["near", "far"],
+            pixel_centres_mrad=[(1.0, 0.0), (-1.0, 0.0)],
+            attributes=attributes,
+        )  # fmt: skip
+
+    monkeypatch.setattr(shot_series, "render", render)
+    return asked
+
+
+def test_shots_at_given_places(rendered, tmp_path):
+    done = []
+    series = shot_series.render_shots("fig09_2x2", FLAT, places=PLACES, passes=3, progress=done.append)
+    assert [(one["aim_x"], one["aim_y"], one["passes"], one["seed"]) for one in rendered] == [
+        (x, y, 3, number) for number, (x, y) in enumerate(PLACES)
+    ]
+    assert [(one.done, one.planned, one.unit) for one in done] == [(1, 3, "shot"), (2, 3, "shot"), (3, 3, "shot")]
+    assert series["waveform"].dims == ("shot", "pixel", "time")
+    assert series["waveform"].values[:, 0, 0].tolist() == [1, 2, 3]
+    np.testing.assert_array_equal(np.array([series["aim_x"], series["aim_y"]]).T, PLACES)
+    assert all(series[name].dims == ("shot",) and name in series.coords for name in TRUTH)
+    np.testing.assert_allclose(series["true_bottom_depth"], 8.0)
+    assert (series.attrs["surface_time_ns"], series.attrs["interrupted"]) == (3.0, 0)
+    assert not {"scene.aim_x", "places_seed", "slope_deviation"} & set(series.attrs)
+    results.save(series, tmp_path / "shots.nc")
+    xr.testing.assert_identical(results.open(tmp_path / "shots.nc"), series)
+    with pytest.raises(UserError, match=r"shots\.exr: an EXR file holds a single shot; use a \.nc file"):
+        results.save(series, tmp_path / "shots.exr")
+    assert len(shot_series.describe_shots(series)) == 4
+
+
+def test_random_places_are_those_of_the_seed(rendered):
+    waves = {"surface_size": 60, "surface_cell_size": 1}
+    series = [shot_series.render_shots("fig09_2x2", waves, count=2, seed=seed) for seed in (1, 1, 2)]
+    assert (
+        series[0]["aim_x"].values.tolist() == series[1]["aim_x"].values.tolist() != series[2]["aim_x"].values.tolist()
+    )
+    assert series[0].attrs["places_seed"] == 1
+    assert min(series[0].attrs["slope_deviation"]) > 0
+
+
+def test_target_keeps_its_place_relative_to_the_aim(rendered):
+    params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
+    series = shot_series.render_shots("fig13_2x2", params, places=PLACES, move_target=True)
+    moved = [(one["target_x"] - one["aim_x"], one["target_y"] - one["aim_y"]) for one in rendered]
+    np.testing.assert_allclose(moved, [(0.3, 0.0)] * 3)
+    assert series.attrs["moved_target"] == 1
+
+
+@pytest.mark.parametrize("kept", [0, 2])
+def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
+    whole = shot_series.render
+
+    def interrupted(scene, **options):
+        if options["seed"] == kept:
+            raise KeyboardInterrupt
+        return whole(scene, **options)
+
+    monkeypatch.setattr(shot_series, "render", interrupted)
+    if kept == 0:
+        with pytest.raises(KeyboardInterrupt):
+            shot_series.render_shots("fig09_2x2", FLAT, places=PLACES)
+        return
+    series = shot_series.render_shots("fig09_2x2", FLAT, places=PLACES)
+    assert series.sizes["shot"] == series["aim_x"].size == 2
+    assert series.attrs["interrupted"] == 1
+
+
+def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
+    whole = shot_series.render
+    monkeypatch.setattr(
+        shot_series,
+        "render",
+        lambda scene, **options: whole(scene, **options).assign_attrs(interrupted=options["seed"]),
+    )
+    (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
+    arguments = ["-D", "spectrum=flat", "--places", tmp_path / "places.csv", "-o", tmp_path / "new" / "shots.nc"]
+    done = run("shots", "fig09_2x2", *arguments)
+    assert done.exit_code == 130
+    assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
+    assert done.stderr == "interrupted after 1 shots; their result is kept.\n"
+    assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "message"),
+    [
+        ("fig09_2x2", {"places": [(0, 0, 1)]}, r"places of shape \(1, 3\) must be 1 to 100000 pairs"),
+        ("fig09_2x2", {"places": []}, r"places of shape \(0,\) must be 1 to 100000 pairs"),
+        ("fig09_2x2", {"places": [(0, math.nan)]}, "places holds nan"),
+        ("fig09_2x2", {"places": "here"}, "places = 'here' must hold numbers only"),
+        ("fig09_2x2", {"places": [(0, -1e5)]}, "places holds -100000 m; it must lie within 10000 m"),
+        ("fig09_2x2", {"places": PLACES, "passes": 1}, "passes = 1 must lie between 2"),
+        ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
+        ("fig09_2x2", {"places": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
+    ],
+)
+def test_invalid_input_is_refused_before_rendering(rendered, scene, options, message):
+    with pytest.raises(UserError, match=message):
+        shot_series.render_shots(scene, FLAT, **options)
+    assert not rendered
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--at", "1,2", "--places", "a.csv"], "--at and --places are alternatives"),
+        (["--at", "1;2"], "--at 1;2 is not of the form 2,5"),
+        (["--places", "missing.csv"], "cannot read missing.csv"),
+        (["-o", "shots.exr"], "--output shots.exr must end in .nc"),
+        (["--count", "1"], "count = 1 must lie between 2 and 100000"),
+    ],
+)
+def test_command_refuses_invalid_options(arguments, message):
+    assert_refused(run("shots", "fig09_2x2", *arguments), message)
