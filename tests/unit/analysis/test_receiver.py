@@ -5,9 +5,10 @@ import logging
 import numpy as np
 import pytest
 import xarray as xr
+from significance import largest_z
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
@@ -115,7 +116,8 @@ def test_sampling_rate_thins_the_time():
 
 
 def test_seed_decides():
-    one, two, three = (detect_waveforms(make(), CHAIN, shots=3, seed=seed) for seed in (1, 1, 2))
+    dataset = make()
+    one, two, three = (detect_waveforms(dataset, CHAIN, shots=3, seed=seed) for seed in (1, 1, 2))
     xr.testing.assert_identical(one, two)
     assert not one["signal"].equals(three["signal"])
 
@@ -132,6 +134,97 @@ def test_warning_of_smoothing_twice(caplog):
         assert not caplog.records
         detect_waveforms(make(response_time_ns=2.0), CHAIN)
     assert "response time already" in caplog.text
+
+
+def series(*scales):
+    """Return shots of the result at several strengths, with a truth of each."""
+    shots = xr.concat([make() * scale for scale in scales], "shot").assign_attrs(make().attrs)
+    return shots.assign_coords(shot=np.arange(len(scales)) + 3, true_slope_along=("shot", 0.1 * np.array(scales)))
+
+
+def test_every_shot_of_a_series_is_recorded():
+    shots = detect_waveforms(series(1.0, 0.5, 0.2), CHAIN, seed=3, background_power=[0, 0, 0, 1e-7])
+    assert shots["signal"].dims == shots["signal_mean"].dims == ("shot", "pixel", "time")
+    np.testing.assert_array_equal(shots["shot"], [3, 4, 5])
+    np.testing.assert_allclose(shots["true_slope_along"], [0.1, 0.05, 0.02])
+    alone = [detect_waveforms(make() * 0.5, CHAIN, background_power=[0, 0, 0, 1e-7])["signal_mean"]]
+    np.testing.assert_allclose(shots["signal_mean"][1], alone[0])
+    z = (shots["signal"] - shots["signal_mean"]) / shots["signal_deviation"]
+    assert np.abs(z.values).max() < largest_z(10**6, z.size)
+
+
+def test_records_of_a_shot_of_a_series_follow_each_other():
+    shots = detect_waveforms(series(1.0, 0.2), CHAIN, shots=200, seed=3)
+    assert shots.sizes["shot"] == 400
+    np.testing.assert_array_equal(shots["shot"], np.arange(400))
+    np.testing.assert_allclose(shots["true_slope_along"], np.repeat([0.1, 0.02], 200))
+    z = (shots["signal"] - shots["signal_mean"]) / shots["signal_deviation"]
+    means = np.sqrt(200) * z.values.reshape(2, 200, -1).mean(axis=1)
+    assert np.abs(means).max() < largest_z(200, means.size)
+    # Noise of each record is its own.
+    assert np.abs(np.corrcoef(z.values.reshape(400, -1))[np.triu_indices(400, 1)]).max() < 0.6
+
+
+@pytest.mark.parametrize("scale", [1.0, 60.0])
+def test_shares_of_saturation_are_the_expected_ones(scale):
+    """The brightest pixel of the stronger light peaks at 3 V, above the range of 0.9 V, the weakest at 0.8 V."""
+    shots = detect_waveforms(make() * scale, CHAIN, shots=500, seed=5)
+    expected = shots["saturation"]
+    count = 500 * expected.sizes["time"]
+    error = np.sqrt((expected * (1 - expected)).mean("time") / count)
+    difference = shots["saturated_samples"] - expected.mean("time")
+    assert np.all(np.abs(difference) <= largest_z(10**6, 4) * error + 1e-9)
+    np.testing.assert_allclose(shots["saturated_shots"], shots["saturated"].any("time").mean("shot"))
+    lines = describe_recording(shots)
+    if scale == 1.0:
+        assert lines[1:] == ["no sample is saturated"]
+    else:
+        assert shots["saturated_samples"][0] < 0.01 < 0.2 < shots["saturated_samples"][3]
+        assert lines[1].startswith("100 % of the shots have saturated samples: a filter of optical density ")
+        assert lines[5].startswith("saturated in black: 100 % of the shots, ")
+
+
+def top_reached(shots):
+    """Return the highest mean with 6 standard deviations, over the top of the range of 0.9 V less a step."""
+    return float((shots["signal_mean"] + 6 * shots["signal_deviation"]).max()) / (0.9 - 1 / 4096)
+
+
+def test_automatic_filter_is_the_least_without_saturation(caplog):
+    strong = make() * 30
+    chosen = detect_waveforms(strong, CHAIN, optical_density="auto")
+    density = chosen.attrs["optical_density"]
+    assert (chosen.attrs["chosen"], chosen.attrs["gain"]) == ("optical_density", 1.0)
+    assert 10 * density == pytest.approx(round(10 * density))
+    assert not caplog.records
+    # Rounding of the digitiser adds to the deviation.
+    assert top_reached(chosen) < 1.001
+    less = detect_waveforms(strong, CHAIN, optical_density=density - 0.1)
+    assert top_reached(less) > 1
+    assert less.attrs["fitting_optical_density"] == density
+    plain = detect_waveforms(strong, CHAIN)
+    assert f"a filter of optical density {density:.1f} (factor {10**density:.3g})" in caplog.text
+    assert plain.attrs["fitting_optical_density"] == density
+    assert describe_recording(chosen)[0] == f"1 shots, receiver custom, gain 1, optical density {density:.4g} (auto)"
+
+
+def test_automatic_gain_is_the_largest_without_saturation():
+    strong = series(30.0, 1.0)
+    chosen = detect_waveforms(strong, CHAIN, gain="auto")
+    gain = chosen.attrs["gain"]
+    assert top_reached(chosen) == pytest.approx(1, abs=1e-3)
+    assert chosen.attrs["receiver.amplifier.transimpedance_ohm"] == pytest.approx(1e4 * gain)
+    assert detect_waveforms(strong, CHAIN).attrs["fitting_gain"] == gain
+    assert detect_waveforms(strong, CHAIN, gain=gain).equals(chosen)
+    assert detect_waveforms(make(), CHAIN, gain="auto").attrs["gain"] == 1
+    # The filter needs as much again for a lower gain, and the gain none behind the filter.
+    behind = detect_waveforms(strong, CHAIN, gain=gain, optical_density=1.0)
+    assert (behind.attrs["fitting_gain"] > gain, behind.attrs["fitting_optical_density"]) == (True, 0.0)
+
+
+def test_filter_attenuates_signal_and_background():
+    plain = detect_waveforms(make(), CHAIN, background_power=1e-8)
+    dimmed = detect_waveforms(make() * 10, CHAIN, background_power=1e-7, optical_density=1.0)
+    np.testing.assert_allclose(dimmed["signal_mean"], plain["signal_mean"])
 
 
 def without(dataset, *, attribute):
@@ -157,6 +250,17 @@ def changed(value):
         (lambda: detect_waveforms(changed(np.nan), CHAIN), "waveform has 1 values that are not finite"),
         (lambda: detect_waveforms(changed(-1e-9), CHAIN), "waveform holds -1e-09 W"),
         (lambda: detect_waveforms(make(), CHAIN, shots=0), "shots = 0"),
+        (lambda: detect_waveforms(make(), CHAIN, gain="auto", optical_density="auto"), "are alternatives"),
+        (lambda: detect_waveforms(make(), "ideal", gain="auto"), "gain = 'auto' needs a receiver with an amplifier"),
+        (lambda: detect_waveforms(make(), "spad", optical_density="auto"), "optical_density = 'auto' needs a receiver"),
+        (lambda: detect_waveforms(make(), "spad", gain=2), "gain = 2 needs an amplifier"),
+        (lambda: detect_waveforms(make(), CHAIN, gain=0), "gain = 0 must be greater than 0"),
+        (lambda: detect_waveforms(make(), CHAIN, gain="most"), "gain = 'most' must be a number"),
+        (lambda: detect_waveforms(make(), CHAIN, optical_density=-1), "optical_density = -1 must lie between 0 and 12"),
+        (
+            lambda: detect_waveforms(make(), CHAIN.with_gain(1e6), optical_density="auto"),
+            "optical_density = 'auto' finds no filter",
+        ),
         (lambda: detect_waveforms(make(), CHAIN, seed=-1), "seed = -1"),
         (lambda: detect_waveforms(make(), CHAIN, background_power=-1.0), "background = -1 must not be negative"),
         (lambda: detect_waveforms(make(), CHAIN, background_power=[1e-9, 1e-9]), r"shape \(2,\); .* \(4,\)"),
