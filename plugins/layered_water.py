@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite_array, in_range
+from mitransient_lidar.core.validation import in_range, number_list
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
@@ -219,7 +219,7 @@ def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn,
 
 def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
     """Return one value a layer of a parameter given for all layers or for each."""
-    values = np.atleast_1d(finite_array(name, given.replace(",", " ").split() if isinstance(given, str) else given))
+    values = number_list(name, given)
     if values.size not in (1, count):
         raise UserError(f"{name} has {values.size} values but must have 1 or {count}, one a layer")
     return np.broadcast_to(values, count)

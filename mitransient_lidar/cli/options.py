@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite, number_list
 
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene, or path of a Mitsuba XML file.")]
 Define = Annotated[
@@ -33,27 +34,18 @@ def parameters(definitions: list[str] | None) -> dict[str, str]:
 
 
 def numbers(option: str, text: str) -> list[float]:
-    """Return numbers separated by commas."""
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise UserError(f"{option} {text} is not of the form 2,5,8.") from None
+    """Return finite numbers separated by commas."""
+    return [float(number) for number in number_list(option, text)]
 
 
 def pair(option: str, text: str) -> tuple[float, float]:
-    """Return two numbers separated by a comma."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise UserError(f"{option} {text} is not of the form 2,5.") from None
-    return first, second
+    """Return two finite numbers separated by a comma."""
+    values = numbers(option, text)
+    if len(values) != 2:
+        raise UserError(f"{option} = {text!r} must be two numbers, as in 2,5")
+    return values[0], values[1]
 
 
 def number_or_auto(option: str, text: str) -> float | str:
-    """Return a number, or the word auto."""
-    if text == "auto":
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise UserError(f"{option} {text} must be a number or auto.") from None
+    """Return a finite number, or the word auto."""
+    return text if text == "auto" else finite(option, text)

@@ -1,6 +1,8 @@
 """Validators of numeric parameters: each returns the clean value or raises ``UserError`` with one sentence."""
 
 import math
+import operator
+from typing import Any, SupportsIndex
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +14,16 @@ IntArray = npt.NDArray[np.int64]
 
 
 def finite(name: str, value: object) -> float:
-    """Return `value` as a float; reject anything that is not a finite number."""
+    """Return a number, or its text, as a float; reject NaN, infinity and other types."""
+    number: float | None
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
-        raise UserError(f"{name} = {value!r} must be a number") from None
+        number = None
+    except OverflowError:
+        number = math.inf
+    if number is None or isinstance(value, bool) or getattr(value, "ndim", 0) > 0:
+        raise UserError(f"{name} = {shown(value)} must be a number")
     if not math.isfinite(number):
         raise UserError(f"{name} = {number} must be finite")
     return number
@@ -48,11 +55,23 @@ def in_range(name: str, value: object, low: float, high: float) -> float:
 
 
 def integer(name: str, value: object, low: int, high: int) -> int:
-    """Return `value` as an integer in the closed interval [`low`, `high`]."""
-    number = in_range(name, value, low, high)
-    if number != int(number):
-        raise UserError(f"{name} = {number:g} must be an integer")
-    return int(number)
+    """Return `value`, an integer or a float without decimals but no text, as an integer in [`low`, `high`]."""
+    if isinstance(value, (float, np.floating)) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, SupportsIndex) or getattr(value, "ndim", 0) > 0:
+        raise UserError(f"{name} = {shown(value)} must be an integer between {low} and {high}")
+    number = operator.index(value)
+    if not low <= number <= high:
+        raise UserError(f"{name} = {shown(number)} must lie between {low} and {high}")
+    return number
+
+
+def shown(value: object) -> str:
+    """Return the text of a value for a message, shortened, on one line."""
+    if isinstance(value, int) and abs(value) > 10**30:
+        return f"{'-' if value < 0 else ''}1e{int(math.log10(abs(value)))}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
@@ -60,11 +79,43 @@ def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise UserError(f"{name} = {values!r} must hold numbers only") from None
+        raise UserError(f"{name} = {shown(values)} must hold numbers only") from None
     if not np.all(np.isfinite(array)):
         bad = array[~np.isfinite(array)][0]
         raise UserError(f"{name} holds {bad} but every value must be finite")
     return array
+
+
+def number_list(name: str, given: object) -> FloatArray:
+    """Return one number, a sequence of numbers, or a text of numbers separated by commas or spaces, shape (N,), N > 0.
+
+    Raises
+    ------
+    UserError
+        If there is no number, an entry is empty or not a number, or a number is not finite.
+    """
+    values: Any = given
+    if isinstance(given, str):
+        entries = [entry.split() for entry in given.split(",")]
+        if not all(entries):
+            missing = "has an empty entry" if any(entries) else "is empty"
+            raise UserError(f"{name} = {shown(given)} {missing}: it must be numbers separated by commas")
+        values = [word for entry in entries for word in entry]
+        if any(not is_number(word) for word in values):
+            raise UserError(f"{name} = {shown(given)} must hold numbers only, separated by commas")
+    array = np.atleast_1d(finite_array(name, values))
+    if array.ndim != 1 or array.size == 0:
+        raise UserError(f"{name} = {shown(given)} must hold at least one number")
+    return array
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a number, which may be NaN or infinite."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def non_negative_array(name: str, values: npt.ArrayLike) -> FloatArray:

@@ -10,6 +10,7 @@ from xml.parsers.expat import ExpatError
 from xml.sax.saxutils import quoteattr
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.checks import check_depth
 
 
 @dataclass
@@ -32,12 +33,13 @@ def read_scene(path: Path) -> str:
 
 
 def parse_scene(text: str, path: Path) -> minidom.Element:
-    """Return the root element of a scene file's text; raise UserError if it is not well-formed XML."""
+    """Return the root element of a scene file's text; raise UserError if it is malformed or nested too deeply."""
     try:
         root = minidom.parseString(text).documentElement
     except ExpatError as error:
         raise UserError(f"scene {path} is not well-formed XML: {error}.") from error
     assert root is not None
+    check_depth(root)
     return root
 
 
@@ -64,7 +66,7 @@ def flat_text(path: Path) -> str:
     text = read_scene(path)
     if "<include" not in text:
         return text
-    root = _expanded(path, text)
+    root = expanded(path)
     assert root.parentNode is not None
     head = [node.toxml() for node in root.parentNode.childNodes if isinstance(node, minidom.Comment)]
     defaults: list[_Default] = []
@@ -77,9 +79,12 @@ def flat_text(path: Path) -> str:
     return "\n".join([*head, *_element(root, [*parameters, *objects, ""]), ""])
 
 
-def _expanded(path: Path, text: str, includers: tuple[Path, ...] = ()) -> minidom.Element:
-    """Return the root element of a scene file, with includes replaced by what Mitsuba takes from them."""
-    root = parse_scene(text, path)
+def expanded(path: Path, includers: tuple[Path, ...] = ()) -> minidom.Element:
+    """Return the root element of a scene file, with includes replaced by what Mitsuba takes from them.
+
+    Format and errors as for `flat_text`.
+    """
+    root = parse_scene(read_scene(path), path)
     files = (path.resolve(), *includers)
     for include in root.getElementsByTagName("include"):
         name = include.getAttribute("filename")
@@ -88,7 +93,7 @@ def _expanded(path: Path, text: str, includers: tuple[Path, ...] = ()) -> minido
             raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
         if part.resolve() in files:
             raise UserError(f"scene {path} includes {name!r}, which includes it in turn.")
-        included = _expanded(part, read_scene(part), files)
+        included = expanded(part, files)
         content = list(included.childNodes)
         if included.tagName != "scene":
             included.removeAttribute("version")

@@ -7,10 +7,16 @@ import difflib
 import os
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitransient_lidar.core.errors import UserError, is_interruption
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.checks import check_dict, check_elements, unknown_parameters
+from mitransient_lidar.loading.includes import expanded
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -34,7 +40,7 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
     Raises
     ------
     UserError
-        If there is no such scene, a parameter is unknown, or a plugin rejects a value.
+        If there is no such scene, a parameter is unknown, not used or empty, a value is invalid, or a part is missing.
     """
     import mitsuba as mi
 
@@ -43,51 +49,105 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
         return scene, scene.id() or "scene", {}
     if isinstance(scene, Mapping):
         _no_parameters(params, "a dict")
+        check_dict(scene)
         with as_user_error():
             return mi.load_dict({"type": "scene", **scene}, optimize=False), "scene", {}
     if not isinstance(scene, (str, os.PathLike)):
-        raise UserError(f"scene = {scene!r} must be a shipped name, a path, a dict or a loaded scene")
+        raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
     path = catalogue.scene_path(scene)
+    parameters, given = _filled(path, params)
+    used = check_elements(expanded(path), parameters)
+    if unused := [name for name in given if name not in used]:
+        raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {path.stem}")
+    # Mitsuba refuses parameters that nothing uses; a part that is missing is told instead.
+    values = {name: value for name, value in parameters.items() if name in used}
+    with as_user_error({name: value for name, value in given.items() if name in used}, path):
+        # Optimisation would merge a bottom and a target of one material into a shape without a name.
+        loaded = mi.load_file(str(path), optimize=False, **values)
+    if not isinstance(loaded, mi.Scene):
+        raise UserError(f"scene {path} holds a {type(loaded).__name__}: its root element must be <scene>")
+    if unused := [name for name in parameters if name not in used]:
+        _tell_missing_part(loaded, unused)
+    return loaded, path.stem, parameters
+
+
+def _filled(path: Path, params: Mapping[str, Any] | None) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the parameters of an XML scene with their values as text, and those that are given."""
     parameters = {**catalogue.scene_parameters(path)}
+    given = {}
+    if params is not None and not isinstance(params, Mapping):
+        raise UserError(f"params = {shown(params)} must be a dict of names and values")
     for name, value in (params or {}).items():
         if name not in parameters:
-            close = difflib.get_close_matches(name, parameters, n=3)
+            close = difflib.get_close_matches(str(name), parameters, n=3)
             hint = f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(parameters))}"
             raise UserError(f"parameter {name!r} is not one of scene {path.stem}: {hint}")
-        parameters[name] = _text(value)
-    with as_user_error():
-        # Optimisation would merge a bottom and a target of one material into a shape without a name.
-        return mi.load_file(str(path), optimize=False, **parameters), path.stem, parameters
+        given[name] = _text(name, value)
+        if not given[name].strip() and parameters[name].strip():
+            raise UserError(f"{name} = {given[name]!r} is empty: it must have a value, as {parameters[name]}")
+    return {**parameters, **given}, given
+
+
+def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
+    """Raise `UserError` if the scene lacks the part that the parameters which nothing uses are for."""
+    present = {
+        "sensor": bool(scene.sensors()),
+        "emitter": bool(scene.emitters()),
+        "medium below a sea surface": any(shape.is_medium_transition() for shape in scene.shapes()),
+    }
+    for part, there in present.items():
+        if not there:
+            listed = ", ".join(unused[:4]) + (", ..." if len(unused) > 4 else "")
+            raise UserError(f"{part}: the scene has none, and its parameters {listed} are used by nothing")
 
 
 @contextlib.contextmanager
-def as_user_error() -> Iterator[None]:
+def as_user_error(given: Mapping[str, str] | None = None, path: Path | None = None) -> Iterator[None]:
     """Convert a ``RuntimeError`` of Mitsuba's parser to a `UserError` of one sentence.
 
     Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError`` or
-    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback.
+    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. `given` are the scene's
+    parameters that the user has set, and `path` its file: where a message names a parameter of a plugin that one of
+    them sets under another name, that name is added.
     """
     try:
         yield
     except RuntimeError as error:
         if is_interruption(error):
             raise KeyboardInterrupt from error
+        raise_if_out_of_memory(error)
         text = str(error)
         if wrapped := re.findall(r"UserError: (.*)", text):
-            raise UserError(" ".join(wrapped[-1].split())) from error
+            message = " ".join(wrapped[-1].split())
+            raise UserError(message + _set_by(message, given or {}, path)) from error
         if empty := re.search(r'failed to instantiate shape plugin of type "(\w+)": jit_var', text):
             raise UserError(f"a shape of type {empty[1]} has no faces: its mesh must have at least one") from error
         if "Traceback (most recent call last)" in text:
             raise
-        raise UserError(" ".join(re.sub(r"\[\w+(\.cpp:\d+)?\] ", "", text).split())) from error
+        text = re.sub(r"\[\w+(\.cpp:\d+)?\] ", "", text)
+        raise UserError(unknown_parameters(text) or " ".join(text.split())) from error
 
 
-def _text(value: Any) -> str:
+def _set_by(message: str, given: Mapping[str, str], path: Path | None) -> str:
+    """Return the addition to a message about a plugin's parameter that a parameter of another name sets."""
+    named = re.match(r"(\w+)\b", message)
+    if path is None or named is None or named[1] in given:
+        return ""
+    for element in expanded(path).getElementsByTagName("*"):
+        reference = re.fullmatch(r"-?\$(\w+)", element.getAttribute("value"))
+        if reference and element.getAttribute("name") == named[1] and reference[1] in given:
+            return f" ({named[1]} is set by {reference[1]} = {given[reference[1]]})"
+    return ""
+
+
+def _text(name: str, value: Any) -> str:
     """Return the value of a parameter as in XML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (list, tuple)):
-        return ", ".join(str(item) for item in value)
+        return ", ".join(_text(name, item) for item in value)
+    if not isinstance(value, (str, int, float, np.number, os.PathLike)):
+        raise UserError(f"{name} = {shown(value)} must be a number, a text or a list of them")
     return str(value)
 
 

@@ -20,7 +20,8 @@ OLDEST_USABLE_LLVM = 17
 
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _LLVM_WHEEL = "karellen-llvm-core"
-_PLUGIN_MODULES = (
+#: Modules of the plugins, below ``mitransient_lidar.plugins``.
+PLUGIN_MODULES = (
     "bases",  # first, with phase.tabulated: others derive from them
     "phase.tabulated",
     "phase.fournier_forand",
@@ -162,7 +163,7 @@ def register_plugins(_old: str | None, new: str) -> None:
     global _registered_for
     if new not in SUPPORTED_VARIANTS or new == _registered_for:
         return
-    for name in _PLUGIN_MODULES:
+    for name in PLUGIN_MODULES:
         module = f"mitransient_lidar.plugins.{name}"
         if module in sys.modules:
             importlib.reload(sys.modules[module])

@@ -117,7 +117,7 @@ def test_invalid_input_is_refused():
     with pytest.raises(UserError, match="must hold 14"):
         shot_statistics.shot_statistics("fig09_2x2", {**WAVES, "bin_count": 40}, count=2)
     for arguments, message in (
-        (["find-shots", "fig09_2x2", "--at", "3;4"], "--at 3;4 is not of the form 2,5"),
+        (["find-shots", "fig09_2x2", "--at", "3;4"], "--at = '3;4' must hold numbers only"),
         (["find-shots", "fig09_2x2", "--slope-sigmas", "-1"], "slope_sigmas = -1 must be"),
         (["find-shots", "fig09_2x2", "--count", "0"], "count = 0 must lie between 1 and 100"),
         (["shot-statistics", "fig09_2x2", "--count", "1"], "count = 1 must lie between 2 and 100000"),

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative_array
+from mitransient_lidar.core.validation import FloatArray, non_negative_array, number_list
 
 LayerValues = float | str | Sequence[float] | FloatArray
 
@@ -74,9 +74,9 @@ class WaterColumn:
         UserError
             As for the class, or if a string does not hold numbers only.
         """
-        edges = _parse("layer_tops", layer_tops)
+        edges = number_list("layer_tops", layer_tops)
         coefficients = {"attenuation": attenuation, "scattering": scattering, "backscattering": backscattering}
-        columns = [_parse(name, values) for name, values in coefficients.items()]
+        columns = [number_list(name, values) for name, values in coefficients.items()]
         return cls(edges, *(np.full(edges.size, c[0]) if c.size == 1 else c for c in columns))
 
     @property
@@ -138,15 +138,6 @@ class WaterColumn:
         inside = np.maximum(np.minimum(lower[..., None], ends) - np.maximum(upper[..., None], starts), 0)
         slanted = inside @ self.attenuation / np.where(drop > 0, drop, 1)
         return np.asarray(np.where(drop > 0, slanted, self.attenuation[self.layer_at(upper)]) * length)
-
-
-def _parse(name: str, values: LayerValues) -> FloatArray:
-    """Return finite numbers, shape (L,)."""
-    words = values.replace(",", " ").split() if isinstance(values, str) else values
-    array = np.atleast_1d(finite_array(name, words))
-    if array.ndim != 1 or array.size == 0:
-        raise UserError(f"{name} = {values!r} must hold at least one number")
-    return array
 
 
 def _ratio(part: FloatArray, total: FloatArray) -> FloatArray:

@@ -89,7 +89,7 @@ REFUSED = [
         "angle_x_max_mrad = 4 must lie",
     ),
     ({"type": "time_gated_film", "bin_count": 10.5}, "bin_count = 10.5 must be an integer"),
-    ({"type": "ocean_surface", "surface_seed": "x"}, "surface_seed = 'x' must be a number"),
+    ({"type": "ocean_surface", "surface_seed": "x"}, "surface_seed = 'x' must be an integer"),
     ({"type": "fournier_forand", "junge_slope": 6.0, "refractive_index": 1.1}, "junge_slope = 6 must lie between"),
     ({"type": "multipixel_receiver", "layout": "2by2"}, "layout = '2by2' must be rows x columns"),
     ({"type": "multipixel_receiver", "layout": "0x2"}, "layout = '0x2'"),

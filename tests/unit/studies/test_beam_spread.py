@@ -235,7 +235,7 @@ def test_quiet_command(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--depths", "2;5"], "--depths 2;5 is not of the form 2,5,8."),
+        (["--depths", "2;5"], "--depths = '2;5' must hold numbers only"),
         (["--depths", "2,nan"], "depths holds nan"),
         (["--depths", "9"], "depths = 9 m must not lie below the bottom, at 8 m"),
         (["--depths", "2", "--passes", "1"], "passes = 1 must lie between 2 and 10000"),

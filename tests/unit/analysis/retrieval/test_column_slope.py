@@ -135,7 +135,7 @@ def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--fov-mrad", "2,wide"], "--fov-mrad 2,wide is not of the form 2,5,8."),
+        (["--fov-mrad", "2,wide"], "--fov-mrad = '2,wide' must hold numbers only"),
         (["--fov-mrad", "0,5"], "each greater than 0"),
         (["--min-depth", "5", "--max-depth", "1"], "max_depth = 1 m must be greater than min_depth = 5 m"),
         # The far edge, 15 mrad out, meets the surface 7.956 ns late: 0.845 m at the group index 1.364.

@@ -248,7 +248,7 @@ def test_command(tmp_path):
     results.save(result(field_of_view_mrad=20.0), tmp_path / "narrow.nc")
     assert "too narrow" in run("retrieve", tmp_path / "narrow.nc").output
     for options, sentence in (
-        (["--slope-deviation", "0.1"], "--slope-deviation 0.1 is not of the form 2,5."),
+        (["--slope-deviation", "0.1"], "--slope-deviation = '0.1' must be two numbers"),
         (["--efficiency", "2"], "efficiency = 2 must"),
         (["-o", "found.txt"], "--output found.txt must end in .nc."),
     ):
