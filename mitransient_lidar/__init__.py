@@ -16,6 +16,7 @@ that plain Mitsuba loads and renders lidar scenes::
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,9 @@ try:
             _variants.check_llvm()
         _variants.register_plugins(None, _mi.variant())
 except _UserError as _error:
+    if _variants.is_command_line():
+        sys.stderr.write(f"{_error}\n")
+        raise SystemExit(2) from None
     raise ImportError(str(_error)) from None
 
 if TYPE_CHECKING:

@@ -30,8 +30,10 @@ class LayeredWater(mi.Medium):
     =======================  ======  ===================================================================================
     Parameter                Type    Meaning
     =======================  ======  ===================================================================================
-    layer_tops               string  Depth of each layer's upper edge [m], first 0, increasing: ``0, 3``. Default: ``0``
-    attenuation              string  Beam attenuation c of each layer [1/m], or one value for all. Default: 0.3
+    layer_tops               string  Depth of each layer's upper edge [m], first 0, increasing to at most 1e5: ``0, 3``.
+                                     Default: ``0``
+    attenuation              string  Beam attenuation c of each layer [1/m], 0 to 1000, or one value for all. Default:
+                                     0.3
     scattering               string  Scattering b [1/m], at most c. Default: 0.15
     backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
     profile                  string  A file instead of the four above: .csv or .nc with ``depth`` [m], two of ``a``,
@@ -47,11 +49,12 @@ class LayeredWater(mi.Medium):
                                      ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
     refractive_index         string  Phase index, 1.0001 to 2, of each layer or all. Default: 1.34
     group_index              string  Group index, 1 to 2, of each layer or all. Default: 1.364 (sea water at 532 nm)
-    plume_scattering         float   Scattering of bubbles behind a ship, added to b [1/m]. Default: 0, no bubbles
-    plume_x, plume_y         float   Start of the bubbles, at the stern [m]. Default: 0
+    plume_scattering         float   Scattering of bubbles behind a ship, added to b [1/m], 0 to 1000. Default: 0, no
+                                     bubbles
+    plume_x, plume_y         float   Start of the bubbles, at the stern [m], -1e6 to 1e6. Default: 0
     plume_bearing_deg        float   Heading of the ship, from +x to +y [deg]. Default: 0
-    plume_length             float   Length of the plume [m]. Default: 200
-    plume_width              float   Width of the plume [m]. Default: 8
+    plume_length             float   Length of the plume [m], 0.001 to 1e6. Default: 200
+    plume_width              float   Width of the plume [m], 0.001 to 1e6. Default: 8
     plume_depth              float   Depth of the plume below the mean sea level [m], 0.01 to 100. Default: 2
     plume_backscatter_ratio  float   bb/b of bubbles for a Fournier-Forand function, 0.0001 to 0.4. Default: 0.02,
                                      between clean bubbles and coated ones (Zhang, Lewis and Johnson 1998,

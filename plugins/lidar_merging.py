@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitransient_lidar.core.validation import integer, non_negative
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.plugins.bases import LidarIntegrator
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
@@ -25,7 +26,7 @@ class LidarMerging(LidarIntegrator):
     photons_per_pass  integer  Paths from the laser in one pass, 1024 to 2^28. Default: 32768, or 65536 from 4096 pixels
                                on
     cell_size         float    Horizontal width of the cells at the surface [m]; 0: from the footprint and the facets of
-                               the sea. Smaller cells have less bias and more noise. Default: 0
+                               the sea. Smaller cells have less bias and more noise. At most 1e4. Default: 0
     point_spacing     float    Distance between points along a path [m]; 0: a twentieth of the distance to the bottom or
                                to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
     ================  =======  =========================================================================================
@@ -72,7 +73,7 @@ class LidarMerging(LidarIntegrator):
         super().__init__(props)
         given = [name for name in ("paths_per_pass", "photons_per_pass") if name in props]
         counts = {name: integer(name, props[name], 1024, 2**28) for name in given}
-        lengths = {name: non_negative(name, props.get(name, 0.0)) for name in ("cell_size", "point_spacing")}
+        lengths = {name: ranged(name, props.get(name, 0.0)) for name in ("cell_size", "point_spacing")}
         self.options = MergingOptions(**counts, **lengths)
 
     def prepare(

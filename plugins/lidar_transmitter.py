@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import finite, in_range
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
@@ -26,29 +27,30 @@ class LidarTransmitter(EmitterWithoutExtent):
     ======================  =========  =================================================================================
     Parameter               Type       Meaning
     ======================  =========  =================================================================================
-    altitude                float      Height above the mean sea level [m], positive. Default: 200
+    altitude                float      Height above the mean sea level [m], 0.1 to 1e6. Default: 200
     off_nadir_deg           float      Angle of the axis from the vertical, towards +x [deg], 0 to 89.9. Default: 20
-    aim_x, aim_y            float      Point where the axis meets the mean sea level [m]. Default: 0
+    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e6 to 1e6. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
-    pulse_energy_mj         float      Energy of the emitted pulse [mJ], positive. Default: 5
+    pulse_energy_mj         float      Energy of the emitted pulse [mJ], 1e-9 to 1e6. Default: 5
     optical_efficiency      float      Share of that energy which leaves the optics, above 0 to 1. Default: 0.9
     beam_profile            string     ``gaussian``, ``top_hat`` or ``image``. Default: ``gaussian``
     divergence_mrad         float      Full angle [mrad] between the points where the irradiance of a Gaussian beam has
                                        fallen to e^-1/2 of its peak (its sigma is half of it); the full angle of a
-                                       top-hat beam. Positive. Default: 10
+                                       top-hat beam. 0.001 to 2000. Default: 10
     divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak (Gaussian
     divergence_1e2_mrad                only); give one of the three
     divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along
-                                       angle_x, this the one along angle_y. Positive. Default: ``divergence_mrad``
+                                       angle_x, this the one along angle_y. 0.001 to 2000. Default:
+                                       ``divergence_mrad``
     ellipse_deg             float      Azimuth of the ellipse's axis of ``divergence_mrad``, from +angle_x (far) towards
                                        +angle_y [deg]. Default: 0
     profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
                                        image about the axis. Row 0 is the far edge (+angle_x), column 0 the -angle_y
                                        edge
     profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
-                                       positive; its cells are squares
+                                       0.001 to 2000; its cells are squares
     wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; recorded in results. Default: 532
-    pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], positive. Default: 5
+    pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], 1e-4 to 1e6. Default: 5
     pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit)
     ======================  =========  =================================================================================
 
@@ -76,7 +78,7 @@ class LidarTransmitter(EmitterWithoutExtent):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.pose = Pose.from_properties(props)
-        self.pulse_energy = 1e-3 * positive("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
+        self.pulse_energy = 1e-3 * ranged("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
         self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
         self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)
         #: Energy that leaves the optics [J].
@@ -90,7 +92,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         if "pulse_file" in props:
             self.pulse = Pulse.from_file(props["pulse_file"])
         else:
-            self.pulse = Pulse.gaussian(positive("pulse_fwhm_ns", props.get("pulse_fwhm_ns", 5.0)))
+            self.pulse = Pulse.gaussian(ranged("pulse_fwhm_ns", props.get("pulse_fwhm_ns", 5.0)))
         self.m_needs_sample_2 = False
         self.m_flags = mi.EmitterFlags.DeltaPosition.value
 
@@ -166,12 +168,12 @@ def _profile(props: mi.Properties, kind: str) -> BeamProfile:
             if name not in props:
                 raise UserError(f"{name} is missing: beam_profile = 'image' needs it")
         image = read_image("profile_file", props["profile_file"])
-        return ImageBeam(image, 1e-3 * _angle("profile_mrad", props["profile_mrad"]))
+        return ImageBeam(image, 1e-3 * ranged("profile_mrad", props["profile_mrad"]))
     along = across = 0.5 * _divergence(props, kind)
     if "divergence_across_mrad" in props:
         if any(name in props for name in _WIDTHS if name != "divergence_mrad"):
             raise UserError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
-        across = 0.5e-3 * _angle("divergence_across_mrad", props["divergence_across_mrad"])
+        across = 0.5e-3 * ranged("divergence_across_mrad", props["divergence_across_mrad"])
     elif "ellipse_deg" in props:
         raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
     rotation = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
@@ -186,12 +188,7 @@ def _divergence(props: mi.Properties, profile: str) -> float:
     name = given[0] if given else "divergence_mrad"
     if profile == "top_hat" and name != "divergence_mrad":
         raise UserError(f"{name} describes a Gaussian beam; a top-hat beam takes divergence_mrad, its full angle")
-    return 1e-3 * _angle(name, props.get(name, 10.0)) / _WIDTHS[name]
-
-
-def _angle(name: str, value: float) -> float:
-    """Return an angle [mrad] if it is positive and at most a radian."""
-    return in_range(name, positive(name, value), 0.0, 1000.0)
+    return 1e-3 * ranged(name, props.get(name, 10.0)) / _WIDTHS[name]
 
 
 mi.register_emitter("lidar_transmitter", lambda props: LidarTransmitter(props))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, positive
+from mitransient_lidar.core.ranges import RANGES, ranged
+from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.plugins.bases import ReceiverSensor
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
@@ -32,12 +33,12 @@ class MultipixelReceiver(ReceiverSensor):
                                                 labels over a square field of view, integers from 0 to 2^24. Row 0 is
                                                 the far edge, column 0 the -angle_y edge. Each label is a pixel, in
                                                 increasing order and named ``label1``, ...; 0 is no pixel
-    field_of_view_mrad                 float    Full angle of the field of view [mrad], positive: diameter, side, or
-                                                diameter of the hexagons' circumscribed circle. Default: 30
+    field_of_view_mrad                 float    Full angle of the field of view [mrad], 0.001 to 3000: diameter, side,
+                                                or diameter of the hexagons' circumscribed circle. Default: 30
     field_of_view_shape                string   ``circle`` or ``square``, for ``RxC``. Default: ``circle``, or
                                                 ``square`` with a focal length
     focal_length_mm, pixel_pitch_um    float    Instead of ``field_of_view_mrad``, for ``RxC``: focal length of the lens
-                                                and distance of square pixels on the detector, both positive. The field
+                                                and distance of square pixels on the detector, 0.001 to 1e6. The field
                                                 of view is then R by C times pitch over focal length, a rectangle (or,
                                                 with ``circle`` and R = C, the inscribed circle)
     (nested)                           sensor   ``pixel_fov`` sensors instead of layout and field of view
@@ -48,12 +49,12 @@ class MultipixelReceiver(ReceiverSensor):
                                                 Values are constant in each cell, and normalised
     blur_file_mrad                     float    Width of that image along angle_y [mrad], above 0 to 1000; its cells are
                                                 squares
-    aperture_area                      float    Area of the aperture [m^2], positive. Default: 0.025
+    aperture_area                      float    Area of the aperture [m^2], 1e-12 to 1000. Default: 0.025
     obscuration                        float    Share of that area which is blocked, as by a secondary mirror, 0 to
                                                 0.999. Default: 0
     optical_efficiency                 float    Share of light that the optics pass, above 0 to 1. Default: 0.9
     two_way_atmospheric_transmittance  float    Share of light that the air transmits, both ways. Default: 0.9
-    response_time_ns                   float    Time constant of the exponential response [ns]. Default: 0
+    response_time_ns                   float    Time constant of the exponential response [ns], 0 to 1e6. Default: 0
     altitude, off_nadir_deg, aim_x,             Pose, as for ``lidar_transmitter``
     aim_y, to_world
     (nested)                           film     ``time_gated_film``
@@ -122,7 +123,7 @@ def _own_pixels(props: mi.Properties) -> PixelArray:
             if name in props:
                 raise UserError(f"{name} = {props[name]!r} is for {kind}: leave it out")
 
-    field_of_view = 1e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+    field_of_view = 1e-3 * ranged("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
     if "pixel_map" in props:
         only_for("receivers without pixel_map", "layout", "fill_factor", "field_of_view_shape", "imager", *_LENS)
         return MappedPixels.from_file(str(props["pixel_map"]), field_of_view)
@@ -144,9 +145,15 @@ def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:
     for name in _LENS:
         if name not in props:
             raise UserError(f"{name} is missing: a lens needs {' and '.join(_LENS)}")
-    focal_length, pitch = (positive(name, props[name]) for name in _LENS)
+    focal_length, pitch = (ranged(name, props[name]) for name in _LENS)
     rows, columns = parse_layout(layout)
-    return 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns
+    sides = 1e-3 * pitch / focal_length * rows, 1e-3 * pitch / focal_length * columns
+    if not RANGES["field_of_view_mrad"][0] <= 1e3 * min(sides) <= 1e3 * max(sides) <= RANGES["field_of_view_mrad"][1]:
+        raise UserError(
+            f"focal_length_mm = {focal_length:g} and pixel_pitch_um = {pitch:g} give a field of view of "
+            f"{1e3 * sides[0]:g} x {1e3 * sides[1]:g} mrad: its sides must lie between 0.001 and 3000"
+        )
+    return sides
 
 
 mi.register_sensor("multipixel_receiver", lambda props: MultipixelReceiver(props))

@@ -6,7 +6,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite, finite_array, in_range, positive
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import finite, finite_array, in_range
 from mitransient_lidar.plugins.bases import ReceiverSensor
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
@@ -22,15 +23,15 @@ class PixelFov(ReceiverSensor):
     shape                         string  ``circle``, ``ring``, ``sector``, ``rectangle``, ``strip`` or ``polygon``.
                                           Default: ``circle``
     field_of_view_mrad            float   Full angle of the circle, ring, sector, or of the circle that a strip is cut
-                                          from [mrad], positive. Default: 30
+                                          from [mrad], 0.001 to 3000. Default: 30
     inner_mrad                    float   ring, sector: full angle of the hole [mrad]. Default: 0
     start_deg,                    float   sector: first azimuth, from +angle_x (far) towards +angle_y [deg], and size
     extent_deg                            [deg], up to 360. Defaults: 0, 360
-    width_mrad,                   float   rectangle: full angle along angle_y and along angle_x [mrad], positive.
-    height_mrad                           Defaults: 15, 15
+    width_mrad,                   float   rectangle: full angle along angle_y and along angle_x [mrad], 0.001 to
+    height_mrad                           3000. Defaults: 15, 15
     angle_x_min_mrad,             float   strip: the part of the circle between these angle_x [mrad]
     angle_x_max_mrad
-    angle_x_mrad, angle_y_mrad    float   circle, ring, sector, rectangle: centre [mrad]. Default: 0
+    angle_x_mrad, angle_y_mrad    float   circle, ring, sector, rectangle: centre [mrad], -3000 to 3000. Default: 0
     vertices_mrad                 string  polygon: corners ``angle_x angle_y, angle_x angle_y, ...`` [mrad], at least
                                           three; its edges must not cross, touch or overlap
     pixel_name                    string  Name in the result. Default: ``pixel`` (numbered by ``multipixel_receiver``)
@@ -71,12 +72,12 @@ def _field(props: mi.Properties) -> FovShape:
     """Build the shape from the plugin's parameters."""
 
     def mrad(name: str, default: float) -> float:
-        return 1e-3 * finite(name, props.get(name, default))
+        return 1e-3 * ranged(name, props.get(name, default))
 
     shape = props.get("shape", "circle")
     centre = (mrad("angle_x_mrad", 0.0), mrad("angle_y_mrad", 0.0))
     if shape in ("circle", "ring", "sector"):
-        outer = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+        outer = 0.5e-3 * ranged("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
         if shape == "circle":
             return Sector(outer, centre=centre)
         inner = 0.5e-3 * in_range("inner_mrad", props.get("inner_mrad", 0.0), 0.0, 2e3 * outer * (1 - 1e-6))
@@ -86,11 +87,11 @@ def _field(props: mi.Properties) -> FovShape:
         extent = np.deg2rad(in_range("extent_deg", props.get("extent_deg", 360.0), 1e-3, 360.0))
         return Sector(outer, inner, start, extent, centre)
     if shape == "rectangle":
-        width = 0.5e-3 * positive("width_mrad", props.get("width_mrad", 15.0))
-        height = 0.5e-3 * positive("height_mrad", props.get("height_mrad", 15.0))
+        width = 0.5e-3 * ranged("width_mrad", props.get("width_mrad", 15.0))
+        height = 0.5e-3 * ranged("height_mrad", props.get("height_mrad", 15.0))
         return Rectangle(centre[0] - height, centre[0] + height, centre[1] - width, centre[1] + width)
     if shape == "strip":
-        radius = 0.5e-3 * positive("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
+        radius = 0.5e-3 * ranged("field_of_view_mrad", props.get("field_of_view_mrad", 30.0))
         edge = 1e3 * radius
         low = in_range("angle_x_min_mrad", props.get("angle_x_min_mrad", -edge), -1e6, edge * (1 - 1e-6))
         least = max(low, -edge) * (1 + 1e-6) + 1e-9

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.height_maps import read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
@@ -67,7 +68,8 @@ class Bottom:
             raise UserError(f"map_size = {map_size} needs a height map: give its filename")
         self.terrain = read_height_map(path, map_size) if path else None
         # The heights of a map may be relative to the sea level.
-        self.depth = (positive if self.terrain is None else non_negative)("depth", get("depth", 8.0))
+        depth = get("depth", 8.0)
+        self.depth = ranged("depth", positive("depth", depth) if self.terrain is None else depth)
         #: Rise along x and y [m/m].
         self.slope = tuple(
             math.tan(math.radians(in_range(name, get(name, 0.0), -_STEEPEST_TILT, _STEEPEST_TILT)))
@@ -85,7 +87,7 @@ class Bottom:
         if self.terrain is not None:
             x, y = self.terrain.x, self.terrain.y
             middle, widest = (float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2), float(max(x[-1] - x[0], y[-1] - y[0]))
-        self.centre = finite("centre_x", get("centre_x", middle[0])), finite("centre_y", get("centre_y", middle[1]))
+        self.centre = ranged("centre_x", get("centre_x", middle[0])), ranged("centre_y", get("centre_y", middle[1]))
         widest = max([widest, *(2 * patch.reach(self.centre) for patch in self.patches)])
         self.curvature = in_range("curvature", get("curvature", 0.0), -1.0, 1.0)
         #: Side of the cells [m], infinite for a plane.
@@ -93,7 +95,7 @@ class Bottom:
         self.refined_size = _length(get, "refined_size", widest)
         #: Direction across the crests [rad].
         self.ripple_bearing = math.radians(finite("ripple_bearing_deg", get("ripple_bearing_deg", 0.0)))
-        self.size = positive("size", get("size", 1000.0))
+        self.size = ranged("size", get("size", 1000.0))
         self.reflectance = in_range("reflectance", get("reflectance", 0.1), 0.0, 1.0)
         self._check()
 
@@ -197,7 +199,7 @@ class Seabed(mi.Mesh):
     ========================  ======  ==================================================================================
     Parameter                 Type    Meaning
     ========================  ======  ==================================================================================
-    depth                     float   Depth at x = y = 0 [m], greater than 0. Default: 8
+    depth                     float   Depth at x = y = 0 [m], above 0 to 1e5. Default: 8
     slope_x_deg, slope_y_deg  float   Tilt, -45 to 45 [deg]: positive where the bottom rises towards +x, +y. Default: 0
     curvature                 float   Curvature of a bowl about the centre, -1 to 1 [1/m], negative for a mound; it ends
                                       half of ``refined_size`` from the centre. Default: 0
@@ -211,13 +213,15 @@ class Seabed(mi.Mesh):
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
-    centre_x, centre_y        float   Centre of the finely resolved square [m]. Default: 0, or the map's centre
+    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e6 to 1e6. Default: 0, or the
+                                      map's centre
     refined_size              float   Its side [m], or ``auto``: 20 m, or the map's longer side, or more for the
                                       patches. Default: ``auto``
     cell_size                 float   Side of its cells [m], or ``auto``: an eighth of the ripples' length, an eighth of
                                       the smallest patch's radius, the map's own or 0.25 m, the smallest of them.
                                       Default: ``auto``
-    size                      float   Side of the bottom [m]: cells grow outside the square. Default: 1000
+    size                      float   Side of the bottom [m], 0.001 to 1e6: cells grow outside the square.
+                                      Default: 1000
     (nested)                  bsdf    Any BSDF instead of the Lambertian one
     ========================  ======  ==================================================================================
 

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import non_negative
+from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
 from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.daylight.sky import SKIES, read_direction, relative_irradiance
@@ -21,7 +21,7 @@ class Sky(EmitterWithoutExtent):
     distribution     string  ``clear`` (Harrison and Coombes 1988: bright around the sun and at the horizon),
                              ``overcast`` (Moon and Spencer 1942: three times as bright at the zenith as at the
                              horizon), or ``uniform``. Default: ``clear``
-    irradiance       float   Irradiance at the sea on a level plane [W m^-2 nm^-1], at least 0. Default for ``clear``:
+    irradiance       float   Irradiance at the sea on a level plane [W m^-2 nm^-1], 0 to 1e6. Default for ``clear``:
                              that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`); required
                              for the others
     sun_zenith_deg   float   ``clear``: angle of the sun from the vertical [deg], 0 to 89. Default: 40
@@ -59,7 +59,7 @@ class Sky(EmitterWithoutExtent):
         if "irradiance" not in props and self.distribution != "clear":
             raise UserError(f"irradiance is missing: a sky of distribution = {self.distribution!r} needs it")
         default = clear_sky_irradiance(zenith).diffuse
-        self.irradiance = non_negative("irradiance", props.get("irradiance", default))
+        self.irradiance = ranged("irradiance", props.get("irradiance", default))
         self._scale = self.irradiance / relative_irradiance(self.distribution, self.sun)
         self.m_needs_sample_2 = True
         self.m_flags = mi.EmitterFlags.Infinite.value

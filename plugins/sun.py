@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.validation import in_range, non_negative
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.lidar.clear_sky import SUN_RADIUS_DEG, clear_sky_irradiance
 from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.daylight.sky import read_direction
@@ -21,7 +22,7 @@ class Sun(EmitterWithoutExtent):
     ==================  =====  =========================================================================================
     zenith_deg          float  Angle of the sun's centre from the vertical [deg], 0 to 89. Default: 40
     azimuth_deg         float  Its azimuth, from +x (the receiver's viewing direction) towards +y [deg]. Default: 0
-    irradiance          float  Irradiance at the sea on a plane normal to its rays [W m^-2 nm^-1], at least 0. Default:
+    irradiance          float  Irradiance at the sea on a plane normal to its rays [W m^-2 nm^-1], 0 to 1e6. Default:
                                that of a clear sky at 532 nm (`physics.lidar.clear_sky.clear_sky_irradiance`)
     angular_radius_deg  float  Radius of its disc [deg], 0.001 to 5. Default: 0.2666
     ==================  =====  =========================================================================================
@@ -49,7 +50,7 @@ class Sun(EmitterWithoutExtent):
         super().__init__(props)
         self.zenith_deg, self.direction = read_direction(props)
         default = clear_sky_irradiance(self.zenith_deg).direct_normal
-        self.irradiance = non_negative("irradiance", props.get("irradiance", default))
+        self.irradiance = ranged("irradiance", props.get("irradiance", default))
         radius = in_range("angular_radius_deg", props.get("angular_radius_deg", SUN_RADIUS_DEG), 1e-3, 5.0)
         # sin^2 of half the radius, as the cosine of so small an angle is 1 to rounding.
         self._edge = float(np.sin(0.5 * np.radians(radius)) ** 2)

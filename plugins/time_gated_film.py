@@ -6,7 +6,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite, integer, non_negative, positive
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -22,15 +23,16 @@ class TimeGatedFilm(mi.Film):
     ================  =======  =========================================================================================
     Parameter         Type     Meaning
     ================  =======  =========================================================================================
-    time_start_ns     float    Start of the first bin [ns] after the pulse's peak leaves the transmitter. Default: 1390
-    bin_width_ns      float    Width of a bin [ns], positive. Default: 0.5
+    time_start_ns     float    Start of the first bin [ns] after the pulse's peak leaves the transmitter, up to
+                               1e9 before or after. Default: 1390
+    bin_width_ns      float    Width of a bin [ns], 1e-6 to 1e6. Default: 0.5
     bin_count         integer  Number of bins, 1 to 1 000 000. Default: 320
     gate_count        integer  Number of gates, 0 (none) to 100 000. Default: 0
     gate_start_ns     float    Half height of the first gate's rising edge [ns]
     gate_start_depth  float    Instead: depth of the echoes that arrive at that time [m], on the receiver's axis
-    gate_width_ns     float    Time between the half heights of a gate's edges [ns], positive. Default: 10
-    gate_step_ns      float    Time from gate to gate [ns], positive. Default: the width
-    gate_rise_ns,     float    10-90 % times of raised-cosine edges [ns], 0 (sharp) or more. Default: 0
+    gate_width_ns     float    Time between the half heights of a gate's edges [ns], 1e-6 to 1e9. Default: 10
+    gate_step_ns      float    Time from gate to gate [ns], 1e-6 to 1e9. Default: the width
+    gate_rise_ns,     float    10-90 % times of raised-cosine edges [ns], 0 (sharp) to 1e9. Default: 0
     gate_fall_ns
     gate_profile      string   Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1
     pulses            integer  Number of pulses that each gate accumulates, 1 to 10^9. Default: 1
@@ -60,8 +62,8 @@ class TimeGatedFilm(mi.Film):
     def __init__(self, props: mi.Properties) -> None:
         #: Time bins of the record.
         self.axis = TimeAxis(
-            finite("time_start_ns", props.get("time_start_ns", 1390.0)),
-            positive("bin_width_ns", props.get("bin_width_ns", 0.5)),
+            ranged("time_start_ns", props.get("time_start_ns", 1390.0)),
+            ranged("bin_width_ns", props.get("bin_width_ns", 0.5)),
             integer("bin_count", props.get("bin_count", 320), 1, 1_000_000),
         )
         #: Gates of the scene, or None.
@@ -136,19 +138,19 @@ def _gate_plan(props: mi.Properties) -> GatePlan | None:
     starts = [name for name in _GATE_START if name in given]
     if len(starts) != 1:
         raise UserError(f"gate_count = {count} gates need either gate_start_ns or gate_start_depth")
-    start = finite(starts[0], props[starts[0]])
+    start = ranged(starts[0], props[starts[0]])
     pulses = integer("pulses", props.get("pulses", 1), 1, 10**9)
     if "gate_profile" in props:
         for name in _GATE_SHAPE:
             if name in given:
                 raise UserError(f"{name} = {props[name]:g} and gate_profile: give one of them")
         profile = GateShape.from_file(str(props["gate_profile"]))
-        step = positive("gate_step_ns", props.get("gate_step_ns", profile.width_ns))
+        step = ranged("gate_step_ns", props.get("gate_step_ns", profile.width_ns))
         train = GateTrain.measured(profile, 0.0, step, count, pulses)
     else:
-        width = positive("gate_width_ns", props.get("gate_width_ns", 10.0))
-        rise, fall = (non_negative(name, props.get(name, 0.0)) for name in _GATE_SHAPE[1:])
-        step = positive("gate_step_ns", props.get("gate_step_ns", width))
+        width = ranged("gate_width_ns", props.get("gate_width_ns", 10.0))
+        rise, fall = (ranged(name, props.get(name, 0.0)) for name in _GATE_SHAPE[1:])
+        step = ranged("gate_step_ns", props.get("gate_step_ns", width))
         train = GateTrain(0.0, width, step, count, rise, fall, pulses)
     return GatePlan(train, **{"start_ns" if starts[0] == "gate_start_ns" else "start_depth": start})
 

@@ -6,7 +6,9 @@ stdout, everything else to stderr. Commands import what they need when they run,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 import typer
@@ -15,6 +17,7 @@ from typer.core import TyperGroup
 from mitransient_lidar._version import __version__
 from mitransient_lidar.cli import gates, render, results, retrieve, scenes, studies, waveforms
 from mitransient_lidar.cli.messages import exit_on_error
+from mitransient_lidar.core.errors import UserError
 
 #: Commands by the headings of the help.
 _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
@@ -41,8 +44,22 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
 }
 
 
+#: Error of the parser of options, of the release of Click that Typer uses.
+_UsageError: Any = typer.BadParameter.__base__
+
+
 class _GroupedCommands(TyperGroup):
-    """A command whose help lists the subcommands under headings."""
+    """A command whose help lists the subcommands under headings, and whose usage errors are one sentence."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """Parse the options before the subcommand."""
+        with _short_usage_errors():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Parse the options of the subcommand, and run it."""
+        with _short_usage_errors():
+            return super().invoke(ctx)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write one section a heading."""
@@ -53,6 +70,29 @@ class _GroupedCommands(TyperGroup):
         for heading, rows in sections.items():
             with formatter.section(heading):
                 formatter.write_dl(rows)
+
+
+@contextlib.contextmanager
+def _short_usage_errors() -> Iterator[None]:
+    """Convert an error of the options to a `UserError`; a command without arguments still prints its help."""
+    with exit_on_error():
+        try:
+            yield
+        except _UsageError as error:
+            if type(error).__name__ == "NoArgsIsHelpError":
+                raise
+            raise UserError(_usage_sentence(error)) from error
+
+
+def _usage_sentence(error: Any) -> str:
+    """Return one sentence with the option, its value and what is allowed."""
+    details = getattr(error.__cause__, "errors", None)  # of Pydantic, which leaves out the value
+    command = getattr(error.ctx, "command_path", "mitransient-lidar")
+    if details is None or error.param is None:
+        return f"{' '.join(error.format_message().split()).rstrip('.')}; see {command} --help."
+    problem = details()[0]
+    allowed = problem["msg"].removeprefix("Input should be ").partition(",")[0]
+    return f"{error.param.opts[0]} = {problem['input']!r} must be {allowed}"
 
 
 app = typer.Typer(
@@ -67,6 +107,8 @@ _scenes_app = typer.Typer(rich_markup_mode=None)
 
 def main() -> None:
     """Run the command line."""
+    # Commands draw to files only: Matplotlib refuses to be imported with an unknown backend.
+    os.environ["MPLBACKEND"] = "agg"
     app(prog_name="mitransient-lidar")
 
 

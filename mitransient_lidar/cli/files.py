@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing, together
+from mitransient_lidar.core.files import check_encodable, replacing, together
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 def check_writable(folder: Path, targets: list[Path]) -> None:
     """Check that files can be written into a folder, without creating it."""
+    for path in (folder, *targets):
+        check_encodable(path)
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
 from mitransient_lidar.rendering.interruption import TerminationAsInterrupt
 
 if TYPE_CHECKING:
@@ -23,13 +23,17 @@ _MOST_PIXELS = 12  # listed in the summary
 
 @contextlib.contextmanager
 def exit_on_error() -> Iterator[None]:
-    """Exit with one sentence and code 2 on invalid input and files that cannot be used.
+    """Exit with one sentence and code 2 on invalid input, unusable files and exhausted memory.
 
     Ctrl-C, SIGTERM and SIGHUP give the codes 130, 143 and 129.
     """
     with TerminationAsInterrupt() as signals:
         try:
-            yield
+            try:
+                yield
+            except (MemoryError, RuntimeError) as error:
+                raise_if_out_of_memory(error)
+                raise
         except UserError as error:
             typer.echo(str(error), err=True)
             raise typer.Exit(_INVALID_INPUT) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import platform
@@ -27,6 +28,17 @@ _MOVES = ".moves"
 _moves: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("moves", default=None)
 
 
+def check_encodable(path: Path) -> None:
+    """Raise `UserError` if the name of a file is not text that can be encoded in UTF-8, or contains NUL."""
+    text = str(path)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise UserError(f"cannot write {text!a}: its name is not valid UTF-8.") from error
+    if "\0" in text:
+        raise UserError(f"cannot write {text!a}: its name contains the character NUL.")
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield the path of a temporary file in the folder of `path`, which replaces `path` on success.
@@ -37,9 +49,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     UserError
-        If the operating system reports an error.
+        If the name cannot be encoded, or the operating system reports an error.
     """
     path, moves = Path(path), _moves.get()
+    check_encodable(path)
     _sweep(path.parent)
     temporary = _temporary(path)
     try:
@@ -48,7 +61,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.replace(temporary, path)
         else:
             moves.append((temporary, path))
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
+        # HDF5 and OpenEXR report a full disk by their own errors, with the operating system's message in them.
+        if getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error):
+            reason = f"{os.strerror(errno.ENOSPC)}, while writing the temporary file {temporary}, which is removed"
+            raise UserError(f"cannot write {path}: {reason}.") from error
+        if isinstance(error, RuntimeError):
+            raise
         raise UserError(f"cannot write {path}: {_reason(error, temporary, path)}.") from error
     finally:
         if moves is None or (temporary, path) not in moves:

@@ -13,6 +13,7 @@ from xml.dom import minidom
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import limits
 from mitransient_lidar.core.validation import finite, in_range, integer, is_number, shown
 
 #: Largest coordinate [m] and scale of a transform: 32-bit coordinates are accurate to 6 cm there.
@@ -88,6 +89,9 @@ def check_elements(root: minidom.Element, parameters: Mapping[str, str]) -> set[
                 _check_numbers(label, element.tagName, attribute, value)
             elif element.tagName in ("spectrum", "rgb") and attribute == "value":
                 _check_spectrum(label, value)
+            if attribute == "value" and element.tagName in ("float", "integer", "string"):
+                for number in _numbers_in(value):
+                    _check_range(label.name, owner, number)
             if attribute == "value" and _is_share(element):
                 for word in re.split(r"[\s,]+", value.strip()):
                     in_range(label.name, word.rpartition(":")[2], 0, 1)
@@ -111,8 +115,11 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                     _check_shares(label, value["value"])
             elif value is None or isinstance(value, (complex, bytes)):
                 raise UserError(f"{label} = {shown(value)} must be a number, a text, a transform or an object")
-            elif isinstance(value, float) and not isinstance(value, bool):
-                finite(label, value)
+            elif isinstance(value, (int, float, str)) and not isinstance(value, bool):
+                if isinstance(value, float):
+                    finite(label, value)
+                for number in _numbers_in(str(value)):
+                    _check_range(label, key, number)
                 if _SHARE.search(key):
                     _check_shares(label, value)
             elif hasattr(value, "matrix"):
@@ -222,6 +229,18 @@ def _is_plain(value: object) -> bool:
     return isinstance(value, (int, float)) or (
         isinstance(value, (list, tuple)) and all(isinstance(item, (int, float)) for item in value)
     )
+
+
+def _numbers_in(text: str) -> list[float]:
+    """Return the numbers of a text that holds nothing else, empty for other texts."""
+    words = text.replace(",", " ").split()
+    return [float(word) for word in words] if all(map(is_number, words)) else []
+
+
+def _check_range(label: str, name: str, number: float) -> None:
+    """Check a number against the range of the parameter `name`."""
+    if found := limits(name):
+        in_range(label, number, *found)
 
 
 def _check_shares(label: str, values: Any) -> None:

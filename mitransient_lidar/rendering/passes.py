@@ -9,14 +9,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError, is_interruption
-from mitransient_lidar.core.validation import FloatArray, in_range, positive
+from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
+from mitransient_lidar.core.validation import FloatArray, in_range, integer, positive
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
 
 logger = logging.getLogger(__name__)
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
+
+#: Largest number of passes that can be asked for.
+MOST_PASSES = 10**9
 
 
 #: Quantile of the relative standard errors that is compared with the target, unless another one is requested.
@@ -78,8 +81,9 @@ class Goal:
         for name, value in (("target_error", target_error), ("max_time", max_time)):
             if value is not None:
                 positive(name, value)
-        if passes is not None and passes < 2:
-            raise UserError(f"passes = {passes} must be at least 2: their spread gives the standard error")
+        if passes is not None:
+            # Their spread gives the standard error.
+            passes = integer("passes", passes, 2, MOST_PASSES)
         given = not target_error is max_time is passes is None
         goal = cls(target_error, max_time, passes) if given else default
         if target_quantile is None:
@@ -167,7 +171,7 @@ def run_passes(
     goal
         End of the render.
     seed
-        Seed of the render, any integer.
+        Seed of the render, as from `check_seed`.
     errors
         Returns the relative standard errors, an array of any size; called from the second pass on.
     errors_of
@@ -184,7 +188,7 @@ def run_passes(
     KeyboardInterrupt
         On a Ctrl-C during the first passes.
     UserError
-        That of `verify`.
+        That of `verify`, or if memory runs out.
     """
     count, lost, interrupted = 0, 0.0, False
     median = p95 = error = None
@@ -218,8 +222,9 @@ def run_passes(
                     progress(state)
                 if count >= smallest:
                     interruption.check()
-    except (KeyboardInterrupt, RuntimeError) as raised:
+    except (KeyboardInterrupt, RuntimeError, MemoryError) as raised:
         if not is_interruption(raised):
+            raise_if_out_of_memory(raised)
             raise
         if count < smallest:
             raise KeyboardInterrupt from raised
@@ -261,6 +266,11 @@ def _pace(ends: list[float]) -> float:
     """
     first = 1 if len(ends) > 2 else 0
     return (ends[-1] - ends[first]) / (len(ends) - 1 - first)
+
+
+def check_seed(seed: object) -> int:
+    """Return the seed of a render, an integer of 64 bits with a sign; raise UserError for others."""
+    return integer("seed", seed, -(2**63), 2**63 - 1)
 
 
 def pass_seed(seed: int, number: int) -> int:

@@ -18,7 +18,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering.accuracy import RatioStatistics
-from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, pass_seed, run_passes
+from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, check_seed, pass_seed, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     choose_integrator,
@@ -70,7 +70,7 @@ def render_passive(
     params, variant
         As for `render.render`.
     seed
-        Any integer; frames and passes have independent random numbers.
+        Integer from -2^63 to 2^63 - 1; frames and passes have independent random numbers.
     frames
         Number of frames, 1 to 10 000.
     frame_step_s
@@ -96,6 +96,7 @@ def render_passive(
     """
     frames, step = integer("frames", frames, 1, 10_000), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
+    seed = check_seed(seed)
     goal = Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
     images: list[tuple[FloatArray, FloatArray]] = []
     start, lost = time.perf_counter(), 0.0

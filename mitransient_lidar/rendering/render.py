@@ -12,7 +12,7 @@ import numpy as np
 from mitransient_lidar.core.validation import positive
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, check_seed, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     choose_integrator,
@@ -70,10 +70,10 @@ def render(
     max_time
         Longest time for the passes [s], greater than 0. At least two passes are rendered.
     passes
-        Number of passes, at least 2. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
+        Number of passes, 2 to 10^9. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
         or after 60 s.
     seed
-        Any integer; the same seed gives the same result on the same machine.
+        Integer from -2^63 to 2^63 - 1; the same seed gives the same result on the same machine.
     max_memory
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
         only the gates are kept, with a warning.
@@ -96,6 +96,7 @@ def render(
         If the scene, a parameter or an option is invalid, or no light returns.
     """
     Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
+    seed = check_seed(seed)
     max_memory = _DEFAULT_MAX_MEMORY_GB if max_memory is None else positive("max_memory", max_memory)
     session = open_scene(scene, params, variant)
     chosen = choose_integrator(session.scene, integrator)

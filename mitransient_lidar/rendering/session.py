@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
+from mitransient_lidar.loading.checks import check_dict
 from mitransient_lidar.loading.scenes import as_user_error, load_scene
 from mitransient_lidar.rendering.passes import PassLog
 
@@ -67,6 +69,10 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
     elif isinstance(wanted, mi.Integrator):
         chosen = wanted
     else:
+        if not isinstance(wanted, (str, Mapping)):
+            raise UserError(f"integrator = {shown(wanted)} must be the name or the dict of an integrator plugin")
+        if not isinstance(wanted, str):
+            check_dict(wanted)
         with as_user_error():
             chosen = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
     if not hasattr(chosen, "plugin"):

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import in_range
 
 
 @dataclass(frozen=True)
@@ -41,18 +42,18 @@ class Pose:
         Parameters
         ----------
         altitude
-            Height above the mean sea level [m], positive.
+            Height above the mean sea level [m], 0.1 to 1e6.
         off_nadir_deg
             Angle of the axis from the vertical [deg], 0 to 89.9.
         aim_x, aim_y
-            Point where the axis meets the mean sea level [m].
+            Point where the axis meets the mean sea level [m], -1e6 to 1e6.
 
         Values out of range raise UserError.
         """
-        altitude = positive("altitude", altitude)
+        altitude = ranged("altitude", altitude)
         angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9))
         sin, cos = np.sin(angle), np.cos(angle)
-        origin = np.array([finite("aim_x", aim_x) - altitude * sin / cos, finite("aim_y", aim_y), altitude])
+        origin = np.array([ranged("aim_x", aim_x) - altitude * sin / cos, ranged("aim_y", aim_y), altitude])
         return cls(origin, np.array([sin, 0.0, -cos]), np.array([cos, 0.0, sin]), np.array([0.0, 1.0, 0.0]))
 
     @classmethod
@@ -66,7 +67,10 @@ class Pose:
             if "altitude" in props or "off_nadir_deg" in props:
                 raise UserError(f"{props.plugin_name()}: give either to_world or altitude and off_nadir_deg, not both")
             matrix = np.array(props["to_world"].matrix, dtype=np.float64)
-            frame = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+            lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+            if not (np.isfinite(matrix).all() and np.all(lengths > 0)):
+                raise UserError(f"{props.plugin_name()}: to_world must be finite, and no axis have a scale of 0")
+            frame = matrix[:3, :3] / lengths
             if not np.allclose(frame.T @ frame, np.eye(3), atol=1e-4):
                 raise UserError(f"{props.plugin_name()}: to_world must be a rotation and a translation, without shear")
             return cls(matrix[:3, 3], frame[:, 2], frame[:, 1], frame[:, 0])

@@ -44,7 +44,7 @@ def test_every_plugin_file_is_registered():
     from mitransient_lidar.loading import variants
 
     files = [path.relative_to(ROOT / "plugins").with_suffix("") for path in (ROOT / "plugins").rglob("*.py")]
-    assert {".".join(file.parts) for file in files if file.name != "__init__"} == set(variants._PLUGIN_MODULES)
+    assert {".".join(file.parts) for file in files if file.name != "__init__"} == set(variants.PLUGIN_MODULES)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import FloatArray, non_negative_array, number_list
 
 LayerValues = float | str | Sequence[float] | FloatArray
@@ -26,7 +27,7 @@ class WaterColumn:
     layer_tops : array_like, shape (L,)
         Depth of the upper edge of each layer [m]. The first is 0 and they increase strictly.
     attenuation : array_like, shape (L,)
-        Beam attenuation coefficient c [1/m], at least `scattering`.
+        Beam attenuation coefficient c [1/m], at least `scattering`, at most 1000.
     scattering : array_like, shape (L,)
         Scattering coefficient b [1/m], at least `backscattering`.
     backscattering : array_like, shape (L,)
@@ -50,6 +51,7 @@ class WaterColumn:
                 raise UserError(f"{name} of shape {values.shape} must be a list of one value per layer")
             if values.size != np.size(self.layer_tops):
                 raise UserError(f"{name} has {values.size} values but layer_tops has {np.size(self.layer_tops)} layers")
+            ranged(name, values.max())
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if self.layer_tops[0] != 0:

@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.validation import finite, in_range, non_negative, positive
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import finite, in_range
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,9 @@ class BubblePlume:
     Parameters
     ----------
     scattering
-        Scattering coefficient of the bubbles [1/m], added to that of the water.
+        Scattering coefficient of the bubbles [1/m], 0 to 1000, added to that of the water.
     x, y
-        Start of the plume, at the stern [m].
+        Start of the plume, at the stern [m], -1e6 to 1e6.
     bearing
         Heading of the ship [rad], counter-clockwise from +x; the plume lies behind.
     length, width, depth
@@ -42,12 +43,12 @@ class BubblePlume:
     def from_properties(cls, props: mi.Properties) -> BubblePlume | None:
         """Read the parameters ``plume_...`` of the plugin ``layered_water``; None without bubbles."""
         plume = cls(
-            non_negative("plume_scattering", props.get("plume_scattering", 0.0)),
-            finite("plume_x", props.get("plume_x", 0.0)),
-            finite("plume_y", props.get("plume_y", 0.0)),
+            ranged("plume_scattering", props.get("plume_scattering", 0.0)),
+            ranged("plume_x", props.get("plume_x", 0.0)),
+            ranged("plume_y", props.get("plume_y", 0.0)),
             np.deg2rad(finite("plume_bearing_deg", props.get("plume_bearing_deg", 0.0))),
-            positive("plume_length", props.get("plume_length", 200.0)),
-            positive("plume_width", props.get("plume_width", 8.0)),
+            ranged("plume_length", props.get("plume_length", 200.0)),
+            ranged("plume_width", props.get("plume_width", 8.0)),
             in_range("plume_depth", props.get("plume_depth", 2.0), 0.01, 100.0),
         )
         return plume if plume.scattering > 0 else None

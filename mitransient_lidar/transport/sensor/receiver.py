@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.validation import in_range, non_negative, positive
+from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams, stratified_point, unit_points
@@ -29,13 +30,13 @@ class ReceiverOptics:
     Parameters
     ----------
     aperture_area
-        Area [m^2] normal to every ray of the (small) field of view, positive.
+        Area [m^2] normal to every ray of the (small) field of view, 1e-12 to 1000.
     optical_efficiency
         Share of the collected light that reaches the detector, above 0 to 1.
     two_way_atmospheric_transmittance
         Share of the light that the air transmits both ways, above 0 to 1.
     response_time_ns
-        Time constant of the receiver's exponential (single-pole) impulse response [ns]; 0 is ideal.
+        Time constant of the receiver's exponential (single-pole) impulse response [ns], at most 1e6; 0 is ideal.
     obscuration
         Share of the aperture's area that is blocked, as by a secondary mirror, 0 to 0.999.
     """
@@ -51,10 +52,10 @@ class ReceiverOptics:
         """Read the five parameters of a sensor plugin; raise UserError when one is out of range."""
         name = "two_way_atmospheric_transmittance"
         return cls(
-            positive("aperture_area", props.get("aperture_area", 0.025)),
+            ranged("aperture_area", props.get("aperture_area", 0.025)),
             in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0),
             in_range(name, props.get(name, 0.9), 1e-12, 1.0),
-            non_negative("response_time_ns", props.get("response_time_ns", 0.0)),
+            ranged("response_time_ns", props.get("response_time_ns", 0.0)),
             in_range("obscuration", props.get("obscuration", 0.0), 0.0, _LARGEST_OBSCURATION),
         )
 

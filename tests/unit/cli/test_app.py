@@ -131,7 +131,7 @@ def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
         (["--target-error", "nan"], "target_error = nan must be finite"),
         (["--max-time", "-1"], "max_time = -1 must be greater than 0"),
         (["--max-time", "inf"], "max_time = inf must be finite"),
-        (["--passes", "1"], "passes = 1 must be at least 2"),
+        (["--passes", "1"], "passes = 1 must lie between 2 and 1000000000"),
         (["-D", "wind"], "-D wind is not of the form name=value."),
         (["-D", "=3"], "-D =3 is not of the form name=value."),
     ],

@@ -1,0 +1,55 @@
+"""Physical ranges of the parameters of plugins, by name: wide enough for every instrument and water."""
+
+from __future__ import annotations
+
+from mitransient_lidar.core.validation import finite, in_range, non_negative, positive
+
+_PLACE = (-1e6, 1e6)  # 32-bit coordinates are accurate to 6 cm at the ends
+_LENGTH = (1e-3, 1e6)
+_VIEW_MRAD = (1e-3, 3000.0)  # full angles, short of half the sphere
+_BEAM_MRAD = (1e-3, 2000.0)
+_TIME_NS = (-1e9, 1e9)
+_DURATION_NS = (1e-6, 1e9)
+_PER_METRE = (0.0, 1000.0)
+
+#: Lowest and highest value of each parameter, in the unit of its name, else in m, m^2, 1/m or s.
+RANGES: dict[str, tuple[float, float]] = {
+    "altitude": (0.1, 1e6),
+    **dict.fromkeys(("aim_x", "aim_y", "centre_x", "centre_y", "plume_x", "plume_y", "wake_x", "wake_y"), _PLACE),
+    "pulse_energy_mj": (1e-9, 1e6),
+    "pulse_fwhm_ns": (1e-4, 1e6),
+    **dict.fromkeys(("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"), _BEAM_MRAD),
+    **dict.fromkeys(("divergence_across_mrad", "profile_mrad"), _BEAM_MRAD),
+    **dict.fromkeys(("field_of_view_mrad", "width_mrad", "height_mrad"), _VIEW_MRAD),
+    **dict.fromkeys(("angle_x_mrad", "angle_y_mrad"), (-3000.0, 3000.0)),
+    **dict.fromkeys(("focal_length_mm", "pixel_pitch_um"), (1e-3, 1e6)),
+    "aperture_area": (1e-12, 1000.0),
+    "response_time_ns": (0.0, 1e6),
+    **dict.fromkeys(("time_start_ns", "gate_start_ns"), _TIME_NS),
+    "bin_width_ns": (1e-6, 1e6),
+    "gate_start_depth": (-1e5, 1e5),
+    **dict.fromkeys(("gate_width_ns", "gate_step_ns"), _DURATION_NS),
+    **dict.fromkeys(("gate_rise_ns", "gate_fall_ns"), (0.0, 1e9)),
+    **dict.fromkeys(("cell_size", "point_spacing"), (0.0, 1e4)),
+    **dict.fromkeys(("layer_tops", "depth", "water_depth"), (0.0, 1e5)),
+    **dict.fromkeys(("attenuation", "scattering", "backscattering"), _PER_METRE),
+    **dict.fromkeys(("water_scattering", "plume_scattering"), _PER_METRE),
+    **dict.fromkeys(("size", "refined_size", "map_size", "plume_length", "plume_width"), _LENGTH),
+    "irradiance": (0.0, 1e6),
+    "time": (-1e9, 1e9),
+}
+
+#: Range of other angles, whose names end in _deg.
+_ANY_ANGLE_DEG = (-3600.0, 3600.0)
+
+
+def limits(name: str) -> tuple[float, float] | None:
+    """Return lowest and highest value of a parameter, or None if it has no range here."""
+    return RANGES.get(name, _ANY_ANGLE_DEG if name.endswith("_deg") else None)
+
+
+def ranged(name: str, value: object) -> float:
+    """Return a parameter of a plugin as a float within its range in `RANGES`; else raise ``UserError``."""
+    low, high = RANGES[name]
+    check = positive if low > 0 else non_negative if low == 0 else finite
+    return in_range(name, check(name, value), low, high)
