@@ -63,7 +63,7 @@ def find_llvm() -> Path | None:
 
 
 def is_command_line() -> bool:
-    """Return whether this process was started as the command ``mitransient-lidar`` or ``python -m mitransient_lidar``."""
+    """Return whether this process is the command ``mitransient-lidar``, or ``python -m mitransient_lidar``."""
     module = ("-m", "mitransient_lidar") in zip(sys.orig_argv, sys.orig_argv[1:], strict=False)
     return module or Path(sys.argv[0]).stem == "mitransient-lidar"
 

@@ -75,6 +75,8 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
             check_dict(wanted)
         with as_user_error():
             chosen = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
+    if not hasattr(chosen, "plugin") and isinstance(wanted, str):
+        raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
     if not hasattr(chosen, "plugin"):
         raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
     if passive and not chosen.passive:

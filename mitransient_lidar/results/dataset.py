@@ -128,7 +128,7 @@ def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple
     Raises
     ------
     UserError
-        If the variable or a coordinate is missing, or the dimensions are others.
+        If the variable or a coordinate is missing, the dimensions are others or empty, or the times are invalid.
     """
     if name not in dataset:
         raise UserError(f"the dataset has no variable {name}: it must be a result with a record in time")
@@ -139,6 +139,7 @@ def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple
         raise UserError(f"{name} has the dimensions {dims}; they must be (pixel, time) or (row, column, time){after}")
     if missing := [dim for dim in dims if dim not in dataset.coords]:
         raise UserError(f"the dataset has no coordinate {missing[0]}; {name} over {dims} needs it")
+    _check_axes("the dataset", dataset, dims)
     return dims
 
 
@@ -248,7 +249,7 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises
     ------
     UserError
-        If the file is missing, damaged, truncated, or not a result of this package.
+        If the file is missing, damaged, truncated, or not a result of this package, or its times are invalid.
     """
     path = Path(path)
     if input_format(path) == "exr":
@@ -256,7 +257,26 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
     dataset = netcdf.read_netcdf(path)
     if any(name not in dataset for name in _VARIABLES):
         raise UserError(f"{path} is a NetCDF file, but not a result of mitransient-lidar.")
+    dims = tuple(str(dim) for dim in dataset["waveform"].dims)
+    if "time" not in dims or "time" not in dataset.coords:
+        raise UserError(f"{path} has no coordinate time: its waveform has the dimensions {', '.join(dims)}.")
+    _check_axes(path, dataset, dims)
     return dataset
+
+
+def _check_axes(place: object, dataset: xr.Dataset, dims: tuple[str, ...]) -> None:
+    """Reject a record without pixels or bins, or whose times are no numbers, not finite or not increasing."""
+    if empty := [dim for dim in dims if dataset.sizes[dim] == 0]:
+        raise UserError(f"{place} is empty: its dimension {empty[0]} has the length 0, but must have at least 1.")
+    times = dataset["time"].values
+    if times.dtype.kind not in "fiu":
+        raise UserError(f"{place} has the coordinate time of type {times.dtype}: it must hold numbers, in ns.")
+    if not np.isfinite(times).all():
+        raise UserError(f"{place} has the coordinate time = {times[~np.isfinite(times)][0]}: it must be finite.")
+    for index in np.flatnonzero(np.diff(times) <= 0)[:1]:
+        raise UserError(
+            f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly."
+        )
 
 
 def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:

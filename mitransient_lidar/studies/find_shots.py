@@ -30,6 +30,9 @@ _LARGEST_SEARCH = 512.0
 #: Largest number of pixels whose footprints are mapped.
 _MOST_MAPPED_PIXELS = 64
 
+#: Largest difference of the nearest place from the slopes wanted, in standard deviations of the slopes.
+_NEAREST = 1.0
+
 _PASSES = 12
 
 
@@ -94,6 +97,11 @@ class SeaMap:
         spread = np.sqrt([np.mean(self.along**2), np.mean(self.across**2)])
         wanted = slope_sigmas * np.array(KINDS[kind]) * spread
         distance = np.hypot((self.along - wanted[0]) / spread[0], (self.across - wanted[1]) / spread[1])
+        if not (nearest := float(np.min(distance, initial=np.inf))) <= _NEAREST:
+            raise UserError(
+                f"slope_sigmas = {slope_sigmas:g}: the sea has no place of the kind {kind} with such a slope; the "
+                f"nearest one differs by {nearest:.1f} standard deviations, and at most {_NEAREST:g} are allowed"
+            )
         shots: list[Shot] = []
         for index in np.argsort(distance, axis=None):
             j, i = np.unravel_index(index, distance.shape)
@@ -151,7 +159,7 @@ def find_shots(
     Raises
     ------
     UserError
-        If the scene is invalid or has no waves, or a number is out of range.
+        If the scene is invalid or has no waves, a number is out of range, or the sea has no such slopes.
     """
     slope_sigmas, count = positive("slope_sigmas", slope_sigmas), integer("count", count, 1, 100)
     loaded = open_scene(scene, params).scene
