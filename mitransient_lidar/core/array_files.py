@@ -27,6 +27,7 @@ class Variable(NamedTuple):
     dims: tuple[str, ...]  #: Names of its dimensions.
     values: Array
     is_coordinate: bool
+    units: str  #: Its attribute ``units``, "" if it has none.
 
 
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
@@ -91,7 +92,12 @@ def read_netcdf(path: Path) -> dict[str, Variable]:
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path} is damaged, or is not a NetCDF-4 file.") from error
     return {
-        str(name): Variable(tuple(map(str, variable.dims)), variable.values, name in dataset.coords)
+        str(name): Variable(
+            dims=tuple(map(str, variable.dims)),
+            values=variable.values,
+            is_coordinate=name in dataset.coords,
+            units=str(variable.attrs.get("units", "")),
+        )
         for name, variable in dataset.variables.items()
     }
 

@@ -1,75 +1,300 @@
-"""Reading of tables from text files, with line numbers in error messages."""
+"""Reading of measured tables from text files, with line numbers in error messages."""
 
 from __future__ import annotations
 
+import logging
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.headings import (
+    TIME,
+    Column,
+    Heading,
+    is_unit,
+    parse_heading,
+    read_headings,
+    unknown_columns,
+)
+from mitransient_lidar.core.validation import FloatArray, IntArray
+
+logger = logging.getLogger(__name__)
+
+_MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---"})
+
+#: Values that instruments write for missing ones.
+_FILL_VALUES = frozenset({-99.0, -999.0, -9999.0, -99999.0, -9.99e-29})
+
+#: Times [ns] without a unit that span less are probably seconds.
+_SHORTEST_RECORD = 1e-3
+
+_COMMENT = re.compile(r"(#(?!N/A)|%|//|!)[#%/!]*\s*")
+_INLINE_COMMENT = re.compile(r"#(?!N/A).*")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+
+#: Blanks in a heading that do not stand before a unit.
+_BETWEEN_NAMES = re.compile(r"\s+(?![\[(]|1/\w|m\^?-1|in\s)")
 
 
-def read_lines(path: str | PathLike[str]) -> list[tuple[int, str]]:
-    """Read the non-empty lines of a UTF-8 text file without their comments, which start with #.
+class Table(NamedTuple):
+    """Columns of numbers from a text file."""
 
-    Returns
-    -------
-    list of (int, str)
-        Number of the line, counted from 1, and its text.
+    columns: dict[str, FloatArray]  #: Values by the names of their columns, in their first units, shape (rows,).
+    lines: list[int]  #: Number of the line of each row, counted from 1.
+    without_unit: frozenset[str]  #: Names of the columns whose unit is not given.
+
+
+class _Line(NamedTuple):
+    """Line of a file that is not empty."""
+
+    number: int
+    text: str  #: Without the mark of a comment.
+    separator: str  #: Semicolon, tab, comma, or empty for blanks.
+    cells: list[str]
+
+    def heading(self, width: int) -> list[str]:
+        """Return the cells; names with blanks inside are joined if that makes their number `width`."""
+        if self.separator or len(self.cells) <= width:
+            return self.cells
+        splits = (re.split(blanks, self.text) for blanks in (r"\s{2,}", _BETWEEN_NAMES))
+        return next((cells for cells in splits if len(cells) == width), self.cells)
+
+
+def read_table(
+    path: str | PathLike[str], columns: Sequence[Column], ignored: Collection[str] = (), positional: bool = False
+) -> Table:
+    """Read a table from a text file as an instrument or a spreadsheet writes it.
+
+    Above the rows there may be lines of text. The first one that names two or more of the columns is the heading; it
+    may be a comment, and the line below it may give the units. Cells are separated by semicolons, tabs, commas or
+    blanks; between semicolons and tabs, a comma in a number is the decimal point. Comments follow a #, or begin their
+    line with %, // or !. Rows with missing values (empty, nan, na, n/a, null, none, dashes) are left out with a warning
+    in the log.
+
+    Parameters
+    ----------
+    path : path-like
+        Text file in UTF-8; a byte order mark may precede it.
+    columns : sequence of Column
+        Columns that the file may have.
+    ignored : collection of str
+        Names of other columns that it may have, in lower case; the log tells that they are not used.
+    positional : bool
+        Whether a file without heading has exactly `columns`, in their order and first units.
 
     Raises
     ------
     UserError
-        If the file cannot be read or is not text.
+        If the file cannot be read or is not text; a name or unit is unknown, a column is there twice, or the columns
+        belong to several wavelengths; or a line does not hold one number for each column.
     """
+    lines, comments = _read_lines(path)
+    width = _width(lines)
+    start = next((i for i, line in enumerate(lines) if len(line.cells) == width and _is_row(line)), len(lines))
+    names, start = _find_heading(lines, comments, start, width, columns)
+    headings: Sequence[Heading | None]
+    if names:
+        names, start = _with_units(names, lines, start, columns)
+        headings = read_headings(path, names, columns, ignored)
+    else:
+        start = _without_heading(path, lines, start, width, columns, positional)
+        headings = [Heading(column, "", "") for column in columns]
+    rows = lines[start:]
+    values = np.array([_numbers(path, line, names, headings) for line in rows], dtype=np.float64)
+    wanted = [heading for heading in headings if heading is not None]
+    table = dict(zip((heading.column.name for heading in wanted), values.reshape(-1, len(wanted)).T, strict=True))
+    kept = complete_rows(path, table, [f"line {line.number}" for line in rows])
+    return Table(
+        {name: column[kept] for name, column in table.items()},
+        [rows[row].number for row in kept],
+        frozenset(heading.column.name for heading in wanted if not heading.unit),
+    )
+
+
+def read_two_columns(path: str | PathLike[str], first: Column, second: Column) -> Table:
+    """Read two columns as `read_table` does; without a heading they are in this order and in their first units."""
+    return read_table(path, (first, second), positional=True)
+
+
+def read_time_samples(path: str | PathLike[str], quantity: Column) -> tuple[FloatArray, FloatArray]:
+    """Read times [ns] and the values of a quantity, in any order below a heading, or in this order without one.
+
+    Raises
+    ------
+    UserError
+        As `read_table`; or if the unit of time is not given and the record is shorter than a picosecond in ns.
+    """
+    table = read_two_columns(path, TIME, quantity)
+    times, values = table.columns["time"], table.columns[quantity.name]
+    if times.size > 1 and "time" in table.without_unit and np.ptp(times) < _SHORTEST_RECORD:
+        raise UserError(
+            f"{path} has times from {times.min():g} to {times.max():g} without a unit, too short for ns: the heading"
+            " must name it, such as time_s."
+        )
+    return times, values
+
+
+def complete_rows(path: str | PathLike[str], columns: Mapping[str, FloatArray], places: Sequence[str]) -> IntArray:
+    """Return the indices of the rows without NaN; warn of the others, with the place of the first one."""
+    missing = np.zeros(len(places), dtype=bool)
+    for values in columns.values():
+        missing |= np.isnan(values)
+    if missing.any():
+        first = places[int(np.argmax(missing))]
+        logger.warning(
+            "%s: %d of %d rows left out for missing values, the first in %s", path, missing.sum(), len(places), first
+        )
+    return np.flatnonzero(~missing)
+
+
+def _read_lines(path: str | PathLike[str]) -> tuple[list[_Line], list[_Line]]:
+    """Return the lines of a file, and its comments."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}.") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is not a text file in UTF-8.") from error
-    lines = [(number, line.split("#")[0].strip()) for number, line in enumerate(text.splitlines(), start=1)]
-    return [(number, line) for number, line in lines if line]
+    lines: list[_Line] = []
+    comments: list[_Line] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        mark = _COMMENT.match(line)
+        content = line[mark.end() :] if mark else _INLINE_COMMENT.sub("", line)
+        if content.strip(" \t,;"):
+            (comments if mark else lines).append(_split(number, content.strip(" ")))
+    return lines, comments
 
 
-def read_two_columns(path: str | PathLike[str], columns: str) -> tuple[FloatArray, list[int]]:
-    """Read two columns of numbers separated by commas or spaces, below an optional heading without numbers.
-
-    Parameters
-    ----------
-    path : path-like
-        Text file; # starts a comment.
-    columns : str
-        Contents of the two columns, for the message.
-
-    Returns
-    -------
-    table : ndarray, shape (N, 2)
-    lines : list of int
-        Number of the line of each row.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read, or a line does not hold two numbers.
-    """
-    lines = [(number, line.replace(",", " ").split()) for number, line in read_lines(path)]
-    if lines and all(_number(word) is None for word in lines[0][1]):
-        del lines[0]
-    rows = []
-    for number, words in lines:
-        numbers = [_number(word) for word in words]
-        if len(numbers) != 2 or None in numbers:
-            raise UserError(f"{path}, line {number}: {' '.join(words)!r} must be two numbers, {columns}")
-        rows.append(numbers)
-    return np.array(rows, dtype=np.float64).reshape(len(rows), 2), [number for number, _ in lines]
+def _split(number: int, text: str) -> _Line:
+    """Split a line into cells."""
+    has_tab = "\t" in text
+    # Next to a tab or blank a comma separates; inside a number between tabs it is the decimal point.
+    has_comma = re.search(r",(\s|$)|\s,", text) if has_tab else "," in text
+    separator = ";" if ";" in text else "," if has_comma else "\t" if has_tab else ""
+    cells = [cell.strip(" \t\"'") for cell in (text.split(separator) if separator else text.split())]
+    if separator in (";", "\t"):
+        cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+    return _Line(number, text, separator, cells)
 
 
-def _number(word: str) -> float | None:
-    """Return a word as a number, or None."""
+def _width(lines: Sequence[_Line]) -> int:
+    """Return the most common number of cells in lines that hold mostly numbers, 0 if there are none."""
+    counts = Counter(
+        len(line.cells)
+        for line in lines
+        if any(_number(cell) is not None for cell in line.cells)
+        and 2 * sum(_is_number(cell) for cell in line.cells) > len(line.cells)
+    )
+    return counts.most_common(1)[0][0] if counts else 0
+
+
+def _is_row(line: _Line) -> bool:
+    """Return whether all cells are numbers or missing values, and not all of them missing."""
+    return all(map(_is_number, line.cells)) and any(_number(cell) is not None for cell in line.cells)
+
+
+def _find_heading(
+    lines: Sequence[_Line], comments: Sequence[_Line], start: int, width: int, columns: Sequence[Column]
+) -> tuple[list[str], int]:
+    """Return the names of the heading and the index of the line below it; no names and `start` if there is none."""
+    for i, line in enumerate(lines[:start]):
+        names = line.heading(width)
+        known = sum(parse_heading(name, columns) is not None for name in names)
+        if known > 1 and (len(names) in (width, known) or not width) and not any(map(_is_number, filter(None, names))):
+            return names, i + 1
+    for line in comments:
+        names = line.heading(width)
+        if len(names) == width > 1 and all(parse_heading(name, columns) for name in names):
+            below = sum(other.number < line.number for other in lines)
+            if below <= start:
+                return names, below
+    return [], start
+
+
+def _with_units(
+    names: list[str], lines: Sequence[_Line], start: int, columns: Sequence[Column]
+) -> tuple[list[str], int]:
+    """Return the names with the units of the line below them, and the index of the first row."""
+    cells = lines[start].cells if start < len(lines) else []
+    if len(cells) != len(names) or all(map(_is_number, cells)):
+        return names, start
+    named = [(name, parse_heading(name, columns), cell) for name, cell in zip(names, cells, strict=True)]
+    if not all(is_unit(cell, heading.column) for _, heading, cell in named if heading):
+        return names, start
+    full = [f"{name} [{cell}]" if heading and cell and not heading.unit else name for name, heading, cell in named]
+    return full, start + 1
+
+
+def _without_heading(
+    path: str | PathLike[str],
+    lines: Sequence[_Line],
+    start: int,
+    width: int,
+    columns: Sequence[Column],
+    positional: bool,
+) -> int:
+    """Return the index of the first row of a file without heading; refuse unknown headings."""
+    row = lines[start] if start < len(lines) else None
+    for i, line in enumerate(lines[:start]):
+        if _number(line.cells[0]) is not None and len(line.cells) == width:
+            start = i
+            break
+        names = line.heading(width)
+        if row is None or (len(names) == width and line.separator == row.separator):
+            raise unknown_columns(path, names, columns)
+    if not positional:
+        raise unknown_columns(path, [], columns)
+    if start < len(lines):
+        logger.info("%s: no heading, read as %s", path, " and ".join(_with_first_unit(column) for column in columns))
+    return start
+
+
+def _numbers(
+    path: str | PathLike[str], line: _Line, names: Sequence[str], headings: Sequence[Heading | None]
+) -> list[float]:
+    """Return the numbers of a line in the first units of their columns, NaN where one is missing."""
+    cells = line.cells
+    values = [_value(cell, heading) for cell, heading in zip(cells, headings, strict=False) if heading is not None]
+    numbers = [value for value in values if value is not None]
+    if len(cells) == len(headings) and len(numbers) == len(values):
+        return numbers
+    where = f"{path}, line {line.number}"
+    if not names:
+        wanted = " and ".join(_with_first_unit(heading.column) for heading in headings if heading)
+        raise UserError(f"{where}: {' '.join(cells)!r} must be two numbers, {wanted}")
+    if len(cells) != len(names):
+        raise UserError(f"{where} has {len(cells)} values but must have {len(names)}, one for each column.")
+    wrong = next(i for i, heading in enumerate(headings) if heading and _value(cells[i], heading) is None)
+    raise UserError(f"{where}: {names[wrong]} = {cells[wrong]!r} must be a number.")
+
+
+def _value(cell: str, heading: Heading) -> float | None:
+    """Return a cell in the first unit of its column, NaN if it is missing, None if it is no number."""
+    number = np.nan if cell.lower() in _MISSING else _number(cell)
+    if number is None:
+        return None
+    return np.nan if heading.column.fill_values and number in _FILL_VALUES else number * heading.factor
+
+
+def _with_first_unit(column: Column) -> str:
+    """Return the name of a column with the unit that holds without a heading."""
+    unit = next(iter(column.units), "")
+    return f"{column.name} in {unit}" if unit.isalpha() else column.name
+
+
+def _number(cell: str) -> float | None:
+    """Return a cell as a number, or None."""
     try:
-        return float(word)
+        return float(cell)
     except ValueError:
         return None
+
+
+def _is_number(cell: str) -> bool:
+    return cell.lower() in _MISSING or _number(cell) is not None

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.text_tables import read_two_columns
+from mitransient_lidar.core.headings import UNITLESS, Column
+from mitransient_lidar.core.text_tables import read_time_samples
 from mitransient_lidar.core.validation import FloatArray, in_range, non_negative, positive, time_samples
 from mitransient_lidar.physics.piecewise_linear import integral
 
@@ -18,6 +19,8 @@ _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
 
 #: Relative tolerance of the sum of half edges against the width, for rounded decimals.
 _ROUNDING = 1e-9
+
+_TRANSMISSION = Column("transmission", ("transmittance", "gate", "gain", "value"), UNITLESS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +101,11 @@ class GateShape:
 
     @classmethod
     def from_file(cls, path: str | PathLike[str]) -> GateShape:
-        """Read a measured gate from two columns of a text file, times and transmissions as for `sampled`."""
-        table, _ = read_two_columns(path, "time in ns and transmission")
-        return cls.sampled(*table.T)
+        """Read a measured gate, times and transmissions as for `sampled`, from a text file.
+
+        The columns are those of `core.text_tables.read_time_samples`; a transmission may be in %.
+        """
+        return cls.sampled(*read_time_samples(path, _TRANSMISSION))
 
     @property
     def span_ns(self) -> tuple[float, float]:

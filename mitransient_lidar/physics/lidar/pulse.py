@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from os import PathLike
 from typing import Literal
@@ -10,12 +11,26 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.text_tables import read_two_columns
+from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.text_tables import read_time_samples
 from mitransient_lidar.core.validation import FloatArray, non_negative, positive, time_samples
 from mitransient_lidar.physics.piecewise_linear import integral, locate, node_integrals
 
+logger = logging.getLogger(__name__)
+
 FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 _TAIL = 1e-10  # energy left out at each end of a kernel
+
+#: Lowest sample of a file relative to the largest one; what lies below 0 is noise.
+_LOWEST_SAMPLE = -0.1
+
+_POWER = Column(
+    "power",
+    (
+        *("p", "w", "mw", "signal", "amplitude", "ampl", "intensity", "irradiance", "energy", "counts", "current"),
+        *("v", "mv", "volt", "volts", "voltage", "ch1", "ch2", "ch3", "ch4"),
+    ),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +82,37 @@ class Pulse:
 
     @classmethod
     def from_file(cls, path: str | PathLike[str]) -> Pulse:
-        """Read a sampled pulse from two columns of a text file, times and powers as for `sampled`."""
-        table, _ = read_two_columns(path, "time in ns and power")
-        return cls.sampled(*table.T)
+        """Read a sampled pulse from a text file.
+
+        Parameters
+        ----------
+        path : path-like
+            File for `core.text_tables.read_time_samples`: times as for `sampled`, and the power in any unit, which may
+            be called power, signal, amplitude, intensity, voltage, counts, W, V or mV, among others. Samples below 0,
+            down to -0.1 of the largest one, are noise and set to 0 with a warning in the log.
+
+        Raises
+        ------
+        UserError
+            If the file cannot be read, a sample is lower than that, or `sampled` refuses the samples.
+        """
+        times, power = read_time_samples(path, _POWER)
+        lowest = power.min(initial=0.0)
+        if lowest < 0 and np.all(np.isfinite(power)):
+            if lowest < _LOWEST_SAMPLE * power.max():
+                raise UserError(
+                    f"{path} has power = {lowest:g} with a largest one of {power.max():g}: samples must not be negative"
+                    " beyond noise, a tenth of the largest one."
+                )
+            logger.warning(
+                "%s: %d of %d samples are below 0, down to %.2g of the largest one, and set to 0",
+                path,
+                np.sum(power < 0),
+                power.size,
+                lowest / power.max(),
+            )
+            power = np.maximum(power, 0.0)
+        return cls.sampled(times, power)
 
     def cumulative(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Fraction of the energy that has left the transmitter by the times `t_ns` [ns]."""

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.data_tables import PhaseFunction, log_log_interpolation
@@ -18,6 +19,10 @@ _COUNT = 32768
 
 _FEWEST_ANGLES = 10
 _SMALLEST_LAST_DEG = 170.0
+
+_DEGREES = {**dict.fromkeys(("degrees", "deg", "degree", "°"), 1.0), **dict.fromkeys(("rad", "radians"), 180 / np.pi)}
+_ANGLE = Column("angle", ("theta", "scattering angle"), _DEGREES)
+_VALUE = Column("value", ("p", "phase function", "beta", "beta tilde", "vsf", "volume scattering function"))
 
 
 class MeasuredPhase(NamedTuple):
@@ -33,9 +38,9 @@ def read_phase_table(path: str | PathLike[str]) -> MeasuredPhase:
     Parameters
     ----------
     path : path-like
-        Text file of two columns, separated by commas or spaces: scattering angle [deg], increasing within 0 to 180, at
-        least 10 of any spacing, the last 170 or more; and value, positive, in 1/sr or any other unit per solid angle
-        (such as a volume scattering function). # starts a comment; a first line without numbers is a heading.
+        Text file of two columns, as `core.text_tables.read_table` reads it: scattering angle in degrees, or in rad if
+        its heading says so, increasing within 0 to 180 degrees, at least 10 of any spacing, the last 170 or more; and
+        value, positive, in 1/sr or any other unit per solid angle (such as a volume scattering function).
 
     Returns
     -------
@@ -80,9 +85,10 @@ def _interpolation(path: str | PathLike[str], theta: FloatArray, value: FloatArr
 
 def _read_columns(path: str | PathLike[str]) -> tuple[FloatArray, FloatArray]:
     """Return angles [rad], shape (N,), and values, shape (N,)."""
-    table, lines = read_two_columns(path, "angle in degrees and value")
+    columns, lines, _ = read_two_columns(path, _ANGLE, _VALUE)
+    angles, values = columns["angle"], columns["value"]
     last = None
-    for number, (angle, value) in zip(lines, table, strict=True):
+    for number, angle, value in zip(lines, angles, values, strict=True):
         here = f"{path}, line {number}"
         if not 0 <= angle <= 180:
             raise UserError(f"{here}: angle = {angle:g} must lie between 0 and 180 degrees")
@@ -91,10 +97,10 @@ def _read_columns(path: str | PathLike[str]) -> tuple[FloatArray, FloatArray]:
         if not 0 < value < np.inf:
             raise UserError(f"{here}: value = {value:g} must be finite and greater than 0")
         last = angle
-    if len(table) < _FEWEST_ANGLES:
-        raise UserError(f"{path} has {len(table)} angles but must have at least {_FEWEST_ANGLES}")
-    if table[-1, 0] < _SMALLEST_LAST_DEG:
+    if len(angles) < _FEWEST_ANGLES:
+        raise UserError(f"{path} has {len(angles)} angles but must have at least {_FEWEST_ANGLES}")
+    if angles[-1] < _SMALLEST_LAST_DEG:
         raise UserError(
-            f"{path} ends at {table[-1, 0]:g} degrees but its last angle must be at least {_SMALLEST_LAST_DEG:g}"
+            f"{path} ends at {angles[-1]:g} degrees but its last angle must be at least {_SMALLEST_LAST_DEG:g}"
         )
-    return np.radians(table[:, 0]), table[:, 1].copy()
+    return np.radians(angles), values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,13 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.array_files import read_netcdf, readable_suffix
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.text_tables import read_lines
+from mitransient_lidar.core.headings import METRES, PER_METRE, UNITLESS, Column, read_headings
+from mitransient_lidar.core.text_tables import complete_rows, read_table
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
+
+logger = logging.getLogger(__name__)
 
 COEFFICIENT_FLOOR = 1e-4
 """Attenuation and scattering [1/m] below which tolerances are absolute; pure sea water scatters 20 times as much."""
@@ -26,7 +30,37 @@ THINNEST_LAYER = 1e-6
 """Least thickness of a layer [m], in steep profiles."""
 
 _PROPERTIES = ("a", "b", "c", "omega")
-_COLUMNS = ("depth", *_PROPERTIES, "bb", "bb_ratio")
+
+_COLUMNS = (
+    Column("depth", ("d", "dep", "depths", "water depth"), METRES),
+    Column("z", (), METRES),
+    *(
+        Column(name, aliases, PER_METRE, spectral=True, fill_values=True)
+        for name, aliases in {
+            "a": ("absorption", "absorption coefficient"),
+            "b": ("scattering", "scattering coefficient"),
+            "c": ("attenuation", "attenuation coefficient", "beam attenuation", "beam attenuation coefficient"),
+            "bb": ("backscattering", "backscatter", "backscattering coefficient"),
+        }.items()
+    ),
+    *(
+        Column(name, aliases, UNITLESS, spectral=True, fill_values=True)
+        for name, aliases in {
+            "omega": ("omega0", "w0", "albedo", "single scattering albedo", "b/c"),
+            "bb_ratio": ("bb/b", "backscatter ratio", "backscattering ratio"),
+        }.items()
+    ),
+)
+
+#: First words of other columns in the files of probes.
+_OTHER_QUANTITIES = frozenset(
+    {
+        *("time", "date", "datetime", "timestamp", "hour", "station", "cast", "record", "scan", "index", "flag"),
+        *("latitude", "lat", "longitude", "lon", "temperature", "temp", "t", "salinity", "sal", "s", "density"),
+        *("pressure", "pres", "p", "conductivity", "cond", "oxygen", "ph", "turbidity", "chlorophyll", "chl", "chla"),
+        *("fluorescence", "cdom", "fdom", "par", "kd"),
+    }
+)
 
 #: Tolerance, relative to c, of more than two given properties, for rounded decimals.
 _DISAGREEMENT = 0.02
@@ -225,90 +259,93 @@ def read_profile(path: str | os.PathLike[str]) -> Profile:
     Parameters
     ----------
     path : path
-        ``.csv``, columns separated by commas below a line with their names, # starts a comment; or ``.nc``, NetCDF-4
-        with variables over the dimension ``depth``. Names:
+        ``.csv``, ``.txt``, ``.dat`` or ``.tsv``, a table that `core.text_tables.read_table` reads, or ``.nc``, NetCDF-4
+        with variables over the dimension ``depth`` or ``z``, whose attribute ``units`` is read. Names of columns, in
+        any order, with or without unit and wavelength (``depth_m``, ``a532``, ``c(532) 1/m``):
 
-        ``depth``
-            depth [m], at least 0, increasing;
+        ``depth`` or ``z``
+            depth [m], at least 0; z may also be the height, at most 0;
         ``a``, ``b``, ``c``, ``omega``
             absorption, scattering, attenuation [1/m], at least 0, and albedo b/c, 0 to 1: any two of them. If there
             are more, the first two in this order are used, and the others must agree with them within 2 % of c;
         ``bb`` or ``bb_ratio``
             backscattering [1/m], at most b, or its ratio to b, 0 to 1. Default: the ratio 0.0183.
 
-        Other columns, or variables over the depth alone, are rejected as possible misspellings.
+        Rows are sorted by depth, and those of one depth are averaged. Rows with missing values are left out; of
+        coefficients, -99, -999, -9999 and -99999 count as missing. The log tells of all this. Columns of other
+        quantities that a probe measures, such as temperature or time, are not used; all others are rejected as possible
+        misspellings.
 
     Returns
     -------
     Profile
-        a, b and bb are linear between the rows of the file.
+        a, b and bb are linear between the depths of the file.
 
     Raises
     ------
     UserError
-        If the file is missing, damaged or of another format; names are unknown, missing or repeated; a value is not a
-        finite number within its range, or contradicts the others; depths do not increase, or are fewer than 2. The
-        message names the line, or the index along ``depth``.
+        If the file is missing, damaged or of another format; names or units are unknown, missing or repeated; a value
+        is not a number within its range, or contradicts the others; or there are fewer than 2 depths. The message names
+        the line, or the index along the dimension.
     """
     path = Path(path)
-    readers = {".csv": _read_csv, ".nc": _read_netcdf}
+    readers = {**dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_text), ".nc": _read_netcdf}
     columns, places = readers[readable_suffix(path, readers, "profile")](path)
-    if len(places) < 2:
-        raise UserError(f"{path} has {len(places)} depths but a profile must have at least 2.")
     try:
-        return _profile(columns)
+        columns = _in_order(path, _checked(path, columns))
     except _RowError as error:
         raise UserError(f"{path}, {places[error.row]}: {error.text}.") from None
+    if columns["depth"].size < 2:
+        raise UserError(f"{path} has {columns['depth'].size} depths but a profile must have at least 2.")
+    return Profile(**columns)
 
 
-def _read_csv(path: Path) -> tuple[_Columns, list[str]]:
+def _read_text(path: Path) -> tuple[_Columns, list[str]]:
     """Return the columns by name, and the line of each row."""
-    cells = [(n, [cell.strip() for cell in line.split(",")]) for n, line in read_lines(path)]
-    rows = [(n, row) for n, row in cells if any(row)]
-    names = rows[0][1] if rows else []
-    _check_names(path, names)
-    table = []
-    for n, row in rows[1:]:
-        if len(row) != len(names):
-            raise UserError(f"{path}, line {n} has {len(row)} values but must have {len(names)}, one for each column.")
-        for name, cell in zip(names, row, strict=True):
-            try:
-                table.append(float(cell))
-            except ValueError:
-                raise UserError(f"{path}, line {n}: {name} = {cell!r} must be a number.") from None
-    values = np.reshape(table, (-1, len(names)))
-    return dict(zip(names, values.T, strict=True)), [f"line {n}" for n, _ in rows[1:]]
+    table = read_table(path, _COLUMNS, _OTHER_QUANTITIES)
+    _check_names(path, list(table.columns))
+    return table.columns, [f"line {number}" for number in table.lines]
 
 
 def _read_netcdf(path: Path) -> tuple[_Columns, list[str]]:
-    """Return the variables by name, and the index of each depth."""
-    columns = {name: item.values for name, item in read_netcdf(path).items() if item.dims == ("depth",)}
+    """Return the variables by name, and the index of each row along the dimension."""
+    variables = read_netcdf(path)
+    dimension = "depth" if any(item.dims == ("depth",) for item in variables.values()) else "z"
+    profiles = {name: item for name, item in variables.items() if item.dims == (dimension,)}
+    names = [f"{name} [{item.units}]" if item.units else name for name, item in profiles.items()]
+    headings = read_headings(path, names, _COLUMNS, _OTHER_QUANTITIES)
+    columns: _Columns = {}
+    for (name, item), heading in zip(profiles.items(), headings, strict=True):
+        if heading is not None:
+            if item.values.dtype.kind not in "iuf":
+                raise UserError(f"{path} has {name} of type {item.values.dtype}, but it must hold real numbers.")
+            columns[heading.column.name] = item.values.astype(np.float64) * heading.factor
     _check_names(path, list(columns))
-    for name, values in columns.items():
-        if values.dtype.kind not in "iuf":
-            raise UserError(f"{path} has {name} of type {values.dtype}, but it must hold real numbers.")
-    places = [f"index {i} of depth" for i in range(columns["depth"].size)]
-    return {name: values.astype(np.float64) for name, values in columns.items()}, places
+    places = [f"index {i} of {dimension}" for i in range(next(iter(columns.values())).size)]
+    kept = complete_rows(path, columns, places)
+    return {name: values[kept] for name, values in columns.items()}, [places[row] for row in kept]
 
 
 def _check_names(path: Path, names: list[str]) -> None:
-    """Reject unknown, repeated, missing and contradictory names of columns."""
-    allowed = ", ".join(_COLUMNS)
-    for name in names:
-        if name not in _COLUMNS:
-            raise UserError(f"{path} has an unknown column {name!r}: allowed are {allowed}.")
-        if names.count(name) > 1:
-            raise UserError(f"{path} has {names.count(name)} columns {name!r} but must have only one of them.")
-    if "depth" not in names or sum(name in _PROPERTIES for name in names) < 2:
+    """Reject missing and contradictory columns."""
+    if ("depth" in names) == ("z" in names) or sum(name in _PROPERTIES for name in names) < 2:
         raise UserError(
-            f"{path} has the columns {', '.join(names) or 'none'}: needed are depth and two of a, b, c, omega."
+            f"{path} has the columns {', '.join(names) or 'none'}: needed are depth or z and two of a, b, c, omega."
         )
     if "bb" in names and "bb_ratio" in names:
         raise UserError(f"{path} has the columns bb and bb_ratio, but must have only one of them.")
 
 
-def _profile(columns: _Columns) -> Profile:
-    """Return the profile of columns with valid names."""
+def _checked(path: Path, columns: _Columns) -> _Columns:
+    """Return depth, absorption, scattering and backscattering of the rows, as they follow in the file."""
+    z = columns.pop("z", None)
+    if z is not None:
+        heights = bool(np.all(z <= 0) and np.any(z < 0))
+        if heights:
+            logger.info("%s: z is the height, from %g to %g m", path, z.min(), z.max())
+        elif np.any(z < 0):
+            _require(z >= 0, "z = {:g} must not be negative, unless all z are heights of at most 0", z)
+        columns["depth"] = np.abs(z)
     for name, values in columns.items():
         _require(np.isfinite(values), name + " = {:g} must be finite", values)
         _require(values >= 0, name + " = {:g} must not be negative", values)
@@ -316,7 +353,22 @@ def _profile(columns: _Columns) -> Profile:
             _require(values <= 1, name + " = {:g} must lie between 0 and 1", values)
     a, b = _absorption_scattering(columns)
     bb = columns["bb"] if "bb" in columns else columns.get("bb_ratio", PETZOLD_BACKSCATTER_RATIO) * b
-    return Profile(columns["depth"], a, b, bb)
+    _require(bb <= b, "bb = {:g} 1/m must not exceed b = {:g} 1/m", bb, b)
+    return {"depth": columns["depth"], "absorption": a, "scattering": b, "backscattering": bb}
+
+
+def _in_order(path: Path, columns: _Columns) -> _Columns:
+    """Return the columns by increasing depth, with the rows of one depth averaged."""
+    falling = int(np.sum(np.diff(columns["depth"]) < 0))
+    depth, index, counts = np.unique(columns["depth"], return_inverse=True, return_counts=True)
+    if falling:
+        logger.info("%s: rows sorted by depth, which decreases %d times", path, falling)
+    if depth.size < index.size:
+        logger.warning("%s: %d rows averaged to %d different depths", path, index.size, depth.size)
+    averaged = {name: np.bincount(index, values) / counts for name, values in columns.items()}
+    # Rounding of the averages may make bb exceed an equal b.
+    averaged["backscattering"] = np.minimum(averaged["backscattering"], averaged["scattering"])
+    return {**averaged, "depth": depth}
 
 
 def _absorption_scattering(columns: _Columns) -> tuple[FloatArray, FloatArray]:

@@ -1,10 +1,16 @@
-"""Tables in text files, and line numbers of their errors."""
+"""Tables in text files as instruments write them, and line numbers of their errors."""
+
+import logging
 
 import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.text_tables import read_lines, read_two_columns
+from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.text_tables import read_table, read_time_samples
+
+POWER = Column("power", ("p", "v", "mv"))
+TIMES, VALUES = [0.0, 0.5, 2.0], [0.0, 3e-1, 1.0]
 
 
 @pytest.fixture
@@ -12,34 +18,100 @@ def path(tmp_path):
     return tmp_path / "table.txt"
 
 
-def test_lines_keep_their_numbers(path):
-    path.write_text("# comment\n\n a, b # units\n1,2\n", encoding="utf-8-sig")
-    assert read_lines(path) == [(3, "a, b"), (4, "1,2")]
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,0\n0.5,0.3\n2,1\n",
+        "time (ns), power\n0, 0\n# gap\n0.5\t3e-1\n 2 1 # tail\n",
+        "\ufeff# Laser 7\r\n\r\ntime_ns;power\r\n0;0\r\n0.5;0.3\r\n2;1\r\n",
+        "power\tt [ps]\n0\t0\n0.3\t500\n1\t2000\n",
+        "t / ps   V\n0 0\n500 0.3\n2000 1\n",
+        "TIME [ns]  P [a.u.]\n0 0\n0.5 0.3\n2 1\n",
+        "Instrument 4711\nShots;12\nt;power\nµs;mW\n0;0\n5e-4;0,3\n2e-3;1\n",
+        "# measured in 2024\n# time_s power\n0 0\n5e-10 0.3\n2e-9 1\n",
+        "% a comment\n! another one\n// a third\nns,mV,\n0,0,\n0.5,0.3,\n2,1,\n",
+        "time_ns,power\n0,0\n0.3,NaN\n0.5,0.3\n,4\n2,1\n9,--\n9,n/a\n",
+        '"Time (s)"\t"Power"\n0\t0\n5e-10\t0,3\n2e-9\t1\n',
+    ],
+)
+def test_the_same_samples_in_any_form(path, text):
+    path.write_bytes(text.encode())
+    times, values = read_time_samples(path, POWER)
+    np.testing.assert_allclose(times, TIMES, rtol=1e-15)
+    np.testing.assert_array_equal(values, VALUES)
 
 
-@pytest.mark.parametrize("heading", ["", "time (ns), power\n"])
-def test_two_columns(path, heading):
-    path.write_text(heading + "0, 1\n# gap\n2 3e-1\n")
-    table, lines = read_two_columns(path, "time and power")
-    np.testing.assert_array_equal(table, [[0, 1], [2, 0.3]])
-    assert lines == [1 + bool(heading), 3 + bool(heading)]
+def test_lines_keep_their_numbers_and_missing_rows_are_told(path, caplog):
+    path.write_text("\nt,power\n# x\n1,2\n1,nan\n3,4\n5,\n")
+    with caplog.at_level(logging.INFO):
+        table = read_time_table(path)
+    assert table.lines == [4, 6]
+    assert caplog.messages == [f"{path}: 2 of 4 rows left out for missing values, the first in line 5"]
+
+
+def read_time_table(path):
+    return read_table(path, (Column("time", ("t",), {"ns": 1.0}), POWER))
+
+
+def test_a_file_without_heading_is_told(path, caplog):
+    path.write_text("Laser pulse of 2024\n0 0\n1 2\n")
+    with caplog.at_level(logging.INFO):
+        read_time_samples(path, POWER)
+    assert caplog.messages == [f"{path}: no heading, read as time in ns and power"]
+
+
+def test_fill_values_count_as_missing_only_where_the_column_says_so(path):
+    columns = Column("a", fill_values=True), Column("b")
+    path.write_text("a,b\n1,-9999\n-9999,1\n-999.0,1\n2,3\n")
+    table = read_table(path, columns)
+    np.testing.assert_array_equal(table.columns["a"], [1, 2])
+    np.testing.assert_array_equal(table.columns["b"], [-9999, 3])
+
+
+def test_other_columns_of_text_are_ignored_if_they_are_known(path, caplog):
+    path.write_text("date,b,station,a\n2024-05-01,1,A7,2\n2024-05-02,3,A8,4\n")
+    with caplog.at_level(logging.INFO):
+        table = read_table(path, (Column("a"), Column("b")), {"date", "station"})
+    np.testing.assert_array_equal(table.columns["a"], [2, 4])
+    np.testing.assert_array_equal(table.columns["b"], [1, 3])
+    assert caplog.messages == [f"{path}: columns date, station are not used"]
 
 
 def test_empty_files_have_no_rows(path):
     path.write_text("# only a comment\n")
-    assert read_two_columns(path, "time and power")[0].shape == (0, 2)
+    times, values = read_time_samples(path, POWER)
+    assert times.shape == values.shape == (0,)
 
 
-@pytest.mark.parametrize("line", ["1 2 3", "1", "1 x", "time power"])
-def test_lines_without_two_numbers_are_rejected(path, line):
-    path.write_text(f"0 0\n{line}\n")
-    with pytest.raises(UserError, match=f"table.txt, line 2: '{line}' must be two numbers, time and power"):
-        read_two_columns(path, "time and power")
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        *((f"0 0\n{line}\n", f"line 2: '{line}' must be two numbers, time in ns and power") for line in ("1 2 3", "1")),
+        ("0 0\n1 x\n", "line 2: '1 x' must be two numbers, time in ns and power"),
+        ("0 x\n1 2\n3 4\n", "line 1: '0 x' must be two numbers"),
+        ("0 0\ntime power\n", "line 2: 'time power' must be two numbers"),
+        ("t,power\n0,0\n1,x\n", r"line 3: power = 'x' must be a number\.$"),
+        ("t,power\n0,0\n1,2,3\n4,5\n", r"line 3 has 3 values but must have 2, one for each column\.$"),
+        (
+            "t [fs],power\n0,0\n1,2\n",
+            r"unit in column 't \[fs\]' \(found: t \[fs\], power\): allowed are time \[ns, ps, us, ms, s\], power",
+        ),
+        ("Zeit,Leistung\n0,0\n1,2\n", r"no heading with known columns \(found: Zeit, Leistung\): allowed are time"),
+        ("t,power,CH1\n0,0,1\n1,2,1\n", r"unknown column 'CH1' \(found: t, power, CH1\): allowed are time .*, power\."),
+        ("t,V,mV\n0,0,1\n1,2,1\n", "has 2 columns V and mV for power: allowed is one"),
+        ("t,power\n0,0\n4e-9,1\n", "times from 0 to 4e-09 without a unit, too short for ns: .* such as time_s"),
+    ],
+)
+def test_unclear_tables_are_rejected(path, text, message):
+    path.write_text(text)
+    with pytest.raises(UserError, match=message) as error:
+        read_time_samples(path, POWER)
+    assert "\n" not in str(error.value)
 
 
 def test_unreadable_files_are_rejected(path):
     with pytest.raises(UserError, match=r"cannot read .*table.txt: No such file or directory"):
-        read_lines(path)
+        read_time_samples(path, POWER)
     path.write_bytes(b"\xff")
     with pytest.raises(UserError, match=r"table.txt is not a text file in UTF-8"):
-        read_lines(path)
+        read_time_samples(path, POWER)

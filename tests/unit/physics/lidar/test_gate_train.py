@@ -57,6 +57,8 @@ def test_profile_files(tmp_path):
     path = tmp_path / "gate.csv"
     path.write_text("# ns, transmission\n0, 0\n1 1\n\n3,0 # end\n")
     assert GateShape.from_file(path).width_ns == pytest.approx(1.5)
+    path.write_text("gate [%]; t [ps]\n0; 0\n100; 1000\n0; 3000\n")
+    assert GateShape.from_file(path).width_ns == pytest.approx(1.5)
     path.write_text("1 2 3\n4 5 6\n")
     with pytest.raises(ValueError, match="line 1: '1 2 3' must be two numbers, time in ns and transmission"):
         GateShape.from_file(path)

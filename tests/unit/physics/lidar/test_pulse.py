@@ -39,6 +39,19 @@ def test_pulse_file(tmp_path):
         Pulse.from_file(path)
 
 
+def test_pulse_file_of_an_oscilloscope(tmp_path, caplog):
+    """The noise below 0 is cut off; a pulse of the wrong sign is refused."""
+    path = tmp_path / "pulse.txt"
+    path.write_bytes(b"Model;4711\r\nTime [s];CH1 (mV)\r\n-1e-9;-0,5\r\n0;0\r\n1e-9;40\r\n4e-9;0\r\n")
+    pulse = Pulse.from_file(path)
+    np.testing.assert_allclose(pulse.times_ns, [-2, -1, 0, 3], rtol=1e-12)
+    np.testing.assert_allclose(pulse.power, [0, 0, 0.5, 0], rtol=1e-12)
+    assert caplog.messages == [f"{path}: 1 of 4 samples are below 0, down to -0.013 of the largest one, and set to 0"]
+    path.write_text("ns, V\n0, 0\n1, -1\n2, 0.1\n")
+    with pytest.raises(ValueError, match=r"pulse.txt has power = -1 with a largest one of 0.1: samples must not be"):
+        Pulse.from_file(path)
+
+
 @pytest.mark.parametrize("bin_width", [0.1, 0.5, 5.0, 200.0])
 @pytest.mark.parametrize("response", [0.0, 1e-4, 2.0, 50.0])
 def test_gaussian_kernel(bin_width, response):

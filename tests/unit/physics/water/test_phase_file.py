@@ -38,6 +38,15 @@ def test_henyey_greenstein_at_uneven_angles(tmp_path, g):
     assert integral == pytest.approx(1, abs=3e-3)
 
 
+def test_angles_in_rad(tmp_path):
+    degrees = uneven_angles()
+    values = henyey_greenstein(np.radians(degrees), 0.9)
+    expected = read_phase_table(write(tmp_path / "degrees.csv", degrees, values))
+    path = write(tmp_path / "rad.csv", np.radians(degrees), values)
+    path.write_text("theta [rad], vsf [1/sr]\n" + path.read_text())
+    np.testing.assert_allclose(read_phase_table(path).table.value, expected.table.value, rtol=1e-9)
+
+
 @pytest.mark.parametrize("factor", [3.0, 4 * np.pi, 0.15])
 def test_factor_of_unnormalised_values(tmp_path, factor):
     degrees = uneven_angles()
@@ -109,8 +118,7 @@ GOOD = [f"{angle} 1" for angle in range(10, 190, 10)]
         ([], "phase.txt has 0 angles but must have at least 10"),
         (GOOD[-9:], "has 9 angles but must have at least 10"),
         (GOOD[:-2], "ends at 160 degrees but its last angle must be at least 170"),
-        (["# x", *GOOD[:3], "nan 1", *GOOD[4:]], "phase.txt, line 5: angle = nan must lie between 0 and 180 degrees"),
-        ([*GOOD[:3], "40 nan", *GOOD[4:]], "line 4: value = nan must be finite and greater than 0"),
+        (["# x", *GOOD[:3], "inf 1", *GOOD[4:]], "phase.txt, line 5: angle = inf must lie between 0 and 180 degrees"),
         ([*GOOD[:3], "40 inf", *GOOD[4:]], "line 4: value = inf must be finite and greater than 0"),
         ([*GOOD[:3], "40 0", *GOOD[4:]], "line 4: value = 0 must be finite and greater than 0"),
         (["-1 1", *GOOD], "line 1: angle = -1 must lie between 0 and 180 degrees"),

@@ -1,5 +1,7 @@
 """Continuous profiles: from files, and as layers whose optical depths are those of the linear profile."""
 
+import logging
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -202,22 +204,83 @@ def test_comments_and_blank_lines(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "z,a,b,bb\n0,0.1,0.2,0.01\n-1.5,0.2,0.4,0.02\n-4,0.1,0.2,0.01\n",
+        "Station 7\n\nbb532;depth_m;c(532) 1/m;T;a532\n0,01;4;0,3;12,5;0,1\n0,02;1,5;0,6;12;0,2\n0,01;0;0,3;12;0,1\n",
+        "\ufeffDepth [cm]\tb\ta\tbb/b\r\n0\t0.2\t0.1\t0.05\r\n150\t0.4\t0.2\t0.05\r\n400\t0.2\t0.1\t0.05\r\n",
+        "# probe 3\ndepth a     b bb\nm  1/m   1/m   1/m\n0 0.1 0.2 0.01\n1.5 0.2 0.4 0.02\n4 0.1 0.2 0.01\n",
+        "depth,omega,c,bb\n0,0.666666666666666667,0.3,0.01\n1.5,0.666666666666666667,0.6,0.02\n2,-9999,1,1\n4,0.666666666666666667,.3,.01",
+        "depth,a,b,bb\n4,0.1,0.2,0.01\n1.5,0.1,0.3,0.01\n1.5,0.3,0.5,0.03\n0,0.1,0.2,0.01\n1,nan,1,1\n",
+    ],
+)
+def test_the_same_profile_in_any_form(tmp_path, text):
+    path = tmp_path / "water.txt"
+    path.write_bytes(text.encode())
+    read = read_profile(path)
+    np.testing.assert_allclose(read.depth, [0, 1.5, 4], rtol=1e-15)
+    np.testing.assert_allclose(read.absorption, [0.1, 0.2, 0.1], rtol=1e-14)
+    np.testing.assert_allclose(read.scattering, [0.2, 0.4, 0.2], rtol=1e-14)
+    np.testing.assert_allclose(read.backscattering, [0.01, 0.02, 0.01], rtol=1e-14)
+
+
+def test_what_is_done_to_a_file_is_told(tmp_path, caplog):
+    path = tmp_path / "water.csv"
+    path.write_text("z, time, a532, b\n-4,8,1,1\n-4,9,2,2\n-2,10,,1\n0,11,1,1\n-9,12,2,2\n")
+    with caplog.at_level(logging.INFO):
+        read = read_profile(path)
+    np.testing.assert_array_equal(read.depth, [0, 4, 9])
+    np.testing.assert_array_equal(read.absorption, [1, 1.5, 2])
+    assert caplog.messages == [
+        f"{path}: coefficients at 532 nm",
+        f"{path}: columns time are not used",
+        f"{path}: 1 of 5 rows left out for missing values, the first in line 4",
+        f"{path}: z is the height, from -9 to 0 m",
+        f"{path}: rows sorted by depth, which decreases 1 times",
+        f"{path}: 4 rows averaged to 3 different depths",
+    ]
+
+
+def test_units_of_netcdf_variables(tmp_path):
+    path = tmp_path / "water.nc"
+    units = {"depth": "cm", "a": "m-1", "b": "km**-1"}
+    values = {"depth": [0.0, 300.0], "a": [0.1, 0.2], "b": [100.0, 200.0]}
+    variables = {name: ("depth", values[name], {"units": unit}) for name, unit in units.items()}
+    xr.Dataset(variables).to_netcdf(path, engine="h5netcdf")
+    read = read_profile(path)
+    np.testing.assert_allclose(read.depth, [0, 3], rtol=1e-15)
+    np.testing.assert_allclose(read.scattering, read.absorption, rtol=1e-15)
+    xr.Dataset({**variables, "a": ("depth", values["a"], {"units": "W"})}).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"water.nc has an unknown unit in column 'a \[W\]'"):
+        read_profile(path)
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"water.csv has the columns none: needed are depth and two of a, b, c, omega\.$"),
-        ("a,b\n0,0\n0,0", "has the columns a, b: needed are depth and two of a, b, c, omega"),
-        ("depth,c,bb\n0,1,0\n1,1,0", "has the columns depth, c, bb: needed are depth and two of a, b, c, omega"),
-        ("depth,a,b,Bb\n0,0,0,0\n", "has an unknown column 'Bb': allowed are depth, a, b, c, omega, bb, bb_ratio"),
-        ("depth,a,b,a\n0,0,0,0\n", "has 2 columns 'a' but must have only one of them"),
+        (
+            "",
+            r"water.csv has no heading with known columns \(found: none\): allowed are depth, z \[m, cm, ",
+        ),
+        ("0,1,1\n1,1,1\n", r"water.csv has no heading with known columns \(found: none\)"),
+        ("a,b\n0,0\n0,0", "has the columns a, b: needed are depth or z and two of a, b, c, omega"),
+        ("depth,z,a,b\n0,0,0,0", "has the columns depth, z, a, b: needed are depth or z and two"),
+        ("depth,c,bb\n0,1,0\n1,1,0", "has the columns depth, c, bb: needed are depth or z and two of a, b, c, omega"),
+        (
+            "depth,a,b,bbp\n0,0,0,0\n",
+            r"unknown column 'bbp' \(found: depth, a, b, bbp\): .* a, b, c, bb \[1/m, .*\], omega, bb_ratio \[1, %\]",
+        ),
+        ("depth,a440,c532\n0,0,0\n", "has columns for 440 and 532 nm, a440 and c532: allowed is one wavelength"),
+        ("depth,a,b,a\n0,0,0,0\n", "has 2 columns a and a for a: allowed is one"),
         ("depth,a,b,bb,bb_ratio\n0,0,0,0,0\n", "columns bb and bb_ratio, but must have only one"),
         ("depth,a,b\n0,1,1\n", "has 1 depths but a profile must have at least 2"),
         ("depth,a,b\n# x\n0,1,1\n1,1\n", r"water.csv, line 4 has 2 values but must have 3, one for each column\.$"),
-        ("depth,a,b\n0,1,1\n1,,1\n", r"line 3: a = '' must be a number"),
         ("depth,a,b\n0,1,1\n1,1,clear\n", "line 3: b = 'clear' must be a number"),
-        ("depth,a,b\n0,1,nan\n1,1,1\n", r"water.csv, line 2: b = nan must be finite\.$"),
+        ("depth,a,b\n0,1,nan\n1,1,1\n", r"water.csv has 1 depths but a profile must have at least 2\.$"),
+        ("z,a,b\n-1,1,1\n1,1,1\n", "line 2: z = -1 must not be negative, unless all z are heights of at most 0"),
         ("depth,a,b\n0,1,1\ninf,1,1\n", "line 3: depth = inf must be finite"),
         ("depth,a,b\n-1,1,1\n1,1,1\n", "line 2: depth = -1 must not be negative"),
-        ("depth,a,b\n0,1,1\n\n2,1,1\n2,1,1\n", "line 5: depth = 2 m follows 2 m but depths must increase"),
+        ("depth,a,b\n0,1,1\n\n2,1,1\n1,inf,1\n", "line 5: a = inf must be finite"),
         ("depth,a,b\n0,1,1\n2,-0.1,1\n", "line 3: a = -0.1 must not be negative"),
         ("depth,b,c\n0,1,1\n2,0.4,0.3\n", "line 3: b = 0.4 1/m must not exceed c = 0.3 1/m"),
         ("depth,a,c\n0,1,1\n2,0.4,0.3\n", "line 3: a = 0.4 1/m must not exceed c = 0.3 1/m"),
@@ -255,11 +318,11 @@ def test_invalid_netcdf_files_are_rejected(tmp_path):
         return path
 
     depth = {"depth": [0.0, 1.0]}
-    with pytest.raises(ValueError, match=r"water.nc, index 1 of depth: a = nan must be finite"):
-        read_profile(write(depth, a=[0.1, np.nan], b=[0.1, 0.1]))
-    with pytest.raises(ValueError, match=r"water.nc has an unknown column 'BB'"):
-        read_profile(write(depth, a=[0.1, 0.1], b=[0.1, 0.1], BB=[0.1, 0.1]))
-    with pytest.raises(ValueError, match=r"columns a, b: needed are depth and two"):
+    with pytest.raises(ValueError, match=r"water.nc, index 1 of depth: a = -0.1 must not be negative"):
+        read_profile(write(depth, a=[0.1, -0.1], b=[0.1, 0.1]))
+    with pytest.raises(ValueError, match=r"water.nc has an unknown column 'BX'"):
+        read_profile(write(depth, a=[0.1, 0.1], b=[0.1, 0.1], BX=[0.1, 0.1]))
+    with pytest.raises(ValueError, match=r"columns a, b: needed are depth or z and two"):
         read_profile(write(a=[0.1, 0.1], b=[0.1, 0.1]))
     with pytest.raises(ValueError, match=r"water.nc has a of type .*, but it must hold real numbers"):
         read_profile(write(depth, a=["x", "y"], b=[0.1, 0.1]))
@@ -271,7 +334,9 @@ def test_invalid_netcdf_files_are_rejected(tmp_path):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(ValueError, match=r"cannot read .*none.csv: No such file or directory\.$"):
         read_profile(tmp_path / "none.csv")
-    with pytest.raises(ValueError, match=r"cannot read .*water.xlsx: the name of a profile must end in .csv, .nc\.$"):
+    with pytest.raises(
+        ValueError, match=r"cannot read .*water.xlsx: the name of a profile must end in .csv, .txt, .dat, .tsv, .nc\.$"
+    ):
         read_profile(tmp_path / "water.xlsx")
     (tmp_path / "water.csv").write_bytes(b"depth,a,b\n\xff")
     with pytest.raises(ValueError, match=r"water.csv is not a text file in UTF-8"):

@@ -1,0 +1,69 @@
+"""Names, units and wavelengths in headings."""
+
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.headings import METRES, PER_METRE, TIME, UNITLESS, Column, parse_heading, read_headings
+
+DEPTH, Z = Column("depth", (), METRES), Column("z", (), METRES)
+A, C = Column("a", (), PER_METRE, spectral=True), Column("c", ("beam attenuation",), PER_METRE, spectral=True)
+BB, RATIO = Column("bb", (), PER_METRE, spectral=True), Column("bb_ratio", ("bb/b",), UNITLESS, spectral=True)
+COLUMNS = (TIME, DEPTH, Z, A, C, BB, RATIO)
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "factor", "wavelength"),
+    [
+        ("depth", DEPTH, 1, ""),
+        ("depth_m", DEPTH, 1, ""),
+        ("Depth [m]", DEPTH, 1, ""),
+        ("depth/cm", DEPTH, 0.01, ""),
+        ("depth in feet", DEPTH, 0.3048, ""),
+        ("z", Z, 1, ""),
+        ("a532", A, 1, "532"),
+        ("A_532nm", A, 1, "532"),
+        ("a(532 nm) [m-1]", A, 1, "532"),
+        ("c(532) 1/m", C, 1, "532"),
+        ("c / (1/km)", C, 1e-3, ""),
+        ("Beam attenuation 532 [m⁻¹]", C, 1, "532"),
+        ("c_m^-1", C, 1, ""),
+        ("bb", BB, 1, ""),
+        ("bb532/m-1", BB, 1, "532"),
+        ("bb/b", RATIO, 1, ""),
+        ("bb_ratio (%)", RATIO, 0.01, ""),
+        ("t_ns", None, 1, ""),
+        ("time_ns", TIME, 1, ""),
+        ("time (µs)", TIME, 1e3, ""),
+        ("ps", TIME, 1e-3, ""),
+        ("temperature", None, 1, ""),
+        ("1/m", None, 1, ""),
+        ("m", None, 1, ""),
+        ("", None, 1, ""),
+    ],
+)
+def test_headings_are_understood(text, column, factor, wavelength):
+    columns = COLUMNS if text != "t_ns" else COLUMNS[1:]
+    heading = parse_heading(text, columns)
+    assert (heading.column if heading else None) is column
+    if heading:
+        assert heading.known_unit
+        assert heading.factor == pytest.approx(factor)
+        assert heading.wavelength == wavelength
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["depth", "Tiefe"], r"^x.csv has an unknown column 'Tiefe' \(found: depth, Tiefe\): allowed are time \[ns, "),
+        (
+            ["depth [hPa]", "a"],
+            r"unit in column 'depth \[hPa\]' \(found: .*depth, z \[m, cm, mm, km, ft\]",
+        ),
+        (["a_nw", "depth"], "unknown unit in column 'a_nw'"),
+        (["a412", "a532"], "has 2 columns a412 and a532 for a: allowed is one"),
+        (["a412", "c532"], "has columns for 412 and 532 nm, a412 and c532: allowed is one wavelength"),
+    ],
+)
+def test_unclear_headings_are_rejected(names, message):
+    with pytest.raises(UserError, match=message):
+        read_headings("x.csv", names, COLUMNS)
