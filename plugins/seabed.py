@@ -13,7 +13,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_negative, positive
-from mitransient_lidar.physics.sea.height_maps import read_height_map
+from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import fill_mesh
 
@@ -63,13 +63,11 @@ class Bottom:
     """
 
     def __init__(self, get: Get) -> None:
-        path, map_size = get("filename", ""), get("map_size", None)
-        if map_size is not None and not path:
-            raise UserError(f"map_size = {map_size} needs a height map: give its filename")
-        self.terrain = read_height_map(path, map_size) if path else None
-        # The heights of a map may be relative to the sea level.
-        depth = get("depth", 8.0)
-        self.depth = ranged("depth", positive("depth", depth) if self.terrain is None else depth)
+        self.terrain = _read_terrain(get)
+        # The heights of a map may be relative to the sea level; those of a survey are.
+        surveyed = self.terrain is not None and (self.terrain.origin is not None or get("map_values", "") == "depths")
+        depth = get("depth", 0.0 if surveyed else 8.0)
+        self.depth = ranged("depth", (positive if self.terrain is None else non_negative)("depth", depth))
         #: Rise along x and y [m/m].
         self.slope = tuple(
             math.tan(math.radians(in_range(name, get(name, 0.0), -_STEEPEST_TILT, _STEEPEST_TILT)))
@@ -86,7 +84,10 @@ class Bottom:
         middle, widest = (0.0, 0.0), _DEFAULT_SIZE
         if self.terrain is not None:
             x, y = self.terrain.x, self.terrain.y
-            middle, widest = (float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2), float(max(x[-1] - x[0], y[-1] - y[0]))
+            widest = float(max(x[-1] - x[0], y[-1] - y[0]))
+            # A part of a map in map coordinates lies about its origin.
+            if self.terrain.origin is None or get("refined_size", "auto") == "auto":
+                middle = float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2
         self.centre = ranged("centre_x", get("centre_x", middle[0])), ranged("centre_y", get("centre_y", middle[1]))
         widest = max([widest, *(2 * patch.reach(self.centre) for patch in self.patches)])
         self.curvature = in_range("curvature", get("curvature", 0.0), -1.0, 1.0)
@@ -132,9 +133,10 @@ class Bottom:
                 )
         height = float(self.heights(*(np.array([value]) for value in self.centre))[0, 0])
         if height >= 0:
+            hint = "" if self.terrain is None else ", and map_values be depths if the map is of depths"
             raise UserError(
                 f"depth = {self.depth:g} puts the bottom at z = {height:.3g} m in its middle, "
-                f"({self.centre[0]:g}, {self.centre[1]:g}): it must lie below the sea there"
+                f"({self.centre[0]:g}, {self.centre[1]:g}): it must lie below the sea there{hint}"
             )
 
     def lines(self) -> tuple[FloatArray, FloatArray]:
@@ -170,6 +172,22 @@ class Bottom:
         return values
 
 
+def _read_terrain(get: Get) -> HeightMap | None:
+    """Read the height map, if there is one."""
+    path = get("filename", "")
+    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes")
+    size, x, y, values, holes = (get(name, None) for name in names)
+    if not path:
+        for name, value in zip(names, (size, x, y, values, holes), strict=True):
+            if value is not None:
+                raise UserError(f"{name} = {value} needs a height map: give its filename")
+        return None
+    if (x is None) != (y is None):
+        raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
+    origin = None if x is None else (finite("origin_x", x), finite("origin_y", y))
+    return read_height_map(path, size, origin, values or "heights", holes or "refuse")
+
+
 def _read_patches(text: str) -> tuple[Patch, ...]:
     """Read patches from ``x y radius reflectance; ...``."""
     patches = []
@@ -199,7 +217,8 @@ class Seabed(mi.Mesh):
     ========================  ======  ==================================================================================
     Parameter                 Type    Meaning
     ========================  ======  ==================================================================================
-    depth                     float   Depth at x = y = 0 [m], above 0 to 1e5. Default: 8
+    depth                     float   Depth at x = y = 0 [m], above 0 to 1e5; with a height map from 0, added to its
+                                      depths. Default: 8, or 0 with a map of depths, or in map coordinates
     slope_x_deg, slope_y_deg  float   Tilt, -45 to 45 [deg]: positive where the bottom rises towards +x, +y. Default: 0
     curvature                 float   Curvature of a bowl about the centre, -1 to 1 [1/m], negative for a mound; it ends
                                       half of ``refined_size`` from the centre. Default: 0
@@ -207,14 +226,20 @@ class Seabed(mi.Mesh):
                                       none. Default: 0
     ripple_length             float   Distance of their crests [m]. Default: 0.2
     ripple_bearing_deg        float   Direction across the crests, from +x to +y [deg]. Default: 0
-    filename                  string  Height map that is added (.npy, .npz, .exr or .nc). Where its heights are those
-                                      above the mean sea level, give ``depth`` 0
+    filename                  string  Height map that is added: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), or a
+                                      GeoTIFF (.tif) with the extra ``geo``. Where its heights are those above the mean
+                                      sea level, give ``depth`` 0
     map_size                  float   Side along x of a height map that carries no positions [m]
+    map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: ``heights``
+    map_holes                 string  ``refuse`` or ``fill`` cells without a value, with that of the nearest cell.
+                                      Default: ``refuse``
+    origin_x, origin_y        float   Point of the map, in its coordinates, that lies at x = y = 0 [m]. Default: the
+                                      centre of an .asc or .tif; positions in other files are those of the scene
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
-    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e6 to 1e6. Default: 0, or the
-                                      map's centre
+    centre_x, centre_y        float   Centre of the finely resolved square [m], -1e6 to 1e6. Default: 0, or the map's
+                                      centre; 0 if ``refined_size`` of a map in map coordinates is given
     refined_size              float   Its side [m], or ``auto``: 20 m, or the map's longer side, or more for the
                                       patches. Default: ``auto``
     cell_size                 float   Side of its cells [m], or ``auto``: an eighth of the ripples' length, an eighth of

@@ -1,10 +1,14 @@
-"""Reading of arrays from .npy, .npz, OpenEXR and NetCDF-4 files; damaged files are reported as invalid user input."""
+"""Reading of arrays from files; damaged files are reported as invalid user input.
+
+Formats are .npy, .npz, OpenEXR, NetCDF-4, ESRI ASCII grid and GeoTIFF.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import os
+import warnings
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -15,8 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer, positive
 
 EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: The first four bytes of every OpenEXR file.
+
+_METRES = ("m", "metre", "metres", "meter", "meters")
 
 Array = npt.NDArray[Any]
 
@@ -28,6 +35,14 @@ class Variable(NamedTuple):
     values: Array
     is_coordinate: bool
     units: str  #: Its attribute ``units``, "" if it has none.
+
+
+class Grid(NamedTuple):
+    """Raster in map coordinates."""
+
+    values: npt.NDArray[np.float64]  #: Shape (rows, columns) of increasing y and x; NaN where there is no value.
+    first: tuple[float, float]  #: Position x, y of the centre of the cell in row 0 and column 0 [m].
+    cell: tuple[float, float]  #: Size of the cells along x and y [m].
 
 
 def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
@@ -100,6 +115,93 @@ def read_netcdf(path: Path) -> dict[str, Variable]:
         )
         for name, variable in dataset.variables.items()
     }
+
+
+def read_ascii_grid(path: Path) -> Grid:
+    """Read an ESRI ASCII grid: a header of names and numbers, and rows of cells from the largest y down.
+
+    Header (ESRI, "ASCII raster format"): ncols, nrows, xllcorner or xllcenter, yllcorner or yllcenter, cellsize or dx
+    and dy [m], and nodata_value, by default -9999. A file of the same name that ends in .prj may describe the
+    coordinates; degrees are refused.
+    """
+    try:
+        words = path.read_text("utf-8-sig").replace(",", ".").split()
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: it is not text.") from error
+    length = next((i for i in range(0, len(words), 2) if not words[i][0].isalpha() or words[i].lower() == "nan"), 0)
+    try:
+        header = {words[i].lower(): float(words[i + 1]) for i in range(0, length, 2)}
+        values = np.array(words[length:], dtype=np.float64)
+    except ValueError as error:
+        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: {error}.") from error
+    columns, rows = (integer(f"{path}: {name}", _entry(path, header, name), 1, 10**6) for name in ("ncols", "nrows"))
+    if values.size != columns * rows:
+        raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}.")
+    system = path.with_suffix(".prj")
+    if system.is_file() and system.read_text("utf-8", "replace").lstrip().startswith("GEOG"):
+        raise UserError(f"{path} has coordinates in degrees according to {system}: they must be projected, in metres.")
+    cell = _entry(path, header, "dx", "cellsize"), _entry(path, header, "dy", "cellsize")
+    positive(f"{path}: cellsize", min(cell))
+    first = [
+        header[f"{axis}llcorner"] + size / 2
+        if f"{axis}llcorner" in header
+        else _entry(path, header, f"{axis}llcenter", f"{axis}llcorner")
+        for axis, size in zip("xy", cell, strict=True)
+    ]
+    values[values == header.get("nodata_value", -9999.0)] = np.nan
+    return Grid(values.reshape(rows, columns)[::-1], (first[0], first[1]), cell)
+
+
+def _entry(path: Path, header: dict[str, float], *names: str) -> float:
+    """Return the first of these entries of a header."""
+    for name in names:
+        if np.isfinite(header.get(name, np.nan)):
+            return header[name]
+    raise UserError(f"{path} must have {' or '.join(names)} in its header, which has {', '.join(header) or 'nothing'}.")
+
+
+def read_geotiff(path: Path) -> Grid:
+    """Read a GeoTIFF of one band, in projected coordinates [m] and with heights in metres."""
+    try:
+        import rasterio
+    except ImportError as error:
+        raise UserError(
+            f"cannot read {path}: GeoTIFF needs the extra geo, pip install 'mitransient-lidar[geo]'."
+        ) from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path, driver="GTiff") as file:
+                _check_geotiff(path, file)
+                masked, place = file.read(1, masked=True), file.transform
+                scale, offset = file.scales[0], file.offsets[0]
+    except rasterio.errors.RasterioError as error:
+        raise UserError(f"{path} is damaged, or is not a GeoTIFF.") from error
+    values = scale * masked.astype(np.float64).filled(np.nan) + offset
+    rows, columns = values.shape
+    x, y = place.c + place.a / 2, place.f + place.e / 2
+    if place.e < 0:
+        values, y = values[::-1], y + (rows - 1) * place.e
+    if place.a < 0:
+        values, x = values[:, ::-1], x + (columns - 1) * place.a
+    return Grid(values, (x, y), (abs(place.a), abs(place.e)))
+
+
+def _check_geotiff(path: Path, file: Any) -> None:
+    """Refuse rasters of several bands, without or with rotated map coordinates, and of other units than metres."""
+    place, system = file.transform, file.crs
+    if file.count != 1:
+        raise UserError(f"{path} has {file.count} bands: a height map must have one.")
+    if place.is_identity:
+        raise UserError(f"{path} has no map coordinates: a GeoTIFF must have them.")
+    if place.b != 0 or place.d != 0:
+        raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
+    if system is not None and system.is_geographic:
+        raise UserError(f"{path} has coordinates in degrees ({system}): they must be projected, in metres.")
+    if system is not None and system.is_projected and system.linear_units_factor[1] != 1:
+        raise UserError(f"{path} has coordinates in {system.linear_units_factor[0]}: they must be in metres.")
+    if (file.units[0] or "m").lower() not in _METRES:
+        raise UserError(f"{path} has heights in {file.units[0]}: they must be in metres.")
 
 
 @contextlib.contextmanager

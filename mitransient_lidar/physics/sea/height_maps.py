@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,21 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import Array, read_exr, read_netcdf, read_npy, read_npz, readable_suffix
+from mitransient_lidar.core.array_files import (
+    Array,
+    read_ascii_grid,
+    read_exr,
+    read_geotiff,
+    read_netcdf,
+    read_npy,
+    read_npz,
+    readable_suffix,
+)
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, IntArray, positive
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
+
+logger = logging.getLogger(__name__)
 
 #: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
 _UNEVENNESS = 1e-3
@@ -28,6 +40,7 @@ class HeightMap:
     heights: FloatArray  #: Elevation [m], shape (rows, columns); row 0 has the smallest y, column 0 the smallest x.
     x: FloatArray  #: Positions of the columns [m], increasing, at least 2.
     y: FloatArray  #: Positions of the rows [m], increasing, at least 2.
+    origin: tuple[float, float] | None = None  #: Point of the map at x = y = 0 [m], if it is in map coordinates.
 
     def sample(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return the elevation on grid lines by bilinear interpolation.
@@ -47,13 +60,19 @@ class HeightMap:
         return np.asarray(columns[j] * (1 - up[:, None]) + columns[j + 1] * up[:, None])
 
 
-def read_height_map(path: str | os.PathLike[str], size: float | None = None) -> HeightMap:
+def read_height_map(
+    path: str | os.PathLike[str],
+    size: float | None = None,
+    origin: tuple[float, float] | None = None,
+    values: str = "heights",
+    holes: str = "refuse",
+) -> HeightMap:
     """Read a height map from a file.
 
     Parameters
     ----------
     path : path
-        File with heights in metres; its suffix selects the format:
+        File with heights or depths in metres; its suffix selects the format:
 
         ``.npy``
             a two-dimensional array, ``heights[j, i]`` at the j-th y and the i-th x;
@@ -63,44 +82,130 @@ def read_height_map(path: str | os.PathLike[str], size: float | None = None) -> 
             an image of one channel, or its channel Y, else R, else Z; its top row has the largest y;
         ``.nc``
             a variable ``height`` or ``elevation``, or the only one with two dimensions, of the dimensions (y, x) or
-            (x, y) with, optionally, the coordinates ``x`` and ``y`` [m]. Dimensions of other names count as (y, x).
+            (x, y) with, optionally, the coordinates ``x`` and ``y`` [m]. Dimensions of other names count as (y, x);
+        ``.asc``
+            an ESRI ASCII grid in metres;
+        ``.tif``, ``.tiff``
+            a GeoTIFF of one band in projected coordinates [m], with the optional package rasterio.
     size : float, optional
         Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
         squares. Required if the file has no positions, not allowed if it has.
+    origin : (float, float), optional
+        Point (x, y) of the map [m], within it, that lies at x = y = 0 of the result. Default: the centre of an .asc or
+        .tif; other positions are kept.
+    values : {'heights', 'depths'}
+        Whether the values are positive up or down.
+    holes : {'refuse', 'fill'}
+        Whether cells without a finite value are refused, or filled with the value of the nearest cell that has one,
+        with a warning in the log.
 
     Raises
     ------
     UserError
         If the file is missing, damaged or of another format; the map not two-dimensional, of fewer than 2 rows or
-        columns, or with holes; positions not increasing or not evenly spaced; or `size` not positive, missing or
-        superfluous.
+        columns, or with holes; positions not increasing or not evenly spaced, in degrees or rotated; `size` not
+        positive, missing or superfluous; or `origin` outside the map, or given for a file without positions.
     """
     path = Path(path)
-    readers = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": _read_netcdf}
-    values, positions = readers[readable_suffix(path, readers, "height map")](path)
+    for name, given, allowed in (("values", values, ("heights", "depths")), ("holes", holes, ("refuse", "fill"))):
+        if given not in allowed:
+            raise UserError(f"map_{name} = {given!r} must be {' or '.join(allowed)}")
+    kind = readable_suffix(path, (*_READERS, *_GRID_READERS), "height map")
+    if kind in _GRID_READERS:
+        if size is not None:
+            raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
+        grid = _GRID_READERS[kind](path)
+        heights = _checked_heights(path, grid.values)
+        x, y = ((np.arange(n) - (n - 1) / 2) * cell for n, cell in zip(heights.shape[::-1], grid.cell, strict=True))
+        # Map coordinates have up to eight digits: the shift is added to exact positions about the centre.
+        centre = grid.first[0] - float(x[0]), grid.first[1] - float(y[0])
+    else:
+        contents, positions = _READERS[kind](path)
+        heights = _checked_heights(path, contents)
+        x, y = _positions(path, positions, heights.shape, size)
+        centre = None
+        if origin is not None and not positions:
+            raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
+    if values == "depths":
+        heights = -heights
+    heights = _without_holes(path, heights, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
+    return _moved(path, HeightMap(heights, x, y), centre, origin)
+
+
+def _checked_heights(path: Path, values: Array) -> FloatArray:
+    """Return real numbers in two dimensions."""
     heights = _numbers(path, "heights", values)
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise UserError(f"{path} has heights of shape {heights.shape}, but must have at least 2 rows and 2 columns.")
-    holes = np.argwhere(~np.isfinite(heights))
-    if len(holes) > 0:
-        row, column = holes[0]
-        raise UserError(
-            f"{path} has holes, {len(holes)} of {heights.size} heights, the first in row {row} and column {column}"
-            " counted from 0 at the smallest y and x: every height must be finite."
-        )
-    rows, columns = heights.shape
+    return heights
+
+
+def _positions(
+    path: Path, positions: dict[str, Array], shape: tuple[int, ...], size: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return x of the columns and y of the rows [m], from the file or of a map of a size about the origin."""
+    rows, columns = shape
     if len(positions) == 1:
         raise UserError(f"{path} has positions {next(iter(positions))} only: it must have both x and y, or none.")
     if positions:
         if size is not None:
             raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
-        x, y = _even_positions(path, "x", positions["x"], columns), _even_positions(path, "y", positions["y"], rows)
-    elif size is None:
+        return _even_positions(path, "x", positions["x"], columns), _even_positions(path, "y", positions["y"], rows)
+    if size is None:
         raise UserError(f"{path} has no positions of its heights: give the size of the map along x, in metres.")
-    else:
-        cell = positive("size", size) / (columns - 1)
-        x, y = (np.asarray((np.arange(n) - (n - 1) / 2) * cell, dtype=np.float64) for n in (columns, rows))
-    return HeightMap(heights, x, y)
+    cell = positive("size", size) / (columns - 1)
+    x, y = (np.asarray((np.arange(n) - (n - 1) / 2) * cell, dtype=np.float64) for n in (columns, rows))
+    return x, y
+
+
+def _without_holes(path: Path, heights: FloatArray, spacing: tuple[float, float], treatment: str) -> FloatArray:
+    """Return the heights with holes filled from the nearest cell; refuse them if they are not to be filled."""
+    empty = ~np.isfinite(heights)
+    count = int(empty.sum())
+    if count == 0:
+        return heights
+    row, column = np.argwhere(empty)[0]
+    if treatment == "refuse" or count == heights.size:
+        raise UserError(
+            f"{path} has holes, {count} of {heights.size} heights, the first in row {row} and column {column} counted"
+            " from 0 at the smallest y and x: every height must be finite, unless map_holes of a seabed is fill."
+        )
+    from scipy.ndimage import distance_transform_edt
+
+    nearest = distance_transform_edt(empty, sampling=spacing, return_distances=False, return_indices=True)
+    logger.warning("%s: %d of %d heights are missing, filled from the nearest cells", path, count, heights.size)
+    return np.asarray(heights[tuple(nearest)])
+
+
+def _moved(
+    path: Path, terrain: HeightMap, centre: tuple[float, float] | None, origin: tuple[float, float] | None
+) -> HeightMap:
+    """Return the map with a point of it at x = y = 0, and log where that is.
+
+    The positions of `terrain` are relative to `centre`, or as they are in the file if it is None.
+    """
+    heights, axes = terrain.heights, (terrain.x, terrain.y)
+    if centre is None and origin is None:
+        if not all(axis[0] <= 0 <= axis[-1] for axis in axes):
+            logger.warning(
+                "%s: x from %.10g to %.10g and y from %.10g to %.10g m do not contain x = y = 0, where the lidar"
+                " aims by default; origin_x and origin_y of a seabed move the map",
+                *(path, axes[0][0], axes[0][-1], axes[1][0], axes[1][-1]),
+            )
+        return terrain
+    middle = centre or (0.0, 0.0)
+    point = middle if origin is None else origin
+    for name, axis, zero, value in zip("xy", axes, middle, point, strict=True):
+        low, high = zero + float(axis[0]), zero + float(axis[-1])
+        if not low <= finite(f"origin_{name}", value) <= high:
+            raise UserError(f"origin_{name} = {value:.10g} must lie between {low:.10g} and {high:.10g}, within {path}.")
+    x, y = (axis + (zero - value) for axis, zero, value in zip(axes, middle, point, strict=True))
+    logger.info(
+        "%s: map of %d x %d cells, %g x %g m, heights from %g to %g m; x = y = 0 is its point (%.10g, %.10g)%s",
+        *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], heights.min(), heights.max(), *point),
+        ", the centre" if origin is None else "",
+    )
+    return HeightMap(heights, x, y, point)
 
 
 def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatArray:
@@ -172,3 +277,7 @@ def _read_netcdf(path: Path) -> _Contents:
     heights = data[names[0]]
     values = heights.values.T if heights.dims == ("x", "y") else heights.values
     return values, {name: variables[name].values for name in ("x", "y") if name in variables}
+
+
+_READERS = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": _read_netcdf}
+_GRID_READERS = {".asc": read_ascii_grid, ".tif": read_geotiff, ".tiff": read_geotiff}

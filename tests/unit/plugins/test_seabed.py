@@ -77,6 +77,34 @@ def test_height_map_about_the_sea_level(tmp_path):
     np.testing.assert_allclose(look_down(shape, [0.0, 5.0], [0.0, 2.0])[0], -7.25)
 
 
+GRID = """ncols 5
+nrows 3
+xllcorner 512340.25
+yllcorner 6543209.75
+cellsize 2
+NODATA_value -99
+7 7 7 8 9
+7 -99 7 8 9
+5 6 7 8 9
+"""
+
+
+def test_surveyed_depths_are_those_below_the_sea_level(tmp_path):
+    """Origins are kept to the millimetre: those of 32 bits would be off by up to a quarter of a metre."""
+    path = tmp_path / "survey.asc"
+    path.write_text(GRID)
+    survey = {"filename": str(path), "map_values": "depths", "map_holes": "fill"}
+    shape = load(**survey)
+    assert shape.bottom.depth == 0
+    assert shape.bottom.terrain.origin == (512345.25, 6543212.75)
+    np.testing.assert_allclose(look_down(shape, [0.0, 3.0, -4.0], [0.0, 1.0, -2.0])[0], [-7, -8.5, -5], atol=1e-6)
+    moved = load(**survey, origin_x=512349.125, origin_y=6543211.125)
+    # The middle of the fine square is that of the map, 3.875 m west and 1.625 m north of the new origin.
+    assert moved.bottom.centre == (-3.875, 1.625)
+    np.testing.assert_allclose(look_down(moved, [0.0, -3.875], [0.0, 1.625])[0], [-8.9375, -7], atol=1e-6)
+    assert load(**survey, origin_x=512349.125, origin_y=6543211.125, refined_size=4.0).bottom.centre == (0, 0)
+
+
 @pytest.mark.slow
 def test_patches_have_their_reflectance_and_area():
     shape = load(patches="0 0 1 0.4; 3, -1, 0.5, 0; 0.5 0 0.3 0.9", reflectance=0.2)
@@ -125,6 +153,9 @@ def test_reads_from_xml():
         ({"cell_size": 0.0}, "cell_size = 0 must be greater than 0"),
         ({"size": 0.0}, "size = 0 must be greater than 0"),
         ({"map_size": 4.0}, "map_size = 4.0 needs a height map"),
+        ({"origin_y": 4.0}, "origin_y = 4.0 needs a height map"),
+        ({"map_holes": "fill"}, "map_holes = fill needs a height map"),
+        ({"filename": "any.asc", "origin_x": 4.0}, "origin_x = 4.0 and origin_y = None must be given together"),
         ({"filename": "nowhere.npy", "map_size": 4.0}, "cannot read nowhere.npy: No such file"),
         ({"patches": "0 0 1 1.3"}, "patches: reflectance of number 1 = 1.3 must lie between 0 and 1"),
         ({"patches": "0 0 1 0.3; 2 2 0 0.1"}, "patches: radius of number 2 = 0 must be greater than 0"),

@@ -1,5 +1,9 @@
 """Height maps from every file format: orientation, positions, and rejected files."""
 
+import logging
+import sys
+import warnings
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -217,5 +221,192 @@ def test_pickled_objects_are_never_loaded(tmp_path):
 
 
 def test_other_suffixes_are_rejected(tmp_path):
-    with pytest.raises(ValueError, match=r"map.tif: the name of a height map must end in .npy, .npz, .exr, .nc"):
+    with pytest.raises(ValueError, match=r"map.xyz: the name of a height map must end in .npy, .npz, .exr, .nc, .asc"):
+        read_height_map(tmp_path / "map.xyz")
+
+
+HEADER = {"ncols": 4, "nrows": 3, "xllcorner": 499997, "yllcorner": 6000004.5, "cellsize": 2, "NODATA_value": -9999}
+
+
+def write_ascii_grid(path, rows=HEIGHTS[::-1], **changes):
+    """Write a grid whose cell centres are X + 500001 and, as its cells are squares, 6000005.5, ...7.5, ...9.5."""
+    header = {name: value for name, value in {**HEADER, **changes}.items() if value is not None}
+    lines = [f"{name:<14}{value}" for name, value in header.items()]
+    path.write_text("\n".join([*lines, *(" ".join(map(str, row)) for row in rows), ""]))
+    return path
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"xllcorner": None, "xllcenter": 499998, "yllcorner": None, "yllcenter": 6000005.5},
+        {"cellsize": None, "dx": 2, "dy": 2, "NODATA_value": None},
+        {"cellsize": "2,0"},
+    ],
+)
+def test_ascii_grid_is_placed_by_its_centre_or_a_point(tmp_path, caplog, changes):
+    path = write_ascii_grid(tmp_path / "map.asc", **changes)
+    with caplog.at_level(logging.INFO):
+        read = read_height_map(path)
+    assert_is_the_map(read, y=[-2, 0, 2])
+    assert read.origin == (500001, 6000007.5)
+    assert caplog.messages == [
+        f"{path}: map of 4 x 3 cells, 6 x 4 m, heights from 0 to 25 m; x = y = 0 is its point (500001, 6000007.5), the"
+        " centre"
+    ]
+    moved = read_height_map(path, origin=(499999.0, 6000005.5))
+    assert_is_the_map(moved, x=X + 2, y=[0, 2, 4])
+    assert moved.origin == (499999.0, 6000005.5)
+
+
+def test_origin_moves_positions_of_other_formats(tmp_path, caplog):
+    path = write_npz(tmp_path / "map.npz", heights=HEIGHTS, x=X + 5e5, y=Y)
+    assert_is_the_map(read_height_map(path, origin=(5e5, 5.5)), y=[-0.5, 0, 0.5])
+    caplog.clear()
+    assert_is_the_map(read_height_map(path), x=X + 5e5)
+    assert "x from 499997 to 500003 and y from 5 to 6 m do not contain x = y = 0" in caplog.messages[0]
+
+
+def test_depths_are_positive_down(tmp_path):
+    path = write_ascii_grid(tmp_path / "map.asc")
+    np.testing.assert_array_equal(read_height_map(path, values="depths").heights, -HEIGHTS)
+
+
+def test_holes_have_the_value_of_the_nearest_cell(tmp_path, caplog):
+    rows = HEIGHTS[::-1].copy()
+    rows[0, 0], rows[1, 3] = -9999, np.nan
+    path = write_ascii_grid(tmp_path / "map.asc", rows)
+    with pytest.raises(UserError, match=r"has holes, 2 of 12 heights, the first in row 1 and column 3.*unless map_"):
+        read_height_map(path)
+    read = read_height_map(path, holes="fill")
+    # Without the cell in row 2 and column 0, its neighbours are those to the right and below.
+    assert read.heights[2, 0] in (HEIGHTS[2, 1], HEIGHTS[1, 0])
+    assert read.heights[1, 3] in (HEIGHTS[1, 2], HEIGHTS[0, 3], HEIGHTS[2, 3])
+    kept = np.isfinite(rows[::-1]) & (rows[::-1] != -9999)
+    np.testing.assert_array_equal(read.heights[kept], HEIGHTS[kept])
+    assert "2 of 12 heights are missing, filled from the nearest cells" in caplog.text
+
+
+def test_holes_of_oblong_cells_are_filled_along_the_short_side(tmp_path):
+    rows = np.array([[1.0, 2, 3], [4, -9999, 6], [7, 8, 9]])
+    path = write_ascii_grid(tmp_path / "map.asc", rows, ncols=3, cellsize=None, dx=1, dy=3)
+    assert read_height_map(path, holes="fill").heights[1, 1] in (4, 6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ncols": 5}, "has 12 values but must have ncols = 5 times nrows = 3"),
+        ({"ncols": -4, "nrows": -3}, "ncols = -4 must lie between 1 and"),
+        (
+            {"nrows": None},
+            "must have nrows in its header, which has ncols, xllcorner, yllcorner, cellsize",
+        ),
+        ({"xllcorner": None}, "must have xllcenter or xllcorner in its header"),
+        ({"cellsize": 0}, "cellsize = 0 must be greater than 0"),
+        ({"cellsize": "wide"}, "map.asc is damaged, or is not an ESRI ASCII grid: could not convert"),
+        ({"rows": [["a"] * 12]}, "map.asc is damaged, or is not an ESRI ASCII grid"),
+    ],
+)
+def test_invalid_ascii_grids_are_rejected(tmp_path, changes, message):
+    with pytest.raises(UserError, match=message):
+        read_height_map(write_ascii_grid(tmp_path / "map.asc", **changes))
+
+
+def test_ascii_grid_in_degrees_is_rejected(tmp_path):
+    path = write_ascii_grid(tmp_path / "map.asc")
+    (tmp_path / "map.prj").write_text('PROJCS["WGS 84 / UTM zone 33N", GEOGCS["WGS 84"]]')
+    assert_is_the_map(read_height_map(path), y=[-2, 0, 2])
+    (tmp_path / "map.prj").write_text('GEOGCS["WGS 84"]')
+    with pytest.raises(UserError, match=r"has coordinates in degrees according to .*map.prj"):
+        read_height_map(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": 6.0}, r"size = 6.0 must not be given: .*map.asc has positions of its own"),
+        ({"origin": (6000007.5, 500001)}, r"origin_x = 6000007.5 must lie between 499998 and 500004, within .*map.asc"),
+        ({"origin": (5e5, 6000009.75)}, r"origin_y = 6000009.75 must lie between 6000005.5 and 6000009.5, within"),
+        ({"origin": (np.nan, 0)}, "origin_x = nan must be finite"),
+        ({"values": "fathoms"}, "map_values = 'fathoms' must be heights or depths"),
+        ({"holes": "keep"}, "map_holes = 'keep' must be refuse or fill"),
+    ],
+)
+def test_invalid_placements_are_rejected(tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        read_height_map(write_ascii_grid(tmp_path / "map.asc"), **options)
+
+
+def test_origin_needs_positions(tmp_path):
+    path = write_npy(tmp_path / "map.npy", HEIGHTS)
+    with pytest.raises(UserError, match=r"origin_x and origin_y must not be given: .*map.npy has no positions"):
+        read_height_map(path, 6.0, (0.0, 0.0))
+
+
+def test_geotiff_without_rasterio_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    (tmp_path / "map.tif").write_bytes(b"II")
+    with pytest.raises(UserError, match=r"GeoTIFF needs the extra geo, pip install 'mitransient-lidar\[geo\]'"):
         read_height_map(tmp_path / "map.tif")
+
+
+def write_geotiff(path, heights=HEIGHTS[::-1], count=1, transform=(2, 0, 499997, 0, -2, 6000010.5), crs=32633, **tags):
+    rasterio = pytest.importorskip("rasterio")
+    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": count, "dtype": heights.dtype}
+    place = {"crs": f"EPSG:{crs}", "transform": rasterio.Affine(*transform)} if transform else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        file = rasterio.open(path, "w", driver="GTiff", **shape, **place, nodata=tags.get("nodata"))
+    with file:
+        for band in range(count):
+            file.write(heights, band + 1)
+        file.scales, file.offsets = [tags.get("scale", 1.0)] * count, [tags.get("offset", 0.0)] * count
+        file.units = [tags.get("unit", "")] * count
+    return path
+
+
+def test_geotiff_equals_the_ascii_grid(tmp_path):
+    expected = read_height_map(write_ascii_grid(tmp_path / "map.asc"))
+    south_up = {"heights": HEIGHTS, "transform": (2, 0, 499997, 0, 2, 6000004.5)}
+    scaled = {"heights": (HEIGHTS[::-1] * 10 + 50).astype(np.int16), "scale": 0.1, "offset": -5.0, "unit": "metre"}
+    for changes in ({}, {"heights": HEIGHTS[::-1].astype(np.float32)}, south_up, scaled):
+        read = read_height_map(write_geotiff(tmp_path / "map.TIF", **changes))
+        np.testing.assert_allclose(read.heights, HEIGHTS, rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(read.x, expected.x)
+        np.testing.assert_array_equal(read.y, expected.y)
+        assert read.origin == expected.origin
+
+
+def test_geotiff_without_value(tmp_path):
+    heights = HEIGHTS[::-1].copy()
+    heights[2, 1] = -32768
+    path = write_geotiff(tmp_path / "map.tif", heights, nodata=-32768)
+    with pytest.raises(UserError, match="has holes, 1 of 12 heights, the first in row 0 and column 1"):
+        read_height_map(path)
+    assert read_height_map(path, holes="fill").heights[0, 1] in (0, 2, 11)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"count": 2}, "has 2 bands: a height map must have one"),
+        ({"crs": 4326}, r"has coordinates in degrees \(EPSG:4326\): they must be projected, in metres"),
+        ({"crs": 2263}, "has coordinates in US survey foot: they must be in metres"),
+        ({"transform": None}, "has no map coordinates"),
+        ({"transform": (2, 0.1, 499997, 0, -2, 6000010.5)}, "is rotated against its map coordinates"),
+        ({"unit": "ft"}, "has heights in ft: they must be in metres"),
+    ],
+)
+def test_unsuitable_geotiffs_are_rejected(tmp_path, changes, message):
+    with pytest.raises(UserError, match=message):
+        read_height_map(write_geotiff(tmp_path / "map.tif", **changes))
+
+
+def test_damaged_geotiffs_are_rejected(tmp_path):
+    content = write_geotiff(tmp_path / "map.tif", np.arange(4e4).reshape(200, 200)).read_bytes()
+    for damaged in (content[: len(content) // 2], b"", b"no image\n" * 20):
+        (tmp_path / "map.tif").write_bytes(damaged)
+        with pytest.raises(UserError, match=r"map.tif is damaged, or is not a GeoTIFF"):
+            read_height_map(tmp_path / "map.tif")
