@@ -362,7 +362,7 @@ def _in_order(path: Path, columns: _Columns) -> _Columns:
     falling = int(np.sum(np.diff(columns["depth"]) < 0))
     depth, index, counts = np.unique(columns["depth"], return_inverse=True, return_counts=True)
     if falling:
-        logger.info("%s: rows sorted by depth, which decreases %d times", path, falling)
+        logger.info("%s: sorted by depth, as %d of %d rows lie above the row before", path, falling, index.size)
     if depth.size < index.size:
         logger.warning("%s: %d rows averaged to %d different depths", path, index.size, depth.size)
     averaged = {name: np.bincount(index, values) / counts for name, values in columns.items()}

@@ -236,7 +236,7 @@ def test_what_is_done_to_a_file_is_told(tmp_path, caplog):
         f"{path}: columns time are not used",
         f"{path}: 1 of 5 rows left out for missing values, the first in line 4",
         f"{path}: z is the height, from -9 to 0 m",
-        f"{path}: rows sorted by depth, which decreases 1 times",
+        f"{path}: sorted by depth, as 1 of 4 rows lie above the row before",
         f"{path}: 4 rows averaged to 3 different depths",
     ]
 
