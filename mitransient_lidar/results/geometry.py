@@ -142,7 +142,7 @@ class LidarGeometry:
         UserError
             If the efficiency is out of range or unknown, or another attribute is missing.
         """
-        energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * _efficiency(attributes, efficiency)
+        energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
         return LidarSystem(
             self.height,
             self.off_nadir,
@@ -286,7 +286,8 @@ def _fraction_in_view(attributes: Attributes) -> float:
     return math.erf(half / math.sqrt(2)) ** 2
 
 
-def _efficiency(attributes: Attributes, given: float | None) -> float:
+def two_way_efficiency(attributes: Attributes, given: float | None = None) -> float:
+    """Return a given efficiency of optics and atmosphere, or that of the scene's parameters; see `lidar_system`."""
     if given is not None:
         return in_range("efficiency", given, 0, 1)
     names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")

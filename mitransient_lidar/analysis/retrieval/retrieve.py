@@ -20,35 +20,53 @@ from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefracti
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, in_range, positive
-from mitransient_lidar.results.geometry import LidarGeometry, required_number
+from mitransient_lidar.core.validation import FloatArray, finite, in_range, positive
+from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
+from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED, PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.results.geometry import LidarGeometry, required_number, two_way_efficiency
 
 _LOG = logging.getLogger(__name__)
+_MOST_PIXELS = 64  # whose echoes are modelled on a sea
 _COLUMN_START = 1.75  # echo widths after the surface at which `echo_table` begins to fit the column
 
 
 def surface_slopes(
-    dataset: xr.Dataset, *, slope_deviation: tuple[float, float] | None = None, facets: float = 1.0
+    dataset: xr.Dataset,
+    *,
+    wind_speed: float | None = None,
+    wind_direction_deg: float | None = None,
+    slope_deviation: tuple[float, float] | None = None,
+    facets: float = 1.0,
+    efficiency: float | None = None,
 ) -> xr.Dataset:
-    """Estimate the slope of the surface, and its direction, from the times of the pixels' surface echoes.
+    """Estimate slope, direction and height of the surface from times and strengths of the pixels' surface echoes.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         Waveforms of at least two pixels.
+    wind_speed : float, optional
+        Wind speed [m/s], 1 to 30, whose sea gives the prior. By default, that of the scene if its sea has the spectrum
+        of Elfouhaily and the slopes of Cox and Munk.
+    wind_direction_deg : float, optional
+        Direction that the wind blows towards, counter-clockwise from +x [degree]. By default, that of the scene, or +x.
     slope_deviation : (float, float), optional
-        Prior: standard deviations of the slopes along the lidar's azimuth and across, averaged over a footprint [1],
-        above 0. Without it, the estimates are much steeper than the sea.
+        Prior for an unknown sea instead: standard deviations of the slopes along the lidar's azimuth and across,
+        averaged over a footprint [1], above 0.
     facets : float
         As for `surface_slope.fit_plane`.
+    efficiency : float, optional
+        As for `bottom`.
 
     Returns
     -------
     xarray.Dataset
         Over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive for
         a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
-        the lidar's azimuth to the left [degree]; ``surface_range`` along the axis and ``surface_height`` above the mean
-        level [m]; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
+        the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and
+        ``surface_height`` above the mean level [m]; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
+        Attributes: ``slope_method``, ``times and strengths``, ``times on a sea`` or ``times``, and
+        ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
 
     Raises
     ------
@@ -57,25 +75,54 @@ def surface_slopes(
 
     Notes
     -----
+    With a known wind, the estimate is `surface_slope.slopes_on_sea`: of slopes averaged over the beam's footprint, with
+    errors that hold on this sea. It needs a Gaussian beam and 2 to 64 pixels with outlines. Strengths count if the
+    waveform is in W and the efficiency known. Otherwise a plane is fitted to the times; without a prior, its slopes
+    are much steeper than those of a sea.
+
     Times are those of the ``gaussian`` estimator. The light of a pixel is that of a Gaussian beam inside its outline,
     or without outlines a point at its centre.
     """
     lidar = LidarGeometry.from_attributes(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
         raise UserError("surface slopes need waveforms of at least 2 pixels over the dimension pixel")
-    echoes = echo_table.extract(dataset).sel(echo="surface").transpose(..., "pixel")
-    shape = echoes["time_ns"].shape[:-1]
-    time, error = (echoes[name].values.reshape(-1, dataset.sizes["pixel"]) for name in ("time_ns", "time_ns_stderr"))
-    plane = surface_slope.fit_plane(time, pixel_light(dataset), lidar.off_nadir, stderr_ns=error, facets=facets)
-    slopes = [(plane.along, plane.along_stderr), (plane.across, plane.across_stderr)]
-    if slope_deviation is not None:
-        slopes = [
-            surface_slope.with_prior(*pair, positive("slope_deviation", one))
-            for pair, one in zip(slopes, slope_deviation, strict=True)
-        ]
-    (along, along_error), (across, across_error) = slopes
+    if slope_deviation is not None and wind_speed is not None:
+        raise UserError(f"slope_deviation = {slope_deviation} and wind_speed = {wind_speed:g} are alternatives")
+    echoes = echo_table.extract(dataset).transpose(..., "pixel")
+    surface = echoes.sel(echo="surface")
+    shape = surface["time_ns"].shape[:-1]
+    time, error = (surface[name].values.reshape(-1, dataset.sizes["pixel"]) for name in ("time_ns", "time_ns_stderr"))
+    light = pixel_light(dataset)
+    plane = surface_slope.fit_plane(time, light, lidar.off_nadir, stderr_ns=error, facets=facets)
+    wind = None if slope_deviation is not None else _wind(dataset, wind_speed, wind_direction_deg)
+    if wind is not None:
+        scale = _energy_scale(dataset, efficiency)
+        measured = _pixel_echoes(echoes, lidar, light)
+        lines = _outlines(dataset)
+        beam = 0.5e-3 * required_number(dataset.attrs, "divergence_mrad")
+        sender = SeaLidar(lidar.height, lidar.off_nadir, beam, PixelMap.of_outlines(lines), lidar.refractive_index)
+        sea = surface_slope.slopes_on_sea(measured, sea_shots(sender, *wind), scale)
+        seen = np.isfinite(time).any(axis=1)
+        along, across, height = np.where(seen, sea.mean.T, np.nan)
+        variance = np.where(seen, np.diagonal(sea.covariance, axis1=1, axis2=2).T, np.nan)
+        along_error, across_error, height_error = np.sqrt(variance)
+        method = "times on a sea" if scale is None else "times and strengths"
+        distance = (lidar.height - height) / math.cos(lidar.off_nadir)
+        prior = np.sqrt(np.diag(sea.prior)) / (1, 1, math.cos(lidar.off_nadir))
+    else:
+        slopes = [(plane.along, plane.along_stderr), (plane.across, plane.across_stderr)]
+        if slope_deviation is not None:
+            slopes = [
+                surface_slope.with_prior(*pair, positive("slope_deviation", one))
+                for pair, one in zip(slopes, slope_deviation, strict=True)
+            ]
+        (along, along_error), (across, across_error) = slopes
+        height, height_error = lidar.height - plane.range_m * math.cos(lidar.off_nadir), np.full(len(time), np.nan)
+        method, distance = "times", plane.range_m
+        # Of an unknown sea, the slopes over a footprint vary at most as much as all slopes.
+        total = float(dataset.attrs.get("surface_slope_variance", np.inf))
+        prior = np.array([*(slope_deviation or [math.sqrt(0.5 * total)] * 2), np.nan])
     steepness, direction = surface_slope.steepest(along, across)
-    height = lidar.height - plane.range_m * math.cos(lidar.off_nadir)
     table = {
         "slope_along": (along, "1", "slope of the surface along the lidar's azimuth"),
         "slope_along_stderr": (along_error, "1", "standard error of the slope along"),
@@ -83,21 +130,85 @@ def surface_slopes(
         "slope_across_stderr": (across_error, "1", "standard error of the slope across"),
         "slope_deg": (np.degrees(steepness), "degree", "angle of the surface from the horizontal"),
         "slope_direction_deg": (np.degrees(direction), "degree", "direction of the rise from the lidar's azimuth"),
-        "surface_range": (plane.range_m, "m", "distance to the surface along the axis"),
+        "surface_range": (distance, "m", "distance to the surface along the axis"),
+        "surface_range_stderr": (height_error / math.cos(lidar.off_nadir), "m", "standard error of the distance"),
         "surface_height": (height, "m", "height of the surface above the mean sea level"),
         "plane_misfit": (plane.misfit_ns, "ns", "deviation of the echoes from a plane"),
     }
-    return _labelled(dataset, table, shape)
+    found = _labelled(dataset, table, shape)
+    return found.assign_attrs(slope_method=method, slope_prior_deviation=[float(one) for one in prior])
+
+
+def _wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) -> tuple[float, float] | None:
+    """Return wind speed [m/s] and direction from the lidar's azimuth [rad], None if a sea cannot be modelled."""
+    attributes = dataset.attrs
+    sea = attributes.get("scene.spectrum"), attributes.get("scene.slope_variance")
+    pixels = len(_outlines(dataset))
+    beam = attributes.get("beam_profile", "gaussian"), attributes.get("divergence_across_mrad")
+    usable = (
+        "divergence_mrad" in attributes
+        and beam[0] == "gaussian"
+        and beam[1] in (None, attributes["divergence_mrad"])
+        and 2 <= pixels <= _MOST_PIXELS
+        and pixels == dataset.sizes["pixel"]
+    )
+    if speed is not None and not usable:
+        raise UserError(
+            f"wind_speed = {speed:g} needs a result of a round Gaussian beam and 2 to {_MOST_PIXELS} pixels with "
+            "outlines; slope_deviation does not"
+        )
+    if speed is None:
+        known = float(attributes.get("scene.wind_speed", 0)) if sea == ("elfouhaily", "cox_munk") else 0.0
+        if not usable or not LEAST_WIND_SPEED <= known <= MAX_WIND_SPEED:
+            return None
+        speed = known
+    direction = float(attributes.get("scene.wind_direction_deg", 0)) if direction_deg is None else direction_deg
+    axis = np.asarray(attributes.get("receiver_pose", [0.0, 0, 0, 1, 0]), dtype=np.float64)[3:5]
+    azimuth = math.atan2(axis[1], axis[0]) if np.hypot(*axis) > 1e-9 else 0.0
+    return speed, math.radians(finite("wind_direction_deg", direction)) - azimuth
+
+
+def _energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
+    """Return the pulse energy times efficiencies and aperture [J m^2], None if echoes are not in J or it is unknown."""
+    names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
+    known = efficiency is not None or all(name in dataset.attrs for name in names)
+    if "signal" in dataset or not known:
+        return None
+    energy, aperture = (required_number(dataset.attrs, name) for name in ("pulse_energy_mj", "aperture_area"))
+    return 1e-3 * energy * two_way_efficiency(dataset.attrs, efficiency) * aperture
+
+
+def _pixel_echoes(
+    echoes: xr.Dataset, lidar: LidarGeometry, light: surface_slope.PixelLight
+) -> surface_slope.PixelEchoes:
+    """Return the surface echoes of a table of `echo_table.extract` whose last dimension is pixel."""
+    pixels, width = echoes.sizes["pixel"], float(echoes.attrs["echo_fwhm_ns"])
+    surface = echoes.sel(echo="surface")
+    time, error, energy, energy_error = (
+        surface[name].values.reshape(-1, pixels) for name in ("time_ns", "time_ns_stderr", "energy", "energy_stderr")
+    )
+    level = echoes["amplitude"].sel(echo="column").values.reshape(-1, pixels)
+    known = np.isfinite(level)
+    # Pixels without a column hide as little as possible.
+    column = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(level.T, known.T, strict=True)])
+    column = np.maximum(1e-9 * width * column, 1e-6 * np.nanmax(energy, initial=1e-30))
+    ns_per_rad = 2e9 / C0 * lidar.slant_range * math.tan(lidar.off_nadir)
+    return surface_slope.PixelEchoes(time, error, energy, energy_error, column, ns_per_rad * light.spread, width)
+
+
+def _outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:
+    """Return the outlines of the pixels of a result [rad]; an empty list without them."""
+    outlines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
+    return [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in outlines]
 
 
 def pixel_light(dataset: xr.Dataset) -> surface_slope.PixelLight:
     """Return the distribution of the light in the pixels of a result."""
-    outlines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
+    outlines = _outlines(dataset)
     angle_x, angle_y = (1e-3 * dataset[name].values.astype(np.float64) for name in ("angle_x", "angle_y"))
     if len(outlines) != angle_x.size or "divergence_mrad" not in dataset.attrs:
         return surface_slope.PixelLight(angle_x, angle_y, np.zeros_like(angle_x))
-    lines: list[list[npt.ArrayLike]] = [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in outlines]
-    return surface_slope.PixelLight.of_outlines(lines, 0.5e-3 * required_number(dataset.attrs, "divergence_mrad"))
+    return surface_slope.PixelLight.of_outlines(outlines, 0.5e-3 * required_number(dataset.attrs, "divergence_mrad"))
 
 
 def bottom(
