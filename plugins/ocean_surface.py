@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.physics.sea.resolution import Instrument, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import fill_mesh
 
@@ -42,23 +46,34 @@ class OceanSurface(mi.Mesh):
     wake_x, wake_y            float    Centre of the ship [m]. Default: 0
     refined_size              float    Side of the finely resolved patch [m], or ``auto``. Default: ``auto``
     cell_size                 float    Side of its cells [m], or ``auto``. Default: ``auto``
-    centre_x, centre_y        float    Centre of the patch [m], where the beam meets the sea. Default: 0
-    size                      float    Side of the surface [m]: cells grow outside the patch. Default: 1000
+    centre_x, centre_y        float    Centre of the patch [m], or ``auto``: where the lidar's axis meets the sea, or
+                                       the centre of a height map. Default: ``auto``
+    size                      float    Side of the surface [m], or ``auto``: 1000 or more. Cells grow outside the patch.
+                                       Default: ``auto``
     period                    float    Period of the sea [m], or ``auto``: three peak wavelengths or more, in steps of
                                        32 m, at most 512 m. Default: ``auto``
     map_size                  float    Side of a height map that carries no positions [m]
-    altitude, off_nadir_deg,  float    Transmitter and receiver for which ``auto`` chooses patch and cells: a quarter of
-    field_of_view_mrad,                the beam's standard deviation, 0.02 to 0.5 m. Without them: 32 m of 0.25 m
-    divergence_mrad
+    altitude, off_nadir_deg,  float    Values for the choice of ``auto`` instead of those of ``lidar_transmitter`` and
+    field_of_view_mrad,                receiver in the scene; or instead of ``divergence_mrad`` one of
+    divergence_mrad                    ``divergence_fwhm_mrad`` and ``divergence_1e2_mrad``
     (nested)                  bsdf     Any BSDF instead of the ripples
     interior                  medium   The water: ``layered_water``
     ========================  =======  =================================================================================
+
+    Automatic cells are a quarter of the beam's standard deviation on the sea and at most half of a pixel's side there,
+    0.02 to 0.5 m, and shorter than the footprint. The patch holds beam and field of view with a margin of 8 m. With
+    more than 1024 cells per side it is limited to the beam, and then the cells grow. A scene without a lidar has 32 m
+    in cells of 0.25 m. The choice is made when the scene is rendered, or loaded by ``mitransient_lidar``.
 
     The mesh represents the waves that its facets resolve. The rest of the total slope variance, along and across the
     wind, is an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of Gaussian
     slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With
     ``cox_munk`` and ``spectrum`` the total does not depend on the cells. The variance of the ripples is at least 1e-5,
-    so that a point laser can be connected; `slope_variance` of the loaded object is the total.
+    so that a point laser can be connected; `slope_variance` of the loaded object is the total. Waves shorter than a
+    sixteenth of the period are needed for a mesh: where automatic cells are longer, all slopes are ripples.
+
+    Above 2048 cells per period the waves are a sum of bands. The longest waves are the same as in coarse cells; each
+    band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the last one's period.
 
     Outside the patch the facets are longer and resolve fewer slopes, with the ripples of the patch, for light that has
     scattered far. Light beyond ``size`` is lost and reported after rendering.
@@ -77,18 +92,23 @@ class OceanSurface(mi.Mesh):
         {'type': 'ocean_surface', 'wind_speed': 3.0, 'interior': {'type': 'layered_water'}}
     """
 
+    #: Whether new seas are level planes until `fit`: while a scene loads that fits its seas at once.
+    is_placeholder = False
+
     def __init__(self, props: mi.Properties) -> None:
-        #: Shape of the surface (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
-        self.sea = SeaSurface.read(props.get)
-        #: Slope variances of the ripples along and across the wind, and in total with those of the waves.
-        self.ripple_variance, self.slope_variance = self.sea.ripple_variance, self.sea.slope_variance
-        #: Side of the cells of the fine patch, pairs of triangles [m]; infinite for a flat sea.
-        self.cell_size = self.sea.cell_size
+        self._values: dict[str, Any] = {}
+        self._fitted, self._waits = False, OceanSurface.is_placeholder
+
+        def get(name: str, default: Any) -> Any:
+            self._values[name] = props.get(name, default)
+            return self._values[name]
+
+        self._use(SeaSurface.read(get, is_placeholder=self._waits))
         children = [child for _, child in props.objects()]
         water = next((child for child in children if isinstance(child, mi.Medium)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
         if self.has_ripples:
-            alpha_u, alpha_v = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)
+            alpha_u, alpha_v = self._roughness()
             indices = {"int_ior": getattr(water, "refractive_index", 1.34), "ext_ior": 1.0}
             ripples = {"type": "roughdielectric", "distribution": "beckmann", "alpha_u": alpha_u, "alpha_v": alpha_v}
             props["ripples"] = mi.load_dict(ripples | indices)
@@ -97,6 +117,39 @@ class OceanSurface(mi.Mesh):
         mesh = self.sea.mesh()
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         fill_mesh(self, mesh)
+
+    def fit(self, instruments: Sequence[Instrument]) -> bool:
+        """Choose the automatic values for the lasers and receivers of the scene, once; return whether any changed."""
+        if self._fitted:
+            return False
+        self._fitted = True
+
+        def get(name: str, _: Any) -> Any:
+            return self._values[name]
+
+        if not self._waits and Resolution.read(get, instruments) == Resolution.read(get, ()):
+            return False
+        self._use(SeaSurface.read(get, instruments))
+        fill_mesh(self, self.sea.mesh())
+        if self.has_ripples:
+            buffers = mi.traverse(self)
+            for axis, alpha in zip("uv", self._roughness(), strict=True):
+                buffers[f"bsdf.alpha_{axis}.value"] = alpha
+            buffers.update()
+        return True
+
+    def _use(self, sea: SeaSurface) -> None:
+        #: Shape of the surface (`mitransient_lidar.physics.sea.sea_surface.SeaSurface`).
+        self.sea = sea
+        #: Slope variances of the ripples along and across the wind, and in total with those of the waves.
+        self.ripple_variance, self.slope_variance = sea.ripple_variance, sea.slope_variance
+        #: Side of the cells of the fine patch, pairs of triangles [m]; infinite for a flat sea.
+        self.cell_size = sea.cell_size
+
+    def _roughness(self) -> tuple[float, float]:
+        """Return Beckmann's alpha of the ripples along and across the wind."""
+        along, across = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)
+        return along, across
 
     def to_string(self) -> str:
         """Return a description."""

@@ -44,14 +44,19 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
     """
     import mitsuba as mi
 
+    from mitransient_lidar.transport.scene import fit_seas
+
     if isinstance(scene, mi.Scene):
         _no_parameters(params, "a loaded scene")
+        fit_seas(scene)
         return scene, scene.id() or "scene", {}
     if isinstance(scene, Mapping):
         _no_parameters(params, "a dict")
         check_dict(scene)
-        with as_user_error():
-            return mi.load_dict({"type": "scene", **scene}, optimize=False), "scene", {}
+        with as_user_error(), _placeholder_seas():
+            loaded = mi.load_dict({"type": "scene", **scene}, optimize=False)
+        fit_seas(loaded)
+        return loaded, "scene", {}
     if not isinstance(scene, (str, os.PathLike)):
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
     path = catalogue.scene_path(scene)
@@ -61,13 +66,14 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
         raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {path.stem}")
     # Mitsuba refuses parameters that nothing uses; a part that is missing is told instead.
     values = {name: value for name, value in parameters.items() if name in used}
-    with as_user_error({name: value for name, value in given.items() if name in used}, path):
+    with as_user_error({name: value for name, value in given.items() if name in used}, path), _placeholder_seas():
         # Optimisation would merge a bottom and a target of one material into a shape without a name.
         loaded = mi.load_file(str(path), optimize=False, **values)
     if not isinstance(loaded, mi.Scene):
         raise UserError(f"scene {path} holds a {type(loaded).__name__}: its root element must be <scene>")
     if unused := [name for name in parameters if name not in used]:
         _tell_missing_part(loaded, unused)
+    fit_seas(loaded)
     return loaded, path.stem, parameters
 
 
@@ -99,6 +105,18 @@ def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
         if not there:
             listed = ", ".join(unused[:4]) + (", ..." if len(unused) > 4 else "")
             raise UserError(f"{part}: the scene has none, and its parameters {listed} are used by nothing")
+
+
+@contextlib.contextmanager
+def _placeholder_seas() -> Iterator[None]:
+    """Load seas as level planes: their meshes are made once the lidar is known."""
+    from mitransient_lidar.plugins.ocean_surface import OceanSurface
+
+    OceanSurface.is_placeholder = True
+    try:
+        yield
+    finally:
+        OceanSurface.is_placeholder = False
 
 
 @contextlib.contextmanager

@@ -73,16 +73,17 @@ class SeaMap:
         if sea is None or not math.isfinite(sea.cell_size):
             raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
         transmitter = _transmitter(scene)
-        count = getattr(sea.waves, "heights", np.zeros((0, 0))).shape[0] or int(sea.size / sea.cell_size)
-        count = min(count, int(_LARGEST_SEARCH / sea.cell_size)) // 2
-        lines = np.arange(-count, count) * sea.cell_size
+        # Of a sea of several grids the coarsest.
+        cell = getattr(sea.waves, "cell_size", sea.cell_size)
+        count = min(getattr(sea.waves, "cells", int(sea.size / cell)), int(_LARGEST_SEARCH / cell)) // 2
+        lines = np.arange(-count, count) * cell
         heights = sea.heights(lines, lines)
         azimuth, spread_along, spread_across = _footprint(transmitter)
         # A circle of the same area replaces the elliptical footprint.
-        sigma = math.sqrt(spread_along * spread_across) / sea.cell_size
+        sigma = math.sqrt(spread_along * spread_across) / cell
         # The sea of a spectrum is periodic; a height map ends at its edges.
         smooth = gaussian_filter(heights, sigma, mode="wrap" if sea.spectrum != "height_map" else "nearest")
-        up, right = np.gradient(smooth, sea.cell_size)
+        up, right = np.gradient(smooth, cell)
         cos, sin = math.cos(azimuth), math.sin(azimuth)
         return cls(lines, lines, heights, cos * right + sin * up, cos * up - sin * right)
 

@@ -13,8 +13,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.sea.resolution import Instrument
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque
+from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
@@ -139,6 +141,7 @@ class LidarScene(WaterScene):
         UserError
             When a part is missing, not supported, or there are several where one is allowed.
         """
+        fit_seas(scene)
         receiver = receiver or find_receiver(sensor)
         film = sensor.film()
         if not isinstance(getattr(film, "axis", None), TimeAxis):
@@ -163,6 +166,32 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
     if not isinstance(receiver, Receiver):
         raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
     return receiver
+
+
+def fit_seas(scene: mi.Scene) -> None:
+    """Let each ``ocean_surface`` choose its automatic values for the lasers and receivers of the scene, once.
+
+    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used.
+    """
+    instruments = []
+    for emitter in scene.emitters():
+        if hasattr(emitter, "pulse_energy") and emitter.pose.origin[2] > 0:
+            spreads = emitter.angular_spread, emitter.widest_angular_spread
+            instruments.append(Instrument.laser(*_above_sea(emitter.pose), spreads))
+    for sensor in scene.sensors():
+        receiver = getattr(sensor, "receiver", None)
+        if isinstance(receiver, Receiver) and receiver.pose.origin[2] > 0:
+            pixels = receiver.pixels
+            side = float(np.sqrt(pixels.area / pixels.count))
+            instruments.append(Instrument.receiver(*_above_sea(receiver.pose), pixels.field_of_view, side))
+    if any([shape.fit(instruments) for shape in scene.shapes() if hasattr(shape, "ripple_variance")]):
+        scene.parameters_changed([])
+
+
+def _above_sea(pose: Pose) -> tuple[tuple[float, float], float, float]:
+    """Return where the axis meets the mean sea level [m], the altitude [m], and the off-nadir angle [rad]."""
+    spot = pose.ground_point()
+    return (float(spot[0]), float(spot[1])), float(pose.origin[2]), np.deg2rad(min(pose.off_nadir_deg, 89.9))
 
 
 def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape], float]:

@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
 
@@ -288,3 +289,40 @@ def test_any_mesh_with_water_below_it_is_a_sea(lidar_scene, passes, tmp_path):
     error = np.hypot(first.std(ddof=1), second.std(ddof=1)) / np.sqrt(8)
     assert abs(first.mean() - second.mean()) < 5 * error
     assert error < 0.05 * first.mean()
+
+
+def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
+    """The same mesh and ripples however the scene was loaded; bits of a render depend on nothing else."""
+    scene = {
+        "tx": {"divergence_mrad": 5.0, "aim_x": 5.0, "altitude": 100.0},
+        "rx": {"aim_x": 5.0, "altitude": 100.0, "field_of_view_mrad": 10.0},
+    }
+    automatic = lidar_scene(**scene, sea={"spectrum": "elfouhaily", "wind_speed": 2.0})
+    explicit = lidar_scene(
+        **scene,
+        sea={
+            **{"spectrum": "elfouhaily", "wind_speed": 2.0, "centre_x": 5.0, "centre_y": 0.0},
+            **{"altitude": 100.0, "divergence_1e2_mrad": 10.0, "field_of_view_mrad": 10.0},
+        },
+    )
+    before = next(shape for shape in automatic.shapes() if hasattr(shape, "sea")).sea.cell_size
+    parts = []
+    for loaded in (automatic, explicit):
+        load_scene(loaded)
+        shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
+        parameters = mi.traverse(shape)
+        names = ("vertex_positions", "vertex_texcoords", "faces", "bsdf.alpha_u.value", "bsdf.alpha_v.value")
+        rays = mi.Ray3f(mi.Point3f(mi.Float(np.linspace(-3, 12, 31)), 0.3, 20.0), mi.Vector3f(0, 0, -1))
+        parts.append([*(np.array(parameters[name]) for name in names), np.array(loaded.ray_intersect(rays).t)])
+        assert shape.cell_size < 0.25 * 2.5e-3 * 107 < before
+    for first, second in zip(*parts, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_seas_with_all_values_of_their_own_stay_as_loaded(lidar_scene):
+    own = {"spectrum": "elfouhaily", "refined_size": 8.0, "cell_size": 0.5, "centre_x": 1.0, "centre_y": 2.0}
+    loaded = lidar_scene(sea={**own, "size": 50.0})
+    shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
+    sea = shape.sea
+    load_scene(loaded)
+    assert shape.sea is sea

@@ -79,9 +79,27 @@ def realise(
     UserError
         If `period` or `depth` is not positive, `cells` not even and positive, or `time` or `current` not finite.
     """
-    from scipy.fft import fftshift, irfft2
+    return heights_of(wave_coefficients(spectrum, period, cells, seed, time, depth, current))
 
-    ix, iy, dk = _wave_grid(period, cells)
+
+def wave_coefficients(
+    spectrum: WaveSpectrum,
+    period: float,
+    cells: int,
+    seed: int,
+    time: float = 0.0,
+    depth: float = math.inf,
+    current: tuple[float, float] = (0.0, 0.0),
+) -> npt.NDArray[np.complex128]:
+    """Return the complex amplitudes [m] of the waves of `realise`, whose parameters they are.
+
+    Returns
+    -------
+    ndarray, shape (cells, cells/2 + 1)
+        Amplitudes of the waves of `wave_numbers`; the other half plane is their conjugate. Those of the constant and of
+        the Nyquist wavenumbers are 0.
+    """
+    ix, iy, dk = wave_numbers(period, cells)
     finite("time", time)
     _check_depth(depth)
     velocity = finite_array("current", current)
@@ -105,7 +123,15 @@ def realise(
     coefficients[0, 0] = 0
     # At the Nyquist wavenumber a grid cannot distinguish +k from -k.
     coefficients[half, :] = coefficients[:, half] = 0
-    heights = irfft2(coefficients, s=(iy.size, iy.size), norm="forward", overwrite_x=True)
+    return coefficients
+
+
+def heights_of(coefficients: npt.NDArray[np.complex128]) -> FloatArray:
+    """Return the elevations [m] of `realise` from `wave_coefficients`, which are overwritten."""
+    from scipy.fft import fftshift, irfft2
+
+    cells = len(coefficients)
+    heights = irfft2(coefficients, s=(cells, cells), norm="forward", overwrite_x=True)
     return np.asarray(fftshift(heights), dtype=np.float64)
 
 
@@ -133,11 +159,32 @@ def mesh_slope_variance(
     covariance is that of cells split along the diagonal from (i+1, j) to (i, j+1), averaged over both triangles of a
     cell: 4 sin(a) sin(b) cos(a - b)/d^2 with a = kx d/2, b = ky d/2. It matters only for winds oblique to the mesh.
     """
-    ix, iy, dk = _wave_grid(period, cells)
-    axis = spectrum.direction if direction is None else direction
+    ix, iy, dk = wave_numbers(period, cells)
     half = iy.size // 2
     variance = spectrum.mode_variances(ix, iy, dk)
     variance[half, :] = variance[:, half] = 0
+    axis = spectrum.direction if direction is None else direction
+    return facet_slope_variance(variance, ix, iy, period, cells, axis)
+
+
+def facet_slope_variance(
+    variance: FloatArray, ix: IntArray, iy: IntArray, period: float, cells: float, axis: float
+) -> tuple[float, float]:
+    """Return the slope variances [1] along and across an axis of the facets that sample waves.
+
+    Parameters
+    ----------
+    variance
+        Elevation variances [m^2] of the waves, shape (len(iy), len(ix)); overwritten.
+    ix, iy
+        Their numbers of wavelengths along x and y over the period, from `wave_numbers`.
+    period, cells
+        Period [m], and its length in cells, which may be broken.
+    axis
+        Direction [rad], counter-clockwise from +x.
+
+    For the formula see `mesh_slope_variance`.
+    """
     variance[:, 1:] *= 2  # for the half plane kx < 0
     # sin(a) sin(b) cos(a - b) = sin(2a) sin(2b)/4 + sin(a)^2 sin(b)^2
     a, b = ix * np.pi / cells, iy * np.pi / cells
@@ -153,8 +200,21 @@ def _check_depth(depth: float) -> None:
         raise UserError(f"depth = {depth:g} must be greater than 0")
 
 
-def _wave_grid(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
-    """Return indices of the columns and rows of a real FFT, shapes (cells/2 + 1,) and (cells,), and dk [rad/m]."""
+def wave_numbers(period: float, cells: int) -> tuple[IntArray, IntArray, float]:
+    """Return numbers of wavelengths over a period along x and y, and their unit.
+
+    Parameters
+    ----------
+    period, cells
+        As for `realise`.
+
+    Returns
+    -------
+    ix, iy
+        Indices of the columns and rows of a real FFT, shapes (cells/2 + 1,) and (cells,).
+    dk
+        Wavenumber of one wavelength over the period [rad/m].
+    """
     positive("period", period)
     if cells != int(cells) or cells < 2 or cells % 2:
         raise UserError(f"cells = {cells} must be an even integer of at least 2")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,8 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range, inte
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
-from mitransient_lidar.physics.sea.realization import mesh_slope_variance, realise
+from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
+from mitransient_lidar.physics.sea.resolution import Get, Instrument, Resolution, read_length
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, triangulate
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -40,36 +41,12 @@ _SMALLEST_RIPPLE_VARIANCE = 1e-5
 #: not depend on the resolution, so that a seed defines one sea.
 _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 
-#: Largest number of cells per side of a period and of the fine patch.
-_MOST_CELLS = 4096
-
-#: Sides of a cell and of the patch without a known footprint [m].
-_DEFAULT_CELL, _DEFAULT_SIZE = 0.25, 32.0
-
-#: Cells per standard deviation of the beam, and limits of the resulting cell size [m].
-_CELLS_PER_SPREAD, _SMALLEST_CELL, _LARGEST_CELL = 4.0, 0.02, 0.5
-
-#: Side of the patch: factor on the footprint, and margin [m] for scattered light.
-_SIZE_PER_FOOTPRINT, _SIZE_MARGIN = 1.25, 8.0
+#: Largest number of cells per side of the fine patch, and smallest number per period for waves to be resolved.
+_MOST_CELLS, _FEWEST_CELLS = 4096, 16
 
 _SPECTRA = ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat")
 
-Get = Callable[[str, Any], Any]
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
-
-
-@dataclass(frozen=True)
-class PeriodicHeights:
-    """Elevations [m] of waves from `realization.realise`, shape (cells, cells), and the spacing [m] of their grid."""
-
-    heights: FloatArray
-    cell_size: float
-
-    def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return elevations [m] at the grid points nearest to the grid lines x and y [m], shape (len(y), len(x))."""
-        count = len(self.heights)
-        i, j = ((np.rint(np.asarray(lines) / self.cell_size).astype(int) + count // 2) % count for lines in (x, y))
-        return np.asarray(self.heights[np.ix_(j, i)])
 
 
 @dataclass(frozen=True)
@@ -79,7 +56,7 @@ class SeaSurface:
     spectrum: str  #: Name of the source of the waves.
     wind_speed: float  #: Wind at 10 m [m/s].
     wind_direction: float  #: Direction that the wind blows towards [rad], counter-clockwise from +x.
-    waves: PeriodicHeights | HeightMap | None  #: Elevations, None for a flat sea.
+    waves: PeriodicHeights | NestedHeights | HeightMap | None  #: Elevations, None for a flat sea.
     cell_size: float  #: Side of the cells of the fine patch [m], infinite for a flat sea.
     centre: tuple[float, float]  #: Position of the patch [m].
     refined_size: float  #: Side of the patch [m].
@@ -89,54 +66,72 @@ class SeaSurface:
     wake: Wake | None  #: Heights of a ship's wake [m] on grid lines x and y [m], None without a ship.
 
     @classmethod
-    def read(cls, get: Get) -> SeaSurface:
-        """Build a sea from parameters of the plugin ``ocean_surface``; `get` is a function (name, default) -> value."""
+    def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
+        """Build a sea from parameters of the plugin ``ocean_surface``.
+
+        Parameters
+        ----------
+        get
+            Function (name, default) -> value of a parameter.
+        instruments
+            Lasers and receivers above the sea, for its automatic values.
+        is_placeholder
+            Whether to check the parameters only, and return a sea without waves.
+
+        Raises
+        ------
+        UserError
+            If a parameter is out of range, or a file cannot be read.
+        """
         spectrum = get("spectrum", "elfouhaily")
         if spectrum not in _SPECTRA:
             raise UserError(f"spectrum = {spectrum!r} must be one of {', '.join(_SPECTRA)}")
         wind_speed = in_range("wind_speed", get("wind_speed", 3.0), 0.0, MAX_WIND_SPEED)
         wind_direction = _read_angle(get, "wind_direction_deg")
-        centre = finite("centre_x", get("centre_x", 0.0)), finite("centre_y", get("centre_y", 0.0))
         state = _read_waves(get, spectrum, wind_speed, wind_direction)
         slope_variance = get("slope_variance", "cox_munk")
         seed = integer("surface_seed", get("surface_seed", 1), 0, 2**53)
         wake = _read_wake(get)
-        spread, footprint = _read_footprint(get)
-        cell = _read_length(get, "cell_size") or min(max(spread / _CELLS_PER_SPREAD, _SMALLEST_CELL), _LARGEST_CELL)
-        refined_size = _read_length(get, "refined_size") or _SIZE_PER_FOOTPRINT * footprint + _SIZE_MARGIN
-        size = positive("size", get("size", 1000.0))
-        period = _read_length(get, "period")
+        resolution = Resolution.read(get, instruments)
+        period = read_length(get, "period")
         time = finite("time", get("time", 0.0))
         depth = positive("water_depth", get("water_depth", 1e4))
         current = in_range("current_speed", get("current_speed", 0.0), 0.0, 10.0)
         current_direction = _read_angle(get, "current_direction_deg")
-        map_size = _read_length(get, "map_size")
+        map_size = read_length(get, "map_size")
         path = get("filename", "")
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
-        waves: PeriodicHeights | HeightMap | None = None
+        waves: PeriodicHeights | NestedHeights | HeightMap | None = None
         resolved = (0.0, 0.0)
-        if state is not None:
+        centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
+        if is_placeholder:
+            cell, wake = math.inf, None
+        elif state is not None:
             period = period or _period(state)
-            cells = _cell_count(cell, period)
-            cell = period / cells
-            drift = current * math.cos(current_direction), current * math.sin(current_direction)
-            waves = PeriodicHeights(realise(state, period, cells, seed, time, depth, drift), cell)
-            resolved = mesh_slope_variance(state, period, cells, wind_direction)
+            if cell <= period / _FEWEST_CELLS or get("cell_size", "auto") != "auto":
+                drift = current * math.cos(current_direction), current * math.sin(current_direction)
+                motion = Motion(time, depth, drift)
+                _check_number_of_cells(refined_size, cell)
+                waves, cell, resolved = realise_heights(state, period, cell, seed, motion, wind_direction)
+            elif wake is None:
+                cell = math.inf
         elif spectrum == "height_map":
             waves = terrain = read_height_map(_required(path, spectrum), map_size)
             cell = float(terrain.x[1] - terrain.x[0])
             refined_size = float(terrain.x[-1] - terrain.x[0])
+            middle = tuple(0.5 * float(lines[0] + lines[-1]) for lines in (terrain.x, terrain.y))
+            is_free = [get(name, "auto") == "auto" for name in ("centre_x", "centre_y")]
+            centre = (middle[0] if is_free[0] else centre[0], middle[1] if is_free[1] else centre[1])
+            _check_number_of_cells(refined_size, cell)
             resolved = _facet_variance(terrain, wind_direction)
         elif wake is None:
             cell = math.inf
+        else:
+            _check_number_of_cells(refined_size, cell)
         along, across = (max(_SMALLEST_RIPPLE_VARIANCE, t - r) for t, r in zip(total, resolved, strict=True))
-        if math.isfinite(cell) and refined_size / cell > _MOST_CELLS:
-            raise UserError(
-                f"refined_size = {refined_size:g} with cell_size = {cell:g} needs {refined_size / cell:.0f} cells per "
-                f"side but at most {_MOST_CELLS} are allowed"
-            )
         kind = spectrum if waves is not None else "flat"
+        size = resolution.size
         patch = min(refined_size, size)
         return cls(kind, wind_speed, wind_direction, waves, cell, centre, patch, size, resolved, (along, across), wake)
 
@@ -237,17 +232,13 @@ def _period(state: SeaState) -> float:
     return min(_LONGEST_PERIOD, _PERIOD_STEP * math.ceil(_PERIOD_WAVELENGTHS * longest / _PERIOD_STEP))
 
 
-def _cell_count(cell: float, period: float) -> int:
-    """Return an even number of cells per period, not longer than `cell` [m], that is fast to transform."""
-    from scipy.fft import next_fast_len
-
-    cells = 2 * int(next_fast_len(max(2, math.ceil(0.5 * period / cell - 1e-9)), real=True))
-    if cells > _MOST_CELLS:
+def _check_number_of_cells(refined_size: float, cell: float) -> None:
+    """Refuse a patch of too many cells."""
+    if refined_size / cell > _MOST_CELLS:
         raise UserError(
-            f"cell_size = {cell:g} with period = {period:g} needs {cells} cells per side but at most {_MOST_CELLS} "
-            "are allowed"
+            f"refined_size = {refined_size:g} with cell_size = {cell:g} needs {refined_size / cell:.0f} cells per "
+            f"side but at most {_MOST_CELLS} are allowed"
         )
-    return cells
 
 
 def _facet_variance(terrain: HeightMap, wind_direction: float) -> tuple[float, float]:
@@ -273,32 +264,9 @@ def _read_wake(get: Get) -> Wake | None:
     return partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
 
 
-def _read_footprint(get: Get) -> tuple[float, float]:
-    """Return the beam's standard deviation across range, and the side of the square of beam and field of view [m]."""
-    altitude, divergence = get("altitude", None), get("divergence_mrad", 10.0)
-    off_nadir = math.radians(in_range("off_nadir_deg", get("off_nadir_deg", 20.0), 0.0, 89.9))
-    field = 1e-3 * positive("field_of_view_mrad", get("field_of_view_mrad", 30.0))
-    sigma = 0.5e-3 * positive("divergence_mrad", divergence)
-    if altitude is None:
-        return _CELLS_PER_SPREAD * _DEFAULT_CELL, (_DEFAULT_SIZE - _SIZE_MARGIN) / _SIZE_PER_FOOTPRINT
-    altitude = positive("altitude", altitude)
-    slant = altitude / math.cos(off_nadir)
-    half = min(max(field / 2, 3 * sigma), math.pi / 4)
-    # Towards the horizon a footprint is unbounded; the patch is limited to four times the horizontal range.
-    far = min(math.tan(min(off_nadir + half, math.radians(89.9))), 4 * math.tan(off_nadir) + 1)
-    along = altitude * max(far - math.tan(off_nadir), math.tan(off_nadir) - math.tan(off_nadir - half))
-    return slant * sigma, 2 * max(along, slant * math.tan(half))
-
-
 def _read_angle(get: Get, name: str) -> float:
     """Return an angle of a parameter in degrees [rad], 0 by default."""
     return math.radians(finite(name, get(name, 0.0)))
-
-
-def _read_length(get: Get, name: str) -> float | None:
-    """Return a positive length [m], or None for ``auto``."""
-    value = get(name, "auto")
-    return None if value == "auto" else positive(name, value)
 
 
 def _read_table(path: str) -> TabulatedSpectrum:

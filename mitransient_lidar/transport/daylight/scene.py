@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.scene import WaterScene, find_receiver, find_water
+from mitransient_lidar.transport.scene import WaterScene, find_receiver, find_water, fit_seas
 
 #: Largest angle between the sun and the sun of a clear sky [deg].
 _SAME_DIRECTION_DEG = 0.05
@@ -37,6 +37,7 @@ class DaylightScene(WaterScene):
         UserError
             When a part is missing, not supported, or there are several where one is allowed.
         """
+        fit_seas(scene)
         receiver = find_receiver(sensor)
         found: dict[str, mi.Emitter] = {}
         for emitter in scene.emitters():

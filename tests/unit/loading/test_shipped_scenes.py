@@ -17,7 +17,7 @@ TABLE = {
     **{"time_start_ns": "1390", "bin_width_ns": "1", "bin_count": "150"},
     **{"wind_speed": "3", "wind_direction_deg": "0", "spectrum": "elfouhaily", "slope_variance": "cox_munk"},
     **{"surface_seed": "1", "surface_time": "0"},
-    **{"surface_refined_size": "auto", "surface_cell_size": "auto", "surface_size": "1000"},
+    **{"surface_refined_size": "auto", "surface_cell_size": "auto", "surface_size": "auto"},
     **{"refractive_index": "1.34", "group_index": "1.364", "layer_tops": "0"},
     **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "0"},
     **{"phase": "fournier_forand", "phase_g": "0.924"},

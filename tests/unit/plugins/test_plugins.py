@@ -149,9 +149,12 @@ REFUSED = [
     ({"type": "ocean_surface", "slope_variance": "some"}, "slope_variance = 'some' must be"),
     ({"type": "ocean_surface", "slope_variance": "2"}, "slope_variance = 2 must lie between"),
     ({"type": "ocean_surface", "cell_size": "fine"}, "cell_size = 'fine' must be a number"),
-    ({"type": "ocean_surface", "cell_size": 0.001}, "cell_size = 0.001 with period = 32 needs 32000 cells per side"),
     (
-        {"type": "ocean_surface", "refined_size": 2000.0},
+        {"type": "ocean_surface", "cell_size": 0.001},
+        "refined_size = 32 with cell_size = 0.001 needs 32000 cells per side",
+    ),
+    (
+        {"type": "ocean_surface", "refined_size": 2000.0, "cell_size": 0.25},
         "refined_size = 2000 with cell_size = 0.25 needs 8000 cells per side",
     ),
     ({"type": "ocean_surface", "size": -1.0}, "size = -1 must be greater than 0"),

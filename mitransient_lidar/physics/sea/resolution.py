@@ -1,0 +1,170 @@
+"""Automatic position, size and cells of a sea, from the lidar above it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.physics.lidar.divergence import read_divergence
+
+#: Sides of a cell and of the patch without a lidar [m].
+_DEFAULT_CELL, _DEFAULT_SIZE = 0.25, 32.0
+
+#: Cells per standard deviation of the beam and per side of a pixel, and limits of the resulting cell size [m].
+_CELLS_PER_SPREAD, _CELLS_PER_PIXEL, _SMALLEST_CELL, _LARGEST_CELL = 4.0, 2.0, 0.02, 0.5
+
+#: Largest number of cells per side of an automatic patch, and largest factor by which cells grow to respect it.
+_MOST_CELLS, _LARGEST_GROWTH = 1024, 4.0
+
+#: Side of the patch: factor on the footprint, and margin [m] for scattered light.
+_SIZE_PER_FOOTPRINT, _SIZE_MARGIN = 1.25, 8.0
+
+#: Side of the surface: least length [m], and factor on the footprints with the margin.
+_LEAST_SURFACE, _SURFACE_PER_SIZE = 1000.0, 2.0
+
+#: Half angle of a beam, in standard deviations.
+_BEAM_HALF_WIDTH = 3.0
+
+#: Full angles [rad] of beam and field of view unless they are given.
+_DIVERGENCE, _FIELD_OF_VIEW = 10e-3, 30e-3
+
+Get = Callable[[str, Any], Any]
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A laser or a receiver above the sea."""
+
+    aim: tuple[float, float]  #: Point where its axis meets the mean sea level [m].
+    altitude: float  #: Height above the mean sea level [m].
+    off_nadir: float  #: Angle of the axis from the vertical, at most 89.9 degrees [rad].
+    is_laser: bool
+    half_angle: float  #: Half of the full angle of the light or the field of view [rad].
+    detail: float  #: Angle that a cell may span at most [rad].
+
+    @classmethod
+    def laser(
+        cls, aim: tuple[float, float], altitude: float, off_nadir: float, spreads: tuple[float, float]
+    ) -> Instrument:
+        """Return a laser whose beam has the given narrowest and widest standard deviation [rad]."""
+        narrow, wide = spreads
+        return cls(aim, altitude, off_nadir, True, _BEAM_HALF_WIDTH * wide, narrow / _CELLS_PER_SPREAD)
+
+    @classmethod
+    def receiver(
+        cls, aim: tuple[float, float], altitude: float, off_nadir: float, field_of_view: float, pixel: float
+    ) -> Instrument:
+        """Return a receiver of a full angle and a typical side of a pixel [rad]."""
+        return cls(aim, altitude, off_nadir, False, 0.5 * field_of_view, pixel / _CELLS_PER_PIXEL)
+
+    @property
+    def cell(self) -> float:
+        """Side of the cells that resolve its beam or its pixels [m]."""
+        return self.altitude / math.cos(self.off_nadir) * self.detail
+
+    @property
+    def half_side(self) -> float:
+        """Half of the side of the square about the aim point that holds its footprint [m]."""
+        half = min(self.half_angle, math.pi / 4)
+        # Towards the horizon a footprint is unbounded; the square is limited to four times the horizontal range.
+        tan = math.tan(self.off_nadir)
+        far = min(math.tan(min(self.off_nadir + half, math.radians(89.9))), 4 * tan + 1)
+        along = self.altitude * max(far - tan, tan - math.tan(self.off_nadir - half))
+        return max(along, self.altitude / math.cos(self.off_nadir) * math.tan(half))
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Position, sizes and cells of a sea [m]."""
+
+    centre: tuple[float, float]  #: Position of the fine patch.
+    cell_size: float  #: Largest side of the patch's cells.
+    refined_size: float  #: Side of the patch.
+    size: float  #: Side of the whole surface.
+
+    @classmethod
+    def read(cls, get: Get, instruments: Sequence[Instrument]) -> Resolution:
+        """Read the parameters of the plugin ``ocean_surface``, and choose those that are ``auto``.
+
+        Parameters
+        ----------
+        get
+            Function (name, default) -> value of a parameter.
+        instruments
+            Lasers and receivers above the sea. Values of the parameters ``altitude``, ``off_nadir_deg``,
+            ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
+
+        Raises
+        ------
+        UserError
+            If a value is not positive or out of range.
+        """
+        cell, side = read_length(get, "cell_size"), read_length(get, "refined_size")
+        size = read_length(get, "size")
+        found = _with_own_values(get, instruments)
+        areas = [_square(found), _square([each for each in found if each.is_laser] or found)]
+        centre = tuple(
+            automatic if value == "auto" else finite(name, value)
+            for name, automatic in zip(("centre_x", "centre_y"), areas[0][:2], strict=True)
+            for value in [get(name, "auto")]
+        )
+        everything, lit = (_SIZE_PER_FOOTPRINT * area[2] + _SIZE_MARGIN for area in areas)
+        size = size or max(_LEAST_SURFACE, _SURFACE_PER_SIZE * everything)
+        wanted = min((each.cell for each in found), default=_DEFAULT_CELL)
+        # A beam must not lie within one facet.
+        longest = _LARGEST_GROWTH * min((each.cell for each in found if each.is_laser), default=math.inf)
+        finest = cell or min(max(wanted, _SMALLEST_CELL), _LARGEST_CELL, longest)
+        # Too many cells: the patch gives up the view beyond the beam, then cells grow, then the patch shrinks.
+        patch = side or min(everything, max(lit, _MOST_CELLS * finest))
+        cell = cell or max(finest, patch / _MOST_CELLS)
+        if side is None and cell > longest:
+            cell = max(finest, longest)
+            patch = min(patch, _MOST_CELLS * cell)
+        return cls((centre[0], centre[1]), cell, patch, size)
+
+
+def _square(instruments: Sequence[Instrument]) -> tuple[float, float, float]:
+    """Return centre (x, y) and side [m] of the square that holds the footprints."""
+    if not instruments:
+        return 0.0, 0.0, (_DEFAULT_SIZE - _SIZE_MARGIN) / _SIZE_PER_FOOTPRINT
+    low, high = (
+        [pick(each.aim[axis] + sign * each.half_side for each in instruments) for axis in (0, 1)]
+        for pick, sign in ((min, -1), (max, 1))
+    )
+    if len({each.aim for each in instruments}) == 1:
+        return *instruments[0].aim, 2 * max(each.half_side for each in instruments)
+    return 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), max(high[0] - low[0], high[1] - low[1])
+
+
+def _with_own_values(get: Get, instruments: Sequence[Instrument]) -> list[Instrument]:
+    """Return the instruments with the values that the sea's own parameters give."""
+    altitude, off_nadir, field = get("altitude", None), get("off_nadir_deg", None), get("field_of_view_mrad", None)
+    altitude = None if altitude is None else positive("altitude", altitude)
+    off_nadir = None if off_nadir is None else math.radians(in_range("off_nadir_deg", off_nadir, 0.0, 89.9))
+    field = None if field is None else 1e-3 * positive("field_of_view_mrad", field)
+    divergence = read_divergence(get)
+    found = list(instruments)
+    if altitude is not None and not found:
+        pose = (0.0, 0.0), altitude, math.radians(20.0)
+        spread = 0.5 * _DIVERGENCE
+        found = [Instrument.laser(*pose, (spread, spread)), Instrument.receiver(*pose, _FIELD_OF_VIEW, math.inf)]
+    own = []
+    for each in found:
+        each = replace(each, altitude=altitude or each.altitude)
+        each = each if off_nadir is None else replace(each, off_nadir=off_nadir)
+        if each.is_laser and divergence is not None:
+            spread = 0.5 * divergence
+            each = Instrument.laser(each.aim, each.altitude, each.off_nadir, (spread, spread))
+        elif not each.is_laser and field is not None:
+            each = replace(each, half_angle=0.5 * field)
+        own.append(each)
+    return own
+
+
+def read_length(get: Get, name: str) -> float | None:
+    """Return a positive length [m], or None for ``auto``."""
+    value = get(name, "auto")
+    return None if value == "auto" else positive(name, value)

@@ -1,0 +1,81 @@
+"""Seas of several grids: the same long waves, and the slope variance of the spectrum."""
+
+import numpy as np
+import pytest
+from significance import largest_z
+
+from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
+from mitransient_lidar.physics.sea.realization import mesh_slope_variance
+from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
+from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum
+
+STILL = Motion(0.0, 1e4, (0.0, 0.0))
+SEA = MatchedSpectrum(ElfouhailySpectrum(6.0), *cox_munk(6.0))
+
+
+def facet_slopes(waves, cell, count, first=0):
+    """Return the slopes along x and y of square cells of a patch that starts at a whole number of cells."""
+    lines = cell * (first + np.arange(count + 1))
+    heights = waves.sample(lines, lines)
+    return np.diff(heights, axis=1)[:-1] / cell, np.diff(heights, axis=0)[:, :-1] / cell
+
+
+@pytest.mark.parametrize(("period", "cell"), [(128.0, 0.06), (512.0, 0.2)])
+def test_bands_resolve_the_slope_variance_of_one_fine_grid(period, cell):
+    """A gap or an overlap between the bands is a factor e in wavenumber: several per cent of the variance."""
+    waves, found, variance = realise_heights(SEA, period, cell, 1, STILL, 0.0)
+    assert isinstance(waves, NestedHeights)
+    assert found <= cell
+    # One grid of the same cells over the shortest period that still holds the long waves to 1 %.
+    cells = 2 * round(0.5 * 96.0 / found)
+    np.testing.assert_allclose(variance, mesh_slope_variance(SEA, cells * found, cells, 0.0), rtol=0.01)
+
+
+@pytest.mark.slow
+def test_facets_have_the_stated_slope_variance():
+    """Over 12 seas, along and across the wind, against Student's t."""
+    mean_squares = []
+    for seed in range(12):
+        waves, cell, variance = realise_heights(SEA, 64.0, 0.03, seed, STILL, 0.0)
+        mean_squares.append([np.mean(slopes**2) for slopes in facet_slopes(waves, cell, 600, 300 * seed)])
+    mean_squares = np.array(mean_squares)
+    error = mean_squares.std(axis=0, ddof=1) / np.sqrt(len(mean_squares))
+    assert np.all(error < 0.04 * np.array(variance))
+    assert np.all(np.abs(mean_squares.mean(axis=0) - variance) < largest_z(12, 2) * error)
+
+
+@pytest.mark.slow
+def test_long_waves_are_those_of_a_coarse_sea():
+    """Averaged over half a metre, a fine sea is the coarse one with the same seed; another seed is another sea."""
+    fine, cell, _ = realise_heights(SEA, 64.0, 0.03, 3, STILL, 0.0)
+    assert isinstance(fine, NestedHeights)
+    lines = 0.5 * np.arange(-40, 40)
+    inner = cell * np.arange(-8, 9)
+    averaged = np.zeros((80, 80))
+    for dx in inner[::4]:
+        for dy in inner[::4]:
+            averaged += fine.sample(lines + dx, lines + dy) / 25
+    for seed, low, high in ((3, 0.99, 1.0), (4, -0.6, 0.6)):
+        coarse, spacing, _ = realise_heights(SEA, 64.0, 0.25, seed, STILL, 0.0)
+        assert isinstance(coarse, PeriodicHeights)
+        assert spacing == 0.25
+        assert low < np.corrcoef(averaged.ravel(), coarse.sample(lines, lines).ravel())[0, 1] < high
+
+
+def test_sea_of_bands_repeats_after_its_period():
+    waves, cell, _ = realise_heights(SEA, 128.0, 0.06, 1, STILL, 0.0)
+    lines = cell * np.arange(50)
+    period = round(128.0 / cell) * cell
+    assert period == pytest.approx(128.0, abs=1e-9)
+    np.testing.assert_allclose(waves.sample(lines, lines), waves.sample(lines + period, lines - period), atol=1e-9)
+
+
+def test_waves_of_all_bands_move():
+    """A current of 3 m/s carries a frozen sea: nearly the same after 0.01 s at a place 3 cm further on."""
+    first, cell, _ = realise_heights(SEA, 64.0, 0.03, 1, STILL, 0.0)
+    later = realise_heights(SEA, 64.0, 0.03, 1, Motion(cell / 3.0, 1e4, (3.0, 0.0)), 0.0)[0]
+    lines = cell * np.arange(200)
+    before, moved, kept = first.sample(lines, lines), later.sample(lines + cell, lines), later.sample(lines, lines)
+    short = [np.diff(heights, 2, axis=1) for heights in (before, moved, kept)]
+    assert np.std(short[1] - short[0]) < 0.6 * np.std(short[2] - short[0])
