@@ -10,9 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, number_list
+from mitransient_lidar.core.validation import in_range, number_list, positive
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
+from mitransient_lidar.physics.water.water_types import KINDS as WATERS
+from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
@@ -20,8 +22,8 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water_phases import KINDS, ScattererPhases, phases_of_layers
 from mitransient_lidar.transport.path import Path
 
-#: Upper edges [m], attenuation, scattering and backscattering [1/m] unless they are given.
-_DEFAULTS = ("0", 0.3, 0.15, 0.006)
+#: Attenuation, scattering and backscattering [1/m] unless they are given.
+_DEFAULTS = {"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006}
 
 
 class LayeredWater(mi.Medium):
@@ -36,6 +38,15 @@ class LayeredWater(mi.Medium):
                                      0.3
     scattering               string  Scattering b [1/m], at most c. Default: 0.15
     backscattering           string  Backscattering bb [1/m], at most b. Default: 0.006
+    jerlov                   string  Instead of the three coefficients, the water's type: ``I``, ``IA``, ``IB``, ``II``,
+                                     ``III``, ``1C``, ``3C``, ``5C``, ``7C`` or ``9C``
+    chlorophyll              string  Or its chlorophyll, 0.01 to 30 mg/m^3 (Case 1 water)
+    kd                       string  Or its diffuse attenuation Kd, 0.0486 to 0.738 1/m
+    secchi                   string  Or its Secchi depth, 0.5 to 25 m
+    petzold                  string  Or Petzold's ``clear``, ``coastal`` or ``turbid``
+    pure                     string  Or ``true``: sea water without particles, whose scattering is ``water_scattering``
+    wavelength_nm            float   Wavelength of these waters [nm]: 532, or 400 to 700 for ``chlorophyll`` and
+                                     ``pure``, 514 to 533 for ``petzold``. Default: 532
     profile                  string  A file instead of the four above: .csv or .nc with ``depth`` [m], two of ``a``,
                                      ``b``, ``c``, ``omega``, and ``bb`` or ``bb_ratio`` (`physics.water.profiles`)
     profile_tolerance        float   Largest relative error of the layers that approximate the profile, 1e-5 to 0.5.
@@ -60,6 +71,10 @@ class LayeredWater(mi.Medium):
                                      between clean bubbles and coated ones (Zhang, Lewis and Johnson 1998,
                                      doi:10.1364/AO.37.006525)
     =======================  ======  ===================================================================================
+
+    Of coefficients, the six ways to give a water, and ``profile`` one is allowed; an empty text counts as not given. A
+    water holds for all layers, or is a list with one value a layer: ``1C, 5C``. Sources and uncertainties are those of
+    `physics.water.water_types`, and ``mitransient-lidar water`` prints the coefficients; the indices do not follow.
 
     The first layer includes the wave crests above z = 0, the last one is infinitely deep. With ``petzold``, ``hg`` or a
     nested phase function, bb follows from that function and ``backscattering`` is only checked.
@@ -90,7 +105,7 @@ class LayeredWater(mi.Medium):
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         self.column = _column(props)
         #: Whether the layers approximate a profile from a file.
-        self.from_profile = bool(props.get("profile", ""))
+        self.from_profile = _is_given(props, "profile")
         indices = []
         for name, default, low in (("refractive_index", 1.34, 1.0001), ("group_index", 1.364, 1.0)):
             indices.append(_per_layer(name, props.get(name, default), self.column.count))
@@ -109,7 +124,10 @@ class LayeredWater(mi.Medium):
         # Mitsuba's media accept one phase function.
         for name in list(phases)[1:]:
             del props[name]
-        water = _water_scattering(props.get("water_scattering", 0.0), self.column)
+        molecules = props.get("water_scattering", "")
+        if molecules == "":
+            molecules = self.column.scattering if _is_given(props, "pure") else 0.0
+        water = _water_scattering(molecules, self.column)
         tabulated = partial(TabulatedPhaseFunction, mi.Properties())
         of_layers = phases_of_layers(self.column, phases, kind, phase_g, water, tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
@@ -201,16 +219,40 @@ class LayeredWater(mi.Medium):
 
 
 def _column(props: mi.Properties) -> WaterColumn:
-    """Return the layers of the parameters, or of a profile."""
-    path = props.get("profile", "")
+    """Return the layers of the parameters, of a water by name, or of a profile."""
     tolerance = props.get("profile_tolerance", 0.01)
-    names = ("layer_tops", "attenuation", "scattering", "backscattering")
-    if not path:
-        return WaterColumn.from_text(*(props.get(name, value) for name, value in zip(names, _DEFAULTS, strict=True)))
-    given = [name for name in names if name in props]
-    if given:
-        raise UserError(f"profile = {path!r} says {', '.join(given)}, too: give either")
-    return read_profile(path).layers(tolerance)
+    wavelength = positive("wavelength_nm", props.get("wavelength_nm", 532.0))
+    ways = [name for name in (*WATERS, "profile") if _is_given(props, name)]
+    own = [name for name in ("layer_tops", *_DEFAULTS) if _is_given(props, name)]
+    if not ways:
+        values = {name: props[name] if name in own else default for name, default in _DEFAULTS.items()}
+        return WaterColumn.from_text(props["layer_tops"] if "layer_tops" in own else "0", **values)
+    way = ways[0]
+    excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
+    if excluded:
+        raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
+    if way == "profile":
+        return read_profile(props[way]).layers(tolerance)
+    tops = number_list("layer_tops", props["layer_tops"] if own else "0")
+    texts = str(props[way]).replace(",", " ").split()
+    if len(texts) not in (1, tops.size):
+        raise UserError(f"{way} has {len(texts)} values but must have 1 or {tops.size}, one a layer")
+    try:
+        found = [water_of(way, None if way == "pure" else text, wavelength) for text in texts]
+    except UserError as error:
+        raise UserError(f"{way} = {props[way]!r}: {error}") from error
+    rows = np.array([[water.attenuation, water.scattering, water.backscattering] for water in found])
+    return WaterColumn(tops, *np.broadcast_to(rows.T, (3, tops.size)))
+
+
+def _is_given(props: mi.Properties, name: str) -> bool:
+    """Return whether a parameter has a value other than an empty text; ``false`` counts as not given for ``pure``."""
+    value = props.get(name, "")
+    if name == "pure":
+        if str(value).lower() not in ("", "true", "false"):
+            raise UserError(f"pure = {value!r} must be true or false")
+        return str(value).lower() == "true"
+    return bool(value != "")
 
 
 def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn, np.ndarray]:

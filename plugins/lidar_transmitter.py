@@ -9,16 +9,17 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, in_range
+from mitransient_lidar.physics.lidar.divergence import WIDTHS, given_divergences, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import EmitterWithoutExtent
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
-#: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian.
-_WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": float(np.sqrt(2 * np.log(2))), "divergence_1e2_mrad": 2.0}
-
 _PROFILES = ("gaussian", "top_hat", "image")
+
+#: Full angle of the beam unless it is given [rad].
+_DIVERGENCE = 10e-3
 
 
 class LidarTransmitter(EmitterWithoutExtent):
@@ -37,8 +38,9 @@ class LidarTransmitter(EmitterWithoutExtent):
     divergence_mrad         float      Full angle [mrad] between the points where the irradiance of a Gaussian beam has
                                        fallen to e^-1/2 of its peak (its sigma is half of it); the full angle of a
                                        top-hat beam. 0.001 to 2000. Default: 10
-    divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak (Gaussian
-    divergence_1e2_mrad                only); give one of the three
+    divergence_fwhm_mrad,   float      The same beam by its full width at half maximum, or at e^-2 of the peak; give
+    divergence_1e2_mrad                one of the three. Each is the full angle of a top-hat beam, whose irradiance
+                                       falls from its peak to 0 at the edge. An empty text counts as not given
     divergence_across_mrad  float      Makes the beam elliptic: ``divergence_mrad`` is then the full angle along
                                        angle_x, this the one along angle_y. 0.001 to 2000. Default:
                                        ``divergence_mrad``
@@ -160,8 +162,8 @@ def _profile(props: mi.Properties, kind: str) -> BeamProfile:
     if kind not in _PROFILES:
         raise UserError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
     image_names = ("profile_file", "profile_mrad")
-    for name in (*_WIDTHS, "divergence_across_mrad", "ellipse_deg") if kind == "image" else image_names:
-        if name in props:
+    for name in (*WIDTHS, "divergence_across_mrad", "ellipse_deg") if kind == "image" else image_names:
+        if props.get(name, "") != "":
             raise UserError(f"{name} does not go with beam_profile = {kind!r}")
     if kind == "image":
         for name in image_names:
@@ -169,26 +171,16 @@ def _profile(props: mi.Properties, kind: str) -> BeamProfile:
                 raise UserError(f"{name} is missing: beam_profile = 'image' needs it")
         image = read_image("profile_file", props["profile_file"])
         return ImageBeam(image, 1e-3 * ranged("profile_mrad", props["profile_mrad"]))
-    along = across = 0.5 * _divergence(props, kind)
+    divergence = read_divergence(props.get, kind == "top_hat")
+    along = across = 0.5 * (_DIVERGENCE if divergence is None else divergence)
     if "divergence_across_mrad" in props:
-        if any(name in props for name in _WIDTHS if name != "divergence_mrad"):
+        if any(name != "divergence_mrad" for name in given_divergences(props.get)):
             raise UserError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
         across = 0.5e-3 * ranged("divergence_across_mrad", props["divergence_across_mrad"])
     elif "ellipse_deg" in props:
         raise UserError("ellipse_deg needs divergence_across_mrad: a circular beam cannot be turned")
     rotation = float(np.deg2rad(finite("ellipse_deg", props.get("ellipse_deg", 0.0))))
     return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, rotation)
-
-
-def _divergence(props: mi.Properties, profile: str) -> float:
-    """Return the full angle of the beam [rad] as in ``divergence_mrad``, from any of its three definitions."""
-    given = [name for name in _WIDTHS if name in props]
-    if len(given) > 1:
-        raise UserError(f"lidar_transmitter: give one of {' and '.join(given)}, not both")
-    name = given[0] if given else "divergence_mrad"
-    if profile == "top_hat" and name != "divergence_mrad":
-        raise UserError(f"{name} describes a Gaussian beam; a top-hat beam takes divergence_mrad, its full angle")
-    return 1e-3 * ranged(name, props.get(name, 10.0)) / _WIDTHS[name]
 
 
 mi.register_emitter("lidar_transmitter", lambda props: LidarTransmitter(props))

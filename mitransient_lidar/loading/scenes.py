@@ -21,6 +21,16 @@ from mitransient_lidar.loading.includes import expanded
 if TYPE_CHECKING:
     import mitsuba as mi
 
+_COEFFICIENTS = ("attenuation", "scattering", "backscattering")
+
+#: Parameters of scenes that describe the same thing in several ways.
+_ALTERNATIVES: tuple[tuple[tuple[str, ...], ...], ...] = (
+    (("divergence_mrad",), ("divergence_fwhm_mrad",), ("divergence_1e2_mrad",)),
+    (_COEFFICIENTS, ("jerlov",), ("chlorophyll",), ("kd",), ("secchi",), ("petzold",), ("pure",), ("profile",)),
+    (("water_scattering",), ("pure",)),
+    (("layer_tops",), ("profile",)),
+)
+
 
 def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.Scene, str, dict[str, str]]:
     """Load a scene.
@@ -91,6 +101,7 @@ def _filled(path: Path, params: Mapping[str, Any] | None) -> tuple[dict[str, str
         given[name] = _text(name, value)
         if not given[name].strip() and parameters[name].strip():
             raise UserError(f"{name} = {given[name]!r} is empty: it must have a value, as {parameters[name]}")
+    _empty_alternatives(parameters, given)
     return {**parameters, **given}, given
 
 
@@ -156,6 +167,17 @@ def _set_by(message: str, given: Mapping[str, str], path: Path | None) -> str:
         if reference and element.getAttribute("name") == named[1] and reference[1] in given:
             return f" ({named[1]} is set by {reference[1]} = {given[reference[1]]})"
     return ""
+
+
+def _empty_alternatives(parameters: dict[str, str], params: Mapping[str, str]) -> None:
+    """Empty the defaults of a scene that given parameters replace; plugins refuse two that are given."""
+    given = {name for name, value in params.items() if value != ""}
+    for alternatives in _ALTERNATIVES:
+        for chosen in alternatives:
+            if given.isdisjoint(chosen):
+                continue
+            others = {name for names in alternatives for name in names} - given - set(chosen)
+            parameters.update({name: "" for name in others if name in parameters})
 
 
 def _text(name: str, value: Any) -> str:

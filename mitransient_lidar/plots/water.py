@@ -15,6 +15,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import petzold_average_particle
 from mitransient_lidar.physics.water.profiles import Profile
 from mitransient_lidar.physics.water.seawater import water_phase_function
+from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.studies import water_report
 from mitransient_lidar.studies.water_report import PhaseFunction, fournier_forand_of
@@ -47,7 +48,7 @@ def plot_water(
     if kind == "profile":
         profile = water_report.profile_of(value)
         return plot_profile(profile, profile.layers(tolerance), Path(str(value)).name, path)
-    found = water_report.water_of(kind, value, wavelength_nm, temperature, salinity)
+    found = water_of(kind, value, wavelength_nm, temperature, salinity)
     return plot_phase_function(*water_report.phase_function_of(kind, value, found), path)
 
 

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water import seawater, water_types
-from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.petzold_waters import petzold_water
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
-from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import Profile, read_profile
+from mitransient_lidar.physics.water.water_types import water_of
 
 #: Maps angles [rad] to p [1/sr].
 PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
@@ -43,54 +43,6 @@ _TITLES = {
     "petzold": "Petzold's {} water",
     "pure": "pure sea water",
 }
-
-#: Wavelengths [nm] at which Petzold's waters are used: from the centre of his filter to the usual laser.
-_PETZOLD_RANGE = (514.0, water_types.GREEN_RANGE[1])
-
-#: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
-_NODES = 32768
-
-
-def water_of(
-    kind: str, value: str | None, wavelength_nm: float, temperature: float, salinity: float
-) -> water_types.InherentProperties:
-    """Return the inherent optical properties of a water.
-
-    Parameters
-    ----------
-    kind
-        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``.
-    value
-        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
-        ``coastal`` or ``turbid``; None for pure sea water.
-    wavelength_nm, temperature, salinity
-        Wavelength [nm], temperature [deg C] and salinity [per mille].
-
-    Raises
-    ------
-    UserError
-        If the kind is unknown, or a value is missing, not a number or out of range.
-    """
-    if kind not in _CAUTION:
-        raise UserError(f"kind = {kind!r} must be one of {', '.join(_CAUTION)}")
-    if kind == "pure":
-        if value is not None:
-            raise UserError(f"value = {value!r} must be left out for pure sea water")
-        return water_types.pure_seawater(wavelength_nm, temperature, salinity)
-    text = _given(kind, value)
-    if kind == "jerlov":
-        return water_types.jerlov(text, wavelength_nm)
-    if kind == "petzold":
-        return _petzold(text, wavelength_nm)
-    try:
-        number = float(text)
-    except ValueError:
-        raise UserError(f"value = {text!r} must be a number for {kind}") from None
-    if kind == "chlorophyll":
-        return water_types.chlorophyll(number, wavelength_nm)
-    if wavelength_nm != 532.0:
-        raise UserError(f"wavelength = {wavelength_nm:g} must be 532 nm for {kind}")
-    return water_types.from_kd(number) if kind == "kd" else water_types.from_secchi(number)
 
 
 def describe_water(
@@ -209,17 +161,6 @@ def _ratio_span(profile: Profile) -> str:
     if not scatters.any():
         return "none, nothing scatters"
     return _span(profile.backscattering[scatters] / profile.scattering[scatters])
-
-
-def _petzold(name: str, wavelength_nm: float) -> water_types.InherentProperties:
-    if name not in PETZOLD_WATERS:
-        raise UserError(f"value = {name!r} must be one of {', '.join(PETZOLD_WATERS)} for petzold")
-    low, high = _PETZOLD_RANGE
-    if not low <= wavelength_nm <= high:
-        raise UserError(f"wavelength = {wavelength_nm:g} must lie between {low:g} and {high:g} nm for petzold")
-    a, b = PETZOLD_WATERS[name]
-    share = PowerLawTable.from_function(petzold_water(name), _NODES).backscatter_ratio
-    return water_types.InherentProperties(a, b, b * share)
 
 
 def _given(kind: str, value: str | None) -> str:

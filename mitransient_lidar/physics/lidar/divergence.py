@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, positive
+from mitransient_lidar.core.ranges import ranged
 
 #: Ratio of each definition's full width to the e^-1/2 full width (2 sigma) of a Gaussian beam.
 WIDTHS = {"divergence_mrad": 1.0, "divergence_fwhm_mrad": math.sqrt(2 * math.log(2)), "divergence_1e2_mrad": 2.0}
@@ -31,7 +31,7 @@ def read_divergence(get: Callable[[str, Any], Any], is_top_hat: bool = False) ->
     Returns
     -------
     float or None
-        Full angle [rad] between the points where the irradiance has fallen to e^-1/2 of its peak, above 0 to 1; None if
+        Full angle [rad] between the points where the irradiance has fallen to e^-1/2 of its peak; None if
         no parameter is given.
 
     Raises
@@ -52,5 +52,4 @@ def read_divergence(get: Callable[[str, Any], Any], is_top_hat: bool = False) ->
     if not given:
         return None
     name = given[0]
-    value = in_range(name, positive(name, get(name, "")), 0.0, 1000.0)
-    return 1e-3 * value / (1.0 if is_top_hat else WIDTHS[name])
+    return 1e-3 * ranged(name, get(name, "")) / (1.0 if is_top_hat else WIDTHS[name])

@@ -14,6 +14,8 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, non_negative, positive
 from mitransient_lidar.physics.water.data_tables import read_columns
+from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import WAVELENGTH_RANGE, water_absorption, water_scattering
 
 _CHLOROPHYLL_RANGE = (0.01, 30.0)  # mg/m^3, of the Case 1 model
@@ -24,6 +26,15 @@ PETZOLD_BACKSCATTER_RATIO = 0.0183
 
 GREEN_RANGE = (531.0, 533.0)
 """Wavelengths [nm] accepted as 532 nm."""
+
+#: Wavelengths [nm] at which Petzold's waters are used: from the centre of his filter to the usual laser.
+_PETZOLD_RANGE = (514.0, GREEN_RANGE[1])
+
+#: Nodes of the table that integrates a measured phase function; 822 lie in the backward hemisphere.
+_NODES = 32768
+
+KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure")
+"""Quantities that give a water; see `water_of`."""
 
 #: Diffuse attenuation Kd, and absorption and scattering where they were measured [1/m], by Jerlov's types.
 _JERLOV: dict[str, tuple[float, tuple[float, float] | None]] = {
@@ -240,6 +251,61 @@ def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RAT
     a = _absorption_for(kd, lambda x: ratio * (c - x))
     _check_absorption(a, f"depth = {z:g} with backscatter_ratio = {ratio:g}")
     return InherentProperties(a, c - a, ratio * (c - a))
+
+
+def water_of(
+    kind: str, value: str | None, wavelength_nm: float = 532.0, temperature: float = 20.0, salinity: float = 35.0
+) -> InherentProperties:
+    """Return the inherent optical properties of a water.
+
+    Parameters
+    ----------
+    kind
+        ``jerlov``, ``chlorophyll``, ``kd``, ``secchi``, ``petzold`` or ``pure``.
+    value
+        Jerlov's type (``I`` to ``9C``), chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m] or Petzold's ``clear``,
+        ``coastal`` or ``turbid``; None for pure sea water.
+    wavelength_nm, temperature, salinity
+        Wavelength [nm], temperature [deg C] and salinity [per mille].
+
+    Raises
+    ------
+    UserError
+        If the kind is unknown, or a value is missing, not a number or out of range.
+    """
+    if kind not in KINDS:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+    if kind == "pure":
+        if value is not None:
+            raise UserError(f"value = {value!r} must be left out for pure sea water")
+        return pure_seawater(wavelength_nm, temperature, salinity)
+    if value is None:
+        raise UserError(f"value is missing: {kind} needs one")
+    text = value
+    if kind == "jerlov":
+        return jerlov(text, wavelength_nm)
+    if kind == "petzold":
+        return _petzold(text, wavelength_nm)
+    try:
+        number = float(text)
+    except ValueError:
+        raise UserError(f"value = {text!r} must be a number for {kind}") from None
+    if kind == "chlorophyll":
+        return chlorophyll(number, wavelength_nm)
+    if wavelength_nm != 532.0:
+        raise UserError(f"wavelength = {wavelength_nm:g} must be 532 nm for {kind}")
+    return from_kd(number) if kind == "kd" else from_secchi(number)
+
+
+def _petzold(name: str, wavelength_nm: float) -> InherentProperties:
+    if name not in PETZOLD_WATERS:
+        raise UserError(f"value = {name!r} must be one of {', '.join(PETZOLD_WATERS)} for petzold")
+    low, high = _PETZOLD_RANGE
+    if not low <= wavelength_nm <= high:
+        raise UserError(f"wavelength = {wavelength_nm:g} must lie between {low:g} and {high:g} nm for petzold")
+    a, b = PETZOLD_WATERS[name]
+    share = PowerLawTable.from_function(petzold_water(name), _NODES).backscatter_ratio
+    return InherentProperties(a, b, b * share)
 
 
 def _case1_terms(lam: float) -> tuple[float, float, float]:

@@ -10,7 +10,8 @@ from mitransient_lidar.loading import catalogue, scenes
 
 #: Parameters of table1 in their order.
 TABLE = {
-    **{"pulse_energy_mj": "5", "pulse_fwhm_ns": "5", "divergence_mrad": "10", "wavelength_nm": "532"},
+    **{"pulse_energy_mj": "5", "pulse_fwhm_ns": "5", "divergence_mrad": "10"},
+    **{"divergence_fwhm_mrad": "", "divergence_1e2_mrad": "", "wavelength_nm": "532"},
     **{"optical_efficiency": "0.9", "field_of_view_mrad": "30", "layout": "2x2", "aperture_area": "0.025"},
     **{"two_way_atmospheric_transmittance": "0.9", "response_time_ns": "0"},
     **{"altitude": "200", "off_nadir_deg": "20", "aim_x": "0", "aim_y": "0"},
@@ -20,6 +21,7 @@ TABLE = {
     **{"surface_refined_size": "auto", "surface_cell_size": "auto", "surface_size": "auto"},
     **{"refractive_index": "1.34", "group_index": "1.364", "layer_tops": "0"},
     **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "0"},
+    **dict.fromkeys(("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure", "profile"), ""),
     **{"phase": "fournier_forand", "phase_g": "0.924"},
     **{"bottom_depth": "8", "bottom_reflectance": "0.1"},
 }

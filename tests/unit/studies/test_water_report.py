@@ -12,8 +12,8 @@ from scipy.integrate import trapezoid
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water import water_types
 from mitransient_lidar.physics.water.profiles import read_profile
+from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.plots.water import plot_water
-from mitransient_lidar.studies.water_report import water_of
 
 STATION = """depth, a, b, bb_ratio
 1, 0.1, 0.2, 0.01

@@ -1,0 +1,64 @@
+"""Parameters of scenes that describe one thing in several ways."""
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.physics.water.water_types import water_of
+
+FLAT = {"spectrum": "flat"}
+
+
+def load(scene="table1", **params):
+    """Return the water, the transmitter and the parameters of a shipped scene."""
+    loaded, _, parameters = load_scene(scene, {**FLAT, **params})
+    water = next(shape.interior_medium() for shape in loaded.shapes() if hasattr(shape, "sea"))
+    return water, next(each for each in loaded.emitters() if hasattr(each, "pulse")), parameters
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [("jerlov", "1C"), ("chlorophyll", "0.3"), ("kd", "0.1"), ("secchi", "10"), ("petzold", "coastal"), ("pure", None)],
+)
+@pytest.mark.parametrize("scene", ["table1", "ship_wake"])
+def test_waters_by_name_are_those_of_the_command(scene, kind, value):
+    water, _, parameters = load(scene, **{kind: "true" if value is None else value})
+    expected = water_of(kind, value)
+    for name in ("attenuation", "scattering", "backscattering"):
+        assert getattr(water.column, name) == pytest.approx([getattr(expected, name)])
+        assert parameters[name] == ""
+
+
+def test_layers_of_named_waters():
+    column = load(jerlov="1C, 5C", layer_tops="0, 3")[0].column
+    np.testing.assert_array_equal(column.layer_tops, [0, 3])
+    assert column.attenuation == pytest.approx([water_of("jerlov", name).attenuation for name in ("1C", "5C")])
+    # A scene of layers with one water for all of them is that water.
+    assert load("thin_layer", jerlov="1C")[0].column.attenuation == pytest.approx([0.5271])
+
+
+@pytest.mark.parametrize(
+    ("name", "width"), [("mrad", 1.0), ("fwhm_mrad", np.sqrt(8 * np.log(2)) / 2), ("1e2_mrad", 2.0)]
+)
+def test_each_definition_of_the_divergence_replaces_the_default(name, width):
+    _, transmitter, parameters = load(**{f"divergence_{name}": 7})
+    assert transmitter.divergence == pytest.approx(7e-3 / width)
+    assert [key for key in parameters if key.startswith("divergence") and parameters[key]] == [f"divergence_{name}"]
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"jerlov": "1C", "scattering": 0.1}, "jerlov = '1C' describes the same as scattering: give one of them"),
+        ({"jerlov": "1C", "kd": 0.1}, "jerlov = '1C' describes the same as kd: give one of them"),
+        ({"divergence_mrad": 5, "divergence_1e2_mrad": 9}, "divergence_mrad = 5 and divergence_1e2_mrad = 9 describe"),
+    ],
+)
+def test_two_ways_at_once_are_refused(params, message):
+    with pytest.raises(UserError, match=message):
+        load(**params)
+
+
+def test_an_empty_value_replaces_nothing():
+    assert load(jerlov="")[2]["attenuation"] == "0.3"
