@@ -213,8 +213,9 @@ class _Ground:
     def axis_points(self, z: float) -> list[str]:
         """Return the points where the receiver's axis, and the laser's where it differs, meet a height, as text."""
         drawn = [("axis", self.receiver), *([("laser", self.transmitter)] if self.axes_differ(z) else [])]
-        places = [(name, self.sea.at_height(pose[0], pose[1], z)) for name, pose in drawn]
-        return [f"{name} at ({x:.3f}, {y:.3f}, {z:.3f}) m" for name, (x, y) in places]
+        # Adding 0 turns -0 into 0.
+        places = [(name, np.round([*self.sea.at_height(pose[0], pose[1], z), z], 3) + 0.0) for name, pose in drawn]
+        return [f"{name} at ({x:.3f}, {y:.3f}, {z:.3f}) m" for name, (x, y, z) in places]
 
     def axes_differ(self, z: float) -> bool:
         """Return whether the laser's axis meets a height more than a millimetre away from the receiver's."""

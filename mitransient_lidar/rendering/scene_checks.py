@@ -149,7 +149,7 @@ def _check_record(scene: LidarScene, view: _Rays, probe: EchoProbe) -> None:
         late = axis.start_ns > echo.latest_ns + column + _echo_length(scene)
         if late and view.covered_by(echo.shape):
             raise UserError(
-                f"time_start_ns = {axis.start_ns:g} begins the record after every echo: it must be less than "
+                f"time_start_ns = {axis.start_ns:g} starts the record after every echo: it must be less than "
                 f"{echo.latest_ns:.1f} ns, when the echo of shape {echo.shape.id()!r} ends"
             )
 

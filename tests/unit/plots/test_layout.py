@@ -105,6 +105,8 @@ def test_results_without_outlines_are_dots_and_the_field_of_view():
     y, x = dots.get_offsets().T
     np.testing.assert_allclose(x, on_sea(np.arange(4)), rtol=1e-3, atol=1e-9)
     assert np.all(np.diff(y) < 0)
+    unknown_index = result({"bottom_point": [2.1, 0.0, -8.0], "refractive_index": float("nan")})
+    assert len(plot_layout(unknown_index).axes) == 1
     figure = plot_layout(result({"field_of_view_mrad": 30.0, "field_of_view_shape": "square"}))
     assert figure.axes[0].lines[0].get_xdata().max() == pytest.approx(3.2, abs=0.05)
 
