@@ -1,7 +1,7 @@
 """Every command once, with files, on a scene of few paths; scenes, options and results have tests of their own."""
 
 import pytest
-from command_line import run
+from command_line import assert_refused, run
 
 from mitransient_lidar.cli.app import app
 from mitransient_lidar.loading import catalogue
@@ -24,6 +24,7 @@ RESULT_COMMANDS = {
     "plot": [],
     "waveforms": ["--table"],
     "retrieve": [],
+    "record": ["--gain", "auto"],
     "gates": ["--start-depth", 5, "--width-ns", 5, "--step-ns", 5, "--count", 4],
 }
 OTHER_COMMANDS = {
@@ -78,6 +79,38 @@ def test_command_of_a_result(command, result, tmp_path):
     check(run(command, result, *RESULT_COMMANDS[command]), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["record", "--gain", "most"], "--gain most must be a number or auto."),
+        (["record", "--receiver", "eye"], "chain = 'eye' must be a ReceiverChain or one of ideal"),
+        (["record", "-o", "signals.exr"], "--output signals.exr must end in .nc."),
+        (["record", "--shots", 0], "shots = 0 must lie between 1"),
+        (["plot", "--shot", 0], "--shot 0 needs a series of shots"),
+    ],
+)
+def test_commands_of_a_result_refuse_invalid_options(arguments, message, result):
+    command, *options = arguments
+    assert_refused(run(command, result, *options, *(["-q"] if command == "record" else [])), message)
+
+
+def test_series_of_shots_from_end_to_end(scene, tmp_path):
+    """Shots, a record of them, its echoes, slopes, and drawings, each from the file of the one before."""
+    shots, echoes, signals = (tmp_path / name for name in ("shots.nc", "echoes.csv", "signals.nc"))
+    options = ["--at", "0,0", "--at", "20,-8", "--move-target", "--passes", 2, "-D", "time_start_ns=1370"]
+    done = run("shots", scene, *PARAMETERS, *options, "-o", shots, "-q")
+    check(done, tmp_path)
+    check(run("record", shots, "--receiver", "apd", "--optical-density", "auto", "-o", signals), tmp_path)
+    check(run("waveforms", signals, "--csv", echoes), tmp_path)
+    lines = echoes.read_text().splitlines()
+    assert "true_surface_height" in lines[0]
+    assert {line.split(",")[0] for line in lines[1:]} == {"0", "1"}
+    check(run("retrieve", shots, "--figure", tmp_path / "slopes.png"), tmp_path)
+    check(run("plot", shots), tmp_path)
+    check(run("plot", signals, "--shot", 1), tmp_path)
+    assert_refused(run("plot", signals, "--shot", 2), "--shot 2 must be one of the shots of")
+
+
 def test_comparison_of_a_result_with_itself(result):
     done = run("compare", result, result)
     assert done.exit_code == 0, done.stderr
@@ -90,7 +123,7 @@ def test_command_without_a_result(command, tmp_path, monkeypatch):
 
 
 def test_every_command_is_run():
-    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "compare"}
+    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare"}
     commands = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     groups = {group.name for group in app.registered_groups}
     # The benchmark measures for minutes; its tests replace the renders.

@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Rectangle
 
 from mitransient_lidar import results
+from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plots import waveforms
@@ -123,6 +125,39 @@ def test_imager_shows_energy_with_the_far_row_on_top_and_the_summed_waveform():
     assert image.origin == "upper"
     # Two Gaussian echoes of 2e-5 and 1e-6 W: 2.1e-5 W * 3 sqrt(pi) * 1e-9 s for the first pixel, in fJ.
     assert image.get_array()[0, 0] == pytest.approx(2.1e-5 * 3e-9 * math.sqrt(math.pi) / 1e-15, rel=1e-3)
+
+
+def test_series_shows_the_mean_and_the_band_of_most_shots():
+    scales = np.random.default_rng(2).uniform(0.5, 2.0, 40)
+    shots = xr.concat([make(2, scale=scale) for scale in scales], "shot", combine_attrs="override")
+    linear = waveforms.plot_waveforms(shots, scale="linear").axes[0]
+    shown = shots["waveform"].values[:, 1]
+    np.testing.assert_allclose(linear.lines[1].get_ydata(), 1e6 * shown.mean(axis=0))
+    corners = linear.collections[1].get_paths()[0].vertices
+    limits = [1e6 * np.quantile(shown, share, axis=0).max() for share in (0.05, 0.95)]
+    assert corners[:, 1].max() == pytest.approx(limits[1])
+    assert np.isclose(corners[:, 1], limits[0]).any()
+    assert linear.get_ylim()[1] > limits[1]
+    assert "mean and 90 % of 40 shots" in linear.figure.get_suptitle()
+
+
+def test_imagers_and_records_of_a_series_are_drawn():
+    shots = xr.concat([make(4, grid=(2, 2), scale=scale) for scale in (1.0, 3.0)], "shot", combine_attrs="override")
+    figure = waveforms.plot_waveforms(shots)
+    np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), 1e6 * 20 * make()["waveform"][0])
+    image = next(ax for ax in figure.axes if ax.images).images[0].get_array()
+    energy = shots["impulse_response"].mean("shot").sum("time")
+    np.testing.assert_allclose(image / image.max(), energy / energy.max())
+    recorded = detect_waveforms(shots.assign_coords(shot=[0, 1]), "photodiode", 1, 2)
+    figure = waveforms.plot_waveforms(recorded)
+    assert figure.axes[0].get_ylabel() == "recorded signal (V)"
+    np.testing.assert_allclose(
+        figure.axes[0].lines[0].get_ydata(), recorded["signal"].mean("shot").sum(("row", "column")), atol=1e-9
+    )
+    one = waveforms.plot_waveforms(recorded.isel(shot=1))
+    assert one.get_suptitle() == "fig09  ·  receiver photodiode  ·  shot 1"
+    counts = waveforms.plot_waveforms(detect_waveforms(make(), "spad", 3, 2))
+    assert counts.axes[0].get_ylabel() == "recorded signal per bin"
 
 
 @pytest.mark.slow

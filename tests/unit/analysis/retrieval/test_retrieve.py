@@ -255,6 +255,57 @@ def test_command(tmp_path):
         assert_refused(run("retrieve", tmp_path / "shot.nc", *options), sentence)
 
 
+@pytest.fixture
+def shots_with_truth():
+    """Three shots of level planes at other heights, with their truth."""
+    heights = [0.0, 0.2, -0.3]
+    delays = [2 * height / math.cos(THETA) / C0 for height in heights]
+    shots = series([result(np.stack([waveform(-delay)] * 4)) for delay in delays])
+    truth = {"true_slope_along": [0.0] * 3, "true_slope_across": [0.0] * 3, "true_surface_height": heights}
+    truth |= {"true_bottom_depth": [DEPTH - height for height in heights]}
+    return shots.assign_coords({name: ("shot", values) for name, values in truth.items()})
+
+
+def test_estimates_of_a_series_are_compared_with_its_truth(shots_with_truth):
+    found = retrieve.retrieve(shots_with_truth, slope_deviation=(1e-4, 1e-4))
+    listed = {one.head: one for one in retrieval.estimates(found)}
+    np.testing.assert_allclose(listed["height (m)"].values, listed["height (m)"].truth, atol=0.02)
+    np.testing.assert_allclose(listed["depth (m)"].values, listed["depth (m)"].truth, atol=0.05)
+    made = retrieval.Estimate(
+        "depth (m)", np.array([1.0, 2.0, 3.0, np.nan]), np.full(4, 0.5), np.array([1.0, 1.0, 2, 3])
+    )
+    text = "depth (m): bias +0.667, rms error 0.816, correlation +0.87, rms of error / standard error 1.63, 3 shots"
+    assert retrieval.truth_statistics(made) == text
+    assert retrieval.truth_statistics(made._replace(truth=None)) == ""
+    figure = retrieval.plot_retrieval(found)
+    assert [ax.get_ylabel() for ax in figure.axes] == [f"estimated {head}" for head in listed]
+    np.testing.assert_allclose(figure.axes[3].lines[0].get_xdata(), [8.0, 7.8, 8.3])
+    # Slopes that are all the same have no spread to be drawn over.
+    assert figure.axes[0].get_xlabel() == "shot"
+    with pytest.raises(UserError, match="found has no truth"):
+        retrieval.plot_retrieval(found.drop_vars([name for name in found.coords if str(name).startswith("true_")]))
+
+
+@pytest.mark.slow
+def test_command_lists_the_shots_of_a_series(shots_with_truth, tmp_path):
+    results.save(shots_with_truth.assign_attrs(slope_deviation=[0.05, 0.04]), tmp_path / "shots.nc")
+    options = ["-o", tmp_path / "found.nc", "--figure", tmp_path / "found.png"]
+    done = run("retrieve", tmp_path / "shots.nc", *options)
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert lines[0].split()[:4] == ["shot", "slope", "along", "true"]
+    assert [line.split()[0] for line in lines[1:4]] == ["0", "1", "2"]
+    assert lines[-3].startswith("depth (m): bias ")
+    assert lines[-2:] == [str(tmp_path / "found.nc"), str(tmp_path / "found.png")]
+    kept = xr.load_dataset(tmp_path / "found.nc", engine="h5netcdf")
+    expected = retrieve.retrieve(shots_with_truth, slope_deviation=(0.05, 0.04))
+    np.testing.assert_allclose(kept["slope_along_stderr"], expected["slope_along_stderr"])
+    np.testing.assert_allclose(kept["true_surface_height"], [0.0, 0.2, -0.3])
+    results.save(result(), tmp_path / "one.nc")
+    sentence = "needs a series of shots with true slopes"
+    assert_refused(run("retrieve", tmp_path / "one.nc", "--figure", tmp_path / "one.png"), sentence)
+
+
 def test_errors_of_the_drawing(tmp_path):
     rng = np.random.default_rng(5)
     truth = rng.normal(0, 0.05, 400)

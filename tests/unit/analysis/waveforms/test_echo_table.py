@@ -328,6 +328,43 @@ def test_command_reads_what_a_receiver_recorded(tmp_path):
         assert_refused(run("waveforms", tmp_path / name), sentence)
 
 
+def in_series(*shots):
+    """Return results as a series with a truth of each shot."""
+    joined = xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
+    return joined.assign_coords(true_bottom_depth=("shot", 5.0 + np.arange(len(shots))))
+
+
+def test_shots_of_a_series_have_their_own_errors(tmp_path):
+    """Each shot of a series gives what it gives alone, whatever the errors of the others; the truth comes along."""
+    shots = [result(np.stack([waveform(SURFACE + shift)] * 2)) for shift in (0.0, 1.5, -2.0)]
+    for number, shot in enumerate(shots):
+        shot["waveform_stderr"][:] = 10.0**-number * (1e-8 + 1e-3 * shot["waveform"])
+    found = echo_table.extract(in_series(*shots))
+    for number, shot in enumerate(shots):
+        alone = echo_table.extract(shot)
+        xr.testing.assert_allclose(found.isel(shot=number, drop=True), alone)
+    errors = found["time_ns_stderr"].sel(echo="bottom").isel(pixel=0).values
+    np.testing.assert_allclose(errors[:2] / errors[1:], 10, rtol=0.3)
+    csv_tables.save_csv(found, tmp_path / "echoes.csv")
+    with (tmp_path / "echoes.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert {(line["shot"], line["true_bottom_depth"]) for line in lines} == {("0", "5"), ("1", "6"), ("2", "7")}
+
+
+@pytest.mark.slow
+def test_records_of_a_series_have_true_errors():
+    """Two shots of different strength and time, 200 records each: errors of both are those of their own noise."""
+    powers = (np.maximum(waveform(), 0), 0.2 * np.maximum(waveform(SURFACE + 2), 0))
+    places = in_series(*(result(np.stack([power] * 2)) for power in powers))
+    shots = detect_waveforms(places, "apd", 200, 3, optical_density=1.9)
+    bottoms = echo_table.extract(shots).sel(echo="bottom")
+    for half in (slice(0, 200), slice(200, 400)):
+        time, error = (bottoms[name].isel(shot=half).values.ravel() for name in ("time_ns", "time_ns_stderr"))
+        assert np.std(time) / np.median(error) == pytest.approx(1, abs=0.25)
+    errors = bottoms["time_ns_stderr"].values
+    assert np.median(errors[200:]) > 2 * np.median(errors[:200])
+
+
 def test_flag_names():
     assert csv_tables.flag_names(0) == ""
     assert csv_tables.flag_names(int(EchoFlag.SATURATED | EchoFlag.MERGED)) == "saturated merged"
