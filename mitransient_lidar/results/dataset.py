@@ -255,6 +255,8 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
     if input_format(path) == "exr":
         return _read_exr(path)
     dataset = netcdf.read_netcdf(path)
+    if "signal" in dataset and "waveform" not in dataset:
+        raise UserError(f"{path} holds signals of a receiver; give the result that they were recorded from.")
     if any(name not in dataset for name in _VARIABLES):
         raise UserError(f"{path} is a NetCDF file, but not a result of mitransient-lidar.")
     dims = tuple(str(dim) for dim in dataset["waveform"].dims)

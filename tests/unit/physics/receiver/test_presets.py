@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
@@ -205,3 +206,34 @@ def test_saturation_of_a_strong_echo_is_marked():
 def test_invalid_values_are_rejected(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_fitting_gain_and_attenuation_in_closed_form():
+    """Shot noise alone: N photons reach N + 6 sqrt(N) electrons, and N/a + 6 sqrt(N/a) are those of the limit."""
+    bins, limit = 1.0, 0.5
+    chain = ReceiverChain(LinearDetector(1.0), Amplifier(1e3, limit_v=limit))
+    volts = 1e3 * 1.602176634e-19 / 1e-9
+    capacity = limit / volts
+    photons = np.array([[0.01, 4.0], [2.0, 0.3]]) * capacity
+    power = photons * 6.62607015e-34 * 299792458 / 532e-9 / 1e-9
+    most = 4 * capacity
+    assert chain.fitting_gain(power, bins) == pytest.approx(capacity / (most + 6 * np.sqrt(most)))
+    root = -3 + np.sqrt(9 + capacity)
+    assert chain.fitting_attenuation(power, bins) == pytest.approx(most / root**2, rel=1e-5)
+    # A background counts, and samples that are left out do not.
+    assert chain.fitting_gain(power, bins, samples=slice(0, 1)) == pytest.approx(
+        capacity / (2 * capacity + 6 * np.sqrt(2 * capacity))
+    )
+    more = chain.fitting_attenuation(power, bins, background=power[0, 1])
+    assert more == pytest.approx(2 * most / root**2, rel=1e-5)
+    assert chain.fitting_attenuation(0.1 * power, bins) == chain.fitting_gain(0.1 * power, bins) == 1
+
+
+def test_chains_without_limits_need_no_attenuation():
+    for chain in (RECEIVERS["ideal"], RECEIVERS["spad"], ReceiverChain(LinearDetector(1.0), Amplifier(1e3))):
+        assert chain.fitting_attenuation([1.0], 1.0) == chain.fitting_gain([1.0], 1.0) == 1
+    # Noise above the range cannot be attenuated.
+    noisy = ReceiverChain(LinearDetector(1.0), Amplifier(1e9, 1e3, limit_v=1e-3))
+    assert noisy.fitting_attenuation([1e-6], 1.0) == np.inf
+    with pytest.raises(UserError, match="gain = 2 needs an amplifier"):
+        RECEIVERS["spad"].with_gain(2)
