@@ -51,7 +51,8 @@ def exit_on_error() -> Iterator[None]:
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
     """Exit as after an interruption if one ended the render of a result or of a series of shots."""
     if dataset.attrs.get("interrupted"):
-        done = f"{dataset.sizes['shot']} shots" if "shot" in dataset.dims else f"{dataset.attrs['passes']} passes"
+        series = "shot" in dataset.dims
+        done = f"{dataset.sizes['shot']} of the shots" if series else f"{dataset.attrs['passes']} passes"
         raise KeyboardInterrupt(f"interrupted after {done}; their result is kept.")
 
 

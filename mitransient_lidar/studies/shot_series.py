@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.scene import LidarScene
+
+_LOG = logging.getLogger(__name__)
 
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
 _REACH, _FEWEST_CELLS = 4.5, 4
@@ -149,6 +152,8 @@ def render_shots(
     x, y = pairs[np.argmax(np.hypot(*pairs.T))]
     open_scene(scene, _at(params, x, y, target))  # before the first render
     truth = _truth(session, pairs)
+    if missed := np.count_nonzero(np.isnan(truth[-1])):
+        _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(pairs))
     found: list[xr.Dataset] = []
     try:
         with DeferredInterrupt() as interruption:

@@ -134,6 +134,13 @@ def test_shots_at_given_places(rendered, tmp_path):
     assert len(shot_series.describe_shots(series)) == 4
 
 
+def test_places_beside_the_bottom_are_told(rendered, caplog):
+    """The bottom of the scene is a square of 1 km."""
+    series = shot_series.render_shots("fig09_2x2", FLAT, places=[(0, 0), (600, 0)])
+    np.testing.assert_array_equal(series["true_bottom_depth"], [8.0, np.nan])
+    assert "the axis of 1 of 2 shots misses the bottom" in caplog.text
+
+
 def test_random_places_are_those_of_the_seed(rendered):
     waves = {"surface_size": 60, "surface_cell_size": 1}
     series = [shot_series.render_shots("fig09_2x2", waves, count=2, seed=seed) for seed in (1, 1, 2)]
@@ -183,7 +190,7 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
     done = run("shots", "fig09_2x2", *arguments)
     assert done.exit_code == 130
     assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
-    assert done.stderr == "interrupted after 1 shots; their result is kept.\n"
+    assert done.stderr == "interrupted after 1 of the shots; their result is kept.\n"
     assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
 
 
