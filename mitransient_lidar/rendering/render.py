@@ -68,7 +68,8 @@ def render(
     target_quantile
         Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time
-        Longest time for the passes [s], greater than 0. At least two passes are rendered.
+        Longest time for the passes [s], greater than 0. At least two passes are rendered; where full ones would take
+        longer, with fewer paths (the attribute ``pass_share``).
     passes
         Number of passes, 2 to 10^9. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
         or after 60 s.
@@ -104,6 +105,7 @@ def render(
     lidar: LidarScene = renderer.scene
     from mitransient_lidar.rendering.describe import describe_lidar
     from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
+    from mitransient_lidar.rendering.pass_size import fit_to_time
     from mitransient_lidar.rendering.scene_checks import check_scene
 
     probe = probe_echoes(lidar, renderer.sampler)
@@ -115,12 +117,19 @@ def render(
     accumulator = choose_accumulator(lidar, window, surface.get("surface_time_ns"), max_memory)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
+    goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
+    fitted, share = renderer, 1.0
+
     def render_pass(number: int, seed: int) -> float:
-        record = renderer.render_pass(seed, gates=accumulator.gate_weights)
+        nonlocal fitted, share
+        gates, first = accumulator.gate_weights, None
+        if number == 0 and goal.max_time is not None:
+            start_ns = float(window.start_ns.min())
+            fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
+        record = first or fitted.render_pass(seed, gates=gates)
         accumulator.add(record.histogram)
         return float(record.edge_loss[0])
 
-    goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
     log = run_passes(
         render_pass,
         goal,
@@ -141,6 +150,7 @@ def render(
     attributes = session.attributes(
         integrator=chosen.plugin,
         **pass_attributes(log, seed),
+        pass_share=share,
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

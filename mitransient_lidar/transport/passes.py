@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 
 import drjit as dr
@@ -62,6 +63,17 @@ class PassRenderer(ABC):
     def __init__(self, scene: LidarScene, classes: PathClasses, paths: int) -> None:
         self.scene, self.classes, self.paths = scene, classes, paths
         self.sampler = SensorSampler(scene.receiver, scene.transmitter)
+
+    @property
+    def path_count(self) -> int:
+        """Number of paths of a pass from either end."""
+        return self.paths
+
+    def scaled(self, share: float) -> PassRenderer:
+        """Return a renderer of passes with a share of the paths."""
+        scaled = copy.copy(self)
+        scaled.paths = max(round(share * self.paths), 1)
+        return scaled
 
     def render_pass(self, seed: int, *, paths: int | None = None, gates: GateWeights | None = None) -> PassRecord:
         """Render one pass.

@@ -42,7 +42,7 @@ layout.plot_layout = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 app.main()
 """
 
-#: The command line, with files of at most 60 000 bytes after the render: EXR and NetCDF files fit, the drawing does not.
+#: The command line, with files of at most 60 000 bytes after the render: EXR and NetCDF files fit, a drawing does not.
 DISK_FULL = """
 import resource
 from mitransient_lidar.rendering import render

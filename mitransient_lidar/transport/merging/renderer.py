@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -138,6 +139,17 @@ class MergingRenderer(PassRenderer):
         self.photons = options.photons_per_pass or photons
         self.layout = layout or MergingLayout.of_scene(scene, self.sampler, options)
         self._beam = BeamSampler(scene.transmitter, scene.receiver)
+
+    @property
+    def path_count(self) -> int:
+        """Number of paths of a pass from receiver and laser."""
+        return self.paths + self.photons
+
+    def scaled(self, share: float) -> MergingRenderer:
+        """Return a renderer of passes with a share of the paths, with the same layout and buffers."""
+        scaled = copy.copy(self)
+        scaled.paths, scaled.photons = (max(round(share * count), 1) for count in (self.paths, self.photons))
+        return scaled
 
     def trace(self, record: PassRecord, seed: int, paths: int) -> None:
         """Trace the paths of one pass into a record."""

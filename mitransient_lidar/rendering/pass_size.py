@@ -1,0 +1,112 @@
+"""Number of paths in a pass, reduced where full passes would exceed a time limit."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import drjit as dr
+import mitsuba as mi
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.transport.histogram import GateWeights
+from mitransient_lidar.transport.passes import PassRecord, PassRenderer
+from mitransient_lidar.transport.scene import LidarScene
+
+logger = logging.getLogger(__name__)
+
+#: Share of the paths in a trial pass, the smallest pass.
+_TRIAL = 2**-9
+
+#: Number of smaller passes that should fit into the time, and of full passes that must.
+_SMALL_PASSES, _FULL_PASSES = 4, 2
+
+#: Rays that a slow machine traces in a second (1 to 2 million on two cores): no trial is needed for passes with fewer
+#: rays than it traces in twice the time.
+_RAYS_PER_SECOND = 1e6
+
+#: Paths of a kernel that one thread follows at a time, and those that a GPU follows at once.
+_PATHS_PER_THREAD, _PATHS_ON_GPU = 2**14, 2**17
+
+
+def fit_to_time(
+    renderer: PassRenderer, max_time: float, start_ns: float, *, seed: int, gates: GateWeights | None
+) -> tuple[PassRenderer, float, PassRecord | None]:
+    """Return a renderer of passes that fit into a time limit, with fewer paths where full passes do not.
+
+    Kernels cannot be interrupted. Where the expected number of rays is large for the time, a trial with 1/512 of the
+    paths measures the time of the kernels; if two full passes would exceed the limit, the number of paths is halved
+    until four passes do not, or the work besides the kernels takes longer.
+
+    Parameters
+    ----------
+    renderer
+        Renderer of full passes.
+    max_time
+        Time limit of the render [s].
+    start_ns
+        Time at which light enters the water [ns].
+    seed, gates
+        Arguments of `PassRenderer.render_pass` for the first pass.
+
+    Returns
+    -------
+    renderer
+        Renderer of the passes.
+    share
+        Its share of the paths of full passes.
+    first
+        Record of the first pass, if it is rendered already.
+    """
+    paths = renderer.path_count
+    if paths * _rays_per_path(renderer.scene, start_ns) < 2 * max_time * _RAYS_PER_SECOND:
+        return renderer, 1.0, None
+    began = time.perf_counter()
+    trial = renderer.scaled(_TRIAL)
+    record, kernels, rest = _timed(trial, seed, gates)
+    if _SMALL_PASSES * kernels < max_time:
+        # Without the enlargement of buffers and the compilation of kernels in the first trial.
+        record, kernels, rest = _timed(trial, seed, gates)
+    left = max_time - (time.perf_counter() - began)
+
+    def kernels_of(share: float) -> float:
+        return kernels * (share / _TRIAL) * _at_once(_TRIAL * paths) / _at_once(share * paths)
+
+    if _FULL_PASSES * (rest + kernels_of(1.0)) <= left:
+        return renderer, 1.0, None
+    share = 0.5
+    while share > _TRIAL and kernels_of(share) > max(left / _SMALL_PASSES - rest, rest):
+        share *= 0.5
+    logger.info("passes have 1/%d of the paths, so that they fit into max_time = %g s", round(1 / share), max_time)
+    return (renderer.scaled(share), share, None) if share > _TRIAL else (trial, share, record)
+
+
+def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
+    """Return the largest expected number of rays of a path: scattering events until the end of the record, and ends."""
+    if scene.water is None:
+        return 2.0
+    plume = scene.water.plume
+    scattering = float(scene.water.column.scattering.max()) + (plume.scattering if plume is not None else 0.0)
+    length = C0 * 1e-9 * max(scene.axis.end_ns - start_ns, 0.0) / scene.group_index
+    return 2.0 + scattering * length
+
+
+def _timed(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[PassRecord, float, float]:
+    """Render a pass; return it, the time of its kernels, and the other time except for their compilation [s]."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        began = time.perf_counter()
+        record = renderer.render_pass(seed, gates=gates)
+        dr.sync_thread()
+        total = time.perf_counter() - began
+        history = dr.kernel_history()
+    kernels = 1e-3 * sum(kernel["execution_time"] for kernel in history)
+    compilation = 1e-3 * sum(kernel.get("codegen_time", 0.0) + kernel.get("backend_time", 0.0) for kernel in history)
+    return record, kernels, max(total - kernels - compilation, 0.0)
+
+
+def _at_once(paths: float) -> float:
+    """Return the number of threads, or on a GPU of paths, that share a kernel of a number of paths."""
+    if "cuda" in mi.variant():
+        return min(max(paths, 1.0), _PATHS_ON_GPU)
+    return min(max(paths / _PATHS_PER_THREAD, 1.0), float(dr.thread_count()))

@@ -1,0 +1,107 @@
+"""Passes that fit into a time limit."""
+
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from significance import largest_z
+
+import mitransient_lidar
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading import scenes as loading
+from mitransient_lidar.rendering import pass_size
+from mitransient_lidar.rendering.render import DEFAULT_GATE_GOAL, DEFAULT_GOAL
+
+DENSE = {"plume_scattering": 100, "plume_depth": 10, "plume_width": 100}
+
+
+class Renderer:
+    """Passes of 65 536 paths with 100 scattering events each; the clock of its trials is `clock`."""
+
+    path_count = 2**16
+    scene = SimpleNamespace(
+        water=SimpleNamespace(column=SimpleNamespace(scattering=np.array([4.9 / 0.299792458])), plume=None),
+        axis=SimpleNamespace(end_ns=120.0),
+        group_index=6.0,
+    )
+
+    def __init__(self, share=1.0):
+        self.share = share
+
+    def scaled(self, share):
+        return Renderer(self.share * share)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Return the times of a trial's kernels and of its other work [s], to be set, and the number of trials."""
+    state = SimpleNamespace(kernels=0.0, rest=0.0, trials=0, now=0.0)
+
+    def timed(renderer, seed, gates):
+        assert renderer.share == pass_size._TRIAL
+        state.trials += 1
+        state.now += state.kernels + state.rest
+        return f"record {state.trials}", state.kernels, state.rest
+
+    monkeypatch.setattr(pass_size, "_timed", timed)
+    monkeypatch.setattr(pass_size.time, "perf_counter", lambda: state.now)
+    monkeypatch.setattr(pass_size, "_at_once", lambda paths: 1.0)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("limit", "kernels", "rest", "expected", "trials"),
+    [
+        (4.0, 1e-3, 0.0, 1.0, 0),  # 6.6 million rays: below 2 million a second
+        (1.0, 1e-3, 0.0, 2**-2, 2),  # a full pass takes 0.51 s, and the trials a little
+        (1.1, 1e-3, 0.0, 1.0, 2),
+        (1.0, 0.1, 0.0, 2**-8, 2),  # the trials take 0.2 s, and each of four passes as long
+        (1.0, 0.1, 0.15, 2**-9, 2),  # the trials take 0.5 s
+        (1.0, 0.1, 0.25, 2**-8, 2),  # the other work takes longer than the kernels
+        (1.0, 40.0, 0.2, 2**-9, 1),  # the first trial exceeds the limit
+    ],
+)
+def test_the_share_of_the_paths(clock, limit, kernels, rest, expected, trials):
+    clock.kernels, clock.rest = kernels, rest
+    renderer, share, first = pass_size.fit_to_time(Renderer(), limit, 20.0, seed=1, gates=None)
+    assert (share, renderer.share, clock.trials) == (expected, expected, trials)
+    assert first == (f"record {trials}" if share == pass_size._TRIAL else None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+def test_small_passes_have_the_mean_of_full_ones(integrator):
+    """Energy in four gates of table1: 64 passes of a 64th of the paths, and 12 full ones."""
+    scene, _, _ = loading.load_scene("table1", {"spectrum": "flat"})
+    renderer = mi.load_dict({"type": integrator}).prepare(scene, scene.sensors()[0])
+    means, variances = [], []
+    for share, count in ((1.0, 12), (1 / 64, 64)):
+        passes = renderer.scaled(share)
+        energy = np.array([passes.render_pass(seed).histogram.energy().sum(axis=0) for seed in range(count)])
+        gates = energy[:, 28:108].reshape(count, 4, 20).sum(axis=2)
+        means.append(gates.mean(axis=0))
+        variances.append(gates.var(axis=0, ddof=1) / count)
+    z = (means[0] - means[1]) / np.sqrt(sum(variances))
+    assert np.abs(z).max() < largest_z(12, 4)
+
+
+@pytest.mark.slow
+def test_a_dense_plume_ends_within_seconds():
+    """Two full passes take more than half a minute on two cores."""
+    shot = mitransient_lidar.render("ship_wake", params=DENSE, max_time=1.0)
+    assert shot.attrs["pass_share"] < 1 / 64
+    assert shot.attrs["passes"] >= 2
+    assert float(shot.impulse_response.sum()) > 0
+    assert shot.attrs["elapsed_s"] < 20.0
+
+
+@pytest.mark.slow
+def test_default_renders_of_shipped_scenes_have_full_passes_without_a_trial(monkeypatch):
+    monkeypatch.setattr(pass_size, "_timed", None)
+    for name in catalogue.scene_names():
+        scene, _, _ = loading.load_scene(name)
+        renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+        goal = DEFAULT_GOAL if renderer.scene.gates is None else DEFAULT_GATE_GOAL
+        start_ns = renderer.scene.axis.start_ns
+        assert pass_size.fit_to_time(renderer, goal.max_time, start_ns, seed=0, gates=None) == (renderer, 1.0, None)
