@@ -63,9 +63,11 @@ def announced() -> Iterator[None]:
 
 def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
     """Write a dataset to a NetCDF file and print its path."""
+    from mitransient_lidar.results import netcdf
+
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced(), replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf")
+        netcdf.dump(dataset, temporary, {})
 
 
 def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Dataset, Path], Any]) -> None:

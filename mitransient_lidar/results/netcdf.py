@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
+import h5netcdf
 import numpy as np
 import xarray as xr
+from xarray.backends import H5NetCDFStore
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results.formats import attribute
@@ -33,7 +37,21 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike[str], compressed: 
     encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in dataset.variables}
     for name in compressed:
         encoding[name] |= {"zlib": True, "complevel": 4, "shuffle": True}
-    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    dump(dataset, path, encoding)
+
+
+def dump(dataset: xr.Dataset, path: str | os.PathLike[str], encoding: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write a dataset to a NetCDF-4 file by way of memory, because HDF5 ends the process where the disk is full.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        dataset.dump_to_store(H5NetCDFStore(file), encoding=encoding)
+    Path(path).write_bytes(buffer.getbuffer())
 
 
 def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:

@@ -42,15 +42,16 @@ layout.plot_layout = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 app.main()
 """
 
-#: The command line, with files of at most 60 000 bytes after the render: EXR and NetCDF files fit, a drawing does not.
+#: The command line, with files of limited size after the render.
 DISK_FULL = """
-import resource
+import resource, sys
+limit = int(sys.argv.pop(1))
 from mitransient_lidar.rendering import render
 from mitransient_lidar.cli import app
 original = render.render
 def and_fill_the_disk(*arguments, **options):
     dataset = original(*arguments, **options)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
     return dataset
 render.render = and_fill_the_disk
 app.main()
@@ -121,11 +122,16 @@ def test_files_of_a_killed_command_do_not_appear_and_the_next_one_sweeps_them(tm
 
 @pytest.mark.slow
 @pytest.mark.skipif(resource.getrlimit(resource.RLIMIT_FSIZE)[1] != resource.RLIM_INFINITY, reason="files are limited")
-def test_a_full_disk_leaves_the_former_files(tmp_path):
+@pytest.mark.parametrize(("limit", "file"), [(1000, "table1.exr"), (50_000, "table1.nc"), (60_000, "table1.png")])
+def test_a_full_disk_leaves_the_former_files(tmp_path, limit, file):
+    """Limits in bytes, between the sizes of the files: EXR 44 000, NetCDF 56 000, drawing more than 60 000."""
     (tmp_path / "table1.exr").write_text("old")
-    process, stdout, stderr = render(DISK_FULL, tmp_path)
+    process, stdout, stderr = render(DISK_FULL, tmp_path, before=[limit])
     assert (process.returncode, stdout) == (2, ""), stderr
-    assert stderr.splitlines()[-1] == f"cannot write {tmp_path / 'table1.png'}: File too large."
+    sentence = stderr.splitlines()[-1]
+    assert sentence.startswith(f"cannot write {tmp_path / file}: ")
+    assert sentence.endswith("File too large.")
+    assert ".mitransient-lidar" not in stderr
     assert "Traceback" not in stderr
     assert names(tmp_path) == ["table1.exr"]
     assert (tmp_path / "table1.exr").read_text() == "old"
