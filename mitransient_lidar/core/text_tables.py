@@ -29,7 +29,10 @@ logger = logging.getLogger(__name__)
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---"})
 
 #: Values that instruments write for missing ones.
-_FILL_VALUES = frozenset({-99.0, -999.0, -9999.0, -99999.0, -9.99e-29})
+_FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
+
+#: Lines in which the number of columns shows.
+_LINES_FOR_WIDTH = 10_000
 
 #: Times [ns] without a unit that span less are probably seconds.
 _SHORTEST_RECORD = 1e-3
@@ -106,14 +109,12 @@ def read_table(
         start = _without_heading(path, lines, start, width, columns, positional)
         headings = [Heading(column, "", "") for column in columns]
     rows = lines[start:]
-    values = np.array([_numbers(path, line, names, headings) for line in rows], dtype=np.float64)
-    wanted = [heading for heading in headings if heading is not None]
-    table = dict(zip((heading.column.name for heading in wanted), values.reshape(-1, len(wanted)).T, strict=True))
+    table = _values(path, rows, names, headings)
     kept = complete_rows(path, table, [f"line {line.number}" for line in rows])
     return Table(
         {name: column[kept] for name, column in table.items()},
         [rows[row].number for row in kept],
-        frozenset(heading.column.name for heading in wanted if not heading.unit),
+        frozenset(heading.column.name for heading in headings if heading is not None and not heading.unit),
     )
 
 
@@ -185,12 +186,12 @@ def _split(number: int, text: str) -> _Line:
 
 def _width(lines: Sequence[_Line]) -> int:
     """Return the most common number of cells in lines that hold mostly numbers, 0 if there are none."""
-    counts = Counter(
-        len(line.cells)
-        for line in lines
-        if any(_number(cell) is not None for cell in line.cells)
-        and 2 * sum(_is_number(cell) for cell in line.cells) > len(line.cells)
-    )
+    counts: Counter[int] = Counter()
+    for line in lines[:_LINES_FOR_WIDTH]:
+        numbers = sum(_number(cell) is not None for cell in line.cells)
+        missing = sum(cell.lower() in _MISSING for cell in line.cells) if numbers < len(line.cells) else 0
+        if numbers > 0 and 2 * (numbers + missing) > len(line.cells):
+            counts[len(line.cells)] += 1
     return counts.most_common(1)[0][0] if counts else 0
 
 
@@ -255,31 +256,48 @@ def _without_heading(
     return start
 
 
-def _numbers(
-    path: str | PathLike[str], line: _Line, names: Sequence[str], headings: Sequence[Heading | None]
-) -> list[float]:
-    """Return the numbers of a line in the first units of their columns, NaN where one is missing."""
-    cells = line.cells
-    values = [_value(cell, heading) for cell, heading in zip(cells, headings, strict=False) if heading is not None]
-    numbers = [value for value in values if value is not None]
-    if len(cells) == len(headings) and len(numbers) == len(values):
-        return numbers
+def _values(
+    path: str | PathLike[str], rows: Sequence[_Line], names: Sequence[str], headings: Sequence[Heading | None]
+) -> dict[str, FloatArray]:
+    """Return the values of each column in its first unit, NaN where one is missing."""
+    for line in rows:
+        if len(line.cells) != len(headings):
+            raise _invalid_line(path, line, names, headings, None)
+    values = {}
+    for i, heading in enumerate(headings):
+        if heading is None:
+            continue
+        try:
+            column = np.array([float(line.cells[i]) for line in rows], dtype=np.float64)
+        except ValueError:
+            column = np.full(len(rows), np.nan)
+            for row, line in enumerate(rows):
+                number = _number(line.cells[i])
+                if number is not None:
+                    column[row] = number
+                elif not _is_number(line.cells[i]):
+                    raise _invalid_line(path, line, names, headings, i) from None
+        if heading.column.fill_values:
+            column[np.isin(column, _FILL_VALUES)] = np.nan
+        values[heading.column.name] = column * heading.factor
+    return values
+
+
+def _invalid_line(
+    path: str | PathLike[str],
+    line: _Line,
+    names: Sequence[str],
+    headings: Sequence[Heading | None],
+    column: int | None,
+) -> UserError:
+    """Return the error for a line with a wrong number of cells, or with one in `column` that is no number."""
     where = f"{path}, line {line.number}"
     if not names:
         wanted = " and ".join(_with_first_unit(heading.column) for heading in headings if heading)
-        raise UserError(f"{where}: {' '.join(cells)!r} must be two numbers, {wanted}")
-    if len(cells) != len(names):
-        raise UserError(f"{where} has {len(cells)} values but must have {len(names)}, one for each column.")
-    wrong = next(i for i, heading in enumerate(headings) if heading and _value(cells[i], heading) is None)
-    raise UserError(f"{where}: {names[wrong]} = {cells[wrong]!r} must be a number.")
-
-
-def _value(cell: str, heading: Heading) -> float | None:
-    """Return a cell in the first unit of its column, NaN if it is missing, None if it is no number."""
-    number = np.nan if cell.lower() in _MISSING else _number(cell)
-    if number is None:
-        return None
-    return np.nan if heading.column.fill_values and number in _FILL_VALUES else number * heading.factor
+        return UserError(f"{where}: {' '.join(line.cells)!r} must be two numbers, {wanted}")
+    if column is None:
+        return UserError(f"{where} has {len(line.cells)} values but must have {len(names)}, one for each column.")
+    return UserError(f"{where}: {names[column]} = {line.cells[column]!r} must be a number.")
 
 
 def _with_first_unit(column: Column) -> str:
