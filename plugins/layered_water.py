@@ -46,9 +46,11 @@ class LayeredWater(mi.Medium):
     petzold                  string  Or Petzold's ``clear``, ``coastal`` or ``turbid``
     pure                     string  Or ``true``: sea water without particles, whose scattering is ``water_scattering``
     wavelength_nm            float   Wavelength of these waters [nm]: 532, or 400 to 700 for ``chlorophyll`` and
-                                     ``pure``, 514 to 533 for ``petzold``. Default: 532
-    profile                  string  A file instead of the four above: .csv or .nc with ``depth`` [m], two of ``a``,
-                                     ``b``, ``c``, ``omega``, and ``bb`` or ``bb_ratio`` (`physics.water.profiles`)
+                                     ``pure``, 514 to 533 for ``petzold``; or of the columns of a profile that has
+                                     several, as ``a488, a532``. Default: 532, or that of the only columns
+    profile                  string  A file instead of the four above, with ``depth`` or ``z``, two of ``a``, ``b``,
+                                     ``c``, ``omega``, and ``bb`` or ``bb_ratio``: a table with units in its heading
+                                     (.csv, .txt, .dat, .tsv) or .nc (`physics.water.profiles`)
     profile_tolerance        float   Largest relative error of the layers that approximate the profile, 1e-5 to 0.5.
                                      Default: 0.01
     phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``. Default:
@@ -221,7 +223,7 @@ class LayeredWater(mi.Medium):
 def _column(props: mi.Properties) -> WaterColumn:
     """Return the layers of the parameters, of a water by name, or of a profile."""
     tolerance = props.get("profile_tolerance", 0.01)
-    wavelength = positive("wavelength_nm", props.get("wavelength_nm", 532.0))
+    wavelength = positive("wavelength_nm", props["wavelength_nm"]) if "wavelength_nm" in props else None
     ways = [name for name in (*WATERS, "profile") if _is_given(props, name)]
     own = [name for name in ("layer_tops", *_DEFAULTS) if _is_given(props, name)]
     if not ways:
@@ -232,13 +234,13 @@ def _column(props: mi.Properties) -> WaterColumn:
     if excluded:
         raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
-        return read_profile(props[way]).layers(tolerance)
+        return read_profile(props[way], wavelength).layers(tolerance)
     tops = number_list("layer_tops", props["layer_tops"] if own else "0")
     texts = str(props[way]).replace(",", " ").split()
     if len(texts) not in (1, tops.size):
         raise UserError(f"{way} has {len(texts)} values but must have 1 or {tops.size}, one a layer")
     try:
-        found = [water_of(way, None if way == "pure" else text, wavelength) for text in texts]
+        found = [water_of(way, None if way == "pure" else text, wavelength or 532.0) for text in texts]
     except UserError as error:
         raise UserError(f"{way} = {props[way]!r}: {error}") from error
     rows = np.array([[water.attenuation, water.scattering, water.backscattering] for water in found])

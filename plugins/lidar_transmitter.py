@@ -53,7 +53,8 @@ class LidarTransmitter(EmitterWithoutExtent):
                                        0.001 to 2000; its cells are squares
     wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; recorded in results. Default: 532
     pulse_fwhm_ns           float      Full width at half maximum of a Gaussian pulse [ns], 1e-4 to 1e6. Default: 5
-    pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit)
+    pulse_file              string     Instead: text file with two columns, time [ns] and power (any unit), or in any
+                                       order and unit of time below a heading such as ``t [ps], V``
     ======================  =========  =================================================================================
 
     The beam leaves one point. Its energy per tangent-plane area is a Gaussian

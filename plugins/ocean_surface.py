@@ -21,7 +21,7 @@ class OceanSurface(mi.Mesh):
     ========================  =======  =================================================================================
     spectrum                  string   ``elfouhaily`` (Elfouhaily et al. 1997), ``jonswap`` (needs ``fetch``),
                                        ``pierson_moskowitz``, ``table`` (``filename``: .npz with ``kx``, ``ky`` [rad/m]
-                                       and ``density`` [m^4]), ``height_map`` (``filename``: .npy, .npz, .exr or .nc),
+                                       and ``density`` [m^4]), ``height_map`` (``filename``: formats of ``seabed``),
                                        or ``flat``: no waves, all slopes are ripples. Default: ``elfouhaily``
     wind_speed                float    Wind speed at 10 m [m/s], 0 to 30. Default: 3
     wind_direction_deg        float    Direction the wind blows towards, from +x to +y [deg]. Default: 0

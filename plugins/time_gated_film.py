@@ -34,7 +34,8 @@ class TimeGatedFilm(mi.Film):
     gate_step_ns      float    Time from gate to gate [ns], 1e-6 to 1e9. Default: the width
     gate_rise_ns,     float    10-90 % times of raised-cosine edges [ns], 0 (sharp) to 1e9. Default: 0
     gate_fall_ns
-    gate_profile      string   Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1
+    gate_profile      string   Instead of width and edges: file of two columns, time [ns] and transmission 0 to 1, or in
+                               other units below a heading that names them
     pulses            integer  Number of pulses that each gate accumulates, 1 to 10^9. Default: 1
     ================  =======  =========================================================================================
 

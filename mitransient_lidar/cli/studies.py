@@ -294,7 +294,7 @@ def water(
         typer.Argument(
             metavar="VALUE",
             help="Jerlov type, chlorophyll [mg/m^3], Kd [1/m], Secchi depth [m], Petzold's clear, coastal or turbid, "
-            "or a profile's .csv or .nc file.",
+            "or a profile's file: .csv, .txt, .dat, .tsv or .nc.",
         ),
     ] = None,
     wavelength: Annotated[float, typer.Option(help="Wavelength [nm].")] = 532.0,

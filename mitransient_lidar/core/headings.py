@@ -14,8 +14,11 @@ from mitransient_lidar.core.errors import UserError
 
 logger = logging.getLogger(__name__)
 
-_WAVELENGTH = re.compile(r"@?(\d{3,4})(nm)?")
-_LETTERS_AND_WAVELENGTH = re.compile(r"([a-z][a-z ]*?)[-@]?(\d{3,4})(nm)?")
+_WAVELENGTH = re.compile(r"@?(\d{3,4}(?:\.\d+)?)(nm)?")
+_LETTERS_AND_WAVELENGTH = re.compile(r"([a-z][a-z ]*?)[-@]?(\d{3,4}(?:\.\d+)?)(nm)?")
+
+#: Wavelengths that differ by less [nm] are the same.
+_SAME_WAVELENGTH = 0.05
 
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "⁻": "-", "¹": "1", "^": None, "*": None, "·": None})
 
@@ -63,7 +66,7 @@ class Heading(NamedTuple):
 
     column: Column
     unit: str  #: "" if not given.
-    wavelength: str  #: In nm, "" if not given.
+    wavelength_nm: float  #: 0 if not given.
 
     @property
     def known_unit(self) -> bool:
@@ -86,7 +89,7 @@ def parse_heading(text: str, columns: Sequence[Column]) -> Heading | None:
     # A unit alone, such as "ns", names the only column that it fits.
     unit = _unit(words)
     fitting = [column for column in columns if unit in column.units]
-    return Heading(fitting[0], unit, "") if len(fitting) == 1 and unit else None
+    return Heading(fitting[0], unit, 0.0) if len(fitting) == 1 and unit else None
 
 
 def is_unit(text: str, column: Column) -> bool:
@@ -96,39 +99,68 @@ def is_unit(text: str, column: Column) -> bool:
 
 
 def read_headings(
-    path: str | PathLike[str], names: Sequence[str], columns: Sequence[Column], ignored: Collection[str] = ()
+    path: str | PathLike[str],
+    names: Sequence[str],
+    columns: Sequence[Column],
+    ignored: Collection[str] = (),
+    wavelength_nm: float | None = None,
 ) -> list[Heading | None]:
-    """Return the meaning of each heading of a file; None for those without a name or with one of `ignored`.
+    """Return the meaning of each heading of a file.
+
+    None stands for those without a name, with one of `ignored`, or at another wavelength than the one given.
 
     Raises
     ------
     UserError
-        If a name or unit is unknown, a column is there twice, or the columns belong to several wavelengths.
+        If a name or unit is unknown, a column is there twice, none has the wavelength given, or none is given and the
+        columns have several.
     """
     headings = [parse_heading(name, columns) for name in names]
-    others = [name for name, heading in zip(names, headings, strict=True) if heading is None and name]
-    for name in others:
-        if not any(" ".join(_words(name)[:count]) in ignored for count in range(1, len(_words(name)) + 1)):
+    for name, heading in zip(names, headings, strict=True):
+        if heading is None and name and not _is_one_of(name, ignored):
             raise UserError(f"{path} has an unknown column {name!r} {_found_and_allowed(names, columns)}")
-    named = [(name, heading) for name, heading in zip(names, headings, strict=True) if heading is not None]
-    for name, heading in named:
-        if not heading.known_unit:
+        if heading is not None and not heading.known_unit:
             raise UserError(f"{path} has an unknown unit in column {name!r} {_found_and_allowed(names, columns)}")
+    used = _at_wavelength(path, headings, wavelength_nm)
     for column in columns:
-        same = [name for name, heading in named if heading.column is column]
+        same = [name for name, heading in zip(names, used, strict=True) if heading and heading.column is column]
         if len(same) > 1:
             raise UserError(f"{path} has {len(same)} columns {' and '.join(same)} for {column.name}: allowed is one.")
-    wavelengths = {heading.wavelength: name for name, heading in named if heading.wavelength}
-    if len(wavelengths) > 1:
-        raise UserError(
-            f"{path} has columns for {' and '.join(wavelengths)} nm, {' and '.join(wavelengths.values())}:"
-            " allowed is one wavelength."
-        )
-    for wavelength in wavelengths:
-        logger.info("%s: coefficients at %s nm", path, wavelength)
+    others = [name for name, heading in zip(names, used, strict=True) if heading is None and name]
     if others:
         logger.info("%s: columns %s are not used", path, ", ".join(others))
-    return headings
+    return used
+
+
+def _is_one_of(name: str, others: Collection[str]) -> bool:
+    """Return whether a heading begins with one of the names, as ``temperature [degC]`` does."""
+    words = _words(name)
+    return any(" ".join(words[:count]) in others for count in range(1, len(words) + 1))
+
+
+def _at_wavelength(
+    path: str | PathLike[str], headings: Sequence[Heading | None], wavelength_nm: float | None
+) -> list[Heading | None]:
+    """Return the headings of one wavelength and those without, None for the others."""
+    found = sorted({heading.wavelength_nm for heading in headings if heading and heading.wavelength_nm})
+    text = ", ".join(f"{value:g}" for value in found) or "none"
+    if wavelength_nm is None:
+        if len(found) > 1:
+            raise UserError(
+                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by"
+                " wavelength_nm."
+            )
+        wavelength_nm = found[0] if found else 0.0
+    elif not any(abs(value - wavelength_nm) < _SAME_WAVELENGTH for value in found):
+        raise UserError(f"{path} has no columns for {wavelength_nm:g} nm but must: its wavelengths are {text}.")
+    if found:
+        logger.info("%s: coefficients at %g nm", path, wavelength_nm)
+    return [
+        heading
+        if heading and (not heading.wavelength_nm or abs(heading.wavelength_nm - wavelength_nm) < _SAME_WAVELENGTH)
+        else None
+        for heading in headings
+    ]
 
 
 def unknown_columns(path: str | PathLike[str], names: Sequence[str], columns: Sequence[Column]) -> UserError:
@@ -163,7 +195,8 @@ def _named(name: str, rest: Sequence[str], columns: Sequence[Column]) -> Heading
 
 
 def _with_wavelength(column: Column, wavelength: str, rest: Sequence[str]) -> Heading:
-    return Heading(column, _unit(rest[1:] if wavelength and rest and rest[0] == "nm" else rest), wavelength)
+    unit = _unit(rest[1:] if wavelength and rest and rest[0] == "nm" else rest)
+    return Heading(column, unit, float(wavelength or 0))
 
 
 def _words(text: str) -> list[str]:

@@ -70,7 +70,11 @@ class _Line(NamedTuple):
 
 
 def read_table(
-    path: str | PathLike[str], columns: Sequence[Column], ignored: Collection[str] = (), positional: bool = False
+    path: str | PathLike[str],
+    columns: Sequence[Column],
+    ignored: Collection[str] = (),
+    wavelength_nm: float | None = None,
+    positional: bool = False,
 ) -> Table:
     """Read a table from a text file as an instrument or a spreadsheet writes it.
 
@@ -88,14 +92,16 @@ def read_table(
         Columns that the file may have.
     ignored : collection of str
         Names of other columns that it may have, in lower case; the log tells that they are not used.
+    wavelength_nm : float, optional
+        Wavelength [nm] of the columns, if the file has several.
     positional : bool
         Whether a file without heading has exactly `columns`, in their order and first units.
 
     Raises
     ------
     UserError
-        If the file cannot be read or is not text; a name or unit is unknown, a column is there twice, or the columns
-        belong to several wavelengths; or a line does not hold one number for each column.
+        If the file cannot be read or is not text; a name, unit or wavelength is unknown, or a column is there twice; or
+        a line does not hold one number for each column.
     """
     lines, comments = _read_lines(path)
     width = _width(lines)
@@ -104,10 +110,10 @@ def read_table(
     headings: Sequence[Heading | None]
     if names:
         names, start = _with_units(names, lines, start, columns)
-        headings = read_headings(path, names, columns, ignored)
+        headings = read_headings(path, names, columns, ignored, wavelength_nm)
     else:
         start = _without_heading(path, lines, start, width, columns, positional)
-        headings = [Heading(column, "", "") for column in columns]
+        headings = [Heading(column, "", 0.0) for column in columns]
     rows = lines[start:]
     table = _values(path, rows, names, headings)
     kept = complete_rows(path, table, [f"line {line.number}" for line in rows])

@@ -253,7 +253,7 @@ def _means(z: FloatArray, q: FloatArray, layer_tops: FloatArray) -> FloatArray:
     return np.append(integrals / np.diff(layer_tops), q[-1])
 
 
-def read_profile(path: str | os.PathLike[str]) -> Profile:
+def read_profile(path: str | os.PathLike[str], wavelength_nm: float | None = None) -> Profile:
     """Read a profile from a file.
 
     Parameters
@@ -275,6 +275,8 @@ def read_profile(path: str | os.PathLike[str]) -> Profile:
         coefficients, -99, -999, -9999 and -99999 count as missing. The log tells of all this. Columns of other
         quantities that a probe measures, such as temperature or time, are not used; all others are rejected as possible
         misspellings.
+    wavelength_nm : float, optional
+        Which wavelength [nm] to read from a file with several. Columns without wavelength belong to all.
 
     Returns
     -------
@@ -290,7 +292,7 @@ def read_profile(path: str | os.PathLike[str]) -> Profile:
     """
     path = Path(path)
     readers = {**dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_text), ".nc": _read_netcdf}
-    columns, places = readers[readable_suffix(path, readers, "profile")](path)
+    columns, places = readers[readable_suffix(path, readers, "profile")](path, wavelength_nm)
     try:
         columns = _in_order(path, _checked(path, columns))
     except _RowError as error:
@@ -300,20 +302,20 @@ def read_profile(path: str | os.PathLike[str]) -> Profile:
     return Profile(**columns)
 
 
-def _read_text(path: Path) -> tuple[_Columns, list[str]]:
+def _read_text(path: Path, wavelength_nm: float | None) -> tuple[_Columns, list[str]]:
     """Return the columns by name, and the line of each row."""
-    table = read_table(path, _COLUMNS, _OTHER_QUANTITIES)
+    table = read_table(path, _COLUMNS, _OTHER_QUANTITIES, wavelength_nm)
     _check_names(path, list(table.columns))
     return table.columns, [f"line {number}" for number in table.lines]
 
 
-def _read_netcdf(path: Path) -> tuple[_Columns, list[str]]:
+def _read_netcdf(path: Path, wavelength_nm: float | None) -> tuple[_Columns, list[str]]:
     """Return the variables by name, and the index of each row along the dimension."""
     variables = read_netcdf(path)
     dimension = "depth" if any(item.dims == ("depth",) for item in variables.values()) else "z"
     profiles = {name: item for name, item in variables.items() if item.dims == (dimension,)}
     names = [f"{name} [{item.units}]" if item.units else name for name, item in profiles.items()]
-    headings = read_headings(path, names, _COLUMNS, _OTHER_QUANTITIES)
+    headings = read_headings(path, names, _COLUMNS, _OTHER_QUANTITIES, wavelength_nm)
     columns: _Columns = {}
     for (name, item), heading in zip(profiles.items(), headings, strict=True):
         if heading is not None:

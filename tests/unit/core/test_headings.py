@@ -14,31 +14,31 @@ COLUMNS = (TIME, DEPTH, Z, A, C, BB, RATIO)
 @pytest.mark.parametrize(
     ("text", "column", "factor", "wavelength"),
     [
-        ("depth", DEPTH, 1, ""),
-        ("depth_m", DEPTH, 1, ""),
-        ("Depth [m]", DEPTH, 1, ""),
-        ("depth/cm", DEPTH, 0.01, ""),
-        ("depth in feet", DEPTH, 0.3048, ""),
-        ("z", Z, 1, ""),
-        ("a532", A, 1, "532"),
-        ("A_532nm", A, 1, "532"),
-        ("a(532 nm) [m-1]", A, 1, "532"),
-        ("c(532) 1/m", C, 1, "532"),
-        ("c / (1/km)", C, 1e-3, ""),
-        ("Beam attenuation 532 [m⁻¹]", C, 1, "532"),
-        ("c_m^-1", C, 1, ""),
-        ("bb", BB, 1, ""),
-        ("bb532/m-1", BB, 1, "532"),
-        ("bb/b", RATIO, 1, ""),
-        ("bb_ratio (%)", RATIO, 0.01, ""),
-        ("t_ns", None, 1, ""),
-        ("time_ns", TIME, 1, ""),
-        ("time (µs)", TIME, 1e3, ""),
-        ("ps", TIME, 1e-3, ""),
-        ("temperature", None, 1, ""),
-        ("1/m", None, 1, ""),
-        ("m", None, 1, ""),
-        ("", None, 1, ""),
+        ("depth", DEPTH, 1, 0),
+        ("depth_m", DEPTH, 1, 0),
+        ("Depth [m]", DEPTH, 1, 0),
+        ("depth/cm", DEPTH, 0.01, 0),
+        ("depth in feet", DEPTH, 0.3048, 0),
+        ("z", Z, 1, 0),
+        ("a532", A, 1, 532),
+        ("A_532nm", A, 1, 532),
+        ("a(532 nm) [m-1]", A, 1, 532),
+        ("c(532) 1/m", C, 1, 532),
+        ("c / (1/km)", C, 1e-3, 0),
+        ("Beam attenuation 532 [m⁻¹]", C, 1, 532),
+        ("c_m^-1", C, 1, 0),
+        ("bb", BB, 1, 0),
+        ("bb532/m-1", BB, 1, 532),
+        ("bb/b", RATIO, 1, 0),
+        ("bb_ratio (%)", RATIO, 0.01, 0),
+        ("t_ns", None, 1, 0),
+        ("time_ns", TIME, 1, 0),
+        ("time (µs)", TIME, 1e3, 0),
+        ("ps", TIME, 1e-3, 0),
+        ("temperature", None, 1, 0),
+        ("1/m", None, 1, 0),
+        ("m", None, 1, 0),
+        ("", None, 1, 0),
     ],
 )
 def test_headings_are_understood(text, column, factor, wavelength):
@@ -48,7 +48,7 @@ def test_headings_are_understood(text, column, factor, wavelength):
     if heading:
         assert heading.known_unit
         assert heading.factor == pytest.approx(factor)
-        assert heading.wavelength == wavelength
+        assert heading.wavelength_nm == wavelength
 
 
 @pytest.mark.parametrize(
@@ -60,8 +60,9 @@ def test_headings_are_understood(text, column, factor, wavelength):
             r"unit in column 'depth \[hPa\]' \(found: .*depth, z \[m, cm, mm, km, ft\]",
         ),
         (["a_nw", "depth"], "unknown unit in column 'a_nw'"),
-        (["a412", "a532"], "has 2 columns a412 and a532 for a: allowed is one"),
-        (["a412", "c532"], "has columns for 412 and 532 nm, a412 and c532: allowed is one wavelength"),
+        (["a532", "a_532"], "has 2 columns a532 and a_532 for a: allowed is one"),
+        (["a412", "a532"], "has columns for 412, 532 nm: the wavelength must be chosen, .* by wavelength_nm"),
+        (["a412.5", "c532"], "has columns for 412.5, 532 nm"),
     ],
 )
 def test_unclear_headings_are_rejected(names, message):

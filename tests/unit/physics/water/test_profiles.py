@@ -241,6 +241,17 @@ def test_what_is_done_to_a_file_is_told(tmp_path, caplog):
     ]
 
 
+def test_one_of_several_wavelengths_is_read(tmp_path):
+    path = tmp_path / "water.csv"
+    path.write_text("depth,a488,a531.5,b488,b531.5,bb\n0,1,2,3,4,0.5\n5,1,2,3,4,0.5\n")
+    read = read_profile(path, 531.5)
+    np.testing.assert_array_equal(read.absorption, [2, 2])
+    np.testing.assert_array_equal(read.scattering, [4, 4])
+    np.testing.assert_array_equal(read.backscattering, [0.5, 0.5])
+    with pytest.raises(ValueError, match=r"has no columns for 532 nm but must: its wavelengths are 488, 531.5\."):
+        read_profile(path, 532.0)
+
+
 def test_units_of_netcdf_variables(tmp_path):
     path = tmp_path / "water.nc"
     units = {"depth": "cm", "a": "m-1", "b": "km**-1"}
@@ -270,7 +281,7 @@ def test_units_of_netcdf_variables(tmp_path):
             "depth,a,b,bbp\n0,0,0,0\n",
             r"unknown column 'bbp' \(found: depth, a, b, bbp\): .* a, b, c, bb \[1/m, .*\], omega, bb_ratio \[1, %\]",
         ),
-        ("depth,a440,c532\n0,0,0\n", "has columns for 440 and 532 nm, a440 and c532: allowed is one wavelength"),
+        ("depth,a440,c532\n0,0,0\n", "has columns for 440, 532 nm: the wavelength must be chosen"),
         ("depth,a,b,a\n0,0,0,0\n", "has 2 columns a and a for a: allowed is one"),
         ("depth,a,b,bb,bb_ratio\n0,0,0,0,0\n", "columns bb and bb_ratio, but must have only one"),
         ("depth,a,b\n0,1,1\n", "has 1 depths but a profile must have at least 2"),
