@@ -147,8 +147,7 @@ def _at_wavelength(
     if wavelength_nm is None:
         if len(found) > 1:
             raise UserError(
-                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by"
-                " wavelength_nm."
+                f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by wavelength_nm."
             )
         wavelength_nm = found[0] if found else 0.0
     elif not any(abs(value - wavelength_nm) < _SAME_WAVELENGTH for value in found):

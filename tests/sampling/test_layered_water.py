@@ -171,5 +171,3 @@ def test_profile_is_given_alone_and_exists(tmp_path):
         mi.load_dict({"type": "layered_water", "profile": str(path), "attenuation": 0.4})
     with pytest.raises(RuntimeError, match=r"none\.csv"):
         mi.load_dict({"type": "layered_water", "profile": str(tmp_path / "none.csv")})
-    with pytest.raises(RuntimeError, match="wavelength_nm = 532 needs a profile"):
-        mi.load_dict({"type": "layered_water", "wavelength_nm": 532.0})
