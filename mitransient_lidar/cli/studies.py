@@ -83,12 +83,11 @@ def shots(
         raise UserError("--at and --places are alternatives: give one of them.")
     check_suffix("--output", output, ".nc")
     from mitransient_lidar import results
-    from mitransient_lidar.core.text_tables import read_two_columns
     from mitransient_lidar.studies import shot_series as study
 
     given: Any = [pair("--at", text) for text in at] if at else None
     if places is not None:
-        given = read_two_columns(places, "x and y [m]")[0]
+        given = study.read_places(places)
     with reporting(quiet) as progress:
         series = study.render_shots(
             scene,

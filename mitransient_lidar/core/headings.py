@@ -143,17 +143,18 @@ def _at_wavelength(
 ) -> list[Heading | None]:
     """Return the headings of one wavelength and those without, None for the others."""
     found = sorted({heading.wavelength_nm for heading in headings if heading and heading.wavelength_nm})
-    text = ", ".join(f"{value:g}" for value in found) or "none"
+    if not found:
+        return list(headings)
+    text = ", ".join(f"{value:g}" for value in found)
     if wavelength_nm is None:
         if len(found) > 1:
             raise UserError(
                 f"{path} has columns for {text} nm: the wavelength must be chosen, for a medium by wavelength_nm."
             )
-        wavelength_nm = found[0] if found else 0.0
+        wavelength_nm = found[0]
     elif not any(abs(value - wavelength_nm) < _SAME_WAVELENGTH for value in found):
         raise UserError(f"{path} has no columns for {wavelength_nm:g} nm but must: its wavelengths are {text}.")
-    if found:
-        logger.info("%s: coefficients at %g nm", path, wavelength_nm)
+    logger.info("%s: coefficients at %g nm", path, wavelength_nm)
     return [
         heading
         if heading and (not heading.wavelength_nm or abs(heading.wavelength_nm - wavelength_nm) < _SAME_WAVELENGTH)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError, is_interruption
+from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -31,6 +34,9 @@ _REACH, _FEWEST_CELLS = 4.5, 4
 
 #: Farthest place [m]: single precision resolves a millimetre there.
 _FARTHEST = 1e4
+
+_METRES = {"m": 1.0, "cm": 0.01, "km": 1000.0}
+_PLACE = Column("x", ("aim x",), _METRES), Column("y", ("aim y",), _METRES)
 
 #: Attributes that differ between shots, of which the series keeps the sum, the least or the greatest.
 _MERGED: dict[str, Callable[[list[Any]], Any]] = {
@@ -69,6 +75,12 @@ def rendered_shots(
         yield render(scene, params=_at(params, x, y, target), passes=passes, seed=number)
         if progress is not None:
             progress(Progress(number + 1, len(pairs), "shot"))
+
+
+def read_places(path: str | os.PathLike[str]) -> FloatArray:
+    """Read places from a table with columns x and y [m], shape (count, 2); raise `UserError` if it cannot be read."""
+    table = read_two_columns(path, *_PLACE)
+    return np.column_stack([table.columns[column.name] for column in _PLACE])
 
 
 def random_places(sea: SeaMap, count: int, seed: int) -> FloatArray:
