@@ -98,7 +98,12 @@ def _lines(found: Any) -> list[str]:
     for name, positive in (("along", "a face towards the lidar"), ("across", "a rise to the left")):
         slope, error = value[f"slope_{name}"], value[f"slope_{name}_stderr"]
         known = f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
-        lines.append(f"slope {name}: {'not observable with these pixels' if np.isnan(slope) else known}")
+        unknown = "not observable with these pixels"
+        if value["slope_refused"]:
+            unknown = (
+                f"refused, an estimate is steeper than {found.attrs['steepest_slope']:.2f}, beyond what the sea has"
+            )
+        lines.append(f"slope {name}: {unknown if np.isnan(slope) else known}")
     height = value["surface_height"]
     lines.append("surface: no echo" if np.isnan(height) else f"surface: {height:+.3f} m from the mean level")
     lines += _bottom_lines(found["depth_m"].values, found)

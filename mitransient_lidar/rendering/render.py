@@ -158,6 +158,7 @@ def render(
         beam_outside_surface=probe.missed_beam,
         **describe_lidar(lidar),
         **surface,
+        **_surface_heights(lidar),
         window_start_ns=float(window.start_ns.min()),
         window_end_ns=float(window.end_ns.max()),
     )
@@ -167,6 +168,14 @@ def render(
     pixels = lidar.receiver.pixels
     dims = ("pixel",) if pixels.grid is None else ("row", "column")
     return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
+
+
+def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
+    """Return the lowest and highest point of the sea [m] as an attribute; none without a surface."""
+    boxes = [surface.bbox() for surface in lidar.surfaces]
+    if not boxes:
+        return {}
+    return {"surface_heights_m": [min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)]}
 
 
 def _error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:

@@ -244,6 +244,17 @@ class LinesOfSight:
         """Return some of the lines of sight."""
         return LinesOfSight(**{name: values[index] for name, values in vars(self).items()})
 
+    def combined(self) -> LinesOfSight:
+        """Return the line of sight of the sum of the pixels, weighted with the beam, shape (1,)."""
+        known = np.isfinite(self.beam_share).all() and self.beam_share.sum() > 0
+        weight = (
+            self.beam_share / self.beam_share.sum() if known else np.full(self.off_nadir.shape, 1 / self.off_nadir.size)
+        )
+        mean = {name: np.array([np.sum(weight * values)]) for name, values in vars(self).items()}
+        apart = np.sum(weight * (self.surface_time - mean["surface_time"]) ** 2)
+        mean["surface_spread"] = np.sqrt(np.sum(weight * self.surface_spread**2, keepdims=True) + apart)
+        return LinesOfSight(**mean | {"beam_share": np.array([self.beam_share.sum()])})
+
     def reshaped(self, shape: tuple[int, ...]) -> LinesOfSight:
         """Return the lines of sight in arrays of another shape."""
         return LinesOfSight(**{name: values.reshape(shape) for name, values in vars(self).items()})

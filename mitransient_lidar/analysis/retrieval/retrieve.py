@@ -23,10 +23,17 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, positive
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED, PixelMap, SeaLidar, sea_shots
-from mitransient_lidar.results.geometry import LidarGeometry, required_number, two_way_efficiency
+from mitransient_lidar.results.geometry import (
+    LidarGeometry,
+    LinesOfSight,
+    optional_number,
+    required_number,
+    two_way_efficiency,
+)
 
 _LOG = logging.getLogger(__name__)
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
+_STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
 _COLUMN_START = 1.75  # echo widths after the surface at which `echo_table` begins to fit the column
 
 
@@ -67,6 +74,8 @@ def surface_slopes(
         ``surface_height`` above the mean level [m]; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
         Attributes: ``slope_method``, ``times and strengths``, ``times on a sea`` or ``times``, and
         ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
+        Without a model of the sea, a slope beyond 5 standard deviations of its slopes (attribute
+        ``surface_slope_variance``) is NaN as well, and ``slope_refused`` is 1.
 
     Raises
     ------
@@ -94,6 +103,7 @@ def surface_slopes(
     time, error = (surface[name].values.reshape(-1, dataset.sizes["pixel"]) for name in ("time_ns", "time_ns_stderr"))
     light = pixel_light(dataset)
     plane = surface_slope.fit_plane(time, light, lidar.off_nadir, stderr_ns=error, facets=facets)
+    refused, limit = np.zeros(len(time), dtype=bool), _steepest_sea(dataset)
     wind = None if slope_deviation is not None else _wind(dataset, wind_speed, wind_direction_deg)
     if wind is not None:
         scale = _energy_scale(dataset, efficiency)
@@ -111,6 +121,8 @@ def surface_slopes(
         prior = np.sqrt(np.diag(sea.prior)) / (1, 1, math.cos(lidar.off_nadir))
     else:
         slopes = [(plane.along, plane.along_stderr), (plane.across, plane.across_stderr)]
+        refused = np.any([np.abs(slope) > limit for slope, _ in slopes], axis=0)
+        slopes = [(np.where(refused, np.nan, slope), np.where(refused, np.nan, error)) for slope, error in slopes]
         if slope_deviation is not None:
             slopes = [
                 surface_slope.with_prior(*pair, positive("slope_deviation", one))
@@ -134,9 +146,17 @@ def surface_slopes(
         "surface_range_stderr": (height_error / math.cos(lidar.off_nadir), "m", "standard error of the distance"),
         "surface_height": (height, "m", "height of the surface above the mean sea level"),
         "plane_misfit": (plane.misfit_ns, "ns", "deviation of the echoes from a plane"),
+        "slope_refused": (refused.astype(np.float64), "1", "1 where a slope is steeper than the sea"),
     }
     found = _labelled(dataset, table, shape)
-    return found.assign_attrs(slope_method=method, slope_prior_deviation=[float(one) for one in prior])
+    found = found.assign_attrs(slope_method=method, slope_prior_deviation=[float(one) for one in prior])
+    return found.assign_attrs({"steepest_slope": limit}) if math.isfinite(limit) else found
+
+
+def _steepest_sea(dataset: xr.Dataset) -> float:
+    """Return the largest slope [1] that the sea can have in one direction, infinite if its slopes are unknown."""
+    variance = optional_number(dataset.attrs, "surface_slope_variance")
+    return math.inf if variance is None else _STEEPEST * math.sqrt(0.5 * variance)
 
 
 def _wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) -> tuple[float, float] | None:
@@ -398,6 +418,8 @@ def _summed(dataset: xr.Dataset) -> xr.Dataset:
         summed["waveform_stderr"] = (dataset["waveform_stderr"] ** 2).sum("pixel") ** 0.5
     summed = summed.expand_dims(pixel=["all"]).transpose(..., "pixel", "time")
     summed["waveform"].attrs.update(dataset["waveform"].attrs)
+    if "surface_time" in dataset.coords and "shot" not in dataset["surface_time"].dims:
+        summed = summed.assign_coords(LinesOfSight.from_dataset(dataset).combined().coordinates(("pixel",), (1,)))
     if "shot" in summed.dims and "shot" not in summed.coords:
         summed = summed.assign_coords(shot=np.arange(summed.sizes["shot"]))
     return summed.assign_attrs(dataset.attrs)

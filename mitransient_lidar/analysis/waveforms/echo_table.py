@@ -32,6 +32,8 @@ ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of a surface echo that is distinct from the column
+_OF_DEPTH = 0.005  # error of a depth by multiple scattering, relative to it
+_OF_SPREAD = 0.4  # error of a surface time by the light's distribution, relative to the spread of the arrival
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
     "time_ns": "arrival of the echo",
@@ -97,7 +99,7 @@ def extract(
     layers : int
         Number of changes in the column to test for, 0 to 8; see `column_fits.change_points`.
     depth_from : {'echo', 'mean'}
-        Depths from the surface echo of each waveform, or from the mean surface (attribute ``surface_time_ns``).
+        Depths from the surface echo of each waveform, or from the mean sea level along the pixel's line of sight.
     iterations : int
         Iterations of the deconvolution, 1 to 10 000.
     block : int
@@ -108,9 +110,11 @@ def extract(
     xarray.Dataset
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
         ``echo`` (surface, column, target, bottom): ``time_ns``, ``depth_m``, ``amplitude``, ``energy`` and ``width_ns``
-        with ``_stderr``, and ``flags``, sums of `echo_detection.EchoFlag`. Over the dimensions of the waveforms alone:
-        ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``:
-        ``layer_depth_m``, ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and ``_below``.
+        with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of `echo_detection.EchoFlag`. Without ``echo``:
+        ``surface_time_ns``, the arrival of the surface in the pixel, with ``_stderr``. Over the dimensions of the
+        waveforms alone: ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`,
+        over ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and
+        ``_below``.
 
     Raises
     ------
@@ -120,9 +124,55 @@ def extract(
 
     Notes
     -----
-    Depth is (t - t_surface) c0 cos(theta_water) / (2 n_g), with the angle of the lidar's axis. Time, depth and energy
-    of the column are those of the samples between the surface echo and the next one, its amplitude is extrapolated to
-    the surface, and its width is the time of decay to one half.
+    Depth is (t - t_surface) c0 cos(theta_water) / (2 n_g), with the angle of the pixel's line of sight; see
+    `geometry.LinesOfSight`. Time, depth and energy of the column are those of the samples between the surface echo and
+    the next one, its amplitude is extrapolated to the surface, and its width is the time of decay to one half.
+
+    Surface echoes are held against beam and geometry; see `surface_times.surface_times`. A pixel without direct light
+    has the flag ``no_surface_light``, and ``surface_time_ns`` from the other pixels of its shot. The estimator
+    ``gaussian`` flags a surface echo of less than 3 standard errors as ``no_echo``; its time is that of the column's
+    onset.
+
+    ``depth_m_stderr`` is the error by noise. The method errs by more, which ``depth_m_method_error`` states for
+    ``gaussian``: 0.5 % of the depth, for light that the water delays (more in turbid water), and with `depth_from` ``echo`` 0.4 of the spread
+    of the surface's arrival over the light in the pixel, as the surface echo is hardly distinct from the column.
+
+    Biases by method over a flat bottom, measured with three renders each of ``table1`` with 1x1 pixels, ``spectrum`` flat
+    and bins of 0.5 ns; positive is too deep [m]. The first number of each pair is that of the surface, the second that
+    of the bottom against the mean sea level (`depth_from` ``mean``); with ``echo`` they add up. Angles are in degrees, d
+    is the divergence [mrad], in a field of view of 20 mrad for 2 and 30 mrad for 10. Attenuation, scattering and
+    backscattering [1/m] and depth [m] are 0.15, 0.08, 0.0015 and 8 (clear), 0.3, 0.15, 0.006 and 8 (coastal), and 1,
+    0.8, 0.016 and 4 (turbid). Standard errors are below 0.01 up to 20 degrees for threshold, edge and gaussian, and
+    below 0.1 otherwise.
+
+    ======= ===== == =========== =========== =========== =========== =========== ===========
+    water   angle  d threshold   edge        peak        centroid    gaussian    deconvolved
+    ======= ===== == =========== =========== =========== =========== =========== ===========
+    clear       5  2 +0.01 +0.01 +0.01 +0.01 +0.01 +0.02 +0.01 +0.02 +0.01 +0.02 +0.01 +0.02
+    clear       5 10 +0.03 -0.01 +0.01 +0.01 +0.00 +0.03 +0.00 +0.03 +0.00 +0.03 +0.00 +0.03
+    clear      20  2 +0.00 -0.04 -0.02 -0.01 -0.09 +0.02 -0.14 +0.02 +0.00 +0.02 -0.08 +0.02
+    clear      20 10 +0.37 -0.35 +0.20 -0.15 -0.23 +0.02 -0.25 +0.03 +0.09 +0.03 -0.12 +0.02
+    clear      40  2   -   -0.33 -0.22 -0.10 -0.90 +0.02 -0.81 +0.02 -0.01 +0.02 -0.49 +0.03
+    clear      40 10 +0.97 -1.54 -0.01 -0.65 -1.78 +0.02 -1.67 +0.03 -0.01 +0.04 -1.42 +0.01
+    coastal     5  2 +0.01 -0.01 +0.01 +0.03 +0.01 +0.05 +0.01 +0.05 +0.01 +0.05 +0.00 +0.05
+    coastal     5 10 +0.03 -0.04 +0.01 +0.03 +0.00 +0.06 +0.00 +0.07 +0.00 +0.06 +0.00 +0.06
+    coastal    20  2 -0.03 -0.10 -0.08 -0.00 -0.47 +0.04 -0.38 +0.04 +0.01 +0.04 -0.21 +0.04
+    coastal    20 10 +0.28   -   +0.02 -0.13 -0.64 +0.06 -0.60 +0.07 +0.19 +0.07 -0.42 +0.05
+    coastal    40  2   -     -   -0.19 -0.13 -0.67 +0.03 -0.64 +0.03 -0.03 +0.02 -0.45 +0.02
+    coastal    40 10 +1.02   -   +0.08 -0.69 -1.14 +0.04 -1.26 +0.02 -0.06 +0.06 -1.12 -0.03
+    turbid      5  2 +0.01   -   +0.01 +0.07 +0.00 +0.09 +0.00 +0.10 +0.01 +0.10 +0.00 +0.08
+    turbid      5 10 +0.03   -   +0.01 +0.06 +0.00 +0.10 -0.00 +0.11 +0.00 +0.10 -0.00 +0.09
+    turbid     20  2 -0.07   -   -0.13 +0.03 -0.55 +0.08 -0.49 +0.08 +0.06 +0.08 -0.30 +0.07
+    turbid     20 10 +0.21   -   -0.07 -0.09 -0.68 +0.11 -0.68 +0.11 +0.06 +0.11 -0.53 +0.08
+    turbid     40  2 -0.04   -   -0.18 -0.10 -0.65 +0.05 -0.59 +0.05 -0.02 +0.04 -0.43 +0.03
+    turbid     40 10   -   -0.64   -   -0.36   -   +0.27   -   +0.34 +0.03 +0.12 -1.02 -0.23
+    ======= ===== == =========== =========== =========== =========== =========== ===========
+
+    In water that only absorbs, all methods but threshold and edge have surface biases of at most 0.06, as near facets
+    return most of the light, and bottom biases of at most 0.01, up to 20 degrees; edges of wide echoes are early. The
+    rest is the water's: light scattered near the surface follows the surface echo and delays its peak and centroid by
+    0.1 to 1.8 (surface penetration), and scattered light reaches the bottom later by 0.02 to 0.1. It arrives no earlier
+    than direct light (undercutting) on average. At 40 degrees in turbid water, a wide beam has no bottom echo.
 
     The attenuation K is that of exp(-2 K s) over the path s, corrected for distance and refraction. Bins of rendered
     waveforms are correlated: without ``error_inflation`` the errors are too small.
@@ -239,14 +289,16 @@ def _with_depths(
     lines = waveforms.lines_of(slice(0, waveforms.count))
     shots = waveforms.count // waveforms.baseline.size
     variance = optional_number(dataset.attrs, "surface_slope_variance")
+    lowest, highest = dataset.attrs.get("surface_heights_m", (-np.inf, np.inf))
     time, error, peak = table["time_ns"], table["time_ns_stderr"], table.pop("peak_ns")
-    zero, zero_error = np.empty(time.shape[:2]), np.empty(time.shape[:2])
+    zero, zero_error, by_light = (np.empty(time.shape[:2]) for _ in range(3))
     for number, estimator in enumerate(settings.estimators):
         measured = time[:, number, 0]
         found = surface_times(
             *(values.reshape(shots, -1) for values in (measured, error[:, number, 0])),
             lines.reshaped((shots, -1)),
             slope_variance=_TYPICAL_SLOPE_VARIANCE if variance is None else variance,
+            heights_m=(lowest, highest),
             echo_fwhm_ns=waveforms.echo_fwhm_ns,
         )
         own = found.own.ravel()
@@ -262,6 +314,7 @@ def _with_depths(
             for column in (name, f"{name}_stderr"):
                 table[column][faint, number, 0] = np.nan
         time[absent, number, 0] = error[absent, number, 0] = np.nan
+        by_light[:, number] = np.where(own, _OF_SPREAD * lines.surface_spread, 0)
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
     table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error}
     if settings.depth_from == "echo":
@@ -273,6 +326,10 @@ def _with_depths(
         delay, spread = time - lines.surface_time[:, np.newaxis, np.newaxis], error
         layer_zero = lines.surface_time
     table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
+    # The surface, from which depths count, has no error of depth.
+    counted = (settings.depth_from == "echo") * (np.arange(len(ECHOES)) > 0)
+    by_light = lines.depth_of_delay(by_light)[..., np.newaxis] * counted
+    table["depth_m_method_error"] = np.hypot(_OF_DEPTH * table["depth_m"], by_light)
     if "layer_time_ns" in table:
         table["layer_depth_m"] = lines.depth_of_delay(table.pop("layer_time_ns") - layer_zero[:, np.newaxis])
     return table
@@ -295,6 +352,8 @@ def _label(
         for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
             described = {"units": units[name], "long_name": of + description}
             data[name + suffix] = of_echoes(table[name + suffix], described)
+    by_method = {"units": "m", "long_name": "typical error of the depth by scattering and the light's distribution"}
+    data["depth_m_method_error"] = of_echoes(table["depth_m_method_error"], by_method)
     for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
         values = table["surface_time_ns" + suffix]
         described = {"units": "ns", "long_name": f"{of}arrival of the surface"}

@@ -30,6 +30,7 @@ def surface_times(
     lines: LinesOfSight,
     *,
     slope_variance: float,
+    heights_m: tuple[float, float],
     echo_fwhm_ns: float,
 ) -> SurfaceTimes:
     """Hold the surface echoes of shots against beam and geometry, and replace those without direct light.
@@ -42,6 +43,8 @@ def surface_times(
         Lines of sight with arrays of shape (shots, pixels).
     slope_variance : float
         Variance of the sea's slopes, the sum over two directions [1].
+    heights_m : (float, float)
+        Lowest and highest point of the sea [m], infinite if unknown.
     echo_fwhm_ns : float
         Expected full width of an echo at half maximum [ns].
 
@@ -49,9 +52,9 @@ def surface_times(
     -------
     SurfaceTimes
         A pixel's own time where it has at least a thousandth of the light of the brightest pixel, and where its
-        deviation from the level sea differs from the median of the pixels, weighted with their light, by at most 4
-        standard deviations. Otherwise, that of the level sea plus the mean deviation of the former pixels; NaN without
-        any of them. Where the shares of the beam are unknown, all times are own.
+        deviation from the level sea agrees, within 4 standard deviations, with the heights of the sea and with the
+        median of the pixels, weighted with their light. Otherwise, that of the level sea plus the mean deviation of the
+        former pixels; NaN without any of them. Where the shares of the beam are unknown, all times are own.
 
     Notes
     -----
@@ -65,10 +68,13 @@ def surface_times(
     if np.isnan(share).any():
         return SurfaceTimes(time_ns, stderr_ns, known)
     light = share >= _LEAST_SHARE * share.max(axis=1, keepdims=True)
-    candidate = known & light & (share > 0)
     tilt = _tilt_ns(lines, np.sqrt(0.5 * slope_variance))
     own_error = np.hypot(np.hypot(np.nan_to_num(stderr_ns), lines.surface_spread), _SHAPE * echo_fwhm_ns)
     deviation = np.where(known, time_ns, 0) - lines.surface_time
+    # A crest is nearer than the mean sea level.
+    latest, earliest = (-height / (0.5e-9 * C0 * np.cos(lines.off_nadir)) for height in heights_m)
+    within = (deviation >= earliest - _LIMIT * own_error) & (deviation <= latest + _LIMIT * own_error)
+    candidate = known & light & (share > 0) & within
     middle = _weighted_median(deviation, np.where(candidate, share, 0))
     lit = candidate & (np.abs(deviation - middle) <= _LIMIT * np.hypot(own_error, tilt))
     weight = np.where(lit, 1 / np.hypot(own_error, tilt) ** 2, 0)

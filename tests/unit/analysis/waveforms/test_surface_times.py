@@ -1,0 +1,80 @@
+"""Surface echoes against beam and geometry: which are a pixel's own, and the errors of those that are inferred."""
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.analysis.waveforms.surface_times import surface_times
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.results.geometry import LinesOfSight
+
+HALF = 0.5e-9 * C0  # metres of range per nanosecond
+ANGLE = np.radians(20)
+#: Four pixels 4 mrad about the axis, and one that the beam does not reach.
+X, Y = np.array([4, 4, -4, -4, 0.0]) * 1e-3, np.array([-4, 4, -4, 4, 12.0]) * 1e-3
+SHARE = np.array([0.25, 0.25, 0.25, 0.249, 1e-6])
+
+
+def lines(shots, share=SHARE):
+    cosine = (np.cos(ANGLE) - np.sin(ANGLE) * X) / np.sqrt(1 + X**2 + Y**2)
+    values = (X, Y, np.arccos(cosine), 200 / cosine / HALF, np.full(5, 0.5), np.full(5, 0.106), share)
+    return LinesOfSight(*(np.tile(one, (shots, 1)) for one in values))
+
+
+def infer(time, error=0.05, heights=(-1.0, 1.0), share=SHARE, slope_variance=0.02):
+    errors = np.full(time.shape, error)
+    at = lines(len(time), share)
+    return surface_times(time, errors, at, slope_variance=slope_variance, heights_m=heights, echo_fwhm_ns=5.0)
+
+
+def test_times_of_tilted_seas_are_kept_and_the_dark_pixel_follows_them():
+    """2000 planes with random heights, slopes and errors: z of the inferred time has the variance 1 or less."""
+    rng = np.random.default_rng(1)
+    shots = 2000
+    at = lines(shots)
+    away = at.surface_time * HALF
+    x, y = away * at.sight_x / np.cos(at.off_nadir), away * at.sight_y
+    height = 0.2 * rng.standard_normal((shots, 1))
+    height = height + 0.1 * (rng.standard_normal((shots, 1)) * x + rng.standard_normal((shots, 1)) * y)
+    truth = at.surface_time - height / (np.cos(at.off_nadir) * HALF)
+    noise = np.hypot(0.05, 0.5) * rng.standard_normal(truth.shape)
+    seen = truth + noise
+    seen[:, 4] += 9.0  # scattered light rises a metre late
+    found = infer(seen)
+    assert np.mean(found.own[:, :4]) > 0.999
+    assert not found.own[:, 4].any()
+    np.testing.assert_array_equal(found.time_ns[found.own], seen[found.own])
+    z = (found.time_ns - truth)[:, 4] / found.stderr_ns[:, 4]
+    assert abs(z.mean()) < 5 / np.sqrt(shots)
+    # The true slopes have the assumed variance; the part of the echoes' shape, which this model lacks, is small.
+    assert 0.8 < z.std() < 1.05
+
+
+def test_a_late_echo_in_a_lit_pixel_is_replaced():
+    level = lines(1).surface_time
+    late = level + np.array([0, 0, 12.0, 0, np.nan])
+    found = infer(late)
+    assert found.own.tolist() == [[True, True, False, True, False]]
+    np.testing.assert_allclose(found.time_ns, level)
+    assert found.stderr_ns[0, 2] > 0.3
+
+
+def test_an_echo_outside_the_heights_of_the_sea_is_not_the_surface():
+    """A bottom 8 m deep, 75 ns late in all pixels, has no surface to refer to."""
+    found = infer(lines(1).surface_time + 75)
+    assert not found.own.any()
+    assert np.isnan(found.time_ns).all()
+
+
+def test_unknown_shares_leave_the_times_as_they_are():
+    time = lines(1).surface_time + np.array([0, 30, 0, 0, np.nan])
+    found = infer(time, share=np.full(5, np.nan))
+    np.testing.assert_array_equal(found.time_ns, time)
+    assert found.own.tolist() == [[True, True, True, True, False]]
+
+
+@pytest.mark.parametrize("pixel", [0, 3])
+def test_a_pixel_without_an_echo_takes_the_others(pixel):
+    time = lines(1).surface_time - 3.0
+    time[0, pixel] = np.nan
+    found = infer(time)
+    assert found.time_ns[0, pixel] == pytest.approx(lines(1).surface_time[0, pixel] - 3.0)
