@@ -134,16 +134,17 @@ def extract(
     onset.
 
     ``depth_m_stderr`` is the error by noise. The method errs by more, which ``depth_m_method_error`` states for
-    ``gaussian``: 0.5 % of the depth, for light that the water delays (more in turbid water), and with `depth_from` ``echo`` 0.4 of the spread
-    of the surface's arrival over the light in the pixel, as the surface echo is hardly distinct from the column.
+    ``gaussian``: 0.5 % of the depth, for light that the water delays (more in turbid water), and with `depth_from`
+    ``echo`` 0.4 of the spread of the surface's arrival over the light in the pixel, as the surface echo is hardly
+    distinct from the column.
 
-    Biases by method over a flat bottom, measured with three renders each of ``table1`` with 1x1 pixels, ``spectrum`` flat
-    and bins of 0.5 ns; positive is too deep [m]. The first number of each pair is that of the surface, the second that
-    of the bottom against the mean sea level (`depth_from` ``mean``); with ``echo`` they add up. Angles are in degrees, d
-    is the divergence [mrad], in a field of view of 20 mrad for 2 and 30 mrad for 10. Attenuation, scattering and
-    backscattering [1/m] and depth [m] are 0.15, 0.08, 0.0015 and 8 (clear), 0.3, 0.15, 0.006 and 8 (coastal), and 1,
-    0.8, 0.016 and 4 (turbid). Standard errors are below 0.01 up to 20 degrees for threshold, edge and gaussian, and
-    below 0.1 otherwise.
+    Biases by method over a flat bottom, measured with three renders each of ``table1`` with 1x1 pixels, ``spectrum``
+    flat and bins of 0.5 ns; positive is too deep [m]. The first number of each pair is that of the surface, the second
+    that of the bottom against the mean sea level (`depth_from` ``mean``); with ``echo`` they add up. Angles are in
+    degrees, d is the divergence [mrad], in a field of view of 20 mrad for 2 and 30 mrad for 10. Attenuation, scattering
+    and backscattering [1/m] and depth [m] are 0.15, 0.08, 0.0015 and 8 (clear), 0.3, 0.15, 0.006 and 8 (coastal), and
+    1, 0.8, 0.016 and 4 (turbid). Standard errors are at
+    most 0.013, those of ``peak`` up to 0.1.
 
     ======= ===== == =========== =========== =========== =========== =========== ===========
     water   angle  d threshold   edge        peak        centroid    gaussian    deconvolved
