@@ -14,7 +14,7 @@ from matplotlib.patches import Circle, Patch, Rectangle
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.results.geometry import LidarGeometry, optional_number
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
 
 Scale = Literal["both", "linear", "log"]
 
@@ -25,7 +25,8 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     """Draw the waveforms or recorded signals of a result; of an imager the total of each pixel and the summed waveform.
 
     Bands are +-1 standard error; of a series of shots, the curve is the mean of the shots, and the band holds 90 % of
-    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), on the axis of the receiver.
+    them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight of a single pixel, and on the
+    axis of the receiver for several.
     The depth axis and the layout of the pixels are left out if the result lacks their attributes.
 
     Parameters
@@ -59,7 +60,7 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
     axes[-1].set_xlabel(drawing.TIME_LABEL)
-    _add_depth_axis(axes[0], dataset.attrs)
+    _add_depth_axis(axes[0], dataset)
     figure.suptitle(_title(dataset), fontsize="large")
     return drawing.save(figure, path)
 
@@ -127,13 +128,16 @@ def _draw_waveforms(ax: Axes, dataset: xr.Dataset, curves: _Curves, *, log: bool
     drawing.add_grid(ax, hide=("right",))
 
 
-def _add_depth_axis(ax: Axes, attributes: dict[str, Any]) -> None:
+def _add_depth_axis(ax: Axes, dataset: xr.Dataset) -> None:
     try:
-        geometry = LidarGeometry.from_attributes(attributes, surface="measured")
+        geometry = LidarGeometry.from_attributes(dataset.attrs, surface="measured")
+        zero, metres_per_ns, label = geometry.surface_time_ns, geometry.depth_per_ns, "depth on the axis (m)"
+        if dataset.sizes.get("pixel") == 1:
+            line = LinesOfSight.from_dataset(dataset)
+            zero, metres_per_ns, label = line.surface_time.item(), line.depth_per_ns.item(), "depth (m)"
     except UserError:
         return
-    metres_per_ns = geometry.depth_per_ns
-    drawing.add_top_axis(ax, -geometry.surface_time_ns * metres_per_ns, metres_per_ns, "depth (m)")
+    drawing.add_top_axis(ax, -zero * metres_per_ns, metres_per_ns, label)
 
 
 def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:

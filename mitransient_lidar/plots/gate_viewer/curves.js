@@ -150,7 +150,7 @@ class CurveView {
         svg("text", { x, y: ROOM.top - 9, "text-anchor": "middle" }, plain(tick, depths.digits))
       );
     }
-    elements.push(name(ROOM.top - 26, "depth (m)"));
+    elements.push(name(ROOM.top - 26, `${this.stack.depth_name} (m)`));
     return elements;
   }
 }

@@ -36,11 +36,12 @@ async function loadStack() {
   const stack = JSON.parse(document.getElementById("metadata").textContent);
   stack.gates = stack.gate_start.length;
   stack.pixels = stack.rows * stack.columns;
-  for (const name of ["gate_energy", "gate_energy_stderr"]) stack[name] = await loadArray(name);
+  for (const name of ["gate_energy", "gate_energy_stderr", "surface_time", "depth_per_ns"]) stack[name] = await loadArray(name);
   if (stack.waveform) {
     stack.waveform.power = await loadArray("waveform");
     stack.waveform.error = await loadArray("waveform_stderr");
   }
+  stack.depth_name = stack.surface_time ? "depth on the axis" : "depth";
   stack.gate_middle = stack.gate_start.map((start, k) => start + stack.gate_width[k] / 2);
   stack.maps = Object.fromEntries(
     Object.entries(stack.colour_maps).map(([name, text]) => [name, decodeBase64(text)[0]])
@@ -55,12 +56,15 @@ function picture(stack, view, gate) {
     const slice = [gate * pixels, (gate + 1) * pixels];
     return { values: energy.subarray(...slice), errors: error.subarray(...slice), unit: "J", name: "energy" };
   }
-  const place = stack.gate_depth || stack.gate_middle;
+  // Along its line of sight, each pixel has its own depth at a time.
+  const { surface_time: zero, depth_per_ns: scale } = stack;
+  const place = zero ? stack.gate_middle : stack.gate_depth || stack.gate_middle;
+  const depth = (pixel, value) => (zero ? (value - zero[pixel]) * scale[pixel] : value);
   const values = new Float32Array(pixels);
   for (let pixel = 0; pixel < pixels; pixel++) {
     if (view === "echo") {
       const echo = strongestEcho(stack, pixel, gate);
-      values[pixel] = echo === null ? NaN : place[echo];
+      values[pixel] = echo === null ? NaN : depth(pixel, place[echo]);
       continue;
     }
     let [sum, moment] = [0, 0];
@@ -69,10 +73,11 @@ function picture(stack, view, gate) {
       moment += energy[k * pixels + pixel] * place[k];
     }
     if (view === "sum") values[pixel] = sum;
-    else values[pixel] = sum > 0 ? moment / sum : NaN;
+    else values[pixel] = sum > 0 ? depth(pixel, moment / sum) : NaN;
   }
   if (view === "sum") return { values, errors: null, unit: "J", name: "energy" };
-  return { values, errors: null, unit: stack.gate_depth ? "m" : "ns", name: stack.gate_depth ? "depth" : "time" };
+  const known = zero || stack.gate_depth;
+  return { values, errors: null, unit: known ? "m" : "ns", name: known ? "depth" : "time" };
 }
 
 /**

@@ -124,7 +124,8 @@ class Page {
       // Depths span the gates; the energy summed from the first gate on is the largest.
       const { gate_energy, gate_depth, gate_middle } = this.stack;
       const all = { gate: () => gate_energy, sum: () => picture(this.stack, "sum", 0).values }[view];
-      this.fixedRange = all ? colourRange(all(), options) : extremes(gate_depth || gate_middle);
+      const span = this.stack.surface_time ? this.shown.values : gate_depth || gate_middle;
+      this.fixedRange = all ? colourRange(all(), options) : extremes(span);
       this.rangeKey = key;
     }
     return this.fixedRange;
@@ -174,14 +175,14 @@ class Page {
   gateText(name = "Gate") {
     const { gate_start: start, gate_width: width, gate_depth: depth } = this.stack;
     const times = `${plain(start[this.gate], 2)} to ${plain(start[this.gate] + width[this.gate], 2)} ns`;
-    return `${name} ${this.gate} · ${times}` + (depth ? ` · depth ${plain(depth[this.gate], 2)} m` : "");
+    return `${name} ${this.gate} · ${times}` + (depth ? ` · ${this.stack.depth_name} ${plain(depth[this.gate], 2)} m` : "");
   }
 
   /** List the plotted pixels with their values at the time under the cursor, or else in the gate. */
   drawList() {
     const time = this.moment ?? this.stack.gate_middle[this.gate];
     const depth = depthAt(this.stack, time);
-    byId("moment").textContent = `At ${plain(time, 2)} ns` + (depth === null ? ":" : `, depth ${plain(depth, 2)} m:`);
+    byId("moment").textContent = `At ${plain(time, 2)} ns` + (depth === null ? ":" : `, ${this.stack.depth_name} ${plain(depth, 2)} m:`);
     byId("list").replaceChildren(...this.records.map((entry) => this.listEntry(entry, time)));
     byId("hint").hidden = this.pins.length > 0;
   }

@@ -36,6 +36,7 @@ _LOG = logging.getLogger(__name__)
 _COLOUR_MAPS = ("viridis", "magma", "turbo", "gray")
 _SCRIPTS = ("data", "image", "curves", "main")  # in the order in which they are joined
 _GATES = ("gate_energy", "gate_energy_stderr")
+_SIGHTS = ("surface_time", "depth_per_ns")  # coordinates of `geometry.LinesOfSight`
 _WAVEFORMS = ("waveform", "waveform_stderr")
 _POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 _STRIP_ASPECT = 4.0  # at most, of pixels drawn side by side
@@ -69,7 +70,8 @@ def write_page(
     stack : xarray.Dataset
         A gate stack: ``gate_energy`` and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the
         coordinates ``gate_start`` and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the time of the
-        surface echo is known, ``gate_depth`` [m].
+        surface echo is known, ``gate_depth`` [m]. With the lines of sight of a result, depths of pixels are along them,
+        and those of gates and times are on the receiver's axis.
     path : path
         HTML file to write. An existing file is replaced.
     result : xarray.Dataset, optional
@@ -127,7 +129,7 @@ def _fit(stack: xr.Dataset, record: xr.Dataset | None, room: float, limit_mb: fl
         while factors[-1] < max(stack.sizes["row"], stack.sizes["column"]):
             factors.append(2 * factors[-1])
     for factor in factors:
-        gates = _encode(stack, _GATES, factor)
+        gates = _encode(stack, (*_GATES, *_SIGHTS), factor)
         if gates.size <= room:
             break
     else:
@@ -150,13 +152,15 @@ def _encode(dataset: xr.Dataset, names: Sequence[str], factor: int) -> _Blocks:
         if factor > 1:
             values = _means(values, factor)
         # The page reads images gate by gate, waveforms pixel by pixel.
-        encoded[name] = _base64(np.moveaxis(values, -1, 0) if name in _GATES else values)
+        encoded[name] = _base64(values if name in _WAVEFORMS else np.moveaxis(values, -1, 0))
     rows, columns = values.shape[:2]
     return _Blocks(factor, rows, columns, encoded)
 
 
 def _image(variable: xr.DataArray) -> FloatArray:
-    """Return values as (row, column, gate or time); pixels that form no image are one row."""
+    """Return values as (row, column, gate or time), the last of size 1 without it; pixels without image are one row."""
+    if not {"gate", "time"} & set(variable.dims):
+        variable = variable.expand_dims("gate")
     last = "gate" if "gate" in variable.dims else "time"
     if "pixel" in variable.dims:
         return np.asarray(variable.transpose("pixel", last).values, dtype=np.float64)[np.newaxis]
