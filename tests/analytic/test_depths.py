@@ -112,16 +112,17 @@ def test_waveforms_give_the_depth_of_each_pixel(bottom, count, depth_from):
     assert abs(np.sqrt(np.mean(z**2)) - 1) < 4.5 / np.sqrt(2 * z.size) + 0.05
 
 
-def plate(x, z, rise=0.0, size=60.0):
+def plate(x, z, rise=0.0, size=60.0, reflectance=0.2):
     turned = mi.ScalarTransform4f().translate([x, 0, z]).rotate([0, 1, 0], -np.degrees(np.arctan(rise))).scale(size)
-    diffuse = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.2}}
+    diffuse = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": reflectance}}
     return {"type": "rectangle", "to_world": turned, "bsdf": diffuse}
 
 
 def shoot(lidar_scene, layout, bottom, paths, passes, film=None):
     """Render a level sea with ripples over a bottom."""
     rise = BOTTOMS[bottom]
-    step = {"far": plate(60, -DEPTH), "near": plate(-60, -6.5)}
+    # Mitsuba would merge shapes of one material.
+    step = {"far": plate(60, -DEPTH), "near": plate(-60, -6.5, reflectance=0.21)}
     scene = lidar_scene(
         integrator={"type": "lidar_merging", "paths_per_pass": paths},
         rx={"layout": layout, "field_of_view_mrad": 15.0},

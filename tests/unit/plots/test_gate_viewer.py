@@ -75,6 +75,18 @@ def test_page_contains_all_data(scene, tmp_path):
     assert metadata["depth_of_time"] == pytest.approx([-0.5 - 0.11 * 1402, 0.11])
 
 
+def test_page_contains_the_lines_of_sight(scene, tmp_path):
+    path = tmp_path / "page.html"
+    shape = (ROWS, COLUMNS)
+    times = 1420 + np.arange(ROWS * COLUMNS).reshape(shape) / 64
+    dims = ("row", "column")
+    stack = scene[0].assign_coords(surface_time=(dims, times), depth_per_ns=(dims, np.full(shape, 0.1)))
+    write_page(stack, path)
+    _, arrays, _ = embedded(path)
+    np.testing.assert_array_equal(arrays["surface_time"], times.ravel().astype(np.float32))
+    assert (arrays["depth_per_ns"] == np.float32(0.1)).all()
+
+
 def test_large_pages_show_means(scene, tmp_path, caplog):
     stack, result = scene
     path = tmp_path / "page.html"

@@ -83,7 +83,7 @@ def test_depth_axis():
     figure = waveforms.plot_waveforms(make())
     axes = figure.axes[0]
     (depth,) = axes.child_axes
-    assert depth.get_xlabel() == "depth (m)"
+    assert depth.get_xlabel() == "depth on the axis (m)"
     figure.draw_without_rendering()  # until then the secondary axis has no limits
     # sin 20 deg / 1.34 is the sine of 14.788 deg: 80 ns are 0.299792458 * 80 / (2 * 1.364) * 0.966877 m = 8.5004 m.
     # Without the cosine it would be 8.79 m, with the refractive index for the group index 8.65 m.

@@ -2,10 +2,17 @@
 
 import math
 
+import numpy as np
 import pytest
+import xarray as xr
 
+from mitransient_lidar import results
+from mitransient_lidar.analysis.gates.cut import cut_gates
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.results.geometry import LidarGeometry, optional_number
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results import gate_files, gate_stack
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
 
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
@@ -75,3 +82,77 @@ def test_numbers_that_are_missing_or_invalid():
             LidarGeometry.from_attributes({**ATTRIBUTES, "altitude": value})
     assert optional_number({"a": "x", "b": 3}, "a") is None
     assert optional_number({"a": "x", "b": -3}, "b") == -3.0
+
+
+def image(sights=True):
+    """Return a result of 2 x 3 pixels, with lines of sight or without."""
+    angles = np.stack(np.meshgrid([5.0, -5.0], [-8.0, 0.0, 8.0], indexing="ij"), axis=-1).reshape(-1, 2)
+    values = np.ones((6, 100))
+    built = results.build(
+        *[values] * 4,
+        time=TimeAxis(1400.0, 1.0, 100),
+        pixel_names=[],
+        pixel_centres_mrad=angles,
+        grid=(2, 3),
+        attributes={**ATTRIBUTES, "surface_time_ns": 1420.0},
+    )
+    number = np.arange(6.0)
+    angle, share = THETA + 1e-3 * number, number / 21
+    values = (1e-3 * number, -1e-3 * number, angle, 1419 + number, 0.1 * number, 0.106 + 1e-4 * number, share)
+    lines = LinesOfSight(*values)
+    return (built.assign_coords(lines.coordinates(("row", "column"), (2, 3))) if sights else built), lines
+
+
+def assert_same(found, lines):
+    for name, values in vars(lines).items():
+        np.testing.assert_allclose(getattr(found, name), values, rtol=1e-8, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_lines_of_sight_survive_files_and_gates(tmp_path, suffix):
+    dataset, lines = image()
+    results.save(dataset, tmp_path / f"a{suffix}")
+    assert_same(LinesOfSight.from_dataset(results.open(tmp_path / f"a{suffix}")), lines)
+    gates = cut_gates(dataset, GateTrain(1425.0, 5.0, 5.0, 3))
+    gate_files.save_stack(gates, tmp_path / f"b{suffix}")
+    stack = gate_files.open_stack(tmp_path / f"b{suffix}")
+    assert_same(LinesOfSight.from_dataset(stack), lines)
+    depth = gate_stack.pixel_depths(stack)
+    assert depth.dims == ("row", "column", "gate")
+    expected = (1427.5 + 5 * np.arange(3) - lines.surface_time[:, np.newaxis]) * lines.depth_per_ns[:, np.newaxis]
+    np.testing.assert_allclose(depth.values.reshape(6, 3), expected, rtol=1e-7)
+    assert_same(LinesOfSight.from_dataset(dataset.transpose("time", "column", "row")), lines)
+
+
+def test_lines_of_sight_without_coordinates_are_those_of_the_centres():
+    dataset, _ = image(sights=False)
+    lines = LinesOfSight.from_dataset(dataset)
+    x, y = 1e-3 * dataset["angle_x"].values.ravel(), 1e-3 * dataset["angle_y"].values.ravel()
+    cosine = (math.cos(THETA) - math.sin(THETA) * x) / np.sqrt(1 + x**2 + y**2)
+    np.testing.assert_allclose(np.cos(lines.off_nadir), cosine)
+    level = 2 * 200 / cosine / C0
+    np.testing.assert_allclose(lines.surface_time, level - level.mean() + 1420.0)
+    np.testing.assert_allclose(lines.depth_per_ns, C0 / (2 * GROUP) * np.sqrt(1 - (1 - cosine**2) / N**2))
+    assert np.isnan(lines.beam_share).all()
+    # Times and depths are inverse, in any shape.
+    depths = np.linspace(0, 9, 12).reshape(6, 2)
+    np.testing.assert_allclose(lines.depth_of_time(lines.time_of_depth(depths)), depths, atol=1e-9)
+
+
+def test_sum_of_pixels_looks_where_most_light_is():
+    _, lines = image()
+    total = lines.combined()
+    weight = np.arange(6.0) / 15
+    assert total.surface_time[0] == pytest.approx(1419 + weight @ np.arange(6.0))
+    # A mixture has the mean variance plus the variance of the means.
+    mean = weight @ np.arange(6.0)
+    variance = weight @ (0.1 * np.arange(6.0)) ** 2 + weight @ (np.arange(6.0) - mean) ** 2
+    assert total.surface_spread[0] == pytest.approx(math.sqrt(variance))
+
+
+def test_a_view_above_the_horizon_has_no_line_of_sight():
+    dataset, _ = image(sights=False)
+    with pytest.raises(UserError, match="must point below the horizon"):
+        LinesOfSight.from_dataset(dataset.assign_coords(angle_x=dataset["angle_x"] + 3000))
+    with pytest.raises(UserError, match="no attribute altitude"):
+        LinesOfSight.from_dataset(xr.Dataset(coords={"pixel": ["a"]}))

@@ -104,6 +104,26 @@ def result(values=None, **attributes):
     )
 
 
+def test_a_slope_that_the_sea_cannot_have_is_refused(tmp_path):
+    """A plane of 40 degrees along, in a sea whose slopes have a standard deviation of 0.1 in each direction."""
+    shot = result(np.stack([waveform(delay) for delay in plane_delays(0.84, 0.05)]), surface_slope_variance=0.02)
+    found = retrieve.surface_slopes(shot)
+    assert math.isnan(found["slope_along"])
+    assert math.isnan(found["slope_along_stderr"])
+    assert float(found["slope_refused"]) == 1
+    assert float(found["slope_across"]) == pytest.approx(0.05, abs=0.03)
+    assert found.attrs["steepest_slope"] == pytest.approx(0.5)
+    results.save(shot, tmp_path / "shot.nc")
+    done = run("retrieve", tmp_path / "shot.nc")
+    assert "slope along: refused, an estimate is steeper than 0.50, beyond what the sea has" in done.output
+    # With a prior, only the prior is left.
+    along = retrieve.surface_slopes(shot, slope_deviation=(0.1, 0.1))
+    assert (float(along["slope_along"]), float(along["slope_along_stderr"])) == (0.0, pytest.approx(0.1))
+    kept = retrieve.surface_slopes(result(shot["waveform"].values))
+    assert float(kept["slope_along"]) == pytest.approx(0.84, rel=0.1)
+    assert float(kept["slope_refused"]) == 0
+
+
 def series(shots):
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 

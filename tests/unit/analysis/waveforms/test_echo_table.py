@@ -17,6 +17,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results.geometry import LinesOfSight
 
 DT = 0.5
 BINS = 320
@@ -141,6 +142,64 @@ def test_several_estimators_have_a_dimension_of_their_own():
     # On the column, the peak is late.
     late = table["time_ns"].sel(echo="surface", estimator="peak") - one["time_ns"].sel(echo="surface")
     assert (late > 0.5).all()
+
+
+def lit(dataset, shares):
+    """Return a result of pixels that look straight down, with shares of the beam."""
+    zeros = np.zeros(len(shares))
+    values = (zeros, zeros, zeros, zeros + SURFACE, zeros + 0.1, zeros + PER_NS, np.array(shares))
+    return dataset.assign_coords(LinesOfSight(*values).coordinates(("pixel",), (len(shares),)))
+
+
+def test_a_pixel_without_surface_light_takes_the_surface_of_the_others():
+    """Scattered light that rises 9 ns late: as a surface echo, it would make the bottom a metre shallower."""
+    late = column(SURFACE + 9, SURFACE + 70, 2e-6) + echo(SURFACE + 70, 3e-14)
+    dataset = lit(result(np.stack([waveform()] * 3 + [late])), [0.3, 0.3, 0.3, 1e-7])
+    for estimator in ("gaussian", "peak"):
+        table = echo_table.extract(dataset, estimator)
+        dark = table.isel(pixel=3)
+        flags = int(dark["flags"].sel(echo="surface"))
+        assert flags & EchoFlag.NO_SURFACE_LIGHT
+        assert np.isnan(dark["time_ns"].sel(echo="surface"))
+        assert float(dark["surface_time_ns"]) == pytest.approx(float(table["surface_time_ns"][0]), abs=0.01)
+        bottoms = table.sel(echo="bottom")
+        assert float(bottoms["depth_m"][3] - bottoms["depth_m"][0]) == pytest.approx(0, abs=0.02)
+        assert bottoms["depth_m_stderr"][3] > 10 * bottoms["depth_m_stderr"][0]
+        assert not (table["flags"].isel(pixel=[0, 1, 2]) & EchoFlag.NO_SURFACE_LIGHT).any()
+    # Without shares of the beam, every first echo is the surface.
+    unknown = echo_table.extract(result(dataset["waveform"].values))
+    assert not (unknown["flags"] & EchoFlag.NO_SURFACE_LIGHT).any()
+
+
+def test_a_surface_echo_within_its_error_is_not_listed():
+    """The onset of a column without a surface echo, with noise: a time, but no amplitude or energy."""
+    bare = column(SURFACE, SURFACE + 70, 3e-5) + echo(SURFACE + 70, 6e-13)
+    table = echo_table.extract(recorded(np.stack([bare, waveform()]), 8, 0.02))
+    none, some = (table.sel(echo="surface").isel(pixel=pixel) for pixel in (0, 1))
+    assert (none["flags"] & EchoFlag.NO_ECHO).all()
+    for name in ("amplitude", "energy", "width_ns"):
+        assert np.isnan(none[name]).all()
+        assert np.isfinite(some[name]).all()
+    assert (some["flags"] == 0).all()
+    assert np.abs(none["time_ns"] - SURFACE).max() < 1.5
+    assert np.isfinite(table["depth_m"].sel(echo="bottom")).all()
+
+
+def test_rows_say_why_a_depth_is_unknown():
+    dark = 0 * TIME
+    surface_only = echo(SURFACE, 3e-13)
+    dataset = lit(result(np.stack([waveform(), dark, surface_only])), [0.4, 0.3, 0.3])
+    names, lines = csv_tables.rows(echo_table.extract(dataset))
+    cells = [dict(zip(names, line, strict=True)) for line in lines]
+    reasons = {(row["pixel"], row["echo"]): row["unknown_depth"] for row in cells}
+    assert reasons["red", "bottom"] == ""
+    assert reasons["green", "surface"] == "no surface echo"
+    assert reasons["blue", "bottom"] == "no bottom echo"
+    assert reasons["green", "column"] == "column too short or too noisy"
+    assert all((row["unknown_depth"] == "") == np.isfinite(row["depth_m"]) for row in cells)
+    saturated = int(EchoFlag.SATURATED | EchoFlag.POOR_FIT)
+    assert csv_tables.unknown_depth("bottom", saturated, True) == "saturated"
+    assert csv_tables.unknown_depth("bottom", 0, False) == "no surface echo"
 
 
 def test_imager_and_blocks_give_the_same_as_pixels():
