@@ -199,19 +199,18 @@ class _Sight:
 def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
     """Return the means over the light of the beam that pixels see at a depth [m]."""
     pixels, transmitter = scene.receiver.pixels, scene.transmitter
-    choice = mi.Float(0.5)
 
-    # Points of the beam, of equal energy.
+    # Points of the beam, of equal energy. One of several pixels at a point stands for all of them.
     angle_x, angle_y = transmitter.sample_tangent(_lattice(_POINTS))
     time, angles = _by_transmitter(scene, np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
-    pixel, inside = pixels.pixel_at(*(mi.Float(axis) for axis in angles.T), choice)
-    weight = (np.array(inside) > 0) & np.isfinite(time)
-    by_beam = _means(time, angles, np.array(pixel), weight / _POINTS, pixels.count)
+    pixel, inside = pixels.pixel_at(mi.Float(angles[:, 0]), mi.Float(angles[:, 1]), _choices(_POINTS))
+    share = np.where(np.isfinite(time), np.array(inside, dtype=np.float64) / _POINTS, 0.0)
+    by_beam = _means(time, angles, np.array(pixel), share, pixels.count)
 
     # Points of the pixels, weighted with the beam's density.
     count = int(np.clip(_POINTS_PER_PIXEL * pixels.count, _POINTS, _MOST_POINTS))
     angle_x, angle_y = pixels.sample(_lattice(count))
-    pixel, inside = pixels.pixel_at(angle_x, angle_y, choice)
+    pixel, inside = pixels.pixel_at(angle_x, angle_y, _choices(count))
     angles = np.stack([np.array(angle_x), np.array(angle_y)], axis=1).astype(np.float64)
     time, at_laser = _by_receiver(scene, angles, depth)
     density = np.array(transmitter.tangent_density(*(mi.Float(axis) for axis in at_laser.T)), dtype=np.float64)
@@ -229,7 +228,7 @@ def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
 
 def _means(time: FloatArray, angles: FloatArray, pixel: NDArray[np.integer], weight: FloatArray, count: int) -> _Sight:
     """Return weighted means over the points of each pixel."""
-    total, squares = (np.bincount(pixel, values, count) for values in (weight, weight**2))
+    total, squares = (np.asarray(np.bincount(pixel, one, count), dtype=np.float64) for one in (weight, weight**2))
     safe = np.where(total > 0, total, 1.0)
     first = float(np.nanmin(time)) if np.isfinite(time).any() else 0.0
 
@@ -238,7 +237,7 @@ def _means(time: FloatArray, angles: FloatArray, pixel: NDArray[np.integer], wei
 
     delay = mean(time - first)
     spread = np.sqrt(np.maximum(mean((time - first) ** 2) - delay**2, 0))
-    points = np.where(squares > 0, total**2 / np.where(squares > 0, squares, 1.0), 0)
+    points = total**2 / np.where(squares > 0, squares, 1.0)
     return _Sight(first + delay, spread, np.stack([mean(axis) for axis in angles.T], axis=1), total, points)
 
 
@@ -246,6 +245,11 @@ def _lattice(count: int) -> mi.Point2f:
     """Return the points of a rank-1 lattice in the unit square, computed in 64 bits."""
     index = np.arange(count)
     return mi.Point2f(mi.Float((index + 0.5) / count), mi.Float((index * 0.6180339887498949) % 1))
+
+
+def _choices(count: int) -> mi.Float:
+    """Return evenly distributed numbers from 0 to 1, independent of the points of `_lattice`."""
+    return mi.Float((np.arange(count) * 0.4142135623730951) % 1)
 
 
 def _at_one_place(scene: LidarScene) -> bool:

@@ -122,7 +122,7 @@ def shoot(lidar_scene, layout, bottom, paths, passes, film=None):
     """Render a level sea with ripples over a bottom."""
     rise = BOTTOMS[bottom]
     # Mitsuba would merge shapes of one material.
-    step = {"far": plate(60, -DEPTH), "near": plate(-60, -6.5, reflectance=0.21)}
+    step = {"far": plate(0, -DEPTH, size=200.0), "near": plate(-60, -6.5, reflectance=0.21)}
     scene = lidar_scene(
         integrator={"type": "lidar_merging", "paths_per_pass": paths},
         rx={"layout": layout, "field_of_view_mrad": 15.0},

@@ -296,7 +296,8 @@ def _with_depths(
     for number, estimator in enumerate(settings.estimators):
         measured = time[:, number, 0]
         found = surface_times(
-            *(values.reshape(shots, -1) for values in (measured, error[:, number, 0])),
+            measured.reshape(shots, -1),
+            error[:, number, 0].reshape(shots, -1),
             lines.reshaped((shots, -1)),
             slope_variance=_TYPICAL_SLOPE_VARIANCE if variance is None else variance,
             heights_m=(lowest, highest),

@@ -83,3 +83,14 @@ def test_laser_and_receiver_apart(lidar_scene, place):
         air, water = bend(crossing if depth else 0.0)
         expected = METRE * (out + air + GROUP * water)
         assert found.surface_time[0] + depth / found.depth_per_ns[0] == pytest.approx(expected, abs=0.02)  # 2 mm
+
+
+def test_overlapping_pixels_all_have_their_light(lidar_scene):
+    """Two concentric circles of 8 and 16 mrad about a beam of 5 mrad: 1 - exp(-r^2 / 2) of its light each."""
+    fields = {
+        name: {"type": "pixel_fov", "pixel_name": name, "shape": "circle", "field_of_view_mrad": 2 * radius}
+        for name, radius in (("inner", 4.0), ("outer", 8.0))
+    }
+    found, _ = sights(lidar_scene, rx=fields)
+    np.testing.assert_allclose(found.beam_share, 1 - np.exp(-0.5 * np.array([0.8, 1.6]) ** 2), rtol=0.01)
+    np.testing.assert_allclose(np.degrees(found.off_nadir), 20, atol=2e-3)
