@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 def gates(
     stack: Annotated[Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result that kept its histogram.")],
     start_ns: Annotated[float | None, typer.Option(help="Start of the first gate, at half height [ns].")] = None,
-    start_depth: Annotated[float | None, typer.Option(help="Depth of its start [m], instead of a time.")] = None,
+    start_depth: Annotated[
+        float | None, typer.Option(help="Depth of its start on the axis [m], instead of a time.")
+    ] = None,
     width_ns: Annotated[float | None, typer.Option(help="Width of a gate between half heights [ns].")] = None,
     step_ns: Annotated[float | None, typer.Option(help="Time from gate to gate [ns]; by default the width.")] = None,
     count: Annotated[int, typer.Option(help="Number of gates.")] = 1,

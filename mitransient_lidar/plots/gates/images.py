@@ -28,6 +28,7 @@ from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.gate_files import check_stack
 from mitransient_lidar.results.geometry import optional_number
 
+_LIT = 0.01  # share of the beam in a lit pixel, relative to the brightest
 SIGNIFICANT = 3.0  #: Standard errors above which a value counts.
 
 _BRIGHT = 99.0  # percentile of the pixels of a gate within the colours: a small bright target may be clipped
@@ -158,10 +159,13 @@ def colour_scale(stack: xr.Dataset, *, log: bool) -> ColourScale:
 
 
 def reached_by_surface(stack: xr.Dataset) -> npt.NDArray[np.bool_]:
-    """Return which gates open before the end of the surface echo; none if its time is unknown."""
+    """Return which gates open before the end of the surface echo in a lit pixel; none if its time is unknown."""
     surface = optional_number(stack.attrs, "surface_time_ns")
     if surface is None:
         return np.zeros(stack.sizes["gate"], dtype=bool)
+    if "surface_time" in stack.coords and "beam_share" in stack.coords:
+        lit = stack["beam_share"].values >= _LIT * stack["beam_share"].values.max()
+        surface = max(surface, float(stack["surface_time"].values[lit].max()))
     # Waves and the width of the image lengthen the echo beyond the pulse.
     names = ("pulse_fwhm_ns", "response_time_ns", "gate_rise_ns")
     length = 1.5 * sum(optional_number(stack.attrs, name) or 0.0 for name in names)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.gates.echoes import plot_contrast, plot_depths
-from mitransient_lidar.plots.gates.images import animate_gates, colour_scale, plot_gates
+from mitransient_lidar.plots.gates.images import animate_gates, colour_scale, plot_gates, reached_by_surface
 
 SURFACE_NS, STEP_NS, WIDTH_NS = 1420.0, 5.0, 5.0
 METRES_PER_NS = 0.1
@@ -255,6 +255,17 @@ def test_depth_map_shows_the_depth_below_the_surface():
     assert figure.get_suptitle() == "sand: depth of the strongest echo, gates at 1.05 to 5.65 m on the axis"
     bar = next(ax for ax in figure.axes if ax.get_ylabel() == "depth (m)")
     assert bar.get_ylim()[0] > bar.get_ylim()[1]  # deep below
+
+
+def test_depth_map_begins_below_the_latest_surface_of_lit_pixels():
+    """One row has its surface 5 ns later than the mean, and a dark pixel 50 ns later, which does not count."""
+    stack = echoes(np.full((ROWS, COLUMNS), 4.0))
+    times, share = np.full((ROWS, COLUMNS), SURFACE_NS), np.ones((ROWS, COLUMNS))
+    times[0], times[1, 0], share[1, 0] = SURFACE_NS + 5, SURFACE_NS + 50, 0.0
+    dims = ("row", "column")
+    found = reached_by_surface(stack.assign_coords(surface_time=(dims, times), beam_share=(dims, share)))
+    start = stack["gate_start"].values
+    np.testing.assert_array_equal(found, start < SURFACE_NS + 5 + 7.5)
 
 
 def test_depth_map_of_pixels():
