@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,7 +43,8 @@ def waveforms(
 ) -> None:
     """Measure the echoes in the waveforms of a result.
 
-    Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel.
+    Lists time, depth, amplitude, energy and width of surface, column, target and bottom echo of every pixel. Errors are
+    those by noise, of depths also by the method.
     """
     if output is not None:
         check_suffix("--csv", output, ".csv")
@@ -95,6 +97,8 @@ def _print(found: xr.Dataset) -> None:
         if table.row_count >= _MOST_LINES:
             left_out += 1
             continue
+        # The printed error of a depth includes that of the method.
+        cells["depth_m_stderr"] = math.hypot(cells["depth_m_stderr"], cells["depth_m_method_error"])
         numbers = [_with_error(cells[name], cells[f"{name}_stderr"]) for name in csv_tables.NUMBERS]
         table.add_row(*(str(cells[name]) for name in labels), *numbers, cells["flags"], cells["unknown_depth"])
     # A fixed width keeps the lines unfolded.
@@ -129,8 +133,6 @@ def _print_columns(found: xr.Dataset) -> None:
 
 def _with_error(value: float, error: float) -> str:
     """Return a number with its standard error, or a dash."""
-    import math
-
     if math.isnan(value):
         return "-"
     if not math.isfinite(error) or error <= 0:

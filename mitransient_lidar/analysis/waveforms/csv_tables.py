@@ -45,6 +45,7 @@ def rows(table: xr.Dataset) -> tuple[list[str], Iterator[list[Any]]]:
     ]
     extra = sorted(known, key=lambda name: not name.startswith("angle_"))
     numbers = [name + suffix for name in NUMBERS for suffix in ("", "_stderr")]
+    numbers.insert(numbers.index("depth_m_stderr") + 1, "depth_m_method_error")
     columns = [
         *extra,
         *numbers,
