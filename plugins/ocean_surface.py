@@ -72,6 +72,11 @@ class OceanSurface(mi.Mesh):
     so that a point laser can be connected; `slope_variance` of the loaded object is the total. Waves shorter than a
     sixteenth of the period are needed for a mesh: where automatic cells are longer, all slopes are ripples.
 
+    The mean echo of the surface over many seas does not depend on the cells, but that of one sea does, as facets hold
+    more of its slopes: halving cells between 0.25 and 0.03 m changed the echo of a beam of 10 mrad from 200 m at 20
+    degrees by 2 to 7 % (rms over 6 seas) at a wind of 6 m/s, and by 22 to 34 % at 3 m/s, where the few steepest facets
+    return the light.
+
     Above 2048 cells per period the waves are a sum of bands. The longest waves are the same as in coarse cells; each
     band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the last one's period.
 
@@ -145,6 +150,8 @@ class OceanSurface(mi.Mesh):
         self.ripple_variance, self.slope_variance = sea.ripple_variance, sea.slope_variance
         #: Side of the cells of the fine patch, pairs of triangles [m]; infinite for a flat sea.
         self.cell_size = sea.cell_size
+        #: Side of the cells that the beam alone needs [m], the cells' or more.
+        self.beam_cell_size = sea.beam_cell_size
 
     def _roughness(self) -> tuple[float, float]:
         """Return Beckmann's alpha of the ripples along and across the wind."""

@@ -61,9 +61,13 @@ class WaterScene:
 
     @property
     def facet_size(self) -> float:
-        """Side of the sea surface's cells, pairs of triangles, in the fine patch, or their mean in other meshes [m]."""
+        """Side of the sea surface's cells, pairs of triangles, in the fine patch, or their mean in other meshes [m].
+
+        Cells that are finer for the pixels of an image count as those that the beam needs.
+        """
         sizes = [
-            getattr(surface, "cell_size", None) or float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
+            getattr(surface, "beam_cell_size", None)
+            or float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
             if surface.is_mesh()
         ]

@@ -84,6 +84,9 @@ class Resolution:
     cell_size: float  #: Largest side of the patch's cells.
     refined_size: float  #: Side of the patch.
     size: float  #: Side of the whole surface.
+    cells_per_beam_cell: float = (
+        1.0  #: Length of the cells that the beam alone needs, over that of the cells; 1 or more.
+    )
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument]) -> Resolution:
@@ -103,6 +106,7 @@ class Resolution:
             If a value is not positive or out of range.
         """
         cell, side = read_length(get, "cell_size"), read_length(get, "refined_size")
+        explicit = cell is not None
         size = read_length(get, "size")
         found = _with_own_values(get, instruments)
         areas = [_square(found), _square([each for each in found if each.is_laser] or found)]
@@ -123,7 +127,9 @@ class Resolution:
         if side is None and cell > longest:
             cell = max(finest, longest)
             patch = min(patch, _MOST_CELLS * cell)
-        return cls((centre[0], centre[1]), cell, patch, size)
+        beam = min((each.cell for each in found if each.is_laser), default=cell)
+        beam = cell if explicit else min(max(beam, _SMALLEST_CELL), _LARGEST_CELL, longest)
+        return cls((centre[0], centre[1]), cell, patch, size, max(1.0, beam / cell))
 
 
 def _square(instruments: Sequence[Instrument]) -> tuple[float, float, float]:

@@ -64,6 +64,7 @@ class SeaSurface:
     resolved_variance: tuple[float, float]  #: Slope variances of the facets.
     ripple_variance: tuple[float, float]  #: Slope variances of the ripples.
     wake: Wake | None  #: Heights of a ship's wake [m] on grid lines x and y [m], None without a ship.
+    beam_cell_size: float  #: Side of the cells that the beam alone needs [m], the cells' or more.
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
@@ -133,7 +134,11 @@ class SeaSurface:
         kind = spectrum if waves is not None else "flat"
         size = resolution.size
         patch = min(refined_size, size)
-        return cls(kind, wind_speed, wind_direction, waves, cell, centre, patch, size, resolved, (along, across), wake)
+        beam_cell = cell * resolution.cells_per_beam_cell
+        ripples = along, across
+        return cls(
+            kind, wind_speed, wind_direction, waves, cell, centre, patch, size, resolved, ripples, wake, beam_cell
+        )
 
     @property
     def slope_variance(self) -> float:

@@ -59,6 +59,14 @@ def test_cells_follow_the_beam_or_the_pixels():
     assert choose(lidar(5000.0)).cell_size == 0.5
 
 
+def test_cells_for_pixels_count_as_those_for_the_beam():
+    """Cells of merging follow the beam: at 0.02 m they would be 13 times finer than needed, and as noisy."""
+    fine = choose(lidar(field_of_view=0.01, pixel=1e-5))
+    assert fine.cells_per_beam_cell * fine.cell_size == pytest.approx(choose(lidar()).cell_size)
+    for same in (choose(lidar()), choose(lidar(), cell_size=0.02), choose(lidar(5e5, 1e-4)), choose([])):
+        assert same.cells_per_beam_cell == 1.0
+
+
 def test_narrow_beams_have_a_patch_of_many_fine_cells_and_wide_views_fewer():
     """0.1 mrad in 200 mrad: the patch gives up the view, not the cells that resolve the beam."""
     narrow = choose(lidar(divergence=1e-4, field_of_view=0.2))
