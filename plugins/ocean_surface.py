@@ -75,7 +75,7 @@ class OceanSurface(mi.Mesh):
     The mean echo of the surface over many seas does not depend on the cells, but that of one sea does, as facets hold
     more of its slopes: halving cells between 0.25 and 0.03 m changed the echo of a beam of 10 mrad from 200 m at 20
     degrees by 2 to 7 % (rms over 6 seas) at a wind of 6 m/s, and by 22 to 34 % at 3 m/s, where the few steepest facets
-    return the light.
+    return the light. Give ``cell_size`` to compare receivers of different pixels on exactly the same sea.
 
     Above 2048 cells per period the waves are a sum of bands. The longest waves are the same as in coarse cells; each
     band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the last one's period.

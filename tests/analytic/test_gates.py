@@ -138,12 +138,14 @@ def test_parameters_of_gates_out_of_range(film, words):
 
 def image(lidar_scene, layout, film=None, **integrator):
     """Return an imager of a square field of view over a wavy sea, with eight gates from the surface to the bottom."""
+    # Automatic cells would be finer for more pixels: another sea.
+    cells = {"cell_size": 0.25, "refined_size": 32.0}
     gates = {"gate_start_ns": 1410.0, "gate_width_ns": 10.0, "gate_count": 8, "bin_width_ns": 8.0, "bin_count": 20}
     return lidar_scene(
         integrator={"type": "lidar_merging", "paths_per_pass": 2**16, **integrator},
         film={**gates, **(film or {})},
         rx={"layout": layout, "field_of_view_mrad": 20.0, "field_of_view_shape": "square"},
-        sea={"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk", "surface_seed": 4},
+        sea={"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk", "surface_seed": 4, **cells},
     )
 
 
