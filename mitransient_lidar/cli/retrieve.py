@@ -23,8 +23,15 @@ def retrieve(
         str | None,
         typer.Option(
             metavar="ALONG,ACROSS",
-            help="Standard deviations of the sea's slopes, as prior knowledge; by default those of a series.",
+            help="Standard deviations of the slopes of an unknown sea; by default those of a series.",
         ),
+    ] = None,
+    wind_speed: Annotated[
+        float | None, typer.Option(metavar="M/S", help="Wind speed over the sea; by default that of the scene.")
+    ] = None,
+    wind_direction_deg: Annotated[
+        float | None,
+        typer.Option(metavar="DEG", help="Direction that the wind blows towards, from +x."),
     ] = None,
     efficiency: Annotated[
         float | None, typer.Option(help="Two-way efficiency of optics and air; by default that of the scene.")
@@ -49,10 +56,13 @@ def retrieve(
     dataset = results.open(file)
     if figure is not None and "true_slope_along" not in dataset.coords:
         raise UserError(f"--figure {figure} needs a series of shots with true slopes, but {file} is none.")
-    if deviations is None and "slope_deviation" in dataset.attrs:
-        along, across = dataset.attrs["slope_deviation"]
-        deviations = along, across
-    found = retrieve_from(dataset, slope_deviation=deviations, efficiency=efficiency)
+    found = retrieve_from(
+        dataset,
+        wind_speed=wind_speed,
+        wind_direction_deg=wind_direction_deg,
+        slope_deviation=deviations,
+        efficiency=efficiency,
+    )
     for line in _table(found) if "shot" in found.dims else _lines(found):
         typer.echo(line)
     if output is not None:
@@ -94,7 +104,7 @@ def _lines(found: Any) -> list[str]:
     import numpy as np
 
     value = {str(name): float(one) for name, one in found.data_vars.items() if one.ndim == 0}
-    lines = []
+    lines = [f"slope from {found.attrs['slope_method']}"]
     for name, positive in (("along", "a face towards the lidar"), ("across", "a rise to the left")):
         slope, error = value[f"slope_{name}"], value[f"slope_{name}_stderr"]
         known = f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
@@ -122,10 +132,16 @@ def _bottom_lines(depth: Any, found: Any) -> list[str]:
     if np.isnan(depth[0]):
         return ["bottom: no echo"]
     lines = [f"bottom: {depth[1]:.3f} m deep, {depth[0]:.3f} m through a level sea"]
+    if not found["depth_corrected"].values[1]:
+        lines[0] += " (not corrected for the slope: it is known no better than the sea's slopes are)"
     reflectance = found["reflectance"].values
     if np.isnan(reflectance).all():
         return [*lines, "bottom reflectance: no column that can be fitted"]
-    text = ", ".join(f"{by} {rho:.4f}" for by, rho in zip(found["correction"].values, reflectance, strict=True))
+    applied = [True, *found["reflectance_corrected"].values[1:]]
+    text = ", ".join(
+        f"{by} {rho:.4f}" + ("" if known else " (not corrected)")
+        for by, rho, known in zip(found["correction"].values, reflectance, applied, strict=True)
+    )
     shares = zip(found["bottom_class"].values, found["class_probability"].values, strict=True)
     classes = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares)
     return [*lines, f"bottom reflectance: {text}", f"bottom class: {classes}"]

@@ -16,13 +16,14 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.retrieval import column_retrieval, surface_slope
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, helps
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, positive
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED, PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
 from mitransient_lidar.results.geometry import (
     LidarGeometry,
     LinesOfSight,
@@ -33,6 +34,7 @@ from mitransient_lidar.results.geometry import (
 
 _LOG = logging.getLogger(__name__)
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
+_FEWEST_SHOTS = 8  # whose scatter of reflectance is known
 _STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
 _COLUMN_START = 1.75  # echo widths after the surface at which `echo_table` begins to fit the column
 
@@ -112,28 +114,31 @@ def surface_slopes(
         beam = 0.5e-3 * required_number(dataset.attrs, "divergence_mrad")
         sender = SeaLidar(lidar.height, lidar.off_nadir, beam, PixelMap.of_outlines(lines), lidar.refractive_index)
         sea = surface_slope.slopes_on_sea(measured, sea_shots(sender, *wind), scale)
+        per_height = np.array([1, 1, 1 / math.cos(lidar.off_nadir)])
         seen = np.isfinite(time).any(axis=1)
         along, across, height = np.where(seen, sea.mean.T, np.nan)
         variance = np.where(seen, np.diagonal(sea.covariance, axis1=1, axis2=2).T, np.nan)
-        along_error, across_error, height_error = np.sqrt(variance)
+        along_error, across_error, distance_error = np.sqrt(variance) * per_height[:, np.newaxis]
         method = "times on a sea" if scale is None else "times and strengths"
         distance = (lidar.height - height) / math.cos(lidar.off_nadir)
-        prior = np.sqrt(np.diag(sea.prior)) / (1, 1, math.cos(lidar.off_nadir))
+        prior = np.sqrt(np.diag(sea.prior)) * per_height
     else:
         slopes = [(plane.along, plane.along_stderr), (plane.across, plane.across_stderr)]
         refused = np.any([np.abs(slope) > limit for slope, _ in slopes], axis=0)
         slopes = [(np.where(refused, np.nan, slope), np.where(refused, np.nan, error)) for slope, error in slopes]
+        if slope_deviation is None:
+            slope_deviation = dataset.attrs.get("slope_deviation")
         if slope_deviation is not None:
             slopes = [
                 surface_slope.with_prior(*pair, positive("slope_deviation", one))
                 for pair, one in zip(slopes, slope_deviation, strict=True)
             ]
         (along, along_error), (across, across_error) = slopes
-        height, height_error = lidar.height - plane.range_m * math.cos(lidar.off_nadir), np.full(len(time), np.nan)
-        method, distance = "times", plane.range_m
-        # Of an unknown sea, the slopes over a footprint vary at most as much as all slopes.
-        total = float(dataset.attrs.get("surface_slope_variance", np.inf))
-        prior = np.array([*(slope_deviation or [math.sqrt(0.5 * total)] * 2), np.nan])
+        height = lidar.height - plane.range_m * math.cos(lidar.off_nadir)
+        method, distance, distance_error = "times", plane.range_m, plane.range_stderr
+        prior = np.array(_largest_deviations(dataset))
+        if slope_deviation is not None:
+            prior[:2] = slope_deviation
     steepness, direction = surface_slope.steepest(along, across)
     table = {
         "slope_along": (along, "1", "slope of the surface along the lidar's azimuth"),
@@ -143,7 +148,7 @@ def surface_slopes(
         "slope_deg": (np.degrees(steepness), "degree", "angle of the surface from the horizontal"),
         "slope_direction_deg": (np.degrees(direction), "degree", "direction of the rise from the lidar's azimuth"),
         "surface_range": (distance, "m", "distance to the surface along the axis"),
-        "surface_range_stderr": (height_error / math.cos(lidar.off_nadir), "m", "standard error of the distance"),
+        "surface_range_stderr": (distance_error, "m", "standard error of the distance"),
         "surface_height": (height, "m", "height of the surface above the mean sea level"),
         "plane_misfit": (plane.misfit_ns, "ns", "deviation of the echoes from a plane"),
         "slope_refused": (refused.astype(np.float64), "1", "1 where a slope is steeper than the sea"),
@@ -157,6 +162,19 @@ def _steepest_sea(dataset: xr.Dataset) -> float:
     """Return the largest slope [1] that the sea can have in one direction, infinite if its slopes are unknown."""
     variance = optional_number(dataset.attrs, "surface_slope_variance")
     return math.inf if variance is None else _STEEPEST * math.sqrt(0.5 * variance)
+
+
+def _largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
+    """Return upper limits of the standard deviations of slopes along and across [1], and that of the range [m].
+
+    Without any knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
+    slopes do, and its height as that of the fully developed sea with this slope variance: sigma = 0.21 U^2/(4 g)
+    (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), total 0.003 + 5.08e-3 U (Cox and Munk 1954,
+    doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
+    """
+    total = float(dataset.attrs.get("surface_slope_variance", math.inf))
+    wind = max(total - 0.003, 0.0) / 5.08e-3
+    return math.sqrt(0.5 * total), math.sqrt(0.5 * total), 0.21 * wind**2 / (4 * GRAVITY)
 
 
 def _wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) -> tuple[float, float] | None:
@@ -260,9 +278,11 @@ def bottom(
     xarray.Dataset
         Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
         (``level``), through the plane of the shot (``slope``), and from the ratio of the echo to the column
-        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last. Also ``bottom_energy`` [J], and
-        for the last reflectance ``reflectance_stderr`` from noise, an upper bound, and ``class_probability`` over
-        ``bottom_class``. NaN without a bottom echo; reflectances are NaN without a column, with a warning.
+        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last; ``reflectance_corrected`` and
+        ``depth_corrected``, whether the correction was applied: otherwise the value is the one before it. Also
+        ``bottom_energy`` [J], and for the last reflectance ``reflectance_stderr`` from noise, an upper bound, and
+        ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN without a column,
+        with a warning.
 
     Raises
     ------
@@ -273,6 +293,11 @@ def bottom(
     -----
     Reflectances ``level`` and ``slope`` use the mean attenuation of all shots. The ratio needs a column of at least 8
     bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
+
+    A correction that is not expected to lower the variance is not applied: that for the slope where
+    `slope_corrections.helps` says so, that by the column where its noise exceeds the scatter of the reflectances over
+    the shots. With at least 8 shots, one after which the reflectances of the shots scatter more is not applied to any,
+    as focusing by waves may have the opposite effect; with fewer shots their scatter is not known.
     """
     lidar = LidarGeometry.from_attributes(dataset.attrs)
     share = in_range("relative_error", relative_error, 0, 1)
@@ -295,25 +320,31 @@ def bottom(
     mean_level, mean_attenuation = (_mean(values) for values in (power, attenuation))
     if math.isnan(mean_attenuation):
         _LOG.warning("no waveform has a column long enough for a fit: the reflectance of the bottom is unknown")
+    helpful = _helpful(lidar, time, mean_attenuation, slopes)
+    depth_corrected = helpful["depth"] & np.isfinite(depth[1])
+    depth[1] = np.where(depth_corrected, depth[1], depth[0])
     received = system.energy * system.aperture_area
     reflectance = []
     for distance, path, one in surfaces:
         gain = bottom_gain(distance, np.nan_to_num(path), lidar.refractive_index, one)
         reflectance.append(np.pi * energy * np.exp(2 * mean_attenuation * path) / (received * gain))
+    slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & _steadier(reflectance[1], reflectance[0])
+    reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
     water_gain = system.water_gain(0.0, lidar.off_nadir)
     backscatter = column_retrieval.backscatter_of_level(mean_level, water_gain, lidar.group_index)
     delay = time - echoes["time_ns"].sel(echo="surface").values
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
-    reflectance.append(
-        column_retrieval.bottom_reflectance(energy, at_bottom, backscatter, ray.cos_vertical, lidar.group_index)
-    )
+    vertical = np.where(slope_corrected, ray.cos_vertical, level.cos_vertical)
+    ratio = column_retrieval.bottom_reflectance(energy, at_bottom, backscatter, vertical, lidar.group_index)
     parts = (
         seabed["energy_stderr"].values / energy,
         column["amplitude_stderr"].values / power,
         2 * delay * lidar.metres_per_ns * echoes["attenuation_stderr"].values,
     )
     relative = np.sqrt(sum(np.nan_to_num(part) ** 2 for part in parts))
+    column_corrected = np.isfinite(ratio) & (relative < _scatter(reflectance[1])) & _steadier(ratio, reflectance[1])
+    reflectance.append(np.where(column_corrected, ratio, np.where(np.isfinite(ratio), reflectance[1], np.nan)))
     names, probability = column_retrieval.bottom_class(
         reflectance[2], np.abs(np.nan_to_num(reflectance[2])) * np.hypot(relative, share), classes
     )
@@ -327,6 +358,10 @@ def bottom(
     )
     dims = tuple(found["bottom_energy"].dims)
     depths = np.stack([*np.broadcast_arrays(*depth), np.full(np.shape(depth[1]), np.nan)], axis=-1)
+    applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, np.zeros(1, dtype=bool))}
+    for name, (by_slope, by_column) in applied.items():
+        flags = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
+        found[f"{name}_corrected"] = ((*dims, "correction"), flags, {"long_name": f"correction of the {name} applied"})
     for name, values, dim, unit, text in (
         ("reflectance", np.stack(reflectance, axis=-1), "correction", "1", "reflectance of the bottom"),
         ("depth_m", depths, "correction", "m", "depth of the bottom below the mean sea level"),
@@ -334,6 +369,43 @@ def bottom(
     ):
         found[name] = ((*dims, dim), values, {"units": unit, "long_name": text})
     return found.assign_coords(correction=["level", "slope", "column"], bottom_class=names)
+
+
+def _helpful(
+    lidar: LidarGeometry, time: FloatArray, attenuation: float, slopes: xr.Dataset
+) -> dict[str, npt.NDArray[np.bool_]]:
+    """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance."""
+
+    def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:
+        ray = SlopeRefraction.of(along, across, lidar.off_nadir, lidar.refractive_index)
+        return np.nan_to_num((time - 2e9 * distance / C0) * lidar.metres_per_ns), ray
+
+    def depth(along: FloatArray, across: FloatArray, distance: FloatArray) -> FloatArray:
+        path, ray = through(along, across, distance)
+        return bottom_depth(distance, path, lidar.height, lidar.off_nadir, ray)
+
+    def log_reflectance(along: FloatArray, across: FloatArray, distance: FloatArray) -> FloatArray:
+        path, ray = through(along, across, distance)
+        gain = bottom_gain(distance, path, lidar.refractive_index, ray)
+        return np.asarray(2 * np.nan_to_num(attenuation) * path - np.log(gain))
+
+    names = ("slope_along_stderr", "slope_across_stderr", "surface_range_stderr")
+    errors = [slopes[name].values if name in slopes else np.zeros(1) for name in names]
+    before = slopes.attrs.get("slope_prior_deviation", [math.inf] * 3)
+    quantities = {"depth": depth, "reflectance": log_reflectance}
+    return {name: helps(one, lidar.slant_range, before, errors).reshape(time.shape) for name, one in quantities.items()}
+
+
+def _scatter(reflectance: FloatArray) -> float:
+    """Return the relative standard deviation of reflectances over shots, infinite for few shots."""
+    known = reflectance[np.isfinite(reflectance) & (reflectance > 0)]
+    return float(np.std(np.log(known))) if known.size >= _FEWEST_SHOTS else math.inf
+
+
+def _steadier(corrected: FloatArray, uncorrected: FloatArray) -> bool:
+    """Return whether reflectances scatter less over shots, or have too few shots for that."""
+    scatter = _scatter(corrected)
+    return math.isinf(scatter) or scatter < _scatter(uncorrected)
 
 
 def water(
@@ -389,13 +461,24 @@ def water(
 
 
 def retrieve(
-    dataset: xr.Dataset, *, slope_deviation: tuple[float, float] | None = None, efficiency: float | None = None
+    dataset: xr.Dataset,
+    *,
+    wind_speed: float | None = None,
+    wind_direction_deg: float | None = None,
+    slope_deviation: tuple[float, float] | None = None,
+    efficiency: float | None = None,
 ) -> xr.Dataset:
     """Return the estimates of `surface_slopes`, `bottom` and, if the view is wide enough, `water`; NaN where unknown.
 
     The arguments and errors are those of these functions. If no quantity can be estimated, `UserError` is raised.
     """
-    slopes = surface_slopes(dataset, slope_deviation=slope_deviation)
+    slopes = surface_slopes(
+        dataset,
+        wind_speed=wind_speed,
+        wind_direction_deg=wind_direction_deg,
+        slope_deviation=slope_deviation,
+        efficiency=efficiency,
+    )
     parts = [slopes, bottom(dataset, slopes, efficiency=efficiency)]
     spot = LidarGeometry.from_attributes(dataset.attrs).spot_diameter(dataset.attrs)
     if spot >= column_retrieval.SMALLEST_SPOT:

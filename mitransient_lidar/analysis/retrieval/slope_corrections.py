@@ -5,6 +5,7 @@ Slopes are rises over runs, positive `along` the lidar's azimuth for a face towa
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,3 +88,42 @@ def bottom_gain(surface_range: npt.ArrayLike, path: npt.ArrayLike, n: float, ray
     sagittal = n * distance + length
     tangential = n * distance * ray.cos_water / ray.cos_air + length * ray.cos_air / ray.cos_water
     return np.asarray(transmittance**2 * ray.cos_vertical / (sagittal * tangential))
+
+
+#: Steps of the slopes along and across [1] and of the range [m] in which errors are propagated.
+_STEPS = (0.01, 0.01, 0.01)
+
+
+def helps(
+    quantity: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
+    surface_range: float,
+    before: Sequence[npt.ArrayLike],
+    after: Sequence[npt.ArrayLike],
+) -> npt.NDArray[np.bool_]:
+    """Return whether a correction for slope and range is expected to lower the variance of a quantity.
+
+    Parameters
+    ----------
+    quantity : callable
+        Corrected quantity as a function of the slopes along and across [1] and the range of the surface [m].
+    surface_range : float
+        Range of a level sea at its mean height [m].
+    before, after : sequence of 3 array_like
+        Standard deviations of slopes and range on the sea, infinite where unknown, and standard errors of their
+        estimates; they broadcast. An error of NaN, of a slope that is not estimated, counts in neither.
+
+    Notes
+    -----
+    Without the correction the variance is that of the true correction over the sea, with it that of its error: both to
+    first order about the level sea, for independent slopes and range. NaN quantities are not corrected.
+    """
+    level = np.array([0.0, 0.0, surface_range])
+    variances = [np.zeros(1), np.zeros(1)]
+    for axis, step in enumerate(_STEPS):
+        upper, lower = (quantity(*(level + sign * step * np.eye(3)[axis])) for sign in (1, -1))
+        gradient = (upper - lower) / (2 * step)
+        deviation, error = np.broadcast_arrays(*(np.asarray(one[axis], dtype=np.float64) for one in (before, after)))
+        counts = np.isfinite(error) & (gradient != 0)
+        for number, one in enumerate((deviation, error)):
+            variances[number] = variances[number] + np.where(counts, gradient * np.where(counts, one, 0.0), 0.0) ** 2
+    return np.asarray(variances[1] < variances[0])

@@ -83,8 +83,8 @@ class SurfacePlane:
     ----------
     along, across, along_stderr, across_stderr
         Slopes along the lidar's azimuth and to its left, and their standard errors [1].
-    range_m
-        Distance to the plane along the receiver's axis [m].
+    range_m, range_stderr
+        Distance to the plane along the receiver's axis and its standard error [m].
     misfit_ns
         Root mean square deviation of the echoes from the plane over the degrees of freedom [ns]; NaN without any.
     """
@@ -94,6 +94,7 @@ class SurfacePlane:
     along_stderr: FloatArray
     across_stderr: FloatArray
     range_m: FloatArray
+    range_stderr: FloatArray
     misfit_ns: FloatArray
 
 
@@ -222,6 +223,7 @@ def _planes(
         np.where(has_u, (1 + along**2) / (1 + (b / a) ** 2) * error(of_b) / a, np.nan),
         np.where(has_v, np.abs(forward) * error(of_c) / a, np.nan),
         np.where(some, 1 / a, np.nan),
+        np.where(some, error(of_a) / a**2, np.nan),
         np.where(free > 0, misfit, np.nan),
     )
 
