@@ -6,7 +6,6 @@ The functions take a dataset with ``waveform`` [W] over (pixel, time) or (shot, 
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from typing import Any
@@ -15,25 +14,16 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.analysis.retrieval import column_retrieval, surface_slope
+from mitransient_lidar.analysis.retrieval import column_retrieval, surface_inputs, surface_slope
 from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, helps
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite, in_range, positive
-from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
-from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED, PixelMap, SeaLidar, sea_shots
-from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
-from mitransient_lidar.results.geometry import (
-    LidarGeometry,
-    LinesOfSight,
-    optional_number,
-    required_number,
-    two_way_efficiency,
-)
+from mitransient_lidar.core.validation import FloatArray, in_range, positive
+from mitransient_lidar.physics.sea.surface_echoes import PixelMap, SeaLidar, sea_shots
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number, required_number
 
 _LOG = logging.getLogger(__name__)
-_MOST_PIXELS = 64  # whose echoes are modelled on a sea
 _FEWEST_SHOTS = 8  # whose scatter of reflectance is known
 _STEEPEST = 5.0  # standard deviations of the sea's slopes beyond which an estimate is refused
 _COLUMN_START = 1.75  # echo widths after the surface at which `echo_table` begins to fit the column
@@ -103,14 +93,14 @@ def surface_slopes(
     surface = echoes.sel(echo="surface")
     shape = surface["time_ns"].shape[:-1]
     time, error = (surface[name].values.reshape(-1, dataset.sizes["pixel"]) for name in ("time_ns", "time_ns_stderr"))
-    light = pixel_light(dataset)
+    light = surface_inputs.pixel_light(dataset)
     plane = surface_slope.fit_plane(time, light, lidar.off_nadir, stderr_ns=error, facets=facets)
     refused, limit = np.zeros(len(time), dtype=bool), _steepest_sea(dataset)
-    wind = None if slope_deviation is not None else _wind(dataset, wind_speed, wind_direction_deg)
+    wind = None if slope_deviation is not None else surface_inputs.wind(dataset, wind_speed, wind_direction_deg)
     if wind is not None:
-        scale = _energy_scale(dataset, efficiency)
-        measured = _pixel_echoes(echoes, lidar, light)
-        lines = _outlines(dataset)
+        scale = surface_inputs.energy_scale(dataset, efficiency)
+        measured = surface_inputs.pixel_echoes(echoes, lidar, light)
+        lines = surface_inputs.outlines(dataset)
         beam = 0.5e-3 * required_number(dataset.attrs, "divergence_mrad")
         sender = SeaLidar(lidar.height, lidar.off_nadir, beam, PixelMap.of_outlines(lines), lidar.refractive_index)
         sea = surface_slope.slopes_on_sea(measured, sea_shots(sender, *wind), scale)
@@ -136,7 +126,7 @@ def surface_slopes(
         (along, along_error), (across, across_error) = slopes
         height = lidar.height - plane.range_m * math.cos(lidar.off_nadir)
         method, distance, distance_error = "times", plane.range_m, plane.range_stderr
-        prior = np.array(_largest_deviations(dataset))
+        prior = np.array(surface_inputs.largest_deviations(dataset))
         if slope_deviation is not None:
             prior[:2] = slope_deviation
     steepness, direction = surface_slope.steepest(along, across)
@@ -162,91 +152,6 @@ def _steepest_sea(dataset: xr.Dataset) -> float:
     """Return the largest slope [1] that the sea can have in one direction, infinite if its slopes are unknown."""
     variance = optional_number(dataset.attrs, "surface_slope_variance")
     return math.inf if variance is None else _STEEPEST * math.sqrt(0.5 * variance)
-
-
-def _largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
-    """Return upper limits of the standard deviations of slopes along and across [1], and that of the range [m].
-
-    Without any knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
-    slopes do, and its height as that of the fully developed sea with this slope variance: sigma = 0.21 U^2/(4 g)
-    (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), total 0.003 + 5.08e-3 U (Cox and Munk 1954,
-    doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
-    """
-    total = float(dataset.attrs.get("surface_slope_variance", math.inf))
-    wind = max(total - 0.003, 0.0) / 5.08e-3
-    return math.sqrt(0.5 * total), math.sqrt(0.5 * total), 0.21 * wind**2 / (4 * GRAVITY)
-
-
-def _wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) -> tuple[float, float] | None:
-    """Return wind speed [m/s] and direction from the lidar's azimuth [rad], None if a sea cannot be modelled."""
-    attributes = dataset.attrs
-    sea = attributes.get("scene.spectrum"), attributes.get("scene.slope_variance")
-    pixels = len(_outlines(dataset))
-    beam = attributes.get("beam_profile", "gaussian"), attributes.get("divergence_across_mrad")
-    usable = (
-        "divergence_mrad" in attributes
-        and beam[0] == "gaussian"
-        and beam[1] in (None, attributes["divergence_mrad"])
-        and 2 <= pixels <= _MOST_PIXELS
-        and pixels == dataset.sizes["pixel"]
-    )
-    if speed is not None and not usable:
-        raise UserError(
-            f"wind_speed = {speed:g} needs a result of a round Gaussian beam and 2 to {_MOST_PIXELS} pixels with "
-            "outlines; slope_deviation does not"
-        )
-    if speed is None:
-        known = float(attributes.get("scene.wind_speed", 0)) if sea == ("elfouhaily", "cox_munk") else 0.0
-        if not usable or not LEAST_WIND_SPEED <= known <= MAX_WIND_SPEED:
-            return None
-        speed = known
-    direction = float(attributes.get("scene.wind_direction_deg", 0)) if direction_deg is None else direction_deg
-    axis = np.asarray(attributes.get("receiver_pose", [0.0, 0, 0, 1, 0]), dtype=np.float64)[3:5]
-    azimuth = math.atan2(axis[1], axis[0]) if np.hypot(*axis) > 1e-9 else 0.0
-    return speed, math.radians(finite("wind_direction_deg", direction)) - azimuth
-
-
-def _energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
-    """Return the pulse energy times efficiencies and aperture [J m^2], None if echoes are not in J or it is unknown."""
-    names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
-    known = efficiency is not None or all(name in dataset.attrs for name in names)
-    if "signal" in dataset or not known:
-        return None
-    energy, aperture = (required_number(dataset.attrs, name) for name in ("pulse_energy_mj", "aperture_area"))
-    return 1e-3 * energy * two_way_efficiency(dataset.attrs, efficiency) * aperture
-
-
-def _pixel_echoes(
-    echoes: xr.Dataset, lidar: LidarGeometry, light: surface_slope.PixelLight
-) -> surface_slope.PixelEchoes:
-    """Return the surface echoes of a table of `echo_table.extract` whose last dimension is pixel."""
-    pixels, width = echoes.sizes["pixel"], float(echoes.attrs["echo_fwhm_ns"])
-    surface = echoes.sel(echo="surface")
-    time, error, energy, energy_error = (
-        surface[name].values.reshape(-1, pixels) for name in ("time_ns", "time_ns_stderr", "energy", "energy_stderr")
-    )
-    level = echoes["amplitude"].sel(echo="column").values.reshape(-1, pixels)
-    known = np.isfinite(level)
-    # Pixels without a column hide as little as possible.
-    column = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(level.T, known.T, strict=True)])
-    column = np.maximum(1e-9 * width * column, 1e-6 * np.nanmax(energy, initial=1e-30))
-    ns_per_rad = 2e9 / C0 * lidar.slant_range * math.tan(lidar.off_nadir)
-    return surface_slope.PixelEchoes(time, error, energy, energy_error, column, ns_per_rad * light.spread, width)
-
-
-def _outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:
-    """Return the outlines of the pixels of a result [rad]; an empty list without them."""
-    outlines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
-    return [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in outlines]
-
-
-def pixel_light(dataset: xr.Dataset) -> surface_slope.PixelLight:
-    """Return the distribution of the light in the pixels of a result."""
-    outlines = _outlines(dataset)
-    angle_x, angle_y = (1e-3 * dataset[name].values.astype(np.float64) for name in ("angle_x", "angle_y"))
-    if len(outlines) != angle_x.size or "divergence_mrad" not in dataset.attrs:
-        return surface_slope.PixelLight(angle_x, angle_y, np.zeros_like(angle_x))
-    return surface_slope.PixelLight.of_outlines(outlines, 0.5e-3 * required_number(dataset.attrs, "divergence_mrad"))
 
 
 def bottom(
@@ -358,7 +263,7 @@ def bottom(
     )
     dims = tuple(found["bottom_energy"].dims)
     depths = np.stack([*np.broadcast_arrays(*depth), np.full(np.shape(depth[1]), np.nan)], axis=-1)
-    applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, np.zeros(1, dtype=bool))}
+    applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, False)}
     for name, (by_slope, by_column) in applied.items():
         flags = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
         found[f"{name}_corrected"] = ((*dims, "correction"), flags, {"long_name": f"correction of the {name} applied"})

@@ -10,7 +10,7 @@ from command_line import assert_refused, run
 from scipy.stats import exponnorm, norm, truncnorm
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.retrieval import retrieve
+from mitransient_lidar.analysis.retrieval import retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -159,7 +159,7 @@ def test_prior_weighs_slopes():
     raw = retrieve.surface_slopes(shot)
     # Squares of 6 mrad in a beam of 5 mrad: Gaussians cut at 0 and 6.
     light = truncnorm(0, 1.2, scale=5e-3)
-    assert retrieve.pixel_light(shot).angle_x == pytest.approx(np.sign(ANGLE_X) * light.mean(), rel=1e-3)
+    assert surface_inputs.pixel_light(shot).angle_x == pytest.approx(np.sign(ANGLE_X) * light.mean(), rel=1e-3)
     # Far and near pair with two facets each, alike by 0.4; the time determines tan(theta - tilt).
     slope = float(raw["slope_along"])
     tilt = math.atan(slope)
@@ -170,6 +170,56 @@ def test_prior_weighs_slopes():
     weighed = retrieve.surface_slopes(shot, slope_deviation=(0.05, 0.04))
     error = float(raw["slope_along_stderr"])
     assert float(weighed["slope_along_stderr"]) == pytest.approx(0.05 * error / math.hypot(0.05, error))
+
+
+def of_a_sea(**changes):
+    """A shot whose pixels are squares of 6 mrad in a beam of 10 mrad over a sea of 6 m/s."""
+    lines = [np.array([[0, 0], [x, 0], [x, y], [0, y]]) for x, y in zip(2 * ANGLE_X, 2 * ANGLE_Y, strict=True)]
+    sea = {"scene.spectrum": "elfouhaily", "scene.slope_variance": "cox_munk", "scene.wind_speed": "6"}
+    outlines = json.dumps([[line.ravel().tolist()] for line in lines])
+    values = changes.pop("values", None)
+    return result(values, **{"pixel_outlines": outlines, "divergence_mrad": 10.0, **sea, **changes})
+
+
+@pytest.mark.slow
+def test_strengths_and_the_sea_count():
+    """Echoes of a level sea at the same times, ten times fainter: a face away; with a wind that is given or known."""
+    bright, faint = (
+        retrieve.surface_slopes(of_a_sea(values=np.stack([waveform(t, glint=glint) for t in plane_delays(0, 0)])))
+        for glint in (5e-12, 5e-13)
+    )
+    assert bright.attrs["slope_method"] == "times and strengths"
+    assert float(bright["slope_along"]) > float(faint["slope_along"]) + 0.02
+    # The slopes of the sea over this beam vary by 0.06 and 0.04.
+    np.testing.assert_allclose(bright.attrs["slope_prior_deviation"][:2], [0.06, 0.04], rtol=0.15)
+    assert float(bright["slope_along_stderr"]) < 0.7 * bright.attrs["slope_prior_deviation"][0]
+    given = retrieve.surface_slopes(of_a_sea(**{"scene.spectrum": "table"}), wind_speed=6, wind_direction_deg=0)
+    xr.testing.assert_allclose(given, retrieve.surface_slopes(of_a_sea()))
+    across_wind = retrieve.surface_slopes(of_a_sea(), wind_direction_deg=90)
+    np.testing.assert_allclose(across_wind.attrs["slope_prior_deviation"][:2], [0.04, 0.06], rtol=0.15)
+    no_scale = of_a_sea()
+    del no_scale.attrs["scene.optical_efficiency"]
+    assert retrieve.surface_slopes(no_scale).attrs["slope_method"] == "times on a sea"
+    flat = retrieve.surface_slopes(of_a_sea(**{"scene.spectrum": "height_map"}))
+    assert flat.attrs["slope_method"] == "times"
+
+
+def test_corrections_that_do_not_help_are_not_applied():
+    """One shot whose slope is known worse than the sea's slopes, and eight shots that the slope makes scatter more."""
+    shot = on_axis()
+    sloped = LEVEL.assign(slope_along=0.1, slope_along_stderr=0.2, slope_across_stderr=np.nan, surface_range_stderr=0.0)
+    for deviation, applied in ((0.1, False), (0.3, True)):
+        found = retrieve.bottom(shot, sloped.assign_attrs(slope_prior_deviation=[deviation, deviation, 0.0]))
+        assert bool(found["depth_corrected"].sel(correction="slope")) == applied
+        assert bool(found["reflectance_corrected"].sel(correction="slope")) == applied
+        level, slope = (float(found["depth_m"].sel(correction=name)) for name in ("level", "slope"))
+        assert (abs(slope - level) > 0.01) == applied
+    shots = series([shot] * 8)
+    slopes = LEVEL.expand_dims(shot=8).assign(slope_along=("shot", np.linspace(-0.2, 0.2, 8)))
+    found = retrieve.bottom(shots, slopes)
+    assert not found["reflectance_corrected"].any()
+    assert found["depth_corrected"].sel(correction="slope").all()
+    np.testing.assert_allclose(found["reflectance"].std("shot"), 0, atol=1e-12)
 
 
 def test_bottom_and_water_of_the_lidar_equation():
@@ -370,6 +420,12 @@ def drop(name):
         (lambda: retrieve.surface_slopes(on_axis().isel(pixel=[0])), "waveforms of at least 2 pixels"),
         (lambda: retrieve.surface_slopes(drop("altitude")), "the dataset has no attribute altitude"),
         (lambda: retrieve.surface_slopes(result(), slope_deviation=(0.1, 0.0)), "slope_deviation = 0 must be"),
+        (lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=0.1), r"wind_speed = 0\.1 must lie between 1 and 30"),
+        (lambda: retrieve.surface_slopes(result(), wind_speed=6), "wind_speed = 6 needs a result of a round Gaussian"),
+        (
+            lambda: retrieve.surface_slopes(of_a_sea(), wind_speed=6, slope_deviation=(0.1, 0.1)),
+            "slope_deviation = .* and wind_speed = 6 are alternatives",
+        ),
         (lambda: retrieve.surface_slopes(result(), facets=-1), "facets = -1 must be greater"),
         (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
         (lambda: retrieve.bottom(result(), LEVEL, relative_error=2), "relative_error = 2 must lie between"),

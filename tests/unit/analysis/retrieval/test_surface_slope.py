@@ -2,12 +2,21 @@
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mitransient_lidar.analysis.retrieval.surface_slope import PixelLight, fit_plane, steepest, with_prior
+from mitransient_lidar.analysis.retrieval.surface_slope import (
+    PixelEchoes,
+    PixelLight,
+    fit_plane,
+    slopes_on_sea,
+    steepest,
+    with_prior,
+)
+from mitransient_lidar.physics.sea.surface_echoes import SeaShots
 
 C0 = 0.299792458  # m/ns
 THETA = math.radians(20)
@@ -191,3 +200,55 @@ def test_invalid_facets_and_outlines():
         PixelLight.of_outlines([[[[0, 0], [1, 1]]]], 1.0)
     with pytest.raises(ValueError, match="outlines of pixel 0 must contain a part of the beam"):
         PixelLight.of_outlines([[[[1, 1], [2, 1], [2, 2]]]], 1e-3)
+
+
+def gaussian_shots(count, seed):
+    """Shots of a sea on which all relations are linear: four pixels at the corners, strengths that grow with slope."""
+    rng = np.random.default_rng(seed)
+    along, across, height = (deviation * rng.standard_normal(count) for deviation in (0.06, 0.04, 0.2))
+    planes = -300 * np.outer(along, ANGLE_X) - 320 * np.outer(across, ANGLE_Y) - 6.3 * height[:, np.newaxis]
+    time = 1420 + planes + 0.3 * rng.standard_normal((count, 4))
+    # u = 8 - 40 along, for log energies of -u^2/2: the largest has u near 0.
+    deviation = np.maximum(8 - 40 * along[:, np.newaxis] + 0.5 * rng.standard_normal((count, 4)), 0.5)
+    return SeaShots(np.exp(-0.5 * deviation**2), time, along, across, height)
+
+
+def measured(shots, **changes):
+    nothing = np.zeros_like(shots.energy)
+    echoes = PixelEchoes(shots.time_ns, nothing, shots.energy, nothing, np.full(4, 1e-12), np.zeros(4), 5.0)
+    return replace(echoes, **changes)
+
+
+@pytest.mark.parametrize("scale", [1.0, None])
+def test_slopes_on_a_gaussian_sea(scale):
+    """z of 2000 shots that the statistics do not contain; stated errors also hold noise of 0.15 ns and 0.25 of E."""
+    rng = np.random.default_rng(4)
+    shots = gaussian_shots(2000, 2)
+    times = shots.time_ns + 0.15 * rng.standard_normal(shots.time_ns.shape)
+    energy = shots.energy * np.exp(0.25 * rng.standard_normal(shots.energy.shape))
+    found = slopes_on_sea(measured(shots, time_ns=times, energy=energy), gaussian_shots(20000, 1), scale)
+    truth = np.stack([shots.along, shots.across, shots.height], axis=1)
+    errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    # A transform of the strengths that is linear to a few percent leaves that in the variance.
+    assert np.abs(np.mean(((found.mean - truth) / errors) ** 2, axis=0) - 1).max() < 0.05 + 4.5 * math.sqrt(2 / 2000)
+    assert np.all(errors**2 < np.diag(found.prior))
+    with_strengths = slopes_on_sea(measured(shots), gaussian_shots(2000, 1), 1.0)
+    without = slopes_on_sea(measured(shots), gaussian_shots(2000, 1), None)
+    assert np.all(with_strengths.covariance[:, 0, 0] < 0.5 * without.covariance[:, 0, 0])
+
+
+def test_echoes_that_are_missing_or_lost_tell_less():
+    shots = gaussian_shots(3, 2)
+    sea = gaussian_shots(4000, 1)
+    nothing = np.full_like(shots.energy, np.nan)
+    dark = measured(shots, time_ns=nothing, energy=nothing, column_energy=np.full(4, 1e3))
+    lost = slopes_on_sea(dark, sea, 1.0)
+    np.testing.assert_allclose(lost.covariance, np.broadcast_to(lost.prior, (3, 3, 3)), rtol=1e-2, atol=1e-4)
+    np.testing.assert_allclose(lost.mean, 0, atol=0.02)
+    one = shots.time_ns.copy()
+    one[:, 2] = np.nan
+    full, part = (slopes_on_sea(measured(shots, time_ns=times), sea, None) for times in (shots.time_ns, one))
+    assert np.all(part.covariance[:, 1, 1] > full.covariance[:, 1, 1])
+    np.testing.assert_allclose(part.mean[:, 2], shots.height, atol=0.2)
+    hidden = measured(shots, time_spread_ns=np.ones(4), column_energy=np.full(4, 1e3))
+    assert np.all(slopes_on_sea(hidden, sea, None).covariance[:, 0, 0] > 1.05 * full.covariance[:, 0, 0])

@@ -1,0 +1,103 @@
+"""Quantities of a result from which the slope of the sea surface is estimated: wind, energies, pixels and echoes."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.analysis.retrieval.surface_slope import PixelEchoes, PixelLight
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite
+from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
+from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED
+from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
+from mitransient_lidar.results.geometry import LidarGeometry, required_number, two_way_efficiency
+
+_MOST_PIXELS = 64  # whose echoes are modelled on a sea
+
+
+def pixel_light(dataset: xr.Dataset) -> PixelLight:
+    """Return the distribution of the light in the pixels of a result."""
+    lines = outlines(dataset)
+    angle_x, angle_y = (1e-3 * dataset[name].values.astype(np.float64) for name in ("angle_x", "angle_y"))
+    if len(lines) != angle_x.size or "divergence_mrad" not in dataset.attrs:
+        return PixelLight(angle_x, angle_y, np.zeros_like(angle_x))
+    return PixelLight.of_outlines(lines, 0.5e-3 * required_number(dataset.attrs, "divergence_mrad"))
+
+
+def largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
+    """Return upper limits of the standard deviations of slopes along and across [1], and that of the range [m].
+
+    Without any knowledge of the sea but its total slope variance, the slopes over a footprint vary at most as all its
+    slopes do, and its height as that of the fully developed sea with this slope variance: sigma = 0.21 U^2/(4 g)
+    (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), total 0.003 + 5.08e-3 U (Cox and Munk 1954,
+    doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
+    """
+    total = float(dataset.attrs.get("surface_slope_variance", math.inf))
+    wind = max(total - 0.003, 0.0) / 5.08e-3
+    return math.sqrt(0.5 * total), math.sqrt(0.5 * total), 0.21 * wind**2 / (4 * GRAVITY)
+
+
+def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) -> tuple[float, float] | None:
+    """Return wind speed [m/s] and direction from the lidar's azimuth [rad], None if a sea cannot be modelled."""
+    attributes = dataset.attrs
+    sea = attributes.get("scene.spectrum"), attributes.get("scene.slope_variance")
+    pixels = len(outlines(dataset))
+    beam = attributes.get("beam_profile", "gaussian"), attributes.get("divergence_across_mrad")
+    usable = (
+        "divergence_mrad" in attributes
+        and beam[0] == "gaussian"
+        and beam[1] in (None, attributes["divergence_mrad"])
+        and 2 <= pixels <= _MOST_PIXELS
+        and pixels == dataset.sizes["pixel"]
+    )
+    if speed is not None and not usable:
+        raise UserError(
+            f"wind_speed = {speed:g} needs a result of a round Gaussian beam and 2 to {_MOST_PIXELS} pixels with "
+            "outlines; slope_deviation does not"
+        )
+    if speed is None:
+        known = float(attributes.get("scene.wind_speed", 0)) if sea == ("elfouhaily", "cox_munk") else 0.0
+        if not usable or not LEAST_WIND_SPEED <= known <= MAX_WIND_SPEED:
+            return None
+        speed = known
+    direction = float(attributes.get("scene.wind_direction_deg", 0)) if direction_deg is None else direction_deg
+    axis = np.asarray(attributes.get("receiver_pose", [0.0, 0, 0, 1, 0]), dtype=np.float64)[3:5]
+    azimuth = math.atan2(axis[1], axis[0]) if np.hypot(*axis) > 1e-9 else 0.0
+    return speed, math.radians(finite("wind_direction_deg", direction)) - azimuth
+
+
+def energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
+    """Return the pulse energy times efficiencies and aperture [J m^2], None if echoes are not in J or it is unknown."""
+    names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
+    known = efficiency is not None or all(name in dataset.attrs for name in names)
+    if "signal" in dataset or not known:
+        return None
+    energy, aperture = (required_number(dataset.attrs, name) for name in ("pulse_energy_mj", "aperture_area"))
+    return 1e-3 * energy * two_way_efficiency(dataset.attrs, efficiency) * aperture
+
+
+def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) -> PixelEchoes:
+    """Return the surface echoes of a table of `echo_table.extract` whose last dimension is pixel."""
+    pixels, width = echoes.sizes["pixel"], float(echoes.attrs["echo_fwhm_ns"])
+    surface = echoes.sel(echo="surface")
+    time, error, energy, energy_error = (
+        surface[name].values.reshape(-1, pixels) for name in ("time_ns", "time_ns_stderr", "energy", "energy_stderr")
+    )
+    level = echoes["amplitude"].sel(echo="column").values.reshape(-1, pixels)
+    known = np.isfinite(level)
+    # Pixels without a column hide as little as possible.
+    column = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(level.T, known.T, strict=True)])
+    column = np.maximum(1e-9 * width * column, 1e-6 * np.nanmax(energy, initial=1e-30))
+    ns_per_rad = 2e9 / C0 * lidar.slant_range * math.tan(lidar.off_nadir)
+    return PixelEchoes(time, error, energy, energy_error, column, ns_per_rad * light.spread, width)
+
+
+def outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:
+    """Return the outlines of the pixels of a result [rad]; an empty list without them."""
+    lines = json.loads(dataset.attrs.get("pixel_outlines", "[]"))
+    return [[1e-3 * np.reshape(line, (-1, 2)) for line in one] for one in lines]
