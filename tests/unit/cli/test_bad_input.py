@@ -1,0 +1,490 @@
+"""Invalid input: one sentence on stderr with parameter and value, exit code 2, no output and no file."""
+
+import errno
+import os
+import re
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+
+import mitransient_lidar
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.loading import catalogue, checks, scenes
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.passes import Goal, run_passes
+from mitransient_lidar.rendering.passive import render_passive
+
+NAN, INF = float("nan"), float("inf")
+
+
+def rows(scene, table):
+    """Return (scene, parameter, value, part of the sentence) of a table of parameters by value and part."""
+    return [
+        (scene, name, value, part)
+        for (value, part), names in table.items()
+        for name in (names.split() if isinstance(names, str) else names)
+    ]
+
+
+LASER = "pulse_energy_mj pulse_fwhm_ns divergence_mrad wavelength_nm optical_efficiency"
+RECEIVER = "field_of_view_mrad aperture_area two_way_atmospheric_transmittance response_time_ns"
+POSE = "altitude off_nadir_deg aim_x aim_y"
+RECORD = "time_start_ns bin_width_ns"
+SEA = "wind_speed wind_direction_deg surface_time surface_size phase_g"
+NUMBERS = f"{LASER} {RECEIVER} {POSE} {RECORD} {SEA} bottom_depth bottom_reflectance"
+LISTS = "layer_tops attenuation scattering backscattering water_scattering refractive_index group_index"
+
+TABLE1 = {
+    ("inf", "must be finite"): NUMBERS,
+    ("", "is empty: it must have a value"): f"{NUMBERS} {LISTS} bin_count surface_seed layout spectrum phase",
+    ("deep", "must be a number"): NUMBERS,
+    ("1 2", "must be one number"): f"{LASER} altitude",
+    ("-1", "must lie between"): f"{LASER} {RECEIVER} altitude off_nadir_deg bin_width_ns surface_size",
+    ("1e30", "must lie between"): f"{NUMBERS} attenuation layer_tops backscattering",
+    ("0", "must lie between"): "altitude pulse_energy_mj field_of_view_mrad aperture_area bin_width_ns surface_size",
+    ("0.3,", "has an empty entry"): LISTS,
+    (",", "is empty"): LISTS,
+    ("0.2,,0.4", "has an empty entry"): LISTS,
+    ("0.2, x", "must hold numbers only"): LISTS,
+    ("nan, 2", "must be finite"): "layer_tops scattering",
+    ("1e12", "must be an integer"): "bin_count surface_seed",
+    ("2.5", "must be an integer"): "bin_count surface_seed",
+    ("few", "must be a number"): "bin_count surface_seed",
+    ("nan", "must be finite "): ["bin_count", "surface_seed"][:0],
+    ("1000000000000", "must lie between 1 and 1000000"): "bin_count",
+    ("0", "must lie between 1 and 1000000"): "bin_count",
+    ("-3", "must lie between 0 and"): "surface_seed",
+    ("99999999999999999999", "must lie between"): "bin_count surface_seed",
+    ("1.5", "must lie between 0 and 1"): "bottom_reflectance",
+    ("-0.1", "must lie between 0 and 1"): "bottom_reflectance",
+    ("-8", "must not be negative: the scene uses it as -$bottom_depth"): "bottom_depth",
+    ("10000", "must lie between 0 and 1000"): "attenuation",
+    ("1.1", "must lie between 1e-12 and 1"): "optical_efficiency two_way_atmospheric_transmittance",
+    ("5000", "must lie between 0.001 and 3000"): "field_of_view_mrad",
+    ("2500", "must lie between 0.001 and 2000"): "divergence_mrad",
+    ("95", "must lie between 0 and 89.9"): "off_nadir_deg",
+    ("200", "must lie between 300 and 1100"): "wavelength_nm",
+    ("31", "must lie between 0 and 30"): "wind_speed",
+    ("4e6", "must lie between -1e+06 and 1e+06"): "aim_x aim_y",
+    ("2by2", "must be rows x columns"): "layout",
+    ("0x2", "layout"): "layout",
+    ("9999x9999", "at most 1048576"): "layout",
+    ("hex8", "hexagons"): "layout",
+    ("swell", "must be one of"): "spectrum",
+    ("mie", "must be one of"): "phase",
+    ("1", "must lie between -0.999 and 0.999"): "phase_g",
+    ("some", "must be"): "slope_variance surface_cell_size surface_refined_size",
+    ("0.9", "must lie between 1"): "refractive_index group_index",
+    ("2.5", "must lie between 1"): "refractive_index group_index",
+    ("0.4", "must not exceed attenuation = 0.3"): "scattering",
+    ("0.2", "must not exceed scattering = 0.15"): "backscattering",
+    ("0.1", "scattering = 0.15 must not exceed"): "attenuation",
+    ("0.2", "must be at least 0 and at most scattering"): "water_scattering",
+    ("3, 0", "must start at 0 m"): "layer_tops",
+}
+TARGET = {
+    ("nan", "must be finite"): "target_x target_y target_depth target_size target_reflectance",
+    ("inf", "must be finite"): "target_x target_y target_depth target_size target_reflectance",
+    ("", "is empty"): "target_x target_y target_depth target_size target_reflectance",
+    ("1e30", "must lie between"): "target_x target_y target_depth target_size target_reflectance",
+    ("0", "must be greater than 0"): "target_size",
+    ("-1", "must be greater than 0"): "target_size",
+    ("-9", "must not be negative"): "target_depth",
+    ("2", "must lie between 0 and 1"): "target_reflectance",
+}
+GATED = {
+    (
+        "inf",
+        "must be finite",
+    ): "plate_height plate_x plate_tilt_deg ripple_height ripple_length gate_width_ns gate_step_ns",
+    ("nan", "must be finite"): "plate_size plate_reflectance gate_start_depth gate_rise_ns gate_fall_ns blur_mrad",
+    ("0", "must be greater than 0"): "plate_size",
+    ("-2", "must be greater than 0"): "plate_size",
+    ("1.01", "must lie between 0 and 1"): "plate_reflectance",
+    ("0.5", "must be an integer"): "gate_count pulses",
+    ("0", "must lie between"): "gate_width_ns gate_step_ns",
+}
+PASSIVE = {
+    ("inf", "must be finite"): "sun_zenith_deg sun_azimuth_deg sphere_size plate_depth",
+    ("1e9", "must lie between -3600 and 3600"): "sun_zenith_deg sun_azimuth_deg",
+}
+PARAMETERS = [
+    *rows("table1", TABLE1),
+    *rows("fig02_mine", TARGET),
+    *rows("gated_mine", GATED),
+    *rows("passive_sea", PASSIVE),
+]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Work in an empty folder, which must stay empty."""
+    inside = tmp_path / "work"
+    inside.mkdir()
+    monkeypatch.chdir(inside)
+    yield inside
+    assert list(inside.iterdir()) == []
+
+
+def shows(sentence, value):
+    """Return whether a sentence shows a value, or an entry of it, as it was typed or as a number."""
+    forms = {value.strip(), value.partition(",")[0]}
+    if re.fullmatch(r"[-+.\deE]+", value):
+        forms |= {f"{float(value):g}", str(float(value))}
+    return any(form in sentence for form in forms)
+
+
+@pytest.mark.parametrize(("scene", "name", "value", "part"), PARAMETERS)
+def test_parameters_of_scenes(scene, name, value, part):
+    with pytest.raises(UserError, match=re.escape(part)) as caught:
+        scenes.load_scene(scene, {name: value})
+    sentence = str(caught.value)
+    assert name in sentence
+    assert "\n" not in sentence
+    assert shows(sentence, value)
+
+
+@pytest.mark.parametrize(("scene", "name", "value", "part"), PARAMETERS[::12])
+def test_parameters_of_scenes_on_the_command_line(folder, scene, name, value, part):
+    result = run("render", scene, "--passes", 2, "-D", f"{name}={value}")
+    assert_refused(result, name, part)
+    assert shows(result.stderr, value)
+
+
+RENDER = ("render", "table1")
+OPTIONS = [
+    (RENDER, "--passes", "2.5", "must be a valid integer"),
+    (RENDER, "--passes", "nan", "must be a valid integer"),
+    (RENDER, "--passes", "1e20", "must be a valid integer"),
+    (RENDER, "--passes", "100000000000000000000", "must lie between 2 and 1000000000"),
+    (RENDER, "--passes", "1", "must lie between 2 and 1000000000"),
+    (RENDER, "--seed", "1.5", "must be a valid integer"),
+    (RENDER, "--seed", "18446744073709551616", "must lie between"),
+    (RENDER, "--seed", "-9223372036854775809", "must lie between"),
+    (RENDER, "--target-error", "-0.1", "must be greater than 0"),
+    (RENDER, "--target-error", "few", "must be a valid number"),
+    (RENDER, "--max-time", "0", "must be greater than 0"),
+    (RENDER, "--max-time", "nan", "must be finite"),
+    (RENDER, "--max-memory", "-2", "must be greater than 0"),
+    (RENDER, "--max-memory", "inf", "must be finite"),
+    (RENDER, "--variant", "scalar_rgb", "is not supported: allowed are"),
+    (RENDER, "--integrator", "path", "is not a lidar integrator"),
+    (RENDER, "--integrator", "lidar_mergin", "did you mean lidar_merging"),
+    (RENDER, "--integrator", "passive_volpath", "has no laser"),
+    (RENDER, "-D", "altitude", "is not of the form name=value"),
+    (RENDER, "-D", "altitud=3", "did you mean altitude"),
+    (RENDER, "--output", "\udcff", "not valid UTF-8"),
+    (RENDER, "--passs", "3", "No such option"),
+    (("passive", "passive_sea"), "--frames", "0", "must lie between 1 and 10000"),
+    (("passive", "passive_sea"), "--frames", "x", "must be a valid integer"),
+    (("passive", "passive_sea"), "--frame-step", "0", "must be greater than 0"),
+    (("passive", "passive_sea"), "--filter-width-nm", "inf", "must be finite"),
+    (("find-shots", "table1"), "--slope-sigmas", "20", "the sea has no place of the kind towards"),
+    (("find-shots", "table1"), "--slope-sigmas", "nan", "must be finite"),
+    (("find-shots", "table1"), "--slope-sigmas", "-1", "must be greater than 0"),
+    (("find-shots", "table1"), "--count", "101", "must lie between 1 and 100"),
+    (("find-shots", "table1"), "--at", "3", "must be two numbers"),
+    (("find-shots", "table1"), "--at", "3,nan", "must be finite"),
+    (("find-shots", "table1"), "--at", "3,", "has an empty entry"),
+    (("find-shots", "table1"), "--output", "a.txt", "must end in .png"),
+    (("shot-statistics", "fig09_2x2"), "--count", "1", "must lie between 2 and 100000"),
+    (("shot-statistics", "fig09_2x2"), "--seed", "-1", "must lie between 0 and"),
+    (("target-signal", "fig13_2x2"), "--grid", "16", "must lie between 1 and 15"),
+    (("target-signal", "fig13_2x2"), "--passes", "0", "must lie between"),
+    (("detect", "fig13_2x2"), "--pfa", "0", "must lie between 1e-12 and 0.5"),
+    (("detect", "fig13_2x2"), "--pd", "1", "must lie between"),
+    (("detect", "fig13_2x2"), "--depths", "4,,8", "has an empty entry"),
+    (("detect", "fig13_2x2"), "--depths", "8,4", "depths"),
+    (("detect", "fig13_2x2"), "--shots", "1", "must lie between 100 and 100000"),
+    (("detect", "fig13_2x2"), "--receiver", "eye", "must be a ReceiverChain or one of"),
+    (("beam-spread", "fig09_2x2"), "--depths", "2;5", "must hold numbers only"),
+    (("beam-spread", "fig09_2x2"), "--depths", "inf", "must be finite"),
+    (("fov-sweep", "fig09_2x2"), "--fov-mrad", "2,wide", "must hold numbers only"),
+    (("fov-sweep", "fig09_2x2"), "--min-depth", "deep", "must be a valid number"),
+    (("scattering-orders", "fig09_2x2"), "--orders", "63", "must lie between 1 and 62"),
+    (("water", "pure"), "--wavelength", "x", "must be a valid number"),
+    (("water", "mud"), "--tolerance", "0.1", "kind = 'mud'"),
+    (("bench", "--quick"), "--target-error", "0", "must be greater than 0"),
+]
+
+
+@pytest.mark.parametrize(("command", "option", "value", "part"), OPTIONS)
+def test_options(folder, command, option, value, part):
+    assert_refused(run(*command, option, value), part)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["render"], "Missing argument 'SCENE'"),
+        (["render", "table1", "two"], "Got unexpected extra argument"),
+        (["rendr", "table1"], "No such command 'rendr'"),
+        (["--fast"], "No such option: --fast"),
+        (["scenes", "hide"], "No such command 'hide'"),
+        (["render", "tabel1"], "did you mean table1"),
+        (["render", "."], "is a folder"),
+        (["render", "/dev/zero"], "scene '/dev/zero' is neither a file nor a shipped scene"),
+        (["render", "/dev/null"], "scene '/dev/null' is neither a file nor a shipped scene"),
+        (["scenes", "show", "/dev/zero"], "is neither a file nor a shipped scene"),
+        (["plot", "/dev/zero"], "/dev/zero is neither an EXR nor a NetCDF-4 file"),
+        (["plot", "missing.nc"], "missing.nc"),
+        (["waveforms", "/dev/zero"], "/dev/zero"),
+        (["compare", "/dev/zero", "/dev/zero"], "/dev/zero is neither an EXR nor a NetCDF-4 file"),
+        (["gates", "/dev/zero", "--start-ns", 1, "--width-ns", 1, "--count", 1], "/dev/zero"),
+        (["retrieve", "/dev/zero"], "/dev/zero"),
+    ],
+)
+def test_commands_and_files(folder, arguments, part):
+    assert_refused(run(*arguments), part)
+
+
+def without(tag):
+    """Return table1 without its first element of a tag."""
+    end = tag.split()[0]
+    return lambda text: re.sub(rf"<{tag}(?=[ />])[^>]*?(/>|>.*?</{end}>)", "", text, count=1, flags=re.DOTALL)
+
+
+def replaced(old, new):
+    """Return a change of the text of a scene, which must contain the old part."""
+
+    def change(text):
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        (without("sensor"), "sensor: the scene has none"),
+        (without("emitter"), "emitter: the scene has none"),
+        (without("film"), "film: sensor 'receiver' has none; add a time_gated_film"),
+        (without("medium"), "medium below a sea surface: the scene has none"),
+        (without('shape type="ocean_surface"'), "medium below a sea surface: the scene has none"),
+        (without("integrator"), "integrator: the scene has no lidar integrator"),
+        (replaced('<float name="aperture_area"', '<float name="apertur_area"'), "did you mean aperture_area"),
+        (replaced('<string name="attenuation"', '<string name="atenuation"'), "did you mean attenuation"),
+        (replaced('<float name="divergence_mrad"', '<float name="divergense"'), "there is no parameter divergense"),
+        (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
+        (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
+        (replaced('type="diffuse"', 'type="difuse"'), "did you mean diffuse"),
+        (replaced('"$aperture_area"', '"$aperture"'), "aperture_area = '$aperture' refers to an unknown parameter"),
+        (replaced('"$aperture_area"', '"inf"'), "aperture_area = inf must be finite"),
+        (replaced('"$aperture_area"', '""'), "aperture_area = '' is empty"),
+        (replaced('"$bottom_reflectance"', '"1.2"'), "reflectance = 1.2 must lie between 0 and 1"),
+        (replaced('<scale value="500"/>', '<scale value="0"/>'), "scale = 0 must be greater than 0"),
+        (replaced("<film", "<fillm"), "not well-formed"),
+        (
+            replaced('<scene version="3.0.0">', '<scene version="3.0.0"><bsdf type="diffuse" id="receiver"/>'),
+            "duplicate",
+        ),
+        (replaced('<default name="bottom_depth" value="8"/>', '<default name="bottom_depth" value="0"/>'), "z = 0 m"),
+        (lambda text: "", "not well-formed XML"),
+        (lambda text: '<shape type="sphere" version="3.0.0"/>', "its root element must be <scene>"),
+        (
+            lambda text: f"<scene version='3.0.0'>{'<shape>' * 50_000}{'</shape>' * 50_000}</scene>",
+            "nested more than 64 deep",
+        ),
+    ],
+)
+def test_scene_files(tmp_path, folder, change, part):
+    path = tmp_path / "scene.xml"
+    text = re.sub('name="(\\w+)" +value', r'name="\1" value', catalogue.scene_text("table1"))
+    path.write_text(change(re.sub(r"<(float|string|integer) +name", r"<\1 name", text)), "utf-8")
+    assert_refused(run("render", path, "-q", "--no-plot", "--passes", 2), part)
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Folder with a result, result.nc, of two pixels and 60 bins."""
+    waveform = np.ones((2, 60))
+    attributes = {"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": 1.34, "group_index": 1.34}
+    attributes |= {"scene": "table1", "pulse_fwhm_ns": 5.0, "field_of_view_mrad": 30.0, "layout": "1x2", "passes": 4}
+    dataset = results.build(
+        *[waveform] * 4,
+        time=TimeAxis(1400, 1, 60),
+        pixel_names=["a", "b"],
+        pixel_centres_mrad=[(1, 0), (-1, 0)],
+        attributes=attributes,
+    )
+    folder = tmp_path_factory.mktemp("stored")
+    results.save(dataset, folder / "result.nc")
+    return folder
+
+
+AXES = {
+    "renamed": (lambda raw: raw.rename(time="when"), "time"),
+    "without": (lambda raw: raw.drop_vars("time"), "no coordinate time"),
+    "nan": (lambda raw: raw.assign_coords(time=raw["time"] * NAN), "time = nan"),
+    "infinite": (lambda raw: raw.assign_coords(time=raw["time"] / 0), "time = inf"),
+    "empty": (lambda raw: raw.isel(time=slice(0, 0)), "dimension time has the length 0"),
+    "dark": (lambda raw: raw.isel(pixel=slice(0, 0)), "dimension pixel has the length 0"),
+    "reversed": (lambda raw: raw.isel(time=slice(None, None, -1)), "must increase strictly"),
+    "text": (lambda raw: raw.assign_coords(time=raw["time"].astype(str)), "must hold numbers"),
+}
+GATES = ("--start-ns", 1410, "--width-ns", 5, "--step-ns", 5, "--count", 4)
+
+
+@pytest.mark.parametrize("command", ["plot", "gates", "waveforms", "retrieve", "compare"])
+@pytest.mark.parametrize("axis", AXES)
+def test_results_with_invalid_times(folder, stored, command, axis):
+    change, part = AXES[axis]
+    path = stored / f"{axis}.nc"
+    if not path.exists():
+        raw = xr.load_dataset(stored / "result.nc", engine="h5netcdf", decode_times=False)
+        change(raw).to_netcdf(path, engine="h5netcdf")
+    further = {"gates": GATES, "compare": (stored / "result.nc",)}.get(command, ())
+    assert_refused(run(command, path, *further), part)
+
+
+def quietly(**options):
+    """Return a call of render with two passes of table1 unless other options are given."""
+    return lambda: mitransient_lidar.render(**{"scene": "table1", "passes": 2, **options})
+
+
+def as_dict(**parts):
+    """Return a call of render for a scene given as a dict."""
+    return quietly(scene={"type": "scene", **parts})
+
+
+NESTED = {"type": "sphere"}
+for _ in range(100):
+    NESTED = {"type": "sphere", "child": NESTED}
+SINGULAR = mi.ScalarTransform4f().scale(0)
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
+        (quietly(scene=None), "scene = None must be"),
+        (quietly(scene=["table1"]), "scene = ['table1'] must be"),
+        (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
+        (quietly(passes=2.5), "passes = 2.5 must be an integer"),
+        (quietly(passes=NAN), "passes = nan must be an integer"),
+        (quietly(passes=INF), "passes = inf must be an integer"),
+        (quietly(passes=1e20), "passes = 100000000000000000000 must lie between"),
+        (quietly(passes=10**400), "passes = 1e400 must lie between"),
+        (quietly(passes=True), "passes = True must be an integer"),
+        (quietly(passes=[3]), "passes = [3] must be an integer"),
+        (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
+        (quietly(seed="x"), "seed = 'x' must be an integer"),
+        (quietly(seed=1.5), "seed = 1.5 must be an integer"),
+        (quietly(seed=None), "seed = None must be an integer"),
+        (quietly(seed=2**64), "seed = 18446744073709551616 must lie between"),
+        (quietly(target_error="a"), "target_error = 'a' must be a number"),
+        (quietly(target_error=[0.1]), "target_error = [0.1] must be a number"),
+        (quietly(target_error=NAN), "target_error = nan must be finite"),
+        (quietly(target_error=1j), "target_error = 1j must be a number"),
+        (quietly(max_time="long"), "max_time = 'long' must be a number"),
+        (quietly(max_time=True), "max_time = True must be a number"),
+        (quietly(max_memory={}), "max_memory = {} must be a number"),
+        (quietly(max_memory=10**400), "max_memory = inf must be finite"),
+        (quietly(variant=3), "variant = 3 is not supported"),
+        (quietly(integrator=3), "integrator = 3 must be the name or the dict of an integrator"),
+        (quietly(integrator={"type": "lidar_merging", "paths_per_pass": None}), "paths_per_pass = None must be"),
+        (quietly(integrator={"type": "lidar_merging", "paths": 3}), "lidar_merging: there is no parameter paths"),
+        (quietly(params=["altitude"]), "params = ['altitude'] must be a dict of names and values"),
+        (quietly(params="altitude=3"), "params = 'altitude=3' must be a dict"),
+        (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
+        (quietly(params={"altitude": {}}), "altitude = {} must be a number, a text or a list"),
+        (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
+        (quietly(params={"altitude": 10}), "starts the record after every echo"),
+        (quietly(params={"altitude": 510}), "it must end after the surface echo"),
+        (quietly(params={"time_start_ns": 5000}), "time_start_ns = 5000 starts the record after every echo"),
+        (quietly(scene={}), "sensor: the scene has none"),
+        (quietly(scene={"type": "scene", "x": 3}, params={"a": 1}), "params = ['a'] need an XML scene"),
+        (as_dict(x=None), "x = None must be"),
+        (as_dict(x={"type": "sphere", "radius": None}), "x.radius = None must be"),
+        (as_dict(x={"type": "sphere", "radius": NAN}), "x.radius = nan must be finite"),
+        (as_dict(x={"type": "sphere", "radius": b"1"}), "x.radius = b'1' must be"),
+        (as_dict(x={"type": "sphere", "to_world": SINGULAR}), "x.to_world has a scale of 0"),
+        (as_dict(x={"type": "multipixel_receiver", "aperture_area": 1e30}), "x.aperture_area = 1e+30 must lie between"),
+        (as_dict(x={"type": "diffuse", "reflectance": 1.5}), "x.reflectance = 1.5 must lie between 0 and 1"),
+        (
+            as_dict(x={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 2, 0]}}),
+            "x.reflectance = 2 must lie between 0 and 1",
+        ),
+        (as_dict(x={"type": "seabed", "dept": 3.0}), "seabed: there is no parameter dept; did you mean depth"),
+        (as_dict(**{"3": {3: 4}}), "scene: the key 3 must be a name"),
+        (as_dict(x=NESTED), "nested more than 64 deep"),
+        (lambda: render_passive("passive_sea", passes="8"), "passes = '8' must be an integer"),
+        (lambda: render_passive("passive_sea", seed=2**70), "seed = "),
+        (lambda: mitransient_lidar.open("/dev/zero"), "/dev/zero is neither"),
+    ],
+)
+def test_python_calls(folder, call, sentence):
+    with pytest.raises(UserError, match=re.escape(sentence)) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), MemoryError("Unable to allocate 7 TiB"), RuntimeError("jit_malloc(): out of memory! ...")]
+)
+def test_exhausted_memory_is_one_sentence(error):
+    def render_pass(number, seed):
+        raise error
+
+    with pytest.raises(UserError, match=r"memory ran out .*: use fewer bins, pixels or paths_per_pass") as caught:
+        run_passes(render_pass, Goal(passes=2), seed=0)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_runtime_errors_stay_bugs():
+    def render_pass(number, seed):
+        raise RuntimeError("a bug")
+
+    with pytest.raises(RuntimeError, match="a bug"):
+        run_passes(render_pass, Goal(passes=2), seed=0)
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "full"), RuntimeError("errno = 28, 'No space left on device'")]
+)
+def test_full_disk_names_the_target_and_the_temporary_file(tmp_path, error):
+    def write():
+        with replacing(tmp_path / "a.nc") as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(UserError, match="No space left on device") as caught:
+        write()
+    assert re.search(rf"cannot write {tmp_path}/a\.nc: .* temporary file {tmp_path}/\.\w+\.nc", str(caught.value))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("library", "part"), [("/etc/passwd", "'/etc/passwd'"), ("/nowhere.so", "is not a file")])
+def test_another_library_than_llvm(tmp_path, library, part):
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": library}
+    command = [sys.executable, "-m", "mitransient_lidar", "render", "table1", "-o", str(tmp_path / "out")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines()[-1].startswith("Dr") or "DRJIT_LIBLLVM_PATH" in done.stderr
+    assert part in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_unknown_backend_of_matplotlib_does_not_matter(tmp_path):
+    environment = {**os.environ, "MPLBACKEND": "foo"}
+    command = [sys.executable, "-m", "mitransient_lidar", "water", "pure", "-o", str(tmp_path / "a.png")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert (tmp_path / "a.png").exists()
+
+
+def test_parameters_of_plugins_are_those_of_their_manual_pages():
+    assert checks.plugin_parameters("time_gated_film")[:3] == ["time_start_ns", "bin_width_ns", "bin_count"]
+    assert {"aim_x", "aim_y", "divergence_fwhm_mrad", "pulse_file"} < set(checks.plugin_parameters("lidar_transmitter"))
+    assert checks.plugin_parameters("diffuse") == []
