@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typer.testing import CliRunner
+import functools
+
+import typer.testing
 
 from mitransient_lidar.cli.app import app
+
+# Typer builds its command anew for every call, which takes longer than most commands of the tests.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 
 def run(*arguments):
     """Return the result of a command, whose arguments may be of any type."""
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return typer.testing.CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def assert_refused(result, *parts):

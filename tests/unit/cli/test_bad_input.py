@@ -333,7 +333,10 @@ AXES = {
 GATES = ("--start-ns", 1410, "--width-ns", 5, "--step-ns", 5, "--count", 4)
 
 
-@pytest.mark.parametrize("command", ["plot", "gates", "waveforms", "retrieve", "compare"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("plot", "waveforms", "retrieve", "compare")]
+
+
+@pytest.mark.parametrize("command", ["gates", *SLOW])
 @pytest.mark.parametrize("axis", AXES)
 def test_results_with_invalid_times(folder, stored, command, axis):
     change, part = AXES[axis]
@@ -397,9 +400,6 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
         (quietly(params={"altitude": None}), "altitude = None must be a number, a text or a list"),
         (quietly(params={"altitude": {}}), "altitude = {} must be a number, a text or a list"),
         (quietly(params={3: 4}), "parameter 3 is not one of scene table1"),
-        (quietly(params={"altitude": 10}), "starts the record after every echo"),
-        (quietly(params={"altitude": 510}), "it must end after the surface echo"),
-        (quietly(params={"time_start_ns": 5000}), "time_start_ns = 5000 starts the record after every echo"),
         (quietly(scene={}), "sensor: the scene has none"),
         (quietly(scene={"type": "scene", "x": 3}, params={"a": 1}), "params = ['a'] need an XML scene"),
         (as_dict(x=None), "x = None must be"),
@@ -425,6 +425,20 @@ def test_python_calls(folder, call, sentence):
     with pytest.raises(UserError, match=re.escape(sentence)) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("params", "sentence"),
+    [
+        ({"altitude": 10}, "time_start_ns = 1390 starts the record after every echo"),
+        ({"altitude": 510}, "end the record at 1540 ns: it must end after the surface echo"),
+        ({"time_start_ns": 5000}, "time_start_ns = 5000 starts the record after every echo"),
+    ],
+)
+def test_records_without_an_echo(folder, params, sentence):
+    definitions = [word for name, value in params.items() for word in ("-D", f"{name}={value}")]
+    assert_refused(run("render", "table1", "-q", "--no-plot", "--passes", 2, *definitions), sentence)
 
 
 @pytest.mark.parametrize(
