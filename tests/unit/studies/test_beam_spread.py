@@ -43,7 +43,7 @@ def test_depths_that_are_refused(lidar_scene, depths, message):
     ("option", "message"),
     [
         ({"passes": 1}, "passes = 1 must lie between 2 and 10000"),
-        ({"photons": 10}, "photons = 10 must lie between 1024 and 1.67772e+07"),
+        ({"photons": 10}, "photons = 10 must lie between 1024 and 16777216"),
         ({"seed": -1}, "seed = -1 must lie between 0"),
         ({"params": {"bottom_depth": 3}}, "params = ['bottom_depth'] need an XML scene"),
     ],
