@@ -21,7 +21,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Goal, run_passes
 from mitransient_lidar.rendering.passive import render_passive
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 
 
 def rows(scene, table):
@@ -232,7 +232,6 @@ def test_options(folder, command, option, value, part):
         (["render", "."], "is a folder"),
         (["render", "/dev/zero"], "scene '/dev/zero' is neither a file nor a shipped scene"),
         (["render", "/dev/null"], "scene '/dev/null' is neither a file nor a shipped scene"),
-        (["scenes", "show", "/dev/zero"], "is neither a file nor a shipped scene"),
         (["plot", "/dev/zero"], "/dev/zero is neither an EXR nor a NetCDF-4 file"),
         (["plot", "missing.nc"], "missing.nc"),
         (["waveforms", "/dev/zero"], "/dev/zero"),
@@ -368,16 +367,13 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
     ("call", "sentence"),
     [
         (quietly(scene=3), "scene = 3 must be a shipped name, a path, a dict or a loaded scene"),
-        (quietly(scene=None), "scene = None must be"),
         (quietly(scene=["table1"]), "scene = ['table1'] must be"),
         (quietly(passes="8"), "passes = '8' must be an integer between 2 and 1000000000"),
         (quietly(passes=2.5), "passes = 2.5 must be an integer"),
         (quietly(passes=NAN), "passes = nan must be an integer"),
-        (quietly(passes=INF), "passes = inf must be an integer"),
         (quietly(passes=1e20), "passes = 100000000000000000000 must lie between"),
         (quietly(passes=10**400), "passes = 1e400 must lie between"),
         (quietly(passes=True), "passes = True must be an integer"),
-        (quietly(passes=[3]), "passes = [3] must be an integer"),
         (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
         (quietly(seed="x"), "seed = 'x' must be an integer"),
         (quietly(seed=1.5), "seed = 1.5 must be an integer"),
@@ -388,7 +384,6 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
         (quietly(target_error=NAN), "target_error = nan must be finite"),
         (quietly(target_error=1j), "target_error = 1j must be a number"),
         (quietly(max_time="long"), "max_time = 'long' must be a number"),
-        (quietly(max_time=True), "max_time = True must be a number"),
         (quietly(max_memory={}), "max_memory = {} must be a number"),
         (quietly(max_memory=10**400), "max_memory = inf must be finite"),
         (quietly(variant=3), "variant = 3 is not supported"),
