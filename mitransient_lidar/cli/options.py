@@ -48,4 +48,7 @@ def pair(option: str, text: str) -> tuple[float, float]:
 
 def number_or_auto(option: str, text: str) -> float | str:
     """Return a finite number, or the word auto."""
-    return text if text == "auto" else finite(option, text)
+    try:
+        return text if text == "auto" else finite(option, text)
+    except UserError:
+        raise UserError(f"{option} {text} must be a number or auto.") from None

@@ -63,9 +63,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             moves.append((temporary, path))
     except (OSError, RuntimeError) as error:
         # HDF5 and OpenEXR report a full disk by their own errors, with the operating system's message in them.
-        if getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error):
-            reason = f"{os.strerror(errno.ENOSPC)}, while writing the temporary file {temporary}, which is removed"
-            raise UserError(f"cannot write {path}: {reason}.") from error
+        if os.strerror(errno.ENOSPC) in str(error):
+            raise UserError(f"cannot write {path}: {os.strerror(errno.ENOSPC)}.") from error
         if isinstance(error, RuntimeError):
             raise
         raise UserError(f"cannot write {path}: {_reason(error, temporary, path)}.") from error

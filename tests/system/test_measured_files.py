@@ -90,5 +90,6 @@ def test_an_origin_outside_the_map_is_refused_before_anything_is_written(tmp_pat
     assert done.exit_code == 2
     # Above it is what the log tells of the other files.
     last = done.stderr.splitlines()[-1]
-    assert last == f"origin_x = 412345 must lie between 512335 and 512365, within {tmp_path / 'bottom.asc'}."
+    allowed = f"origin_x = 412345 must lie between 512335 and 512365, within {tmp_path / 'bottom.asc'}."
+    assert last == f"{allowed} (origin_x is set by map_x = 412345)"
     assert not (tmp_path / "out").exists()

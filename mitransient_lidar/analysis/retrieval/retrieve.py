@@ -114,8 +114,12 @@ def surface_slopes(
         prior = np.sqrt(np.diag(sea.prior)) * per_height
     else:
         slopes = [(plane.along, plane.along_stderr), (plane.across, plane.across_stderr)]
-        refused = np.any([np.abs(slope) > limit for slope, _ in slopes], axis=0)
-        slopes = [(np.where(refused, np.nan, slope), np.where(refused, np.nan, error)) for slope, error in slopes]
+        steep = [np.abs(slope) > limit for slope, _ in slopes]
+        refused = np.any(steep, axis=0)
+        slopes = [
+            (np.where(one, np.nan, slope), np.where(one, np.nan, error))
+            for one, (slope, error) in zip(steep, slopes, strict=True)
+        ]
         if slope_deviation is None:
             slope_deviation = dataset.attrs.get("slope_deviation")
         if slope_deviation is not None:

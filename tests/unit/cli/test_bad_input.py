@@ -1,6 +1,5 @@
 """Invalid input: one sentence on stderr with parameter and value, exit code 2, no output and no file."""
 
-import errno
 import os
 import re
 import subprocess
@@ -15,7 +14,6 @@ from command_line import assert_refused, run
 import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import replacing
 from mitransient_lidar.loading import catalogue, checks, scenes
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Goal, run_passes
@@ -45,7 +43,8 @@ TABLE1 = {
     ("inf", "must be finite"): NUMBERS,
     ("", "is empty: it must have a value"): f"{NUMBERS} {LISTS} bin_count surface_seed layout spectrum phase",
     ("deep", "must be a number"): NUMBERS,
-    ("1 2", "must be one number"): f"{LASER} altitude",
+    ("1 2", "must be one number"): "pulse_energy_mj pulse_fwhm_ns wavelength_nm optical_efficiency altitude",
+    ("1 2", "must be a number"): "divergence_mrad",
     ("-1", "must lie between"): f"{LASER} {RECEIVER} altitude off_nadir_deg bin_width_ns surface_size",
     ("1e30", "must lie between"): f"{NUMBERS} attenuation layer_tops backscattering",
     ("0", "must lie between"): "altitude pulse_energy_mj field_of_view_mrad aperture_area bin_width_ns surface_size",
@@ -57,7 +56,6 @@ TABLE1 = {
     ("1e12", "must be an integer"): "bin_count surface_seed",
     ("2.5", "must be an integer"): "bin_count surface_seed",
     ("few", "must be a number"): "bin_count surface_seed",
-    ("nan", "must be finite "): ["bin_count", "surface_seed"][:0],
     ("1000000000000", "must lie between 1 and 1000000"): "bin_count",
     ("0", "must lie between 1 and 1000000"): "bin_count",
     ("-3", "must lie between 0 and"): "surface_seed",
@@ -271,7 +269,7 @@ def replaced(old, new):
         (without("integrator"), "integrator: the scene has no lidar integrator"),
         (replaced('<float name="aperture_area"', '<float name="apertur_area"'), "did you mean aperture_area"),
         (replaced('<string name="attenuation"', '<string name="atenuation"'), "did you mean attenuation"),
-        (replaced('<float name="divergence_mrad"', '<float name="divergense"'), "there is no parameter divergense"),
+        (replaced('<string name="divergence_mrad"', '<string name="divergense"'), "there is no parameter divergense"),
         (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
         (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
         (replaced('type="diffuse"', 'type="difuse"'), "did you mean diffuse"),
@@ -454,21 +452,6 @@ def test_other_runtime_errors_stay_bugs():
 
     with pytest.raises(RuntimeError, match="a bug"):
         run_passes(render_pass, Goal(passes=2), seed=0)
-
-
-@pytest.mark.parametrize(
-    "error", [OSError(errno.ENOSPC, "full"), RuntimeError("errno = 28, 'No space left on device'")]
-)
-def test_full_disk_names_the_target_and_the_temporary_file(tmp_path, error):
-    def write():
-        with replacing(tmp_path / "a.nc") as temporary:
-            temporary.write_text("half")
-            raise error
-
-    with pytest.raises(UserError, match="No space left on device") as caught:
-        write()
-    assert re.search(rf"cannot write {tmp_path}/a\.nc: .* temporary file {tmp_path}/\.\w+\.nc", str(caught.value))
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -144,12 +144,13 @@ def test_a_full_disk_names_the_file_and_not_the_temporary_one(tmp_path):
     def fail(error):
         with replacing(tmp_path / "a.nc") as temporary:
             temporary.write_text("half")
-            raise OSError(*error) if isinstance(error, tuple) else OSError(error.format(temporary))
+            raise error if isinstance(error, Exception) else OSError(error.format(temporary))
 
     hdf5 = "Unable to extend file properly (file write failed: time = today\n, filename = '.mitransient', errno = 28)"
-    for text in ("No space left on device", hdf5):
+    openexr = RuntimeError("errno = 28, 'No space left on device'")
+    for error in (OSError(errno.ENOSPC, "full"), OSError(errno.ENOSPC, hdf5), openexr):
         with pytest.raises(UserError) as caught:
-            fail((errno.ENOSPC, text))
+            fail(error)
         assert str(caught.value) == f"cannot write {tmp_path / 'a.nc'}: No space left on device."
     with pytest.raises(UserError) as caught:
         fail("cannot write {}")

@@ -89,10 +89,10 @@ def test_target_out_of_view_is_told_with_its_distance(lidar_scene, caplog, targe
 
 def test_seabed_in_map_coordinates_is_told(lidar_scene, caplog):
     """Its nearest corner is 500 m nearer in x and y than its centre."""
-    seabed = {"bottom": {"type": "seabed", "centre_x": 674000.0, "centre_y": 6580000.0}}
+    seabed = {"bottom": {"type": "seabed", "centre_x": 674000.0, "centre_y": 658000.0}}
     (message,) = check(lidar_scene(bottom=None, extra=seabed), caplog)
     assert "shape 'bottom' lies out of view" in message
-    assert numbers(message)[0] == pytest.approx(np.hypot(673500 - 2.1, 6579500), rel=1e-5)
+    assert numbers(message)[0] == pytest.approx(np.hypot(673500 - 2.1, 657500), rel=1e-5)
 
 
 def test_target_in_view_outside_the_beam_is_told(lidar_scene, caplog):
@@ -151,10 +151,13 @@ def test_axes_may_meet_in_the_water(lidar_scene, caplog):
         ({"tx": UP}, "the beam misses the sea and every solid: the laser looks above the horizon"),
         ({"rx": UP, "tx": UP}, "laser and receiver look above the horizon"),
         (
-            {"rx": {"aim_x": 900.0}},
+            {"rx": {"aim_x": 900.0}, "sea": {"centre_x": 0.0, "size": 1000.0}},
             r"receiver looks at the sea level from \(896\.\d, -3\.\d\) to .* outside the sea from \(-500",
         ),
-        ({"tx": {"aim_x": 900.0}}, "the beam misses the sea and every solid: the laser looks at"),
+        (
+            {"tx": {"aim_x": 900.0}, "sea": {"centre_x": 0.0, "size": 1000.0}},
+            "the beam misses the sea and every solid: the laser looks at",
+        ),
         ({"rx": {"aim_x": 60.0}}, r"beam and field of view do not overlap: they are 5\d\.\d m apart on the sea level"),
         ({"film": {"bin_count": 20}}, "it must end after the surface echo, which comes at 14"),
         ({"film": {"time_start_ns": 1620.0}}, "starts the record after every echo: it must be less than 149"),

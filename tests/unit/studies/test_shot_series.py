@@ -217,7 +217,7 @@ def test_invalid_input_is_refused_before_rendering(rendered, scene, options, mes
     ("arguments", "message"),
     [
         (["--at", "1,2", "--places", "a.csv"], "--at and --places are alternatives"),
-        (["--at", "1;2"], "--at 1;2 is not of the form 2,5"),
+        (["--at", "1;2"], "--at = '1;2' must hold numbers only"),
         (["--places", "missing.csv"], "cannot read missing.csv"),
         (["-o", "shots.exr"], "--output shots.exr must end in .nc"),
         (["--count", "1"], "count = 1 must lie between 2 and 100000"),
