@@ -91,6 +91,12 @@ def render(
         ``gate_energy`` [J] in addition or instead; see `results.gate_stack`. After Ctrl-C it includes the completed
         passes, and the attribute ``interrupted`` is 1.
 
+    Notes
+    -----
+    Standard errors come from the spread of the passes. Intervals by Student's t with one degree of freedom less than
+    the attribute ``passes`` have their nominal coverage where the error is below a tenth of the value. Where it is 20
+    to 40 %, 95 % intervals of 8 passes hold the mean in 91 to 93 % of the bins, and where it is larger, in fewer.
+
     Raises
     ------
     UserError
