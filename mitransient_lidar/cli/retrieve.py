@@ -114,9 +114,10 @@ def _lines(found: Any) -> list[str]:
                 f"refused, an estimate is steeper than {found.attrs['steepest_slope']:.2f}, beyond what the sea has"
             )
         lines.append(f"slope {name}: {unknown if np.isnan(slope) else known}")
-    height = value["surface_height"]
-    lines.append("surface: no echo" if np.isnan(height) else f"surface: {height:+.3f} m from the mean level")
-    lines += _bottom_lines(found["depth_m"].values, found)
+    height, error = value["surface_height"], value["surface_height_stderr"]
+    known = f"surface: {height:+.3f} +- {error:.3f} m from the mean level"
+    lines.append("surface: no echo" if np.isnan(height) else known)
+    lines += _bottom_lines(found)
     if "kd" not in value:
         return [*lines, "water: not observable, the field of view is too narrow"]
     if np.isnan(value["kd"]):
@@ -126,12 +127,15 @@ def _lines(found: Any) -> list[str]:
     return [*lines, f"c is uncertain: {low:.2g} to {high:.2g} 1/m for bb/b from 0.044 to 0.01"]
 
 
-def _bottom_lines(depth: Any, found: Any) -> list[str]:
+def _bottom_lines(found: Any) -> list[str]:
     import numpy as np
 
+    depth, error = found["depth_m"].values, found["depth_m_stderr"].values
     if np.isnan(depth[0]):
         return ["bottom: no echo"]
-    lines = [f"bottom: {depth[1]:.3f} m deep, {depth[0]:.3f} m through a level sea"]
+    errors = ["" if np.isnan(one) else f" +- {one:.3f}" for one in error]
+    level, corrected = (f"{one:.3f}{by} m" for one, by in zip(depth[:2], errors, strict=False))
+    lines = [f"bottom: {corrected} deep, {level} through a level sea"]
     if not found["depth_corrected"].values[1]:
         lines[0] += " (not corrected for the slope: it is known no better than the sea's slopes are)"
     reflectance = found["reflectance"].values

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.analysis.retrieval import column_retrieval, surface_inputs, surface_slope
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, helps
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
@@ -63,8 +63,8 @@ def surface_slopes(
         Over ``shot`` if present: ``slope_along``, positive for a face towards the lidar, ``slope_across``, positive for
         a rise to the left [1], with ``_stderr``; ``slope_deg`` and ``slope_direction_deg`` of the steepest rise from
         the lidar's azimuth to the left [degree]; ``surface_range`` along the axis, with ``_stderr``, and
-        ``surface_height`` above the mean level [m]; ``plane_misfit`` [ns]. NaN where the pixels do not determine it.
-        Attributes: ``slope_method``, ``times and strengths``, ``times on a sea`` or ``times``, and
+        ``surface_height`` above the mean level [m], with ``_stderr``; ``plane_misfit`` [ns]. NaN where the pixels do
+        not determine it. Attributes: ``slope_method``, ``times and strengths``, ``times on a sea`` or ``times``, and
         ``slope_prior_deviation``, prior standard deviations of the slopes along and across [1] and of the range [m].
         Without a model of the sea, a slope beyond 5 standard deviations of its slopes (attribute
         ``surface_slope_variance``) is NaN as well, and ``slope_refused`` is 1.
@@ -133,6 +133,7 @@ def surface_slopes(
         prior = np.array(surface_inputs.largest_deviations(dataset))
         if slope_deviation is not None:
             prior[:2] = slope_deviation
+    height_error = distance_error * math.cos(lidar.off_nadir)
     steepness, direction = surface_slope.steepest(along, across)
     table = {
         "slope_along": (along, "1", "slope of the surface along the lidar's azimuth"),
@@ -144,6 +145,7 @@ def surface_slopes(
         "surface_range": (distance, "m", "distance to the surface along the axis"),
         "surface_range_stderr": (distance_error, "m", "standard error of the distance"),
         "surface_height": (height, "m", "height of the surface above the mean sea level"),
+        "surface_height_stderr": (height_error, "m", "standard error of the height"),
         "plane_misfit": (plane.misfit_ns, "ns", "deviation of the echoes from a plane"),
         "slope_refused": (refused.astype(np.float64), "1", "1 where a slope is steeper than the sea"),
     }
@@ -187,7 +189,8 @@ def bottom(
     xarray.Dataset
         Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
         (``level``), through the plane of the shot (``slope``), and from the ratio of the echo to the column
-        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last; ``reflectance_corrected`` and
+        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr`` by slope
+        and height of the sea, noise and method, NaN where the sea is unknown; ``reflectance_corrected`` and
         ``depth_corrected``, whether the correction was applied: otherwise the value is the one before it. Also
         ``bottom_energy`` [J], and for the last reflectance ``reflectance_stderr`` from noise, an upper bound, and
         ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN without a column,
@@ -204,9 +207,10 @@ def bottom(
     bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
 
     A correction that is not expected to lower the variance is not applied: that for the slope where
-    `slope_corrections.helps` says so, that by the column where its noise exceeds the scatter of the reflectances over
-    the shots. With at least 8 shots, one after which the reflectances of the shots scatter more is not applied to any,
-    as focusing by waves may have the opposite effect; with fewer shots their scatter is not known.
+    `slope_corrections.variances` gives no lower one with it, that by the column where its noise exceeds the scatter of
+    the reflectances over the shots. With at least 8 shots, one after which the reflectances of the shots scatter more
+    is not applied to any, as focusing by waves may have the opposite effect; with fewer shots their scatter is not
+    known.
     """
     lidar = LidarGeometry.from_attributes(dataset.attrs)
     share = in_range("relative_error", relative_error, 0, 1)
@@ -229,9 +233,11 @@ def bottom(
     mean_level, mean_attenuation = (_mean(values) for values in (power, attenuation))
     if math.isnan(mean_attenuation):
         _LOG.warning("no waveform has a column long enough for a fit: the reflectance of the bottom is unknown")
-    helpful = _helpful(lidar, time, mean_attenuation, slopes)
+    helpful, by_sea = _helpful(lidar, time, mean_attenuation, slopes)
     depth_corrected = helpful["depth"] & np.isfinite(depth[1])
     depth[1] = np.where(depth_corrected, depth[1], depth[0])
+    by_time = np.hypot(seabed["depth_m_stderr"].values, seabed["depth_m_method_error"].values)
+    depth_error = [np.hypot(one, by_time) for one in (by_sea[0], np.where(depth_corrected, by_sea[1], by_sea[0]))]
     received = system.energy * system.aperture_area
     reflectance = []
     for distance, path, one in surfaces:
@@ -266,7 +272,9 @@ def bottom(
         echoes["attenuation"].shape,
     )
     dims = tuple(found["bottom_energy"].dims)
-    depths = np.stack([*np.broadcast_arrays(*depth), np.full(np.shape(depth[1]), np.nan)], axis=-1)
+    unknown = np.full(np.shape(time), np.nan)
+    depths = np.stack(np.broadcast_arrays(*depth, unknown), axis=-1)
+    depth_errors = np.where(np.isfinite(depths), np.stack(np.broadcast_arrays(*depth_error, unknown), axis=-1), np.nan)
     applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, False)}
     for name, (by_slope, by_column) in applied.items():
         flags = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
@@ -274,6 +282,7 @@ def bottom(
     for name, values, dim, unit, text in (
         ("reflectance", np.stack(reflectance, axis=-1), "correction", "1", "reflectance of the bottom"),
         ("depth_m", depths, "correction", "m", "depth of the bottom below the mean sea level"),
+        ("depth_m_stderr", depth_errors, "correction", "m", "error of the depth by the sea, noise and method"),
         ("class_probability", probability, "bottom_class", "1", "probability of the bottom's class"),
     ):
         found[name] = ((*dims, dim), values, {"units": unit, "long_name": text})
@@ -282,8 +291,11 @@ def bottom(
 
 def _helpful(
     lidar: LidarGeometry, time: FloatArray, attenuation: float, slopes: xr.Dataset
-) -> dict[str, npt.NDArray[np.bool_]]:
-    """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance."""
+) -> tuple[dict[str, npt.NDArray[np.bool_]], list[FloatArray]]:
+    """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance.
+
+    Also return the standard deviations of the depth without and with them [m], NaN where the sea is unknown.
+    """
 
     def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:
         ray = SlopeRefraction.of(along, across, lidar.off_nadir, lidar.refractive_index)
@@ -301,8 +313,17 @@ def _helpful(
     names = ("slope_along_stderr", "slope_across_stderr", "surface_range_stderr")
     errors = [slopes[name].values if name in slopes else np.zeros(1) for name in names]
     before = slopes.attrs.get("slope_prior_deviation", [math.inf] * 3)
-    quantities = {"depth": depth, "reflectance": log_reflectance}
-    return {name: helps(one, lidar.slant_range, before, errors).reshape(time.shape) for name, one in quantities.items()}
+    helpful = {}
+    for name, quantity in (("depth", depth), ("reflectance", log_reflectance)):
+        without, corrected = variances(quantity, lidar.slant_range, before, errors)
+        helpful[name] = np.reshape(corrected < without, time.shape)
+    # A slope that is not estimated is as uncertain as on the sea.
+    known = [np.where(np.isnan(error), deviation, error) for error, deviation in zip(errors, before, strict=True)]
+    spread = [
+        np.sqrt(np.reshape(np.broadcast_to(one, time.size), time.shape))
+        for one in variances(depth, lidar.slant_range, before, known)
+    ]
+    return helpful, [np.where(np.isfinite(one), one, np.nan) for one in spread]
 
 
 def _scatter(reflectance: FloatArray) -> float:

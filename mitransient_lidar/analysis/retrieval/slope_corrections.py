@@ -94,13 +94,13 @@ def bottom_gain(surface_range: npt.ArrayLike, path: npt.ArrayLike, n: float, ray
 _STEPS = (0.01, 0.01, 0.01)
 
 
-def helps(
+def variances(
     quantity: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
     surface_range: float,
     before: Sequence[npt.ArrayLike],
     after: Sequence[npt.ArrayLike],
-) -> npt.NDArray[np.bool_]:
-    """Return whether a correction for slope and range is expected to lower the variance of a quantity.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the variances of a quantity without and with the correction for slope and range.
 
     Parameters
     ----------
@@ -118,12 +118,14 @@ def helps(
     first order about the level sea, for independent slopes and range. NaN quantities are not corrected.
     """
     level = np.array([0.0, 0.0, surface_range])
-    variances = [np.zeros(1), np.zeros(1)]
+    without, corrected = np.zeros(1), np.zeros(1)
     for axis, step in enumerate(_STEPS):
         upper, lower = (quantity(*(level + sign * step * np.eye(3)[axis])) for sign in (1, -1))
         gradient = (upper - lower) / (2 * step)
         deviation, error = np.broadcast_arrays(*(np.asarray(one[axis], dtype=np.float64) for one in (before, after)))
-        counts = np.isfinite(error) & (gradient != 0)
-        for number, one in enumerate((deviation, error)):
-            variances[number] = variances[number] + np.where(counts, gradient * np.where(counts, one, 0.0), 0.0) ** 2
-    return np.asarray(variances[1] < variances[0])
+        counts = ~np.isnan(error) & (gradient != 0)
+        without, corrected = (
+            variance + np.where(counts, gradient * np.where(counts, one, 0.0), 0.0) ** 2
+            for variance, one in ((without, deviation), (corrected, error))
+        )
+    return without, corrected

@@ -264,6 +264,27 @@ def test_depth_follows_height_and_slope():
     assert abs(float(found.sel(correction="level")) - DEPTH) > 0.03
 
 
+def test_errors_of_depths_hold_slope_and_range():
+    """To first order about a level sea: the water's angle turns by 1 - cos(air)/(n cos(water)) of the tilt."""
+    shot, deviations = on_axis(), {"slope_along_stderr": 0.05, "surface_range_stderr": 0.2}
+    path, per_range = DEPTH / COS_WATER, math.cos(THETA) - COS_WATER / N
+    turn = path * math.sin(THETA) / N * (1 - math.cos(THETA) / (N * COS_WATER))
+    sea = {"slope_prior_deviation": [0.2, 0.0, 0.4]}
+
+    def errors(slopes):
+        return retrieve.bottom(shot, slopes)["depth_m_stderr"].sel(correction=["level", "slope"]).values
+
+    exact = LEVEL.assign(dict.fromkeys([*deviations, "slope_across_stderr"], 0.0))
+    by_time = errors(exact.assign_attrs(slope_prior_deviation=[0.0, 0.0, 0.0]))
+    found = errors(exact.assign(deviations).assign_attrs(sea))
+    expected = [math.hypot(0.2 * turn, 0.4 * per_range), math.hypot(0.05 * turn, 0.2 * per_range)]
+    np.testing.assert_allclose(np.sqrt(found**2 - by_time**2), expected, rtol=0.01)
+    # A slope that is not estimated is as uncertain as on the sea; an unknown sea leaves the error unknown.
+    unseen = exact.assign(slope_along_stderr=np.nan, surface_range_stderr=0.0)
+    np.testing.assert_allclose(errors(unseen.assign_attrs(sea))[1] ** 2 - by_time[1] ** 2, (0.2 * turn) ** 2, rtol=0.02)
+    assert np.isnan(errors(unseen.assign_attrs(slope_prior_deviation=[math.inf] * 3))).all()
+
+
 def test_estimate_has_all_known_quantities():
     found = retrieve.retrieve(result())
     assert {"slope_along", "reflectance", "kd"} <= set(found)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles.lidar_equation import cos_water
 
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, helps
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import snell
 
@@ -87,20 +87,21 @@ def test_rays_that_miss_the_facet_are_unknown():
     assert np.isnan(bottom_gain(RANGE, 8.0, N, SlopeRefraction.of(np.nan, 0, THETA, N)))
 
 
-def test_corrections_help_where_errors_are_smaller_than_the_sea():
+def test_variances_by_slope_and_range_without_and_with_the_correction():
     """3 along - 2 across + range/10 of a level sea at 210 m: variances by hand, 0.0181 before."""
 
     def quantity(along, across, distance):
         return np.asarray(3 * along - 2 * across + 0.1 * (distance - 210) + np.zeros(1))
 
-    before = (0.04, 0.03, 0.1)
+    sea = (0.04, 0.03, 0.1)
     for after, expected in (
-        ((0.04, 0.02, 0.1), True),
-        ((0.044, 0.0, 0.0), True),
-        ((0.045, 0.01, 0.0), False),
-        ((0.05, np.nan, 0.1), False),
-        ((0.03, np.nan, np.nan), True),
+        ((0.04, 0.02, 0.1), (0.0181, 0.0161)),
+        ((0.044, 0.0, 0.0), (0.0181, 0.017424)),
+        ((0.05, np.nan, 0.1), (0.0145, 0.0226)),
+        ((0.03, np.nan, np.nan), (0.0144, 0.0081)),
     ):
-        assert helps(quantity, 210.0, before, after).tolist() == [expected]
-    assert helps(quantity, 210.0, (np.inf, np.inf, np.inf), (1.0, 1.0, 1.0)).tolist() == [True]
-    assert helps(quantity, 210.0, before, (np.array([0.01, 0.2]), 0.0, 0.0)).tolist() == [True, False]
+        np.testing.assert_allclose(np.ravel(variances(quantity, 210.0, sea, after)), expected, rtol=1e-6)
+    assert np.isinf(variances(quantity, 210.0, (np.inf, np.inf, np.inf), (1.0, 1.0, 1.0))[0])
+    without, corrected = variances(quantity, 210.0, sea, (np.array([0.01, 0.2]), 0.0, 0.0))
+    np.testing.assert_allclose(without, 0.0181, rtol=1e-6)
+    np.testing.assert_allclose(corrected, [9e-4, 0.36], rtol=1e-6)
