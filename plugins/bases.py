@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -16,6 +17,61 @@ from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
+
+
+class RecordedProperties(mi.Properties):
+    """Copy of a plugin's parameters that keeps each value that is read, the default where none is given."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        #: Values by name: of the same types as in `mi.Properties`, None without a value or for an empty text.
+        self.values: dict[str, Any] = {}
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return the value of a parameter, or the default."""
+        return self._kept(name, super().get(name, default))
+
+    def __getitem__(self, name: str) -> Any:
+        return self._kept(name, super().__getitem__(name))
+
+    def __contains__(self, name: str) -> bool:
+        given: bool = super().__contains__(name)
+        if not given:
+            self.values.setdefault(name, None)
+        return given
+
+    def drop_empty(self, *names: str) -> None:
+        """Remove parameters whose value is an empty text: it counts as not given."""
+        for name in names:
+            if name in self and self[name] == "":
+                del self[name]
+
+    def _kept(self, name: str, value: Any) -> Any:
+        self.values[name] = None if isinstance(value, str) and value == "" else value
+        return value
+
+
+def recorded(plugin: Callable[[RecordedProperties], Any]) -> Callable[[mi.Properties], Any]:
+    """Return the constructor to register for a class of plugins, whose objects then have ``parameters``.
+
+    These are the plugin's name as ``type``, the value of each parameter that the object has read, and nested objects.
+    """
+
+    def construct(props: mi.Properties) -> Any:
+        own = RecordedProperties(props)
+        children = dict(props.objects(False))
+        made = plugin(own)
+        # Mitsuba refuses parameters of `props` that nobody has read: the class has read, or removed, those of the copy.
+        given, left = list(props.keys()), set(own.keys())
+        used = [name for name in given if name not in left or own.was_queried(name)]
+        for name in used:
+            props.mark_queried(name)
+        # Mitsuba's base classes read some themselves.
+        others = {name: props[name] for name in used if name not in own.values and name not in children}
+        made.parameters = {"type": props.plugin_name(), **own.values, **others, **children}
+        return made
+
+    return construct
 
 
 class LidarIntegrator(mi.CppADIntegrator):

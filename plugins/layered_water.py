@@ -15,6 +15,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.physics.water.water_types import KINDS as WATERS
 from mitransient_lidar.physics.water.water_types import water_of
+from mitransient_lidar.plugins.bases import RecordedProperties, recorded
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
@@ -103,7 +104,8 @@ class LayeredWater(mi.Medium):
         {'type': 'layered_water', 'attenuation': 0.3, 'scattering': 0.15, 'backscattering': 0.006}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
+        props.drop_empty("layer_tops", *_DEFAULTS, "water_scattering", *WATERS, "profile")
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         self.column = _column(props)
         #: Whether the layers approximate a profile from a file.
@@ -126,10 +128,8 @@ class LayeredWater(mi.Medium):
         # Mitsuba's media accept one phase function.
         for name in list(phases)[1:]:
             del props[name]
-        molecules = props.get("water_scattering", "")
-        if molecules == "":
-            molecules = self.column.scattering if _is_given(props, "pure") else 0.0
-        water = _water_scattering(molecules, self.column)
+        all_scattering = ", ".join(map(repr, self.column.scattering.tolist())) if _is_given(props, "pure") else 0.0
+        water = _water_scattering(props.get("water_scattering", all_scattering), self.column)
         tabulated = partial(TabulatedPhaseFunction, mi.Properties())
         of_layers = phases_of_layers(self.column, phases, kind, phase_g, water, tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
@@ -220,41 +220,42 @@ class LayeredWater(mi.Medium):
         return f"LayeredWater[{self.column}, {indices}]"
 
 
-def _column(props: mi.Properties) -> WaterColumn:
+def _column(props: RecordedProperties) -> WaterColumn:
     """Return the layers of the parameters, of a water by name, or of a profile."""
     tolerance = props.get("profile_tolerance", 0.01)
     wavelength = positive("wavelength_nm", props["wavelength_nm"]) if "wavelength_nm" in props else None
     ways = [name for name in (*WATERS, "profile") if _is_given(props, name)]
-    own = [name for name in ("layer_tops", *_DEFAULTS) if _is_given(props, name)]
+    own = [name for name in ("layer_tops", *_DEFAULTS) if name in props]
     if not ways:
-        values = {name: props[name] if name in own else default for name, default in _DEFAULTS.items()}
-        return WaterColumn.from_text(props["layer_tops"] if "layer_tops" in own else "0", **values)
+        values = {name: props.get(name, default) for name, default in _DEFAULTS.items()}
+        return WaterColumn.from_text(props.get("layer_tops", "0"), **values)
     way = ways[0]
     excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
     if excluded:
         raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
         return read_profile(props[way], wavelength).layers(tolerance)
-    tops = number_list("layer_tops", props["layer_tops"] if own else "0")
+    tops = number_list("layer_tops", props.get("layer_tops", "0"))
+    wavelength = wavelength or props.get("wavelength_nm", 532.0)
     texts = str(props[way]).replace(",", " ").split()
     if len(texts) not in (1, tops.size):
         raise UserError(f"{way} has {len(texts)} values but must have 1 or {tops.size}, one a layer")
     try:
-        found = [water_of(way, None if way == "pure" else text, wavelength or 532.0) for text in texts]
+        found = [water_of(way, None if way == "pure" else text, wavelength) for text in texts]
     except UserError as error:
         raise UserError(f"{way} = {props[way]!r}: {error}") from error
     rows = np.array([[water.attenuation, water.scattering, water.backscattering] for water in found])
     return WaterColumn(tops, *np.broadcast_to(rows.T, (3, tops.size)))
 
 
-def _is_given(props: mi.Properties, name: str) -> bool:
-    """Return whether a parameter has a value other than an empty text; ``false`` counts as not given for ``pure``."""
-    value = props.get(name, "")
+def _is_given(props: RecordedProperties, name: str) -> bool:
+    """Return whether a parameter has a value; ``false`` counts as not given for ``pure``."""
     if name == "pure":
-        if str(value).lower() not in ("", "true", "false"):
+        value = props.get(name, "false")
+        if str(value).lower() not in ("true", "false"):
             raise UserError(f"pure = {value!r} must be true or false")
         return str(value).lower() == "true"
-    return bool(value != "")
+    return name in props
 
 
 def _joined(column: WaterColumn, others: list[np.ndarray]) -> tuple[WaterColumn, np.ndarray]:
@@ -283,4 +284,4 @@ def _water_scattering(given: float | str, column: WaterColumn) -> np.ndarray:
     return water
 
 
-mi.register_medium("layered_water", lambda props: LayeredWater(props))
+mi.register_medium("layered_water", recorded(LayeredWater))

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import integer
-from mitransient_lidar.plugins.bases import LidarIntegrator
+from mitransient_lidar.plugins.bases import LidarIntegrator, recorded
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -109,4 +109,4 @@ class LidarMerging(LidarIntegrator):
         return f"LidarMerging[{self.options}]"
 
 
-mi.register_integrator("lidar_merging", lambda props: LidarMerging(props))
+mi.register_integrator("lidar_merging", recorded(LidarMerging))

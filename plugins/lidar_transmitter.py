@@ -11,15 +11,15 @@ from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, in_range
 from mitransient_lidar.physics.lidar.divergence import WIDTHS, given_divergences, read_divergence
 from mitransient_lidar.physics.lidar.pulse import Pulse
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, recorded
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
 _PROFILES = ("gaussian", "top_hat", "image")
 
-#: Full angle of the beam unless it is given [rad].
-_DIVERGENCE = 10e-3
+#: Full angle of the beam unless it is given [mrad].
+_DIVERGENCE = 10.0
 
 
 class LidarTransmitter(EmitterWithoutExtent):
@@ -78,7 +78,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         {'type': 'lidar_transmitter', 'altitude': 200.0, 'off_nadir_deg': 20.0, 'divergence_mrad': 10.0}
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
         self.pose = Pose.from_properties(props)
         self.pulse_energy = 1e-3 * ranged("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
@@ -158,7 +158,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         )
 
 
-def _profile(props: mi.Properties, kind: str) -> BeamProfile:
+def _profile(props: RecordedProperties, kind: str) -> BeamProfile:
     """Return the beam profile of the plugin's parameters."""
     if kind not in _PROFILES:
         raise UserError(f"beam_profile = {kind!r} must be one of {', '.join(_PROFILES)}")
@@ -173,7 +173,10 @@ def _profile(props: mi.Properties, kind: str) -> BeamProfile:
         image = read_image("profile_file", props["profile_file"])
         return ImageBeam(image, 1e-3 * ranged("profile_mrad", props["profile_mrad"]))
     divergence = read_divergence(props.get, kind == "top_hat")
-    along = across = 0.5 * (_DIVERGENCE if divergence is None else divergence)
+    if divergence is None:
+        props.drop_empty(*WIDTHS)
+        divergence = 1e-3 * float(props.get("divergence_mrad", _DIVERGENCE))
+    along = across = 0.5 * divergence
     if "divergence_across_mrad" in props:
         if any(name != "divergence_mrad" for name in given_divergences(props.get)):
             raise UserError("divergence_across_mrad goes with divergence_mrad, not with another definition of width")
@@ -184,4 +187,4 @@ def _profile(props: mi.Properties, kind: str) -> BeamProfile:
     return (TopHatBeam if kind == "top_hat" else GaussianBeam)(along, across, rotation)
 
 
-mi.register_emitter("lidar_transmitter", lambda props: LidarTransmitter(props))
+mi.register_emitter("lidar_transmitter", recorded(LidarTransmitter))

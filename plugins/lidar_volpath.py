@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer
-from mitransient_lidar.plugins.bases import LidarIntegrator
+from mitransient_lidar.plugins.bases import LidarIntegrator, recorded
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene import LidarScene
@@ -98,4 +98,4 @@ class LidarVolpath(VolpathIntegrator):
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
 
 
-mi.register_integrator("lidar_volpath", lambda props: LidarVolpath(props))
+mi.register_integrator("lidar_volpath", recorded(LidarVolpath))

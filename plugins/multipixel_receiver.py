@@ -7,7 +7,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.plugins.bases import ReceiverSensor
+from mitransient_lidar.plugins.bases import ReceiverSensor, recorded
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
@@ -156,4 +156,4 @@ def _sides_of_lens(props: mi.Properties, layout: str) -> tuple[float, float]:
     return sides
 
 
-mi.register_sensor("multipixel_receiver", lambda props: MultipixelReceiver(props))
+mi.register_sensor("multipixel_receiver", recorded(MultipixelReceiver))

@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.physics.sea.resolution import Instrument, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
-from mitransient_lidar.plugins.bases import fill_mesh
+from mitransient_lidar.plugins.bases import fill_mesh, recorded
 
 
 class OceanSurface(mi.Mesh):
@@ -168,4 +168,4 @@ class OceanSurface(mi.Mesh):
         )
 
 
-mi.register_shape("ocean_surface", lambda props: OceanSurface(props))
+mi.register_shape("ocean_surface", recorded(OceanSurface))

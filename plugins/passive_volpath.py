@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.plugins.lidar_volpath import VolpathIntegrator
 from mitransient_lidar.transport.daylight.renderer import DaylightRecord, DaylightRenderer
 from mitransient_lidar.transport.daylight.scene import DaylightScene
@@ -64,4 +65,4 @@ class PassiveVolpath(VolpathIntegrator):
         return mi.TensorXf(mi.Float(radiance), shape=pixels.grid or (pixels.count,))
 
 
-mi.register_integrator("passive_volpath", lambda props: PassiveVolpath(props))
+mi.register_integrator("passive_volpath", recorded(PassiveVolpath))

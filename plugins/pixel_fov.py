@@ -8,7 +8,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, finite_array, in_range
-from mitransient_lidar.plugins.bases import ReceiverSensor
+from mitransient_lidar.plugins.bases import ReceiverSensor, recorded
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Polygon, Rectangle, Sector, Strip
 from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 
@@ -106,4 +106,4 @@ def _field(props: mi.Properties) -> FovShape:
     raise UserError(f"shape = {shape!r} must be one of circle, ring, sector, rectangle, strip, polygon")
 
 
-mi.register_sensor("pixel_fov", lambda props: PixelFov(props))
+mi.register_sensor("pixel_fov", recorded(PixelFov))

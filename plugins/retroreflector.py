@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.transport.medium.tabulated_phase import deflect
 
 #: Narrowest lobe [deg]: 32-bit directions are accurate to a thousandth of it.
@@ -133,4 +134,4 @@ class Retroreflector(mi.BSDF):
         )
 
 
-mi.register_bsdf("retroreflector", lambda props: Retroreflector(props))
+mi.register_bsdf("retroreflector", recorded(Retroreflector))

@@ -15,7 +15,7 @@ from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_negative, positive
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
-from mitransient_lidar.plugins.bases import fill_mesh
+from mitransient_lidar.plugins.bases import fill_mesh, recorded
 
 #: Steepest tilt [deg] and steepest ripples, height over length, so that facets are at most at 45 degrees with either.
 _STEEPEST_TILT, _STEEPEST_RIPPLE = 45.0, 0.3
@@ -297,4 +297,4 @@ class Seabed(mi.Mesh):
         )
 
 
-mi.register_shape("seabed", lambda props: Seabed(props))
+mi.register_shape("seabed", recorded(Seabed))

@@ -8,7 +8,7 @@ import mitsuba as mi
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.physics.lidar.clear_sky import clear_sky_irradiance
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent, recorded
 from mitransient_lidar.transport.daylight.sky import SKIES, read_direction, relative_irradiance
 
 
@@ -95,4 +95,4 @@ class Sky(EmitterWithoutExtent):
         return f"Sky[{self.distribution}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
 
 
-mi.register_emitter("sky", lambda props: Sky(props))
+mi.register_emitter("sky", recorded(Sky))

@@ -9,7 +9,7 @@ import numpy as np
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.lidar.clear_sky import SUN_RADIUS_DEG, clear_sky_irradiance
-from mitransient_lidar.plugins.bases import EmitterWithoutExtent
+from mitransient_lidar.plugins.bases import EmitterWithoutExtent, recorded
 from mitransient_lidar.transport.daylight.sky import read_direction
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, half_angle
 
@@ -95,4 +95,4 @@ class Sun(EmitterWithoutExtent):
         return f"Sun[zenith_deg={self.zenith_deg:g}, irradiance={self.irradiance:g} W m^-2 nm^-1]"
 
 
-mi.register_emitter("sun", lambda props: Sun(props))
+mi.register_emitter("sun", recorded(Sun))

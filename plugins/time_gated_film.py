@@ -11,6 +11,7 @@ from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.transport.histogram import TransientHistogram
 
 _GATE_START = ("gate_start_ns", "gate_start_depth")
@@ -156,4 +157,4 @@ def _gate_plan(props: mi.Properties) -> GatePlan | None:
     return GatePlan(train, **{"start_ns" if starts[0] == "gate_start_ns" else "start_depth": start})
 
 
-mi.register_film("time_gated_film", lambda props: TimeGatedFilm(props))
+mi.register_film("time_gated_film", recorded(TimeGatedFilm))

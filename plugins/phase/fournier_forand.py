@@ -8,6 +8,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.water.phase import fournier_forand_backscatter_ratio, fournier_forand_parameters
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 
@@ -60,4 +61,4 @@ class FournierForand(TabulatedPhaseFunction):
         )
 
 
-mi.register_phase("fournier_forand", lambda props: FournierForand(props))
+mi.register_phase("fournier_forand", recorded(FournierForand))

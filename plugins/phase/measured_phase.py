@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.phase_file import read_phase_table
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 logger = logging.getLogger(__name__)
@@ -57,4 +58,4 @@ class MeasuredPhase(TabulatedPhaseFunction):
         return f"MeasuredPhase[{self.filename}]"
 
 
-mi.register_phase("measured_phase", lambda props: MeasuredPhase(props))
+mi.register_phase("measured_phase", recorded(MeasuredPhase))

@@ -8,6 +8,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.water.petzold_waters import PETZOLD_WATERS, petzold_water
 from mitransient_lidar.physics.water.phase import petzold_average_particle
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 _AVERAGE = "average_particle"
@@ -51,4 +52,4 @@ class Petzold(TabulatedPhaseFunction):
         return f"Petzold[water={self.water}]"
 
 
-mi.register_phase("petzold", lambda props: Petzold(props))
+mi.register_phase("petzold", recorded(Petzold))

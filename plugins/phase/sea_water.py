@@ -9,6 +9,7 @@ import mitsuba as mi
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import DEPOLARISATION, water_phase_function
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 
 
@@ -44,4 +45,4 @@ class SeaWater(TabulatedPhaseFunction):
         return f"SeaWater[depolarisation={self.depolarisation:g}]"
 
 
-mi.register_phase("sea_water", lambda props: SeaWater(props))
+mi.register_phase("sea_water", recorded(SeaWater))

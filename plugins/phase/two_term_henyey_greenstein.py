@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.physics.water.phase import henyey_greenstein_backscatter_ratio
+from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 
 
@@ -83,4 +84,4 @@ class TwoTermHenyeyGreenstein(mi.PhaseFunction):
         )
 
 
-mi.register_phase("two_term_henyey_greenstein", lambda props: TwoTermHenyeyGreenstein(props))
+mi.register_phase("two_term_henyey_greenstein", recorded(TwoTermHenyeyGreenstein))
