@@ -54,10 +54,14 @@ __all__ = ["__version__", "open", "render"]
 
 
 def render(scene: Any, **options: Any) -> xarray.Dataset:
-    """Render a lidar scene to an accuracy; see :func:`mitransient_lidar.rendering.render.render`."""
+    """Render a lidar scene to an accuracy, or a result (a dataset, or its file) again.
+
+    See :func:`mitransient_lidar.rendering.render.render` and :func:`mitransient_lidar.rendering.again.render_again`.
+    """
+    from mitransient_lidar.rendering.again import is_result, render_again
     from mitransient_lidar.rendering.render import render as render_scene
 
-    return render_scene(scene, **options)
+    return (render_again if is_result(scene) else render_scene)(scene, **options)
 
 
 def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect

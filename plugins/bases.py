@@ -74,6 +74,26 @@ def recorded(plugin: Callable[[RecordedProperties], Any]) -> Callable[[mi.Proper
     return construct
 
 
+def exposed(part: mi.Object) -> tuple[dict[str, Any], list[tuple[str, mi.Object]]]:
+    """Return the values and the nested objects, with their names, that an object shows to ``mi.traverse``."""
+    values: dict[str, Any] = {}
+    objects: list[tuple[str, mi.Object]] = []
+
+    class Callback(mi.TraversalCallback):
+        def put(self, name: str, value: Any, flags: int, kind: Any = None) -> None:
+            (self.put_object if isinstance(value, mi.Object) else self.put_value)(name, value, flags, kind)
+
+        def put_value(self, name: str, value: Any, flags: int, kind: Any = None) -> None:
+            values[name] = value if kind is None else mi.get_property(value, kind, part)
+
+        def put_object(self, name: str, value: mi.Object | None, flags: int, kind: Any = None) -> None:
+            if value is not None:
+                objects.append((name, value))
+
+    part.traverse(Callback())
+    return values, objects
+
+
 class LidarIntegrator(mi.CppADIntegrator):
     """Integrator that prepares a scene and renders one pass of it.
 

@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.includes import flat_text, parse_scene, read_scene
@@ -66,8 +67,13 @@ def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
     Name and errors as in `scene_text`.
     """
     path = scene_path(name)
+    return parameters_of(parse_scene(flat_text(path), path))
+
+
+def parameters_of(root: minidom.Element) -> dict[str, str]:
+    """Return names and default values of the parameters of an XML scene without includes, in their order."""
     parameters: dict[str, str] = {}
-    for tag in parse_scene(flat_text(path), path).getElementsByTagName("default"):
+    for tag in root.getElementsByTagName("default"):
         parameters.setdefault(tag.getAttribute("name"), tag.getAttribute("value"))
     return parameters
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import re
 from collections.abc import Mapping
@@ -65,23 +66,14 @@ def check_elements(root: minidom.Element, parameters: Mapping[str, str]) -> set[
         coordinate exceeds `LARGEST_COORDINATE`.
     """
     used: set[str] = set()
-
-    def fill(text: str) -> tuple[str, list[str]]:
-        """Return a text with parameters in place, the longest names first, and those that it refers to."""
-        referred: list[str] = []
-        while found := [name for name in parameters if f"${name}" in text and name not in referred]:
-            referred.append(max(found, key=len))
-            text = text.replace(f"${referred[-1]}", parameters[referred[-1]])
-        used.update(referred)
-        return text, referred
-
     for element in root.getElementsByTagName("*"):
         if element.tagName == "default":
             continue
         if element.tagName == "sensor" and element.parentNode is root and not element.getElementsByTagName("film"):
             raise UserError(f"film: sensor {element.getAttribute('id')!r} has none; add a time_gated_film inside it")
         for attribute, text in element.attributes.items():
-            value, referred = fill(text)
+            value, referred = with_values(text, parameters)
+            used.update(referred)
             owner = element.getAttribute("name") or element.tagName
             own = owner if attribute == "value" else f"{owner} {attribute}"
             label = _Label(referred[0], parameters[referred[0]], text) if referred else _Label(own, text, text)
@@ -96,6 +88,15 @@ def check_elements(root: minidom.Element, parameters: Mapping[str, str]) -> set[
                 for word in re.split(r"[\s,]+", value.strip()):
                     in_range(label.name, word.rpartition(":")[2], 0, 1)
     return used
+
+
+def with_values(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
+    """Return a text with parameters in place, the longest names first, and those that it refers to."""
+    referred: list[str] = []
+    while "$" in text and (found := [name for name in parameters if f"${name}" in text and name not in referred]):
+        referred.append(max(found, key=len))
+        text = text.replace(f"${referred[-1]}", parameters[referred[-1]])
+    return text, referred
 
 
 def check_dict(scene: Mapping[str, Any]) -> None:
@@ -140,6 +141,7 @@ def unknown_parameters(message: str) -> str | None:
     return None
 
 
+@functools.cache
 def plugin_parameters(plugin: str) -> list[str]:
     """Return the names of the parameters in the manual page of one of our plugins, empty for other plugins."""
     module = _plugin_modules().get(plugin)
@@ -159,6 +161,11 @@ def plugin_parameters(plugin: str) -> list[str]:
 
 #: Plugins of Mitsuba that lidar scenes use.
 _OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
+
+
+def is_own_plugin(plugin: str) -> bool:
+    """Return whether a plugin is one of ours."""
+    return plugin in _plugin_modules()
 
 
 def _plugin_modules() -> dict[str, str]:

@@ -32,7 +32,7 @@ def read_scene(path: Path) -> str:
         raise UserError(f"cannot read scene {path}: {error.strerror}.") from error
 
 
-def parse_scene(text: str, path: Path) -> minidom.Element:
+def parse_scene(text: str, path: Path | str) -> minidom.Element:
     """Return the root element of a scene file's text; raise UserError if it is malformed or nested too deeply."""
     try:
         root = minidom.parseString(text).documentElement

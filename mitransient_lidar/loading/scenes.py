@@ -7,8 +7,10 @@ import difflib
 import os
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.dom import minidom
 
 import numpy as np
 
@@ -16,7 +18,8 @@ from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_o
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.checks import check_dict, check_elements, unknown_parameters
-from mitransient_lidar.loading.includes import expanded
+from mitransient_lidar.loading.includes import flat_text, parse_scene
+from mitransient_lidar.loading.scene_record import SceneRecord
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -32,25 +35,41 @@ _ALTERNATIVES: tuple[tuple[tuple[str, ...], ...], ...] = (
 )
 
 
+@dataclass(frozen=True)
+class LoadedScene:
+    """A loaded scene, its name, the parameters of an XML scene with their values as text, and what loads it again.
+
+    The record is None for a scene from loaded objects.
+    """
+
+    scene: mi.Scene
+    name: str
+    parameters: dict[str, str]
+    record: SceneRecord | None
+
+
 def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.Scene, str, dict[str, str]]:
+    """Return scene, name and parameters of `load`, which also gives parameters and errors."""
+    loaded = load(scene, params)
+    return loaded.scene, loaded.name, loaded.parameters
+
+
+def load(scene: Any, params: Mapping[str, Any] | None = None) -> LoadedScene:
     """Load a scene.
 
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, or a loaded scene.
+        Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
+        scene.
     params
         Values for the ``<default>`` parameters of an XML scene.
-
-    Returns
-    -------
-    scene, name, parameters
-        The loaded scene, its name, and the parameters of an XML scene with their values as text.
 
     Raises
     ------
     UserError
-        If there is no such scene, a parameter is unknown, not used or empty, a value is invalid, or a part is missing.
+        If there is no such scene, a parameter is unknown, not used or empty, a value is invalid, a part is missing, or
+        a file of a record is missing or has changed.
     """
     import mitsuba as mi
 
@@ -58,46 +77,77 @@ def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.
 
     if isinstance(scene, mi.Scene):
         _no_parameters(params, "a loaded scene")
-        fit_seas(scene)
-        return scene, scene.id() or "scene", {}
-    if isinstance(scene, Mapping):
+        loaded = LoadedScene(scene, scene.id() or "scene", {}, None)
+    elif isinstance(scene, Mapping) or (isinstance(scene, SceneRecord) and not scene.is_xml):
         _no_parameters(params, "a dict")
-        check_dict(scene)
-        with as_user_error(), _placeholder_seas():
-            loaded = mi.load_dict({"type": "scene", **scene}, optimize=False)
-        fit_seas(loaded)
-        return loaded, "scene", {}
-    if not isinstance(scene, (str, os.PathLike)):
+        loaded = _load_dict(scene)
+    elif isinstance(scene, SceneRecord):
+        loaded = _load_xml(scene.name, scene.text, params, scene)
+    elif isinstance(scene, (str, os.PathLike)):
+        path = catalogue.scene_path(scene)
+        loaded = _load_xml(path.stem, flat_text(path), params, path)
+    else:
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
-    path = catalogue.scene_path(scene)
-    parameters, given = _filled(path, params)
-    used = check_elements(expanded(path), parameters)
-    if unused := [name for name in given if name not in used]:
-        raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {path.stem}")
+    fit_seas(loaded.scene)
+    return loaded
+
+
+def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
+    """Load a scene given as a dict, or its record."""
+    import mitsuba as mi
+
+    record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
+    given = scene.scene_dict() if isinstance(scene, SceneRecord) else scene
+    check_dict(given)
+    with as_user_error(), _placeholder_seas():
+        loaded = mi.load_dict({"type": "scene", **given}, optimize=False)
+    return LoadedScene(loaded, "scene", {}, record)
+
+
+def _load_xml(name: str, text: str, params: Mapping[str, Any] | None, source: Path | SceneRecord) -> LoadedScene:
+    """Load an XML scene, whose text has no includes, from its file or its record."""
+    import mitsuba as mi
+
+    root = parse_scene(text, source if isinstance(source, Path) else name)
+    known = source.parameters if isinstance(source, SceneRecord) else catalogue.parameters_of(root)
+    parameters, given = _filled(name, known, params)
+    used = check_elements(root, parameters)
+    if unused := [key for key in given if key not in used]:
+        raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {name}")
+    folder = source.parent if isinstance(source, Path) else Path()
+    record = SceneRecord.of_xml(name, text, root, parameters, folder)
+    if isinstance(source, SceneRecord):
+        # Files that given parameters name are found as in any scene.
+        record = replace(record, files={**record.files, **source.files})
+        source.place_files(root, parameters)
     # Mitsuba refuses parameters that nothing uses; a part that is missing is told instead.
-    values = {name: value for name, value in parameters.items() if name in used}
-    with as_user_error({name: value for name, value in given.items() if name in used}, path), _placeholder_seas():
+    referred = used if isinstance(source, Path) else check_elements(root, parameters)
+    values = {key: value for key, value in parameters.items() if key in referred}
+    with as_user_error({key: value for key, value in given.items() if key in used}, root), _placeholder_seas():
         # Optimisation would merge a bottom and a target of one material into a shape without a name.
-        loaded = mi.load_file(str(path), optimize=False, **values)
+        if isinstance(source, Path):
+            loaded = mi.load_file(str(source), optimize=False, **values)
+        else:
+            loaded = mi.load_string(root.toxml(), optimize=False, **values)
     if not isinstance(loaded, mi.Scene):
-        raise UserError(f"scene {path} holds a {type(loaded).__name__}: its root element must be <scene>")
-    if unused := [name for name in parameters if name not in used]:
+        raise UserError(f"scene {name} holds a {type(loaded).__name__}: its root element must be <scene>")
+    if unused := [key for key in parameters if key not in used]:
         _tell_missing_part(loaded, unused)
-    fit_seas(loaded)
-    return loaded, path.stem, parameters
+    return LoadedScene(loaded, name, parameters, record)
 
 
-def _filled(path: Path, params: Mapping[str, Any] | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the parameters of an XML scene with their values as text, and those that are given."""
-    parameters = {**catalogue.scene_parameters(path)}
-    given = {}
+def _filled(
+    scene: str, known: Mapping[str, str], params: Mapping[str, Any] | None
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the parameters of an XML scene, `known` with defaults, with their values as text, and the given ones."""
+    parameters, given = dict(known), {}
     if params is not None and not isinstance(params, Mapping):
         raise UserError(f"params = {shown(params)} must be a dict of names and values")
     for name, value in (params or {}).items():
         if name not in parameters:
             close = difflib.get_close_matches(str(name), parameters, n=3)
             hint = f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(parameters))}"
-            raise UserError(f"parameter {name!r} is not one of scene {path.stem}: {hint}")
+            raise UserError(f"parameter {name!r} is not one of scene {scene}: {hint}")
         given[name] = _text(name, value)
         if not given[name].strip() and parameters[name].strip():
             raise UserError(f"{name} = {given[name]!r} is empty: it must have a value, as {parameters[name]}")
@@ -131,13 +181,13 @@ def _placeholder_seas() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def as_user_error(given: Mapping[str, str] | None = None, path: Path | None = None) -> Iterator[None]:
+def as_user_error(given: Mapping[str, str] | None = None, root: minidom.Element | None = None) -> Iterator[None]:
     """Convert a ``RuntimeError`` of Mitsuba's parser to a `UserError` of one sentence.
 
     Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError`` or
     Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. `given` are the scene's
-    parameters that the user has set, and `path` its file: where a message names a parameter of a plugin that one of
-    them sets under another name, that name is added.
+    parameters that the user has set, and `root` its root element: where a message names a parameter of a plugin that
+    one of them sets under another name, that name is added.
     """
     try:
         yield
@@ -148,7 +198,7 @@ def as_user_error(given: Mapping[str, str] | None = None, path: Path | None = No
         text = str(error)
         if wrapped := re.findall(r"UserError: (.*)", text):
             message = " ".join(wrapped[-1].split())
-            raise UserError(message + _set_by(message, given or {}, path)) from error
+            raise UserError(message + _set_by(message, given or {}, root)) from error
         if empty := re.search(r'failed to instantiate shape plugin of type "(\w+)": jit_var', text):
             raise UserError(f"a shape of type {empty[1]} has no faces: its mesh must have at least one") from error
         if "Traceback (most recent call last)" in text:
@@ -157,12 +207,12 @@ def as_user_error(given: Mapping[str, str] | None = None, path: Path | None = No
         raise UserError(unknown_parameters(text) or " ".join(text.split())) from error
 
 
-def _set_by(message: str, given: Mapping[str, str], path: Path | None) -> str:
+def _set_by(message: str, given: Mapping[str, str], root: minidom.Element | None) -> str:
     """Return the addition to a message about a plugin's parameter that a parameter of another name sets."""
     named = re.match(r"(\w+)\b", message)
-    if path is None or named is None or named[1] in given:
+    if root is None or named is None or named[1] in given:
         return ""
-    for element in expanded(path).getElementsByTagName("*"):
+    for element in root.getElementsByTagName("*"):
         reference = re.fullmatch(r"-?\$(\w+)", element.getAttribute("value"))
         if reference and element.getAttribute("name") == named[1] and reference[1] in given:
             return f" ({named[1]} is set by {reference[1]} = {given[reference[1]]})"

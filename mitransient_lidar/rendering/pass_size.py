@@ -9,14 +9,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.transport.histogram import GateWeights
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
-
-#: Share of the paths in a trial pass, the smallest pass.
-_TRIAL = 2**-9
 
 #: Number of smaller passes that should fit into the time, and of full passes that must.
 _SMALL_PASSES, _FULL_PASSES = 4, 2
@@ -62,7 +60,7 @@ def fit_to_time(
     if paths * _rays_per_path(renderer.scene, start_ns) < 2 * max_time * _RAYS_PER_SECOND:
         return renderer, 1.0, None
     began = time.perf_counter()
-    trial = renderer.scaled(_TRIAL)
+    trial = renderer.scaled(SMALLEST_SHARE)
     record, kernels, rest = _timed(trial, seed, gates)
     if _SMALL_PASSES * kernels < max_time:
         # Without the enlargement of buffers and the compilation of kernels in the first trial.
@@ -70,15 +68,15 @@ def fit_to_time(
     left = max_time - (time.perf_counter() - began)
 
     def kernels_of(share: float) -> float:
-        return kernels * (share / _TRIAL) * _at_once(_TRIAL * paths) / _at_once(share * paths)
+        return kernels * (share / SMALLEST_SHARE) * _at_once(SMALLEST_SHARE * paths) / _at_once(share * paths)
 
     if _FULL_PASSES * (rest + kernels_of(1.0)) <= left:
         return renderer, 1.0, None
     share = 0.5
-    while share > _TRIAL and kernels_of(share) > max(left / _SMALL_PASSES - rest, rest):
+    while share > SMALLEST_SHARE and kernels_of(share) > max(left / _SMALL_PASSES - rest, rest):
         share *= 0.5
     logger.info("passes have 1/%d of the paths, so that they fit into max_time = %g s", round(1 / share), max_time)
-    return (renderer.scaled(share), share, None) if share > _TRIAL else (trial, share, record)
+    return (renderer.scaled(share), share, None) if share > SMALLEST_SHARE else (trial, share, record)
 
 
 def _rays_per_path(scene: LidarScene, start_ns: float) -> float:

@@ -21,6 +21,9 @@ SMALLEST_PASS_COUNT = 8
 #: Largest number of passes that can be asked for.
 MOST_PASSES = 10**9
 
+#: Smallest share of the paths of a full pass.
+SMALLEST_SHARE = 2**-9
+
 
 #: Quantile of the relative standard errors that is compared with the target, unless another one is requested.
 DEFAULT_QUANTILE = 0.95

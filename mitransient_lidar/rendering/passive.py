@@ -6,7 +6,7 @@ import copy
 import logging
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.rendering.accuracy import RatioStatistics
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, check_seed, pass_seed, run_passes
 from mitransient_lidar.rendering.session import (
@@ -49,7 +50,7 @@ def render_passive(
     target_error: float | None = None,
     target_quantile: float | None = None,
     max_time: float | None = None,
-    passes: int | None = None,
+    passes: int | Sequence[int] | None = None,
     seed: int = 0,
     frames: int = 1,
     frame_step_s: float = 0.1,
@@ -66,7 +67,8 @@ def render_passive(
     integrator
         Name or dict of a passive integrator; by default that of the scene, or ``passive_volpath``.
     target_error, target_quantile, max_time, passes
-        End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s.
+        End of a frame, as for `render.render` with pixels instead of bins; by default 0.05 within 120 s. `passes` may
+        be a list with one number a frame.
     params, variant
         As for `render.render`.
     seed
@@ -97,7 +99,11 @@ def render_passive(
     frames, step = integer("frames", frames, 1, 10_000), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
     seed = check_seed(seed)
-    goal = Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
+    counts = list(passes) if isinstance(passes, Sequence) else [passes] * frames
+    if len(counts) != frames:
+        raise UserError(f"passes has {len(counts)} numbers but must have one a frame, {frames}")
+    goals = [Goal.from_options(target_error, max_time, count, DEFAULT_GOAL, target_quantile) for count in counts]
+    rendered: list[int] = []
     images: list[tuple[FloatArray, FloatArray]] = []
     start, lost = time.perf_counter(), 0.0
     for frame in range(frames):
@@ -111,13 +117,14 @@ def render_passive(
             described, first = _describe(renderer), session
             pixels, etendue = renderer.scene.receiver.pixels, _etendue(renderer)
         try:
-            statistics, log, share = _render_frame(renderer, goal, pass_seed(seed, frame), progress)
+            statistics, log, share = _render_frame(renderer, goals[frame], pass_seed(seed, frame), progress)
         except KeyboardInterrupt:
             if not images:
                 raise
             interrupted = True
             break
         images.append((statistics.ratio, statistics.stderr))
+        rendered.append(log.count)
         if statistics.invalid:
             logger.warning("%d of %d pixels have non-finite radiance", statistics.invalid, len(statistics.ratio))
         last, lost, interrupted = log, max(lost, share), log.interrupted
@@ -125,13 +132,15 @@ def render_passive(
             break
     warn_of_edge_loss(lost)
     attributes = first.attributes(
-        integrator=chosen.plugin,
+        integrator=chosen,
         **{**pass_attributes(last, seed), "interrupted": int(interrupted)},
         **described,
         elapsed_s=time.perf_counter() - start,
         error_median=last.error_median,
         error_p95=last.error_p95,
         surface_edge_loss=lost,
+        frame_passes=rendered,
+        frame_step_s=step,
     )
     return build_radiance(
         images,
@@ -179,6 +188,8 @@ def _render_frame(
 
 def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[Any, Mapping[str, Any] | None]:
     """Return scene and parameters with the sea at a later time [s]."""
+    if isinstance(scene, SceneRecord) and not scene.is_xml:
+        scene = scene.scene_dict()
     if isinstance(scene, Mapping):
         moved = {name: copy.copy(part) if isinstance(part, dict) else part for name, part in scene.items()}
         seas = [part for part in moved.values() if isinstance(part, dict) and part.get("type") == "ocean_surface"]
@@ -187,9 +198,12 @@ def _moved(scene: Any, params: Mapping[str, Any] | None, later: float) -> tuple[
         if not seas:
             raise UserError("frames need an ocean_surface in the scene: nothing else changes with time")
         return moved, params
-    if not isinstance(scene, (str, os.PathLike)):
+    if isinstance(scene, SceneRecord):
+        defaults = dict(scene.parameters)
+    elif isinstance(scene, (str, os.PathLike)):
+        defaults = catalogue.scene_parameters(catalogue.scene_path(scene))
+    else:
         raise UserError("frames need a scene by its name, path or dict: the time of a loaded one cannot be changed")
-    defaults = catalogue.scene_parameters(catalogue.scene_path(scene))
     if _TIME_PARAMETER not in defaults:
         raise UserError(f"frames need the parameter {_TIME_PARAMETER} of the scene, the time of its ocean_surface")
     given = {_TIME_PARAMETER: defaults[_TIME_PARAMETER], **(params or {})}

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitransient_lidar.core.validation import positive
+from mitransient_lidar.core.validation import in_range, positive
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.passes import Goal, ProgressCallback, check_seed, run_passes
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Goal, ProgressCallback, check_seed, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     choose_integrator,
@@ -48,6 +48,7 @@ def render(
     passes: int | None = None,
     seed: int = 0,
     max_memory: float | None = None,
+    pass_share: float | None = None,
     variant: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> xarray.Dataset:
@@ -56,7 +57,8 @@ def render(
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, or a loaded scene.
+        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the
+        record of a scene. `again.render_again` takes a result.
     params
         Values for the ``<default>`` parameters of an XML scene.
     integrator
@@ -78,6 +80,8 @@ def render(
     max_memory
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
         only the gates are kept, with a warning.
+    pass_share
+        Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, or less where `max_time` needs it.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
@@ -105,6 +109,8 @@ def render(
     Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
     seed = check_seed(seed)
     max_memory = _DEFAULT_MAX_MEMORY_GB if max_memory is None else positive("max_memory", max_memory)
+    if pass_share is not None:
+        pass_share = in_range("pass_share", pass_share, SMALLEST_SHARE, 1.0)
     session = open_scene(scene, params, variant)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
@@ -124,12 +130,13 @@ def render(
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
-    fitted, share = renderer, 1.0
+    share = 1.0 if pass_share is None else pass_share
+    fitted = renderer if share == 1 else renderer.scaled(share)
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal fitted, share
         gates, first = accumulator.gate_weights, None
-        if number == 0 and goal.max_time is not None:
+        if number == 0 and goal.max_time is not None and pass_share is None:
             start_ns = float(window.start_ns.min())
             fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
         record = first or fitted.render_pass(seed, gates=gates)
@@ -154,9 +161,10 @@ def render(
     lost = log.edge_loss_share(accumulator.received)
     warn_of_edge_loss(lost)
     attributes = session.attributes(
-        integrator=chosen.plugin,
+        integrator=chosen,
         **pass_attributes(log, seed),
         pass_share=share,
+        max_memory_gb=max_memory,
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

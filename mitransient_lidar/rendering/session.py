@@ -11,7 +11,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.checks import check_dict
-from mitransient_lidar.loading.scenes import as_user_error, load_scene
+from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
+from mitransient_lidar.loading.scenes import as_user_error, load
 from mitransient_lidar.rendering.passes import PassLog
 
 if TYPE_CHECKING:
@@ -25,21 +26,27 @@ TOLERATED_LOSS = 1e-3
 
 @dataclass(frozen=True)
 class Session:
-    """A loaded scene with its first sensor, its name, and the parameters of an XML scene with their values as text."""
+    """A loaded scene with its first sensor, its name, and the parameters of an XML scene with their values as text.
+
+    The record, None for a scene from loaded objects, loads the scene again.
+    """
 
     scene: mi.Scene
     sensor: mi.Sensor
     name: str
     parameters: dict[str, str]
+    record: SceneRecord | None
 
-    def attributes(self, **others: Any) -> dict[str, Any]:
-        """Return the attributes of a result: scene, versions, others, and the scene's parameters."""
-        parameters = {f"scene.{key}": value for key, value in self.parameters.items()}
-        return {"scene": self.name, **variants.versions(), **others, **parameters}
+    def attributes(self, integrator: Any = None, **others: Any) -> dict[str, Any]:
+        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`."""
+        recorded = {} if self.record is None else self.record.attributes()
+        own = {} if integrator is None else {"integrator": integrator.plugin}
+        recorded["plugin_parameters"] = plugin_values(self.scene, integrator)
+        return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
 
 
 def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str | None = None) -> Session:
-    """Load a scene as `loading.scenes.load_scene`, with a Mitsuba variant as for `loading.variants.set_variant`.
+    """Load a scene as `loading.scenes.load`, with a Mitsuba variant as for `loading.variants.set_variant`.
 
     Raises
     ------
@@ -47,11 +54,11 @@ def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str
         If the scene cannot be loaded, or has no sensor.
     """
     variants.set_variant(variant)
-    loaded, name, parameters = load_scene(scene, params)
-    sensors = loaded.sensors()
+    loaded = load(scene, params)
+    sensors = loaded.scene.sensors()
     if not sensors:
         raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")
-    return Session(loaded, sensors[0], name, parameters)
+    return Session(loaded.scene, sensors[0], loaded.name, loaded.parameters, loaded.record)
 
 
 def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Any:

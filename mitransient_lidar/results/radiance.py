@@ -111,6 +111,7 @@ def _parts(dataset: xr.Dataset) -> list[exr.Part]:
             for channel, name in (("Y", "radiance"), ("Y.stderr", "radiance_stderr"))
         }
         own = {"timeS": float(frame["time_s"])} if animated else {}
-        header = exr.header({**(readable if index == 0 else {}), **own})
+        exact = {"content": "radiance", "attributes": dataset.attrs} if index == 0 else None
+        header = exr.header({**(readable if index == 0 else {}), **own}, exact)
         parts.append(exr.Part(f"frame{index:04d}" if animated else "", header, channels))
     return parts

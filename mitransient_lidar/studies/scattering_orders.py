@@ -96,7 +96,7 @@ def scattering_orders(
         "order": ("order", np.arange(orders + 1), {"long_name": "scattering events; the last, and more"}),
         "time": ("time", axis.centres_ns, {"units": "ns"}),
     }
-    attributes = session.attributes(integrator=chosen.plugin, **pass_attributes(log, seed))
+    attributes = session.attributes(integrator=chosen, **pass_attributes(log, seed))
     return xr.Dataset(data, coords=coords, attrs=attributes)
 
 

@@ -96,9 +96,7 @@ def target_signal(
     log = run_passes(render_pass, Goal(passes=passes), seed=seed, smallest=_GROUPS, progress=progress)
     result = _measure(np.array(pairs), axis, kernel, pulse.fwhm_ns)
     warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
-    attributes = session.attributes(
-        target=target_id, integrator=chosen.plugin, **pass_attributes(log, seed), **result.attrs
-    )
+    attributes = session.attributes(target=target_id, integrator=chosen, **pass_attributes(log, seed), **result.attrs)
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 

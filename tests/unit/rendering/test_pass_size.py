@@ -39,7 +39,7 @@ def clock(monkeypatch):
     state = SimpleNamespace(kernels=0.0, rest=0.0, trials=0, now=0.0)
 
     def timed(renderer, seed, gates):
-        assert renderer.share == pass_size._TRIAL
+        assert renderer.share == pass_size.SMALLEST_SHARE
         state.trials += 1
         state.now += state.kernels + state.rest
         return f"record {state.trials}", state.kernels, state.rest
@@ -66,7 +66,7 @@ def test_the_share_of_the_paths(clock, limit, kernels, rest, expected, trials):
     clock.kernels, clock.rest = kernels, rest
     renderer, share, first = pass_size.fit_to_time(Renderer(), limit, 20.0, seed=1, gates=None)
     assert (share, renderer.share, clock.trials) == (expected, expected, trials)
-    assert first == (f"record {trials}" if share == pass_size._TRIAL else None)
+    assert first == (f"record {trials}" if share == pass_size.SMALLEST_SHARE else None)
 
 
 @pytest.mark.slow

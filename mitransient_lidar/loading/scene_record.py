@@ -1,0 +1,300 @@
+"""The scene of a result: its text, the files that it names, and the values of all parameters of its plugins.
+
+A result has these attributes:
+
+``scene_xml``
+    Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters.
+``scene_dict``
+    Instead, a scene given as a dict, as JSON: a transform is {"matrix": 4x4, "inverse_transpose": 4x4}.
+``scene_files``
+    JSON list of the files that the scene names: ``plugin``, ``name`` as in the scene, absolute ``path``, ``sha256``.
+``plugin_parameters``
+    JSON object of the objects of the scene and the integrator: ``type`` (of Mitsuba's own plugins ``class``) and values
+    of all parameters, nested objects included; null for one that is not given and has no default, or is not used.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.dom import minidom
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.checks import is_own_plugin, plugin_parameters, with_values
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: Parameters that name files.
+FILE_PARAMETERS = (*("filename", "pixel_map", "blur_file", "profile_file", "pulse_file", "profile", "gate_profile"),)
+
+#: Largest array of a Mitsuba object whose values are stored; others, such as vertices, are in the files.
+_MOST_VALUES = 16
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """What loads a scene again.
+
+    Parameters
+    ----------
+    name
+        Name of the scene.
+    text
+        XML with includes in place, or JSON of a dict.
+    is_xml
+        Whether the text is XML.
+    parameters
+        Parameters of an XML scene with their values as text.
+    files
+        Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
+    """
+
+    name: str
+    text: str
+    is_xml: bool
+    parameters: Mapping[str, str]
+    files: Mapping[tuple[str, str], tuple[str, str]]
+
+    @classmethod
+    def of_xml(
+        cls, name: str, text: str, root: minidom.Element, parameters: Mapping[str, str], folder: Path
+    ) -> SceneRecord:
+        """Return the record of an XML scene, whose text and root have no includes, in a folder."""
+        references = ((plugin, value) for plugin, value, _, _ in _files_of_xml(root, parameters))
+        return cls(name, text, True, dict(parameters), _found(references, folder))
+
+    @classmethod
+    def of_dict(cls, scene: Mapping[str, Any]) -> SceneRecord | None:
+        """Return the record of a scene given as a dict, None if it holds loaded objects or other unknown values."""
+        try:
+            text = json.dumps(_to_json(scene))
+        except TypeError:
+            return None
+        return cls("scene", text, False, {}, _found(_files_of_dict(json.loads(text)), Path()))
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, Any]) -> SceneRecord:
+        """Return the record that `attributes` has written.
+
+        Raises
+        ------
+        UserError
+            If the attributes hold no scene.
+        """
+        kinds = [kind for kind in ("xml", "dict") if f"scene_{kind}" in attributes]
+        if not kinds:
+            raise UserError(
+                "the result does not hold its scene (attribute scene_xml or scene_dict): it was rendered from loaded "
+                "objects, or by an older release; render the scene itself"
+            )
+        prefix = "scene."
+        parameters = {name[len(prefix) :]: value for name, value in attributes.items() if name.startswith(prefix)}
+        files = {
+            (file["plugin"], file["name"]): (file["path"], file["sha256"])
+            for file in json.loads(attributes.get("scene_files", "[]"))
+        }
+        return cls(str(attributes["scene"]), attributes[f"scene_{kinds[0]}"], kinds[0] == "xml", parameters, files)
+
+    def attributes(self) -> dict[str, str]:
+        """Return the attributes of a result from which `from_attributes` returns this record."""
+        described = {f"scene.{name}": value for name, value in self.parameters.items()}
+        described["scene_xml" if self.is_xml else "scene_dict"] = self.text
+        if self.files:
+            rows = [
+                {"plugin": plugin, "name": name, "path": path, "sha256": digest}
+                for (plugin, name), (path, digest) in self.files.items()
+            ]
+            described["scene_files"] = json.dumps(rows)
+        return described
+
+    def place_files(self, root: minidom.Element, parameters: Mapping[str, str]) -> None:
+        """Replace the names of recorded files in an XML scene by their paths; raise UserError if a file has changed."""
+        for plugin, value, element, attribute in _files_of_xml(root, parameters):
+            if (plugin, value) in self.files:
+                element.setAttribute(attribute, _unchanged(*self.files[plugin, value]))
+
+    def scene_dict(self) -> dict[str, Any]:
+        """Return the scene given as a dict, with paths of its files; raise UserError if a file has changed."""
+
+        def placed(part: dict[str, Any]) -> dict[str, Any]:
+            plugin = str(part.get("type", ""))
+            return {
+                key: placed(value)
+                if isinstance(value, dict)
+                else _unchanged(*self.files[plugin, value])
+                if key in FILE_PARAMETERS and (plugin, value) in self.files
+                else value
+                for key, value in part.items()
+            }
+
+        restored: dict[str, Any] = _from_json(placed(json.loads(self.text)))
+        return restored
+
+
+def plugin_values(scene: mi.Scene, integrator: Any = None) -> str:
+    """Return the attribute ``plugin_parameters`` of a loaded scene, with another integrator than its own."""
+    from mitransient_lidar.plugins.bases import exposed
+
+    own = scene.integrator()
+    used = own if integrator is None else integrator
+    objects = [(name, part) for name, part in exposed(scene)[1] if part is not own]
+    return json.dumps({**({} if used is None else {"integrator": _values(used)}), **_named(objects)})
+
+
+def _named(objects: Iterable[tuple[str, mi.Object]]) -> dict[str, Any]:
+    """Return the parameters of objects by their ids or names, else by the names of their plugins."""
+    described: dict[str, Any] = {}
+    for given, part in objects:
+        values = _values(part)
+        name = str(part.id() or given)
+        # Mitsuba numbers objects without a name: _arg_0, object_1398.
+        name = str(values.get("type", values.get("class"))) if re.match(r"_|object_\d", name) else name
+        free = (f"{name}_{number}" for number in itertools.count(2))
+        described[name if name not in described else next(other for other in free if other not in described)] = values
+    return described
+
+
+def _values(part: mi.Object) -> dict[str, Any]:
+    """Return the parameters of an object, and its nested objects, in types of JSON."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mitransient_lidar.plugins.bases import exposed
+
+    own: dict[str, Any] | None = getattr(part, "parameters", None)
+    if own is None:
+        values, objects = exposed(part)
+        small = {name: _plain(value) for name, value in values.items() if dr.width(value) <= _MOST_VALUES}
+        return {"class": part.class_name(), **small, **_named(objects)}
+    objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
+    plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
+    known: list[str] = ["type", *plugin_parameters(str(own["type"]))]
+    return {**dict.fromkeys(known), **plain, **_named(objects)}
+
+
+def _plain(value: Any) -> Any:
+    """Return the value of a parameter in types of JSON: a number, a text, or a list; a transform as its matrix."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if hasattr(value, "matrix"):
+        return np.array(value.matrix, dtype=np.float64).reshape(4, 4).tolist()
+    try:
+        array = np.array(value)
+    except (RuntimeError, TypeError, ValueError):
+        return str(value)
+    if array.dtype.kind not in "biuf":
+        return str(value)
+    return array.item() if array.size == 1 else array.ravel().tolist()
+
+
+def _to_json(value: Any) -> Any:
+    """Return a value of a dict scene in types of JSON; raise TypeError for an unknown one."""
+    if isinstance(value, Mapping):
+        return {key: _to_json(item) for key, item in value.items()}
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, (np.bool_, np.integer, np.floating)):
+        return value.item()
+    if isinstance(value, os.PathLike):
+        return str(value)
+    if isinstance(value, (list, tuple)):
+        return [_to_json(item) for item in value]
+    if hasattr(value, "matrix") and hasattr(value, "inverse_transpose"):
+        parts = {name: np.array(getattr(value, name), dtype=np.float64) for name in ("matrix", "inverse_transpose")}
+        return {name: part.reshape(4, 4).tolist() for name, part in parts.items()}
+    array = np.array(value)
+    if array.shape == (3,) and array.dtype.kind in "fiu":
+        return array.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be stored")
+
+
+def _from_json(value: Any) -> Any:
+    """Return a value of a dict scene from `_to_json`."""
+    if isinstance(value, list):
+        return [tuple(item) if isinstance(item, list) else item for item in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"matrix", "inverse_transpose"}:
+        import drjit.scalar as ds
+        import mitsuba as mi
+
+        return mi.ScalarTransform4d(*(ds.Matrix4f64(value[name]) for name in ("matrix", "inverse_transpose")))
+    return {key: _from_json(item) for key, item in value.items()}
+
+
+def _files_of_xml(
+    root: minidom.Element, parameters: Mapping[str, str]
+) -> Iterator[tuple[str, str, minidom.Element, str]]:
+    """Yield the plugin, the name of a file, and the element and its attribute that name it."""
+    for element in list(root.getElementsByTagName("*")):
+        attribute = "filename" if element.tagName == "spectrum" else "value"
+        named = element.tagName == "string" and element.getAttribute("name") in FILE_PARAMETERS
+        if not named and not (element.tagName == "spectrum" and element.hasAttribute("filename")):
+            continue
+        owner = element.parentNode
+        plugin = owner.getAttribute("type") if isinstance(owner, minidom.Element) else ""
+        plugin, value = (with_values(text, parameters)[0] for text in (plugin, element.getAttribute(attribute)))
+        yield plugin, value, element, attribute
+
+
+def _files_of_dict(scene: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the plugin and the name of each file of a scene given as a dict."""
+    for key, value in scene.items():
+        if isinstance(value, dict):
+            yield from _files_of_dict(value)
+        elif key in FILE_PARAMETERS and isinstance(value, str):
+            yield scene.get("type", ""), value
+
+
+def _found(references: Iterator[tuple[str, str]], folder: Path) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return path and SHA-256 of the files that exist, relative to the working folder or, for Mitsuba, the scene's."""
+    files = {}
+    for plugin, name in references:
+        folders = [Path()] if is_own_plugin(plugin) else [folder, Path()]
+        path = next((found for place in folders if name and (found := place / name).is_file()), None)
+        if path is not None:
+            path = path.resolve()
+            files[plugin, name] = str(path), _sha256(path)
+    return files
+
+
+def _unchanged(path: str, digest: str) -> str:
+    """Return the path of a file; raise UserError if it is missing or its SHA-256 is another one."""
+    if not Path(path).is_file():
+        raise UserError(f"{path} is missing, a file of the scene of the result: restore it, or render the scene anew")
+    if _sha256(Path(path)) != digest:
+        raise UserError(
+            f"{path} has changed since the result was rendered (its SHA-256 is not {digest[:12]}...): restore it, or "
+            "render the scene anew"
+        )
+    return path
+
+
+def _sha256(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    try:
+        state = path.stat()
+        return _hashed(path, state.st_size, state.st_mtime_ns)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+
+
+@functools.lru_cache(maxsize=64)
+def _hashed(path: Path, size: int, modified_ns: int) -> str:
+    """Return the SHA-256 of a file in a state, which a series of renders computes once."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,111 @@
+"""Rendering of a result again, from the scene, the parameters and the passes in its attributes."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import variants
+from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.rendering.render import render
+from mitransient_lidar.results import exr, netcdf
+from mitransient_lidar.results.formats import input_format
+
+logger = logging.getLogger(__name__)
+
+#: Options that end a render.
+_ENDS = ("target_error", "max_time", "passes")
+
+
+def is_result(scene: Any) -> bool:
+    """Return whether a scene is given as a result: a dataset, or the path of a file that ends in .nc or .exr."""
+    if isinstance(scene, (str, os.PathLike)):
+        return Path(scene).suffix.lower() in (".nc", ".exr")
+    return isinstance(scene, xr.Dataset)
+
+
+def read_attributes(result: xr.Dataset | str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the attributes of a result, or of its EXR or NetCDF file; raise UserError if it cannot be read."""
+    if isinstance(result, xr.Dataset):
+        return dict(result.attrs)
+    path = Path(result)
+    if input_format(path) == "netcdf":
+        return dict(netcdf.read_netcdf(path).attrs)
+    return dict(exr.exact_metadata(path, exr.read_parts(path)[0].attributes).get("attributes", {}))
+
+
+def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
+    """Render a result again: the same bits on the same machine, unless options change it.
+
+    Parameters
+    ----------
+    result
+        Dataset of `render.render` or `passive.render_passive`, or its file. Of one that was computed from a result, as
+        gates or signals of a receiver, that result is rendered.
+    options
+        Options of the function that rendered the result, by default those of its attributes. `params` are added to the
+        parameters of its scene.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of the function that rendered the result.
+
+    Raises
+    ------
+    UserError
+        If the result does not hold its scene, a file of the scene has changed, or an option is invalid.
+    """
+    attributes = read_attributes(result)
+    kind = _kind(attributes)
+    record = SceneRecord.from_attributes(attributes)
+    _compare_versions(attributes)
+    own = {"seed": attributes["seed"], "variant": attributes["variant"], "integrator": _integrator(attributes)}
+    if kind == "passive":
+        passes = attributes["frame_passes"]
+        own |= {"frames": len(passes), "frame_step_s": attributes["frame_step_s"]}
+        if "filter_width_nm" in attributes:
+            own["filter_width_nm"] = attributes["filter_width_nm"]
+        ends: dict[str, Any] = {"passes": passes}
+    else:
+        own["max_memory"] = attributes["max_memory_gb"]
+        ends = {"passes": attributes["passes"], "pass_share": attributes["pass_share"]}
+    given = {name: value for name, value in options.items() if value is not None}
+    chosen = {**own, **({} if any(name in given for name in _ENDS) else ends), **given}
+    return render_passive(record, **chosen) if kind == "passive" else render(record, **chosen)
+
+
+def _kind(attributes: Mapping[str, Any]) -> str:
+    """Return which function has rendered a result: ``laser`` or ``passive``; raise UserError for others."""
+    if "shots" in attributes:
+        raise UserError("the result is a series of shots, which is not rendered again: render one shot, by its place")
+    for kind, name in (("passive", "frame_passes"), ("laser", "pass_share")):
+        if name in attributes:
+            return kind
+    raise UserError(
+        "the dataset is not a result that can be rendered again: it must be of render or passive, and of this release "
+        "or a later one"
+    )
+
+
+def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the integrator of a result as a dict for Mitsuba."""
+    values = json.loads(attributes["plugin_parameters"])["integrator"]
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _compare_versions(attributes: Mapping[str, Any]) -> None:
+    """Warn of other versions than those of the result."""
+    for name, version in variants.versions().items():
+        if name != "variant" and attributes.get(name, version) != version:
+            logger.warning(
+                "the result is of %s = %s, and this is %s: its bits may differ", name, attributes[name], version
+            )
