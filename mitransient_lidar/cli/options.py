@@ -11,9 +11,18 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, number_list
 
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene, or path of a Mitsuba XML file.")]
+SceneOrResult = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENE",
+        help="Name of a shipped scene, path of a Mitsuba XML file, or a result (.nc, .exr) to render again, with its "
+        "own options unless others are given.",
+    ),
+]
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
 ]
+OptionalSeed = Annotated[int | None, typer.Option(help="Seed of the random numbers, 0 by default.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]

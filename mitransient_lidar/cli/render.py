@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_writable
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import Define, Quiet, Scene, Seed, parameters
+from mitransient_lidar.cli.options import Define, OptionalSeed, Quiet, SceneOrResult, parameters
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the fil
 
 
 def render(
-    scene: Scene,
+    scene: SceneOrResult,
     define: Define = None,
     output: Folder = Path("."),
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
@@ -41,7 +41,7 @@ def render(
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
     passes: GoalPasses = None,
-    seed: Seed = 0,
+    seed: OptionalSeed = None,
     variant: Variant = None,
     max_memory: Annotated[
         float | None, typer.Option(help="Memory for histograms [GB], 2 by default. With less, only gates are kept.")
@@ -59,19 +59,18 @@ def render(
     together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second one on.
     """
     params = parameters(define)
-    from mitransient_lidar.loading.catalogue import scene_path, scene_text
-
-    name = scene_path(scene).stem
+    name, text, _ = _scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
-    if (gif or mp4 or html) and "gate_count" not in scene_text(scene):
+    if (gif or mp4 or html) and "gate_count" not in text:
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
-    check_writable(output, [*targets, *gates.names()])
+    _check_targets(output, [*targets, *gates.names()], scene)
+    from mitransient_lidar.rendering import again
     from mitransient_lidar.rendering import render as rendering
 
     with reporting(quiet) as progress:
-        dataset = rendering.render(
+        dataset = (again.render_again if again.is_result(scene) else rendering.render)(
             scene,
             params=params,
             integrator=integrator,
@@ -79,7 +78,7 @@ def render(
             target_quantile=target_quantile,
             max_time=max_time,
             passes=passes,
-            seed=seed,
+            **({} if seed is None else {"seed": seed}),
             max_memory=max_memory,
             variant=variant,
             progress=progress,
@@ -95,6 +94,29 @@ def render(
     if not quiet:
         summarise(dataset)
     exit_if_interrupted(dataset)
+
+
+def _scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
+    """Return name and text of a scene, or of that of a result of a command and then its attributes."""
+    from mitransient_lidar.loading.catalogue import scene_path, scene_text
+    from mitransient_lidar.loading.scene_record import SceneRecord
+    from mitransient_lidar.rendering import again
+
+    if not again.is_result(scene):
+        return scene_path(scene).stem, scene_text(scene), {}
+    attributes = again.read_attributes(scene)
+    if (kind := again.result_kind(attributes)) != command:
+        raise UserError(f"{scene} is a result of the command {kind}: use {kind} to render it again")
+    record = SceneRecord.from_attributes(attributes)
+    return record.name, record.text, attributes
+
+
+def _check_targets(output: Path, targets: list[Path], scene: str) -> None:
+    """Check that files can be written, and that none of them is the result that is rendered again."""
+    check_writable(output, targets)
+    for target in targets:
+        if target.exists() and Path(scene).exists() and target.samefile(scene):
+            raise UserError(f"{scene} would be overwritten with its repetition: choose another folder with -o")
 
 
 def _write(dataset: xr.Dataset, target: Path) -> None:
@@ -120,11 +142,11 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
 
 
 def passive(
-    scene: Scene,
+    scene: SceneOrResult,
     define: Define = None,
     output: Folder = Path("."),
-    frames: Annotated[int, typer.Option(help="Number of frames of an animation.")] = 1,
-    frame_step: Annotated[float, typer.Option(help="Time between frames [s].")] = 0.1,
+    frames: Annotated[int | None, typer.Option(help="Number of frames of an animation, 1 by default.")] = None,
+    frame_step: Annotated[float | None, typer.Option(help="Time between frames [s], 0.1 by default.")] = None,
     filter_width_nm: Annotated[
         float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")
     ] = None,
@@ -132,7 +154,7 @@ def passive(
     target_quantile: TargetQuantile = None,
     max_time: MaxTime = None,
     passes: GoalPasses = None,
-    seed: Seed = 0,
+    seed: OptionalSeed = None,
     variant: Variant = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
     quiet: Quiet = False,
@@ -143,31 +165,30 @@ def passive(
     passes hold for each frame.
     """
     params = parameters(define)
-    from mitransient_lidar.loading.catalogue import scene_path
-
-    stem = f"{scene_path(scene).stem}_passive"
-    suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and frames > 1 else [])]
-    targets = [output / f"{stem}{suffix}" for suffix in suffixes]
-    check_writable(output, targets)
+    name, _, former = _scene_of(scene, "passive")
+    is_animation = (frames or len(former.get("frame_passes", [0]))) > 1
+    suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
+    targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
+    _check_targets(output, targets, scene)
     from mitransient_lidar.plots import passive as passive_plots
+    from mitransient_lidar.rendering.again import is_result, render_again
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.results.radiance import save_radiance
 
+    options = {
+        "target_error": target_error,
+        "target_quantile": target_quantile,
+        "max_time": max_time,
+        "passes": passes,
+        "seed": seed,
+        "frames": frames,
+        "frame_step_s": frame_step,
+        "filter_width_nm": filter_width_nm,
+        "variant": variant,
+    }
+    given = {option: value for option, value in options.items() if value is not None}
     with reporting(quiet) as progress:
-        image = render_passive(
-            scene,
-            params,
-            target_error=target_error,
-            target_quantile=target_quantile,
-            max_time=max_time,
-            passes=passes,
-            seed=seed,
-            frames=frames,
-            frame_step_s=frame_step,
-            filter_width_nm=filter_width_nm,
-            variant=variant,
-            progress=progress,
-        )
+        image = (render_again if is_result(scene) else render_passive)(scene, params=params, progress=progress, **given)
     output.mkdir(parents=True, exist_ok=True)
     writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
         ".gif": passive_plots.animate_passive,

@@ -37,12 +37,23 @@ def copy_scene(
     typer.echo(catalogue.copy_scene(name, destination))
 
 
-def info() -> None:
-    """Print versions, the Mitsuba variant and the path of LLVM."""
-    from mitransient_lidar.loading import variants
+def info(
+    file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="An EXR or NetCDF result.")] = None,
+) -> None:
+    """Print versions, the Mitsuba variant and the path of LLVM, or the parameters of a result.
 
-    facts = variants.describe()
-    width = max(map(len, facts))
+    Of a result: its attributes, then every object of its scene with the values of all parameters, defaults too; a dash
+    for those that are not given and have no default, or are not used.
+    """
+    if file is None:
+        from mitransient_lidar.loading import variants
+
+        facts = variants.describe()
+    else:
+        from mitransient_lidar.rendering.again import describe_result
+
+        facts = describe_result(file)
+    width = max(map(len, facts), default=0)
     for name, value in facts.items():
         typer.echo(f"{name:{width}}  {value}")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ from typing import Any
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.scene_record import SceneRecord
-from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.rendering.passive import MOST_FRAMES, render_passive
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import input_format
@@ -42,6 +44,19 @@ def read_attributes(result: xr.Dataset | str | os.PathLike[str]) -> dict[str, An
     return dict(exr.exact_metadata(path, exr.read_parts(path)[0].attributes).get("attributes", {}))
 
 
+def result_kind(attributes: Mapping[str, Any]) -> str:
+    """Return the function that has rendered a result, ``render`` or ``passive``; raise UserError for others."""
+    if "shots" in attributes:
+        raise UserError("the result is a series of shots, which is not rendered again: render one shot, by its place")
+    for kind, name in (("passive", "frame_passes"), ("render", "pass_share")):
+        if name in attributes:
+            return kind
+    raise UserError(
+        "the dataset is not a result that can be rendered again: it must be of render or passive, and of this release "
+        "or a later one"
+    )
+
+
 def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
     """Render a result again: the same bits on the same machine, unless options change it.
 
@@ -65,35 +80,52 @@ def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) ->
         If the result does not hold its scene, a file of the scene has changed, or an option is invalid.
     """
     attributes = read_attributes(result)
-    kind = _kind(attributes)
+    kind = result_kind(attributes)
     record = SceneRecord.from_attributes(attributes)
     _compare_versions(attributes)
     own = {"seed": attributes["seed"], "variant": attributes["variant"], "integrator": _integrator(attributes)}
+    given = {name: value for name, value in options.items() if value is not None}
     if kind == "passive":
         passes = attributes["frame_passes"]
-        own |= {"frames": len(passes), "frame_step_s": attributes["frame_step_s"]}
-        if "filter_width_nm" in attributes:
-            own["filter_width_nm"] = attributes["filter_width_nm"]
-        ends: dict[str, Any] = {"passes": passes}
+        frames = integer("frames", given.get("frames", len(passes)), 1, MOST_FRAMES)
+        own |= {"frames": frames, "frame_step_s": attributes["frame_step_s"]}
+        own["filter_width_nm"] = attributes.get("filter_width_nm")
+        ends: dict[str, Any] = {"passes": [*passes, *[passes[-1]] * frames][:frames]}
     else:
         own["max_memory"] = attributes["max_memory_gb"]
         ends = {"passes": attributes["passes"], "pass_share": attributes["pass_share"]}
-    given = {name: value for name, value in options.items() if value is not None}
     chosen = {**own, **({} if any(name in given for name in _ENDS) else ends), **given}
     return render_passive(record, **chosen) if kind == "passive" else render(record, **chosen)
 
 
-def _kind(attributes: Mapping[str, Any]) -> str:
-    """Return which function has rendered a result: ``laser`` or ``passive``; raise UserError for others."""
-    if "shots" in attributes:
-        raise UserError("the result is a series of shots, which is not rendered again: render one shot, by its place")
-    for kind, name in (("passive", "frame_passes"), ("laser", "pass_share")):
-        if name in attributes:
-            return kind
-    raise UserError(
-        "the dataset is not a result that can be rendered again: it must be of render or passive, and of this release "
-        "or a later one"
-    )
+def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Return the attributes of a result, without texts of JSON or XML, and all parameters of its plugins, as texts.
+
+    A parameter is named by its object and itself, as ``surface.interior.attenuation``. Raises UserError if the file
+    cannot be read.
+    """
+    attributes = read_attributes(path)
+    plugins = json.loads(attributes.pop("plugin_parameters", "{}"))
+    long = [name for name, value in attributes.items() if isinstance(value, str) and re.match(r"\s*[\[{<]", value)]
+    plain = {name: value for name, value in attributes.items() if name not in long}
+    return {name: _text(value) for name, value in {**plain, **_flat(plugins)}.items()}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested objects by their names, joined with points."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _text(value: Any) -> str:
+    """Return a value in one line."""
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return ", ".join(map(_text, value))
+    return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split())
 
 
 def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:

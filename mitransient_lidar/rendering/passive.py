@@ -39,6 +39,9 @@ logger = logging.getLogger(__name__)
 #: Default end of a frame.
 DEFAULT_GOAL = Goal(target_error=0.05, max_time=120.0)
 
+#: Largest number of frames.
+MOST_FRAMES = 10_000
+
 _TIME_PARAMETER = "surface_time"  # time of the sea of an XML scene [s]
 
 
@@ -96,7 +99,7 @@ def render_passive(
     UserError
         If the scene, a parameter or an option is invalid.
     """
-    frames, step = integer("frames", frames, 1, 10_000), positive("frame_step_s", frame_step_s)
+    frames, step = integer("frames", frames, 1, MOST_FRAMES), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
     seed = check_seed(seed)
     counts = list(passes) if isinstance(passes, Sequence) else [passes] * frames

@@ -219,7 +219,7 @@ def _metadata(
         "depth_of_time": None if line is None else line.tolist(),
         "waveform": None,
         "colour_maps": _colour_maps(),
-        "attributes": [[str(name), _readable(value)] for name, value in stack.attrs.items()],
+        "attributes": _attributes(stack),
     }
     if record is not None and waveforms is not None:
         time = record["time"].values
@@ -249,6 +249,12 @@ def _colour_maps() -> dict[str, str]:
     return {name: base64.b64encode(table.tobytes()).decode("ascii") for name, table in tables.items()}
 
 
+def _attributes(stack: xr.Dataset) -> list[list[str]]:
+    """Return names and values of the attributes, without the text of the scene, its files and its objects."""
+    long = ("scene_xml", "scene_dict", "scene_files", "plugin_parameters")
+    return [[str(name), _readable(value)] for name, value in stack.attrs.items() if name not in long]
+
+
 def _readable(value: Any) -> str:
     if isinstance(value, (list, tuple, np.ndarray)):
         return ", ".join(_readable(item) for item in value)
@@ -258,7 +264,7 @@ def _readable(value: Any) -> str:
 def _room_for_metadata(stack: xr.Dataset) -> int:
     """Return a bound on the bytes of the metadata: 25 letters in a number, 12 bytes in a letter."""
     letters = 3 * len(str(stack.attrs.get("scene", "")))  # also the title
-    letters += sum(len(str(name)) + len(_readable(value)) + 8 for name, value in stack.attrs.items())
+    letters += sum(len(name) + len(value) + 8 for name, value in _attributes(stack))
     names = sum(len(str(name)) + 4 for name in stack["pixel"].values) if "pixel" in stack else 0
     return 12 * (letters + names) + 75 * stack.sizes["gate"] + 10_000
 
