@@ -149,14 +149,14 @@ def plugin_values(scene: mi.Scene, integrator: Any = None) -> str:
     own = scene.integrator()
     used = own if integrator is None else integrator
     objects = [(name, part) for name, part in exposed(scene)[1] if part is not own]
-    return json.dumps({**({} if used is None else {"integrator": _values(used)}), **_named(objects)})
+    return json.dumps({**({} if used is None else {"integrator": object_values(used)}), **_named(objects)})
 
 
 def _named(objects: Iterable[tuple[str, mi.Object]]) -> dict[str, Any]:
     """Return the parameters of objects by their ids or names, else by the names of their plugins."""
     described: dict[str, Any] = {}
     for given, part in objects:
-        values = _values(part)
+        values = object_values(part)
         name = str(part.id() or given)
         # Mitsuba numbers objects without a name: _arg_0, object_1398.
         name = str(values.get("type", values.get("class"))) if re.match(r"_|object_\d", name) else name
@@ -165,7 +165,7 @@ def _named(objects: Iterable[tuple[str, mi.Object]]) -> dict[str, Any]:
     return described
 
 
-def _values(part: mi.Object) -> dict[str, Any]:
+def object_values(part: mi.Object) -> dict[str, Any]:
     """Return the parameters of an object, and its nested objects, in types of JSON."""
     import drjit as dr
     import mitsuba as mi

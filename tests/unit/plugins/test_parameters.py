@@ -1,0 +1,125 @@
+"""Parameters that the objects of the plugins keep: every one of their manual pages, with its default."""
+
+import importlib
+import json
+import re
+
+import mitsuba as mi
+import pytest
+
+from mitransient_lidar.loading.checks import plugin_parameters
+from mitransient_lidar.loading.scene_record import object_values, plugin_values
+from mitransient_lidar.loading.variants import PLUGIN_MODULES
+
+#: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
+WITHOUT_VALUE = {
+    "layered_water": {"jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile"},
+    "ocean_surface": {
+        *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
+        *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
+    },
+    "seabed": {"filename", "map_size", "map_values", "map_holes", "origin_x", "origin_y", "patches"},
+    "lidar_transmitter": {
+        *("to_world", "divergence_fwhm_mrad", "divergence_1e2_mrad", "divergence_across_mrad"),
+        *("profile_file", "profile_mrad", "pulse_file"),
+    },
+    "pixel_fov": {
+        *("inner_mrad", "start_deg", "extent_deg", "width_mrad", "height_mrad", "angle_x_min_mrad"),
+        *("angle_x_max_mrad", "vertices_mrad", "pixel_name", "to_world", "blur_file", "blur_file_mrad"),
+    },
+    "multipixel_receiver": {
+        *("imager", "pixel_map", "focal_length_mm", "pixel_pitch_um", "blur_file", "blur_file_mrad", "to_world"),
+    },
+    "time_gated_film": {
+        *("gate_start_ns", "gate_start_depth", "gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns"),
+        *("gate_profile", "pulses"),
+    },
+    "lidar_merging": {"paths_per_pass", "photons_per_pass"},
+    "fournier_forand": {"refractive_index", "junge_slope"},
+}
+
+#: Numbers of defaults that the manual pages of the larger plugins give as a number or a word.
+MOST_DEFAULTS = {
+    **{"layered_water": 18, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
+    **{"lidar_volpath": 6, "time_gated_film": 4},
+}
+
+PLUGINS = [name.rpartition(".")[2] for name in PLUGIN_MODULES if name not in ("bases", "phase.tabulated")]
+
+
+def _values(plugin, folder):
+    """Return the parameters of an object of a plugin for which only the required ones are given."""
+    part = {"type": plugin}
+    if plugin == "measured_phase":
+        path = folder / "phase.csv"
+        path.write_text("\n".join(f"{angle} {1 / angle}" for angle in range(5, 180, 5)))
+        part["filename"] = str(path)
+    return object_values(mi.load_dict(part))
+
+
+def _documented_defaults(plugin):
+    """Return the defaults that the table of a plugin's manual page gives as a number or a word, by parameter."""
+    module = next(name for name in PLUGIN_MODULES if name.rpartition(".")[2] == plugin)
+    page = next(
+        part.__doc__
+        for part in vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
+        if isinstance(part, type) and f"(``{plugin}``)" in (part.__doc__ or "")
+    )
+    rules = list(re.finditer(r"^ *(=+)  =[= ]+$", page, re.MULTILINE))
+    start, width = 4, len(rules[0][1])
+    rows, names = {}, ()
+    for line in page[rules[1].end() : rules[-1].start()].splitlines():
+        cell = tuple(re.findall(r"[a-z]\w*", line[start : start + width]))
+        names = cell or names
+        rows[names] = f"{rows.get(names, '')} {' '.join(line[start + width :].split())}"
+    pattern = re.compile(r"Default: (?:``([^`]+)``|(-?\d+(?:\.\d+)?(?:e[+-]?\d+)?|true|false)\b)")
+    found = {names: pattern.search(text) for names, text in rows.items()}
+    return {name: match[1] or match[2] for names, match in found.items() if match for name in names}
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_every_documented_parameter_is_kept_with_its_default(plugin, tmp_path):
+    values = _values(plugin, tmp_path)
+    names = set(plugin_parameters(plugin))
+    assert values["type"] == plugin
+    assert names
+    assert names <= set(values)
+    assert {name for name, value in values.items() if value is None} == WITHOUT_VALUE.get(plugin, set())
+    defaults = {name: value for name, value in _documented_defaults(plugin).items() if values.get(name) is not None}
+    for name, text in defaults.items():
+        assert str(values[name]).lower() == text or float(values[name]) == float(text), name
+    assert len(defaults) >= MOST_DEFAULTS.get(plugin, 0)
+
+
+def test_given_values_and_nested_objects_are_kept():
+    to_world = mi.ScalarTransform4f().translate([1, 2, 300])
+    film = {"type": "time_gated_film", "gate_count": 2, "gate_start_ns": 1400.0}
+    pixels = {f"p{i}": {"type": "pixel_fov", "shape": "ring", "inner_mrad": float(i)} for i in (1, 2)}
+    values = object_values(mi.load_dict({"type": "multipixel_receiver", "to_world": to_world, **pixels, "film": film}))
+    assert values["to_world"] == [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 300], [0, 0, 0, 1]]
+    assert (values["altitude"], values["layout"]) == (None, None)
+    assert [values[f"p{i}"]["inner_mrad"] for i in (1, 2)] == [1, 2]
+    assert values["film"]["gate_width_ns"] == 10
+    assert json.loads(json.dumps(values)) == values
+
+
+def test_values_of_mitsubas_own_objects_are_kept():
+    """A share of 0.25, the index of air for the outside, and our BSDF inside one of Mitsuba's."""
+    bsdf = {"type": "twosided", "own": {"type": "retroreflector", "width_deg": 3.0}}
+    parts = {
+        "a": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.25}}},
+        "b": {"type": "sphere", "radius": 2.0, "bsdf": bsdf},
+    }
+    scene = mi.load_dict({"type": "scene", **parts})
+    values = json.loads(plugin_values(scene, mi.load_dict({"type": "lidar_volpath"})))
+    assert set(values) == {"integrator", "a", "b"}
+    assert values["integrator"]["connection"] == "mis"
+    assert values["a"]["bsdf"]["reflectance"]["value"] == 0.25
+    assert values["b"]["bsdf"]["own"]["width_deg"] == 3
+
+
+def test_unknown_parameters_are_still_refused():
+    """A plugin that reads all of its parameters does not hide one that it does not have."""
+    with pytest.raises(RuntimeError, match="unreferenced property"):
+        mi.load_dict({"type": "layered_water", "attenuaton": 0.5})
+    assert mi.load_dict({"type": "layered_water", "secchi": "", "attenuation": ""}).parameters["attenuation"] == 0.3
