@@ -1,0 +1,196 @@
+"""Rendering of results again: the same bits of every variable, and what is refused."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+
+import mitransient_lidar
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.results.gate_files import save_sequence, save_stack
+from mitransient_lidar.results.radiance import save_radiance
+
+FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
+SMALL = {"surface_size": "60", "bin_width_ns": "4", "bin_count": "40"}
+
+
+def assert_same_bits(first, second):
+    assert set(first.variables) == set(second.variables)
+    for name, variable in first.variables.items():
+        assert variable.dtype == second[name].dtype
+        assert variable.values.tobytes() == second[name].values.tobytes(), name
+
+
+def scene_dict(tmp_path, **water):
+    """Return a scene of Python objects with a file, a rotated target of Mitsuba's, and a nested BSDF of ours."""
+    profile = tmp_path / "profile.csv"
+    profile.write_text("depth,a,b\n0,0.15,0.15\n10,0.2,0.3\n")
+    turned = mi.ScalarTransform4f().translate([0, 0, -4.1]).rotate([0, 1, 0], 33).scale(0.7)
+    return {
+        "integrator": FEW,
+        "tx": {"type": "lidar_transmitter", "divergence_mrad": 5.0},
+        "rx": {
+            "type": "multipixel_receiver",
+            "layout": "1x1",
+            "film": {"type": "time_gated_film", "bin_width_ns": 2.0, "bin_count": 80},
+        },
+        "sea": {
+            "type": "ocean_surface",
+            "spectrum": "flat",
+            "interior": {"type": "layered_water", "profile": str(profile), "profile_tolerance": 0.1, **water},
+        },
+        "target": {"type": "rectangle", "to_world": turned, "bsdf": {"type": "retroreflector"}},
+        "bottom": {"type": "seabed", "depth": 8.0, "size": np.float64(200)},
+    }
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".exr"])
+def test_a_result_and_its_files_give_the_same_bits(suffix, tmp_path):
+    first = mitransient_lidar.render("table1", params={**SMALL, "jerlov": "1C"}, integrator=FEW, passes=2, seed=-7)
+    path = tmp_path / f"a{suffix}"
+    results.save(first, path)
+    again = mitransient_lidar.render(path)
+    assert_same_bits(first, again)
+    changing = {"history", "elapsed_s"}
+    assert {name for name, value in first.attrs.items() if again.attrs[name] != value} <= changing
+    assert first.attrs["scene_xml"] == catalogue.scene_text("table1")
+    values = json.loads(first.attrs["plugin_parameters"])
+    assert values["surface"]["interior"]["jerlov"] == first.attrs["scene.jerlov"] == "1C"
+    assert values["integrator"]["paths_per_pass"] == 4096
+
+
+def test_given_options_win(tmp_path):
+    first = mitransient_lidar.render(scene_dict(tmp_path), passes=2)
+    other = mitransient_lidar.render(first, seed=1, passes=3)
+    assert (other.attrs["seed"], other.attrs["passes"]) == (1, 3)
+    assert not np.array_equal(other["waveform"], first["waveform"])
+    assert_same_bits(mitransient_lidar.render(other, seed=0, passes=2), first)
+    fewer = mitransient_lidar.render(first, integrator={**FEW, "paths_per_pass": 2048})
+    assert fewer.attrs["passes"] == 2
+    assert json.loads(fewer.attrs["plugin_parameters"])["integrator"]["paths_per_pass"] == 2048
+
+
+def test_scenes_of_python_give_the_same_bits(tmp_path):
+    first = mitransient_lidar.render(scene_dict(tmp_path), passes=2)
+    assert_same_bits(first, mitransient_lidar.render(first))
+    (file,) = json.loads(first.attrs["scene_files"])
+    assert (file["plugin"], file["name"]) == ("layered_water", str(tmp_path / "profile.csv"))
+
+
+def test_changed_and_missing_files_are_refused(tmp_path):
+    first = mitransient_lidar.render(scene_dict(tmp_path), passes=2)
+    path = tmp_path / "profile.csv"
+    text = path.read_text()
+    path.write_text(text.replace("0.3", "0.31"))
+    with pytest.raises(UserError, match=r"profile\.csv has changed since the result was rendered"):
+        mitransient_lidar.render(first)
+    path.unlink()
+    with pytest.raises(UserError, match=r"profile\.csv is missing"):
+        mitransient_lidar.render(first)
+    path.write_text(text)
+    assert_same_bits(first, mitransient_lidar.render(first))
+
+
+def test_files_of_an_xml_scene_are_found_from_another_folder(tmp_path, monkeypatch):
+    """A mesh is named relative to the scene, a profile to the working folder; both are recorded by their paths."""
+    home, other = tmp_path / "home", tmp_path / "other"
+    for folder in (home, other):
+        folder.mkdir()
+    mesh = '<shape type="ply" id="target"><string name="filename" value="target.ply"/></shape>'
+    (home / "own.xml").write_text(catalogue.scene_text("table1").replace("</scene>", f"{mesh}</scene>"))
+    mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, -5])}).write_ply(
+        str(home / "target.ply")
+    )
+    (tmp_path / "profile.csv").write_text("depth,a,b\n0,0.15,0.15\n10,0.2,0.3\n")
+    monkeypatch.chdir(tmp_path)
+    params = {**SMALL, "profile": "profile.csv"}
+    first = mitransient_lidar.render(home / "own.xml", params=params, integrator=FEW, passes=2)
+    assert {file["path"] for file in json.loads(first.attrs["scene_files"])} == {
+        str(tmp_path / "profile.csv"),
+        str(home / "target.ply"),
+    }
+    monkeypatch.chdir(other)
+    assert_same_bits(first, mitransient_lidar.render(first))
+    (other / "new.csv").write_text("depth,a,b\n0,0.15,0.15\n10,0.2,0.35\n")
+    changed = mitransient_lidar.render(first, params={"profile": "new.csv"})
+    assert not np.array_equal(changed["waveform"], first["waveform"])
+    assert_same_bits(changed, mitransient_lidar.render(changed))
+
+
+def test_what_cannot_be_rendered_again_is_refused(tmp_path):
+    loaded = mi.load_dict({"type": "scene", **scene_dict(tmp_path)})
+    first = mitransient_lidar.render(loaded, passes=2)
+    assert not [name for name in first.attrs if name in ("scene_xml", "scene_dict")]
+    with pytest.raises(UserError, match=r"does not hold its scene .* rendered from loaded objects"):
+        mitransient_lidar.render(first)
+    assert json.loads(first.attrs["plugin_parameters"])["sea"]["interior"]["profile_tolerance"] == 0.1
+    with pytest.raises(UserError, match="not a result that can be rendered again"):
+        mitransient_lidar.render(first.drop_attrs())
+
+
+def test_commands(tmp_path):
+    first = mitransient_lidar.render("table1", params=SMALL, integrator=FEW, passes=2)
+    (tmp_path / "a").mkdir()
+    file = tmp_path / "a" / "table1.nc"
+    results.save(first, file)
+    done = run("render", file, "-o", tmp_path / "b", "--no-plot", "-q")
+    assert done.exit_code == 0, done.stderr
+    assert_same_bits(first, results.open(tmp_path / "b" / "table1.nc"))
+    assert_refused(run("render", file, "-o", tmp_path / "a"), "would be overwritten", "choose another folder with -o")
+    assert_refused(run("passive", file, "-o", tmp_path), "result of the command render: use render")
+    assert_refused(run("render", tmp_path / "none.nc"), "No such file")
+    lines = run("info", file).stdout.splitlines()
+    assert [line.split() for line in lines if line.startswith("surface.interior.plume_depth ")] == [
+        ["surface.interior.plume_depth", "2"]
+    ]
+    assert not [line for line in lines if "<" in line]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", catalogue.scene_names())
+def test_every_shipped_scene_gives_the_same_bits(name, tmp_path):
+    layout = {"layout": "8x8"} if catalogue.scene_parameters(name)["layout"] == "128x128" else {}
+    first = mitransient_lidar.render(name, params={"wind_speed": "2.5", **layout}, passes=2, seed=3)
+    assert first.attrs["scene.wind_speed"] == "2.5"
+    save = results.save if "waveform" in first else save_stack
+    save(first, tmp_path / "a.nc")
+    assert_same_bits(first, mitransient_lidar.render(tmp_path / "a.nc"))
+
+
+@pytest.mark.slow
+def test_gates_alone_give_the_same_bits(tmp_path):
+    """Without memory for histograms, gates are summed directly; the limit of memory is repeated, too."""
+    first = mitransient_lidar.render("gated_mine", params={"layout": "32x32"}, passes=2, max_memory=0.012)
+    assert "waveform" not in first
+    save_stack(first, tmp_path / "a.exr")
+    save_sequence(first, tmp_path / "all", "a")
+    for path in (tmp_path / "a.exr", tmp_path / "all" / "a_gate000.exr"):
+        assert_same_bits(first, mitransient_lidar.render(path))
+
+
+@pytest.mark.slow
+def test_passes_that_were_reduced_give_the_same_bits():
+    """A time limit that full passes exceed, in a dense plume, leads to smaller passes, whose share is repeated."""
+    plume = {"plume_scattering": 20, "surface_cell_size": 0.5}
+    first = mitransient_lidar.render("ship_wake", params=plume, integrator="lidar_volpath", max_time=0.5)
+    assert first.attrs["pass_share"] < 1
+    assert_same_bits(first, mitransient_lidar.render(first))
+
+
+@pytest.mark.slow
+def test_daylight_gives_the_same_bits(tmp_path):
+    params = {"layout": "4x4", "surface_cell_size": 2}
+    first = render_passive("passive_sea", params, target_error=0.5, max_time=20, frames=2, filter_width_nm=2.0)
+    assert len(first.attrs["frame_passes"]) == 2
+    for suffix in (".nc", ".exr"):
+        save_radiance(first, tmp_path / f"a{suffix}")
+        assert_same_bits(first, mitransient_lidar.render(tmp_path / f"a{suffix}"))
+    assert mitransient_lidar.render(first, frames=1, passes=2).sizes.get("frame", 1) == 1
+    done = run("passive", tmp_path / "a.exr", "-o", tmp_path / "b", "--no-plot", "-q")
+    assert done.exit_code == 0, done.stderr
+    assert_refused(run("render", tmp_path / "a.nc"), "result of the command passive: use passive")
