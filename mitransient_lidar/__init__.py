@@ -56,12 +56,19 @@ __all__ = ["__version__", "open", "render"]
 def render(scene: Any, **options: Any) -> xarray.Dataset:
     """Render a lidar scene to an accuracy, or a result (a dataset, or its file) again.
 
-    See :func:`mitransient_lidar.rendering.render.render` and :func:`mitransient_lidar.rendering.again.render_again`.
+    See :func:`mitransient_lidar.rendering.render.render`, :func:`mitransient_lidar.rendering.again.render_again` and,
+    for series of shots, :func:`mitransient_lidar.studies.shot_series.render_shots_again`.
     """
-    from mitransient_lidar.rendering.again import is_result, render_again
+    from mitransient_lidar.rendering import again
     from mitransient_lidar.rendering.render import render as render_scene
 
-    return (render_again if is_result(scene) else render_scene)(scene, **options)
+    if not again.is_result(scene):
+        return render_scene(scene, **options)
+    if again.result_kind(again.read_attributes(scene)) != "shots":
+        return again.render_again(scene, **options)
+    from mitransient_lidar.studies.shot_series import render_shots_again
+
+    return render_shots_again(scene, **options)
 
 
 def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect

@@ -35,6 +35,29 @@ def check_writable(folder: Path, targets: list[Path]) -> None:
             raise UserError(f"cannot write {target}: it is a folder.")
 
 
+def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
+    """Return name and text of a scene, or of that of a result of a command and then its attributes."""
+    from mitransient_lidar.loading.catalogue import scene_path, scene_text
+    from mitransient_lidar.loading.scene_record import SceneRecord
+    from mitransient_lidar.rendering import again
+
+    if not again.is_result(scene):
+        return scene_path(scene).stem, scene_text(scene), {}
+    attributes = again.read_attributes(scene)
+    if (kind := again.result_kind(attributes)) != command:
+        raise UserError(f"{scene} is a result of the command {kind}: use {kind} to render it again")
+    record = SceneRecord.from_attributes(attributes)
+    return record.name, record.text, attributes
+
+
+def check_targets(output: Path, targets: list[Path], scene: str) -> None:
+    """Check that files can be written, and that none of them is the result that is rendered again."""
+    check_writable(output, targets)
+    for target in targets:
+        if target.exists() and Path(scene).exists() and target.samefile(scene):
+            raise UserError(f"{scene} would be overwritten with its repetition: choose another place with -o")
+
+
 def check_figure(path: Path | None) -> None:
     """Check that a figure, and the NetCDF file of its data, can be written."""
     if path is None:

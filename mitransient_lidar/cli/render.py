@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import GateFiles, announced, check_writable
+from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
 from mitransient_lidar.cli.options import Define, OptionalSeed, Quiet, SceneOrResult, parameters
 from mitransient_lidar.core.errors import UserError
@@ -59,13 +59,13 @@ def render(
     together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second one on.
     """
     params = parameters(define)
-    name, text, _ = _scene_of(scene, "render")
+    name, text, _ = scene_of(scene, "render")
     # Checked before the render: films with gates have the parameter gate_count.
     if (gif or mp4 or html) and "gate_count" not in text:
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
-    _check_targets(output, [*targets, *gates.names()], scene)
+    check_targets(output, [*targets, *gates.names()], scene)
     from mitransient_lidar.rendering import again
     from mitransient_lidar.rendering import render as rendering
 
@@ -94,29 +94,6 @@ def render(
     if not quiet:
         summarise(dataset)
     exit_if_interrupted(dataset)
-
-
-def _scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
-    """Return name and text of a scene, or of that of a result of a command and then its attributes."""
-    from mitransient_lidar.loading.catalogue import scene_path, scene_text
-    from mitransient_lidar.loading.scene_record import SceneRecord
-    from mitransient_lidar.rendering import again
-
-    if not again.is_result(scene):
-        return scene_path(scene).stem, scene_text(scene), {}
-    attributes = again.read_attributes(scene)
-    if (kind := again.result_kind(attributes)) != command:
-        raise UserError(f"{scene} is a result of the command {kind}: use {kind} to render it again")
-    record = SceneRecord.from_attributes(attributes)
-    return record.name, record.text, attributes
-
-
-def _check_targets(output: Path, targets: list[Path], scene: str) -> None:
-    """Check that files can be written, and that none of them is the result that is rendered again."""
-    check_writable(output, targets)
-    for target in targets:
-        if target.exists() and Path(scene).exists() and target.samefile(scene):
-            raise UserError(f"{scene} would be overwritten with its repetition: choose another folder with -o")
 
 
 def _write(dataset: xr.Dataset, target: Path) -> None:
@@ -165,17 +142,17 @@ def passive(
     passes hold for each frame.
     """
     params = parameters(define)
-    name, _, former = _scene_of(scene, "passive")
+    name, _, former = scene_of(scene, "passive")
     is_animation = (frames or len(former.get("frame_passes", [0]))) > 1
     suffixes = [".nc", ".exr", *([".png"] if plot else []), *([".gif"] if plot and is_animation else [])]
     targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
-    _check_targets(output, targets, scene)
+    check_targets(output, targets, scene)
     from mitransient_lidar.plots import passive as passive_plots
     from mitransient_lidar.rendering.again import is_result, render_again
     from mitransient_lidar.rendering.passive import render_passive
     from mitransient_lidar.results.radiance import save_radiance
 
-    options = {
+    options: dict[str, Any] = {
         "target_error": target_error,
         "target_quantile": target_quantile,
         "max_time": max_time,

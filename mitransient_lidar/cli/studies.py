@@ -8,9 +8,20 @@ from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_figure, check_suffix, write_figure
+from mitransient_lidar.cli.files import check_figure, check_suffix, check_targets, scene_of, write_figure
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
-from mitransient_lidar.cli.options import RECEIVERS, Define, DrawingOnly, Quiet, Scene, Seed, numbers, pair, parameters
+from mitransient_lidar.cli.options import (
+    RECEIVERS,
+    Define,
+    DrawingOnly,
+    Quiet,
+    Scene,
+    SceneOrResult,
+    Seed,
+    numbers,
+    pair,
+    parameters,
+)
 from mitransient_lidar.core.errors import UserError
 
 TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
@@ -56,9 +67,9 @@ def find_shots(
 
 
 def shots(
-    scene: Scene,
+    scene: SceneOrResult,
     define: Define = None,
-    count: Annotated[int, typer.Option(help="Number of shots at random places.")] = 20,
+    count: Annotated[int | None, typer.Option(help="Number of shots at random places, 20 by default.")] = None,
     at: Annotated[
         list[str] | None, typer.Option(metavar="X,Y", help="Place of a shot [m], instead of random ones. Repeatable.")
     ] = None,
@@ -69,8 +80,8 @@ def shots(
     move_target: Annotated[
         bool, typer.Option("--move-target", help="Keep the target's place relative to the aim of each shot.")
     ] = False,
-    passes: Passes = 8,
-    seed: Annotated[int, typer.Option(help="Seed of random places.")] = 1,
+    passes: Annotated[int | None, typer.Option(help="Passes of each shot, 8 by default.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of random places, 1 by default.")] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = Path("shots.nc"),
     quiet: Quiet = False,
 ) -> None:
@@ -82,23 +93,24 @@ def shots(
     if at and places is not None:
         raise UserError("--at and --places are alternatives: give one of them.")
     check_suffix("--output", output, ".nc")
+    scene_of(scene, "shots")
+    check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
+    from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.studies import shot_series as study
 
     given: Any = [pair("--at", text) for text in at] if at else None
     if places is not None:
         given = study.read_places(places)
+    places_of = {"count": count, "places": given, "move_target": move_target or None, "seed": seed}
+    options = {name: value for name, value in places_of.items() if value is not None}
+    if is_result(scene) and options:
+        raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(options)}.")
+    options |= {} if passes is None else {"passes": passes}
+    default = {} if is_result(scene) else {"count": 20, "passes": 8}
+    render = study.render_shots_again if is_result(scene) else study.render_shots
     with reporting(quiet) as progress:
-        series = study.render_shots(
-            scene,
-            parameters(define),
-            count=count,
-            places=given,
-            move_target=move_target,
-            passes=passes,
-            seed=seed,
-            progress=progress,
-        )
+        series = render(scene, params=parameters(define), progress=progress, **{**default, **options})
     output.parent.mkdir(parents=True, exist_ok=True)
     results.save(series, output)
     typer.echo(output)

@@ -109,7 +109,9 @@ def _load_xml(name: str, text: str, params: Mapping[str, Any] | None, source: Pa
     import mitsuba as mi
 
     root = parse_scene(text, source if isinstance(source, Path) else name)
-    known = source.parameters if isinstance(source, SceneRecord) else catalogue.parameters_of(root)
+    known = catalogue.parameters_of(root)
+    if isinstance(source, SceneRecord):
+        known |= source.parameters
     parameters, given = _filled(name, known, params)
     used = check_elements(root, parameters)
     if unused := [key for key in given if key not in used]:

@@ -45,15 +45,13 @@ def read_attributes(result: xr.Dataset | str | os.PathLike[str]) -> dict[str, An
 
 
 def result_kind(attributes: Mapping[str, Any]) -> str:
-    """Return the function that has rendered a result, ``render`` or ``passive``; raise UserError for others."""
-    if "shots" in attributes:
-        raise UserError("the result is a series of shots, which is not rendered again: render one shot, by its place")
-    for kind, name in (("passive", "frame_passes"), ("render", "pass_share")):
+    """Return the command that rendered a result: ``render``, ``shots`` or ``passive``; raise UserError for others."""
+    for kind, name in (("shots", "series_parameters"), ("passive", "frame_passes"), ("render", "pass_share")):
         if name in attributes:
             return kind
     raise UserError(
-        "the dataset is not a result that can be rendered again: it must be of render or passive, and of this release "
-        "or a later one"
+        "the dataset is not a result that can be rendered again: it must be of render, shots or passive, and of this "
+        "release or a later one"
     )
 
 
@@ -81,8 +79,10 @@ def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) ->
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)
+    if kind == "shots":
+        raise UserError("the result is a series of shots: use mitransient_lidar.render, or the command shots")
     record = SceneRecord.from_attributes(attributes)
-    _compare_versions(attributes)
+    compare_versions(attributes)
     own = {"seed": attributes["seed"], "variant": attributes["variant"], "integrator": _integrator(attributes)}
     given = {name: value for name, value in options.items() if value is not None}
     if kind == "passive":
@@ -134,7 +134,7 @@ def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _compare_versions(attributes: Mapping[str, Any]) -> None:
+def compare_versions(attributes: Mapping[str, Any]) -> None:
     """Warn of other versions than those of the result."""
     for name, version in variants.versions().items():
         if name != "variant" and attributes.get(name, version) != version:

@@ -35,7 +35,7 @@ class Session:
     sensor: mi.Sensor
     name: str
     parameters: dict[str, str]
-    record: SceneRecord | None
+    record: SceneRecord | None = None
 
     def attributes(self, integrator: Any = None, **others: Any) -> dict[str, Any]:
         """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import os
@@ -16,6 +17,7 @@ from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
@@ -145,8 +147,9 @@ def render_shots(
         the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a level sea,
         meets the largest solid of the scene, NaN where it misses. Attributes that differ between shots: the mean of
         numbers such as ``surface_time_ns``, the sum of ``elapsed_s``, and the limits of the echo window; positions are
-        left out. ``slope_deviation``: standard deviations of the two slopes of a sea with waves. After Ctrl-C the
-        dataset holds the completed shots, and the attribute ``interrupted`` is 1.
+        left out. ``series_parameters``: JSON of the scene's parameters that shots replace. ``slope_deviation``:
+        standard deviations of the two slopes of a sea with waves. After Ctrl-C the dataset holds the completed shots,
+        and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -187,11 +190,47 @@ def render_shots(
         series = series.assign_coords({name: ("shot", values[: len(found)], {"units": unit, "long_name": text})})
     attributes = merged_attributes([one.attrs for one in found])
     attributes |= {"shots": len(found), "interrupted": int(len(found) < len(pairs)), "moved_target": int(move_target)}
+    own = {name: value for name, value in session.parameters.items() if attributes.get(f"scene.{name}") != value}
+    attributes["series_parameters"] = json.dumps(own)
     if given is None:
         attributes["places_seed"] = seed
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     return series.assign_attrs(attributes)
+
+
+def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
+    """Render a series of shots of `render_shots`, or its file, again: the same bits on the same machine.
+
+    Parameters
+    ----------
+    series
+        A complete series, or the shots that were completed before Ctrl-C.
+    options
+        Options of `render_shots` that change it; `params` are added to the parameters of its scene.
+
+    Raises
+    ------
+    UserError
+        If shots were selected or reordered, the series does not hold its scene, a file of the scene has changed, or an
+        option is invalid.
+    """
+    from mitransient_lidar import results
+    from mitransient_lidar.rendering.again import compare_versions
+
+    found = series if isinstance(series, xr.Dataset) else results.open(series)
+    attributes = found.attrs
+    if "shot" not in found.dims or not np.array_equal(found["shot"], np.arange(attributes["shots"])):
+        raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
+    compare_versions(attributes)
+    given = {name: value for name, value in options.items() if value is not None}
+    params = {**json.loads(attributes["series_parameters"]), **given.pop("params", {})}
+    own = {
+        "places": np.column_stack([found["aim_x"], found["aim_y"]]),
+        "passes": int(attributes["passes"]),
+        "move_target": bool(attributes["moved_target"]),
+    }
+    return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **given})
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:

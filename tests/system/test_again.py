@@ -14,6 +14,7 @@ from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering.passive import render_passive
 from mitransient_lidar.results.gate_files import save_sequence, save_stack
 from mitransient_lidar.results.radiance import save_radiance
+from mitransient_lidar.studies.shot_series import render_shots, render_shots_again
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 SMALL = {"surface_size": "60", "bin_width_ns": "4", "bin_count": "40"}
@@ -141,7 +142,7 @@ def test_commands(tmp_path):
     done = run("render", file, "-o", tmp_path / "b", "--no-plot", "-q")
     assert done.exit_code == 0, done.stderr
     assert_same_bits(first, results.open(tmp_path / "b" / "table1.nc"))
-    assert_refused(run("render", file, "-o", tmp_path / "a"), "would be overwritten", "choose another folder with -o")
+    assert_refused(run("render", file, "-o", tmp_path / "a"), "would be overwritten", "choose another place with -o")
     assert_refused(run("passive", file, "-o", tmp_path), "result of the command render: use render")
     assert_refused(run("render", tmp_path / "none.nc"), "No such file")
     lines = run("info", file).stdout.splitlines()
@@ -194,3 +195,28 @@ def test_daylight_gives_the_same_bits(tmp_path):
     done = run("passive", tmp_path / "a.exr", "-o", tmp_path / "b", "--no-plot", "-q")
     assert done.exit_code == 0, done.stderr
     assert_refused(run("render", tmp_path / "a.nc"), "result of the command passive: use passive")
+
+
+@pytest.mark.slow
+def test_series_of_shots_give_the_same_bits(tmp_path):
+    """Places, truth and a target that goes with the shots are repeated, with parameters that shots replace."""
+    params = {**SMALL, "target_x": 1, "target_depth": 5}
+    first = render_shots("fig13_2x2", params, count=2, move_target=True, passes=2)
+    assert json.loads(first.attrs["series_parameters"]) == {
+        "aim_x": "0",
+        "aim_y": "0",
+        "target_x": "1",
+        "target_y": "0",
+    }
+    results.save(first, tmp_path / "a.nc")
+    assert_same_bits(first, mitransient_lidar.render(tmp_path / "a.nc"))
+    deeper = render_shots_again(first, params={"target_depth": 6})
+    assert not np.array_equal(deeper["waveform"], first["waveform"])
+    np.testing.assert_array_equal(deeper["aim_x"], first["aim_x"])
+    with pytest.raises(UserError, match="rendered again as a whole"):
+        mitransient_lidar.render(first.isel(shot=[1]))
+    assert_refused(run("render", tmp_path / "a.nc"), "result of the command shots: use shots")
+    assert_refused(run("shots", tmp_path / "a.nc", "--seed", 2, "-o", tmp_path / "b.nc"), "leave out seed")
+    done = run("shots", tmp_path / "a.nc", "-o", tmp_path / "b.nc", "-q")
+    assert done.exit_code == 0, done.stderr
+    assert_same_bits(first, results.open(tmp_path / "b.nc"))
