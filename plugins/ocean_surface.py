@@ -153,6 +153,14 @@ class OceanSurface(mi.Mesh):
         #: Side of the cells that the beam alone needs [m], the cells' or more.
         self.beam_cell_size = sea.beam_cell_size
 
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values used for parameters that may be automatic [m]; without cells for a sea without waves."""
+        sea = self.sea
+        values = {"centre_x": sea.centre[0], "centre_y": sea.centre[1], "size": sea.size}
+        fine = {"cell_size": sea.cell_size, "refined_size": sea.refined_size}
+        return values | (fine if np.isfinite(sea.cell_size) else {})
+
     def _roughness(self) -> tuple[float, float]:
         """Return Beckmann's alpha of the ripples along and across the wind."""
         along, across = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)

@@ -287,6 +287,13 @@ class Seabed(mi.Mesh):
         self.add_attribute(REFLECTANCE, 1, self.bottom.reflectances(x, y).ravel().tolist())
         fill_mesh(self, mesh)
 
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values used for parameters that may be automatic [m]; empty for a plane, which has no cells."""
+        bottom = self.bottom
+        fine = {"cell_size": bottom.cell_size, "refined_size": bottom.refined_size}
+        return fine if math.isfinite(bottom.cell_size) else {}
+
     def to_string(self) -> str:
         """Return a description."""
         bottom = self.bottom

@@ -11,6 +11,7 @@ A result has these attributes:
 ``plugin_parameters``
     JSON object of the objects of the scene and the integrator: ``type`` (of Mitsuba's own plugins ``class``) and values
     of all parameters, nested objects included; null for one that is not given and has no default, or is not used.
+    ``used`` holds values that were chosen for automatic ones.
 """
 
 from __future__ import annotations
@@ -142,14 +143,20 @@ class SceneRecord:
         return restored
 
 
-def plugin_values(scene: mi.Scene, integrator: Any = None) -> str:
-    """Return the attribute ``plugin_parameters`` of a loaded scene, with another integrator than its own."""
+def plugin_values(scene: mi.Scene, integrator: Any = None, used: Mapping[str, float] | None = None) -> str:
+    """Return the attribute ``plugin_parameters`` of a loaded scene, with another integrator than its own.
+
+    `used` are the values that were chosen for automatic parameters of the integrator.
+    """
     from mitransient_lidar.plugins.bases import exposed
 
     own = scene.integrator()
-    used = own if integrator is None else integrator
+    integrator = own if integrator is None else integrator
+    described = {} if integrator is None else {"integrator": object_values(integrator)}
+    if used:
+        described["integrator"]["used"] = dict(used)
     objects = [(name, part) for name, part in exposed(scene)[1] if part is not own]
-    return json.dumps({**({} if used is None else {"integrator": object_values(used)}), **_named(objects)})
+    return json.dumps({**described, **_named(objects)})
 
 
 def _named(objects: Iterable[tuple[str, mi.Object]]) -> dict[str, Any]:
@@ -180,7 +187,8 @@ def object_values(part: mi.Object) -> dict[str, Any]:
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
     known: list[str] = ["type", *plugin_parameters(str(own["type"]))]
-    return {**dict.fromkeys(known), **plain, **_named(objects)}
+    used = {"used": part.used_values} if getattr(part, "used_values", None) else {}
+    return {**dict.fromkeys(known), **plain, **used, **_named(objects)}
 
 
 def _plain(value: Any) -> Any:

@@ -131,7 +131,7 @@ def _text(value: Any) -> str:
 def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the integrator of a result as a dict for Mitsuba."""
     values = json.loads(attributes["plugin_parameters"])["integrator"]
-    return {name: value for name, value in values.items() if value is not None}
+    return {name: value for name, value in values.items() if value is not None and name != "used"}
 
 
 def compare_versions(attributes: Mapping[str, Any]) -> None:

@@ -162,6 +162,7 @@ def render(
     warn_of_edge_loss(lost)
     attributes = session.attributes(
         integrator=chosen,
+        used=renderer.used_values,
         **pass_attributes(log, seed),
         pass_share=share,
         max_memory_gb=max_memory,

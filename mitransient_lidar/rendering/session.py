@@ -37,11 +37,16 @@ class Session:
     parameters: dict[str, str]
     record: SceneRecord | None = None
 
-    def attributes(self, integrator: Any = None, **others: Any) -> dict[str, Any]:
-        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`."""
+    def attributes(
+        self, integrator: Any = None, used: Mapping[str, float] | None = None, **others: Any
+    ) -> dict[str, Any]:
+        """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
+
+        `used` are the values that were chosen for automatic parameters of the integrator.
+        """
         recorded = {} if self.record is None else self.record.attributes()
         own = {} if integrator is None else {"integrator": integrator.plugin}
-        recorded["plugin_parameters"] = plugin_values(self.scene, integrator)
+        recorded["plugin_parameters"] = plugin_values(self.scene, integrator, used)
         return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
 
 

@@ -3,7 +3,8 @@
 A result is an `xarray.Dataset` with the variables ``impulse_response`` [J per bin] and ``waveform`` [W] and their
 standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the dimensions (pixel, time), or (row, column,
 time) for an imager. The coordinates are ``time`` [ns] at the centres of the bins, ``pixel`` (names), and the centres of
-the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes. A
+the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes,
+among them the scene and all parameters of its plugins (`loading.scene_record`), from which it can be rendered again. A
 series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates.
 
 EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.

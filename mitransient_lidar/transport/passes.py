@@ -69,6 +69,11 @@ class PassRenderer(ABC):
         """Number of paths of a pass from either end."""
         return self.paths
 
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values used for parameters of the integrator that may be automatic."""
+        return {"paths_per_pass": self.paths}
+
     def scaled(self, share: float) -> PassRenderer:
         """Return a renderer of passes with a share of the paths."""
         scaled = copy.copy(self)

@@ -63,6 +63,8 @@ def test_a_result_and_its_files_give_the_same_bits(suffix, tmp_path):
     values = json.loads(first.attrs["plugin_parameters"])
     assert values["surface"]["interior"]["jerlov"] == first.attrs["scene.jerlov"] == "1C"
     assert values["integrator"]["paths_per_pass"] == 4096
+    assert values["surface"]["size"] == "60"
+    assert values["surface"]["used"]["size"] == 60
 
 
 def test_given_options_win(tmp_path):
@@ -158,6 +160,9 @@ def test_every_shipped_scene_gives_the_same_bits(name, tmp_path):
     layout = {"layout": "8x8"} if catalogue.scene_parameters(name)["layout"] == "128x128" else {}
     first = mitransient_lidar.render(name, params={"wind_speed": "2.5", **layout}, passes=2, seed=3)
     assert first.attrs["scene.wind_speed"] == "2.5"
+    used = json.loads(first.attrs["plugin_parameters"])["integrator"]["used"]
+    assert (used["paths_per_pass"], used["photons_per_pass"]) == (32768, 32768)
+    assert 0.001 < used["cell_size"] < 0.1 < used["point_spacing"] < 5
     save = results.save if "waveform" in first else save_stack
     save(first, tmp_path / "a.nc")
     assert_same_bits(first, mitransient_lidar.render(tmp_path / "a.nc"))

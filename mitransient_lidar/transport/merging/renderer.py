@@ -145,6 +145,12 @@ class MergingRenderer(PassRenderer):
         """Number of paths of a pass from receiver and laser."""
         return self.paths + self.photons
 
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values used for parameters of the integrator that may be automatic; lengths in metres."""
+        lengths = {"cell_size": self.layout.patch_width / _PATCH_PER_CELL, "point_spacing": self.layout.spacing}
+        return {"paths_per_pass": self.paths, "photons_per_pass": self.photons, **lengths}
+
     def scaled(self, share: float) -> MergingRenderer:
         """Return a renderer of passes with a share of the paths, with the same layout and buffers."""
         scaled = copy.copy(self)
