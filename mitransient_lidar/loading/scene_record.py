@@ -80,7 +80,7 @@ class SceneRecord:
         """Return the record of a scene given as a dict, None if it holds loaded objects or other unknown values."""
         try:
             text = json.dumps(_to_json(scene))
-        except TypeError:
+        except (RuntimeError, TypeError, ValueError):
             return None
         return cls("scene", text, False, {}, _found(_files_of_dict(json.loads(text)), Path()))
 
@@ -103,7 +103,7 @@ class SceneRecord:
         parameters = {name[len(prefix) :]: value for name, value in attributes.items() if name.startswith(prefix)}
         files = {
             (file["plugin"], file["name"]): (file["path"], file["sha256"])
-            for file in json.loads(attributes.get("scene_files", "[]"))
+            for file in (json_attribute(attributes, "scene_files") if "scene_files" in attributes else [])
         }
         return cls(str(attributes["scene"]), attributes[f"scene_{kinds[0]}"], kinds[0] == "xml", parameters, files)
 
@@ -141,6 +141,16 @@ class SceneRecord:
 
         restored: dict[str, Any] = _from_json(placed(json.loads(self.text)))
         return restored
+
+
+def json_attribute(attributes: Mapping[str, Any], name: str) -> Any:
+    """Return the value of an attribute of JSON; raise UserError if it is missing or damaged."""
+    if name not in attributes:
+        raise UserError(f"the result has no attribute {name}, without which it is not rendered again")
+    try:
+        return json.loads(attributes[name])
+    except (TypeError, ValueError) as error:
+        raise UserError(f"the attribute {name} of the result is damaged: it must be a text of JSON") from error
 
 
 def plugin_values(scene: mi.Scene, integrator: Any = None, used: Mapping[str, float] | None = None) -> str:

@@ -75,6 +75,7 @@ def load(scene: Any, params: Mapping[str, Any] | None = None) -> LoadedScene:
 
     from mitransient_lidar.transport.scene import fit_seas
 
+    check_params(params)
     if isinstance(scene, mi.Scene):
         _no_parameters(params, "a loaded scene")
         loaded = LoadedScene(scene, scene.id() or "scene", {}, None)
@@ -96,9 +97,9 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     """Load a scene given as a dict, or its record."""
     import mitsuba as mi
 
-    record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
     given = scene.scene_dict() if isinstance(scene, SceneRecord) else scene
     check_dict(given)
+    record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
     with as_user_error(), _placeholder_seas():
         loaded = mi.load_dict({"type": "scene", **given}, optimize=False)
     return LoadedScene(loaded, "scene", {}, record)
@@ -138,13 +139,17 @@ def _load_xml(name: str, text: str, params: Mapping[str, Any] | None, source: Pa
     return LoadedScene(loaded, name, parameters, record)
 
 
+def check_params(params: object) -> None:
+    """Raise `UserError` if parameters of a scene are not given as a dict."""
+    if params is not None and not isinstance(params, Mapping):
+        raise UserError(f"params = {shown(params)} must be a dict of names and values")
+
+
 def _filled(
     scene: str, known: Mapping[str, str], params: Mapping[str, Any] | None
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Return the parameters of an XML scene, `known` with defaults, with their values as text, and the given ones."""
     parameters, given = dict(known), {}
-    if params is not None and not isinstance(params, Mapping):
-        raise UserError(f"params = {shown(params)} must be a dict of names and values")
     for name, value in (params or {}).items():
         if name not in parameters:
             close = difflib.get_close_matches(str(name), parameters, n=3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
@@ -15,13 +14,17 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
 from mitransient_lidar.rendering.passive import MOST_FRAMES, render_passive
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import input_format
 
 logger = logging.getLogger(__name__)
+
+#: Attributes that are options of a render.
+_RENDER_OPTIONS = ("seed", "variant", "passes", "pass_share", "max_memory_gb")
+_PASSIVE_OPTIONS = ("seed", "variant", "frame_passes", "frame_step_s")
 
 #: Options that end a render.
 _ENDS = ("target_error", "max_time", "passes")
@@ -82,6 +85,9 @@ def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) ->
     if kind == "shots":
         raise UserError("the result is a series of shots: use mitransient_lidar.render, or the command shots")
     record = SceneRecord.from_attributes(attributes)
+    needed = {"passive": _PASSIVE_OPTIONS, "render": _RENDER_OPTIONS}[kind]
+    if missing := [name for name in needed if name not in attributes]:
+        raise UserError(f"the result has no attribute {missing[0]}, without which it is not rendered again")
     compare_versions(attributes)
     own = {"seed": attributes["seed"], "variant": attributes["variant"], "integrator": _integrator(attributes)}
     given = {name: value for name, value in options.items() if value is not None}
@@ -105,7 +111,8 @@ def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:
     cannot be read.
     """
     attributes = read_attributes(path)
-    plugins = json.loads(attributes.pop("plugin_parameters", "{}"))
+    plugins = json_attribute(attributes, "plugin_parameters") if "plugin_parameters" in attributes else {}
+    attributes.pop("plugin_parameters", None)
     long = [name for name, value in attributes.items() if isinstance(value, str) and re.match(r"\s*[\[{<]", value)]
     plain = {name: value for name, value in attributes.items() if name not in long}
     return {name: _text(value) for name, value in {**plain, **_flat(plugins)}.items()}
@@ -130,7 +137,7 @@ def _text(value: Any) -> str:
 
 def _integrator(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the integrator of a result as a dict for Mitsuba."""
-    values = json.loads(attributes["plugin_parameters"])["integrator"]
+    values = json_attribute(attributes, "plugin_parameters").get("integrator", {})
     return {name: value for name, value in values.items() if value is not None and name != "used"}
 
 

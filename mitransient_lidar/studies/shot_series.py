@@ -17,7 +17,8 @@ from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
-from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
+from mitransient_lidar.loading.scenes import check_params
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
@@ -220,11 +221,12 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
 
     found = series if isinstance(series, xr.Dataset) else results.open(series)
     attributes = found.attrs
-    if "shot" not in found.dims or not np.array_equal(found["shot"], np.arange(attributes["shots"])):
+    if "shot" not in found.dims or not np.array_equal(found["shot"], np.arange(attributes.get("shots", 0))):
         raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
     compare_versions(attributes)
     given = {name: value for name, value in options.items() if value is not None}
-    params = {**json.loads(attributes["series_parameters"]), **given.pop("params", {})}
+    check_params(given.get("params"))
+    params = {**json_attribute(attributes, "series_parameters"), **given.pop("params", {})}
     own = {
         "places": np.column_stack([found["aim_x"], found["aim_y"]]),
         "passes": int(attributes["passes"]),

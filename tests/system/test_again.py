@@ -134,6 +134,26 @@ def test_what_cannot_be_rendered_again_is_refused(tmp_path):
     assert json.loads(first.attrs["plugin_parameters"])["sea"]["interior"]["profile_tolerance"] == 0.1
     with pytest.raises(UserError, match="not a result that can be rendered again"):
         mitransient_lidar.render(first.drop_attrs())
+    own = mitransient_lidar.render(scene_dict(tmp_path), passes=2)
+    for params, message in ((5, "params = 5 must be a dict"), ({"a": 1}, "need an XML scene")):
+        with pytest.raises(UserError, match=message):
+            mitransient_lidar.render(own, params=params)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"seed": None}, "no attribute seed"),
+        ({"plugin_parameters": "{"}, "plugin_parameters of the result is damaged"),
+        ({"scene_files": 3}, "scene_files of the result is damaged"),
+        ({"variant": "scalar_rgb"}, "variant = 'scalar_rgb' is not supported"),
+    ],
+)
+def test_damaged_results_are_refused(attributes, message, tmp_path):
+    first = mitransient_lidar.render(scene_dict(tmp_path), passes=2)
+    first.attrs = {name: value for name, value in {**first.attrs, **attributes}.items() if value is not None}
+    with pytest.raises(UserError, match=message):
+        mitransient_lidar.render(first)
 
 
 def test_commands(tmp_path):
