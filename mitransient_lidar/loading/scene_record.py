@@ -129,15 +129,13 @@ class SceneRecord:
         """Return the scene given as a dict, with paths of its files; raise UserError if a file has changed."""
 
         def placed(part: dict[str, Any]) -> dict[str, Any]:
-            plugin = str(part.get("type", ""))
-            return {
-                key: placed(value)
-                if isinstance(value, dict)
-                else _unchanged(*self.files[plugin, value])
-                if key in FILE_PARAMETERS and (plugin, value) in self.files
-                else value
-                for key, value in part.items()
-            }
+            found = {}
+            for key, value in part.items():
+                file = (str(part.get("type", "")), value)
+                is_file = key in FILE_PARAMETERS and isinstance(value, str) and file in self.files
+                nested = placed(value) if isinstance(value, dict) else value
+                found[key] = _unchanged(*self.files[file]) if is_file else nested
+            return found
 
         restored: dict[str, Any] = _from_json(placed(json.loads(self.text)))
         return restored

@@ -121,8 +121,9 @@ def _load_xml(name: str, text: str, params: Mapping[str, Any] | None, source: Pa
     record = SceneRecord.of_xml(name, text, root, parameters, folder)
     if isinstance(source, SceneRecord):
         # Files that given parameters name are found as in any scene.
-        record = replace(record, files={**record.files, **source.files})
-        source.place_files(root, parameters)
+        kept = {file: found for file, found in source.files.items() if file[1] not in given.values()}
+        record = replace(record, files={**record.files, **kept})
+        record.place_files(root, parameters)
     # Mitsuba refuses parameters that nothing uses; a part that is missing is told instead.
     referred = used if isinstance(source, Path) else check_elements(root, parameters)
     values = {key: value for key, value in parameters.items() if key in referred}

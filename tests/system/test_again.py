@@ -123,6 +123,9 @@ def test_files_of_an_xml_scene_are_found_from_another_folder(tmp_path, monkeypat
     changed = mitransient_lidar.render(first, params={"profile": "new.csv"})
     assert not np.array_equal(changed["waveform"], first["waveform"])
     assert_same_bits(changed, mitransient_lidar.render(changed))
+    # A parameter that is given names the file of the working folder, also where it has the recorded name.
+    (other / "profile.csv").write_text((other / "new.csv").read_text())
+    assert_same_bits(changed, mitransient_lidar.render(first, params={"profile": "profile.csv"}))
 
 
 def test_what_cannot_be_rendered_again_is_refused(tmp_path):

@@ -8,7 +8,7 @@ import mitsuba as mi
 import pytest
 
 from mitransient_lidar.loading.checks import plugin_parameters
-from mitransient_lidar.loading.scene_record import object_values, plugin_values
+from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, object_values, plugin_values
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 #: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
@@ -57,8 +57,8 @@ def _values(plugin, folder):
     return object_values(mi.load_dict(part))
 
 
-def _documented_defaults(plugin):
-    """Return the defaults that the table of a plugin's manual page gives as a number or a word, by parameter."""
+def _table(plugin):
+    """Return the texts of the table of a plugin's manual page by the names of parameters."""
     module = next(name for name in PLUGIN_MODULES if name.rpartition(".")[2] == plugin)
     page = next(
         part.__doc__
@@ -72,8 +72,13 @@ def _documented_defaults(plugin):
         cell = tuple(re.findall(r"[a-z]\w*", line[start : start + width]))
         names = cell or names
         rows[names] = f"{rows.get(names, '')} {' '.join(line[start + width :].split())}"
+    return rows
+
+
+def _documented_defaults(plugin):
+    """Return the defaults that a plugin's manual page gives as a number or a word, by parameter."""
     pattern = re.compile(r"Default: (?:``([^`]+)``|(-?\d+(?:\.\d+)?(?:e[+-]?\d+)?|true|false)\b)")
-    found = {names: pattern.search(text) for names, text in rows.items()}
+    found = {names: pattern.search(text) for names, text in _table(plugin).items()}
     return {name: match[1] or match[2] for names, match in found.items() if match for name in names}
 
 
@@ -89,6 +94,14 @@ def test_every_documented_parameter_is_kept_with_its_default(plugin, tmp_path):
     for name, text in defaults.items():
         assert str(values[name]).lower() == text or float(values[name]) == float(text), name
     assert len(defaults) >= MOST_DEFAULTS.get(plugin, 0)
+
+
+def test_files_of_every_parameter_that_names_one_are_recorded():
+    """Other parameters whose text names a kind of file only refer to one of these."""
+    texts = {name: text for plugin in PLUGINS for names, text in _table(plugin).items() for name in names}
+    named = {name for name, text in texts.items() if re.search(r"\bfile\b|\.(png|npy|npz|nc|csv|asc)\b", text)}
+    assert named >= set(FILE_PARAMETERS) - {"filename"}
+    assert named - set(FILE_PARAMETERS) == {"spectrum", "origin_x", "origin_y"}
 
 
 def test_given_values_and_nested_objects_are_kept():
