@@ -102,8 +102,8 @@ def shots(
     given: Any = [pair("--at", text) for text in at] if at else None
     if places is not None:
         given = study.read_places(places)
-    places_of = {"count": count, "places": given, "move_target": move_target or None, "seed": seed}
-    options = {name: value for name, value in places_of.items() if value is not None}
+    where = {"count": count, "places": given, "move_target": move_target or None, "seed": seed}
+    options = {name: value for name, value in where.items() if value is not None}
     if is_result(scene) and options:
         raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(options)}.")
     options |= {} if passes is None else {"passes": passes}

@@ -15,7 +15,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.core.validation import FloatArray, integer, positive, shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.rendering.accuracy import RatioStatistics
@@ -102,9 +102,9 @@ def render_passive(
     frames, step = integer("frames", frames, 1, MOST_FRAMES), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
     seed = check_seed(seed)
-    counts = list(passes) if isinstance(passes, Sequence) else [passes] * frames
+    counts: list[Any] = list(passes) if isinstance(passes, (list, tuple)) else [passes] * frames
     if len(counts) != frames:
-        raise UserError(f"passes has {len(counts)} numbers but must have one a frame, {frames}")
+        raise UserError(f"passes = {shown(passes)} must be one number, or {frames}, one a frame")
     goals = [Goal.from_options(target_error, max_time, count, DEFAULT_GOAL, target_quantile) for count in counts]
     rendered: list[int] = []
     images: list[tuple[FloatArray, FloatArray]] = []
