@@ -150,8 +150,8 @@ class OceanSurface(mi.Mesh):
         self.ripple_variance, self.slope_variance = sea.ripple_variance, sea.slope_variance
         #: Side of the cells of the fine patch, pairs of triangles [m]; infinite for a flat sea.
         self.cell_size = sea.cell_size
-        #: Side of the cells that the beam alone needs [m], the cells' or more.
-        self.beam_cell_size = sea.beam_cell_size
+        #: Wavelength of the shortest waves that the beam alone needs [m], that of the sea or more.
+        self.beam_wave = sea.beam_wave
 
     @property
     def used_values(self) -> dict[str, float]:
@@ -171,7 +171,8 @@ class OceanSurface(mi.Mesh):
         sea = self.sea
         return (
             f"OceanSurface[{sea.spectrum}, wind_speed={sea.wind_speed:g} m/s, patch of {sea.refined_size:g} m in cells "
-            f"of {sea.cell_size:g} m, size={sea.size:g} m, faces={self.face_count()}, "
+            f"of {sea.cell_size:g} m, shortest_wave={sea.shortest_wave:g} m, size={sea.size:g} m, "
+            f"faces={self.face_count()}, "
             f"resolved_variance={sea.resolved_variance}, ripple_variance={sea.ripple_variance}]"
         )
 

@@ -22,6 +22,9 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
+#: Length over which slopes change, over the shortest wavelength.
+_FACET_PER_WAVE = 0.25
+
 
 @dataclass(frozen=True)
 class WaterScene:
@@ -61,13 +64,16 @@ class WaterScene:
 
     @property
     def facet_size(self) -> float:
-        """Side of the sea surface's cells, pairs of triangles, in the fine patch, or their mean in other meshes [m].
+        """Length over which slopes of the sea surface change [m].
 
-        Cells that are finer for the pixels of an image count as those that the beam needs.
+        A quarter of the shortest waves that the beam needs or, if longer, the side of a cell; in meshes of other
+        plugins the mean side of a cell, a pair of triangles. Waves that are shorter for the pixels of an image, and
+        cells that are finer than their waves, do not count.
         """
         sizes = [
-            getattr(surface, "beam_cell_size", None)
-            or float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
+            max(surface.cell_size, _FACET_PER_WAVE * surface.beam_wave)
+            if hasattr(surface, "beam_wave")
+            else float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
             if surface.is_mesh()
         ]

@@ -12,8 +12,6 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.realization import (
     facet_slope_variance,
     heights_of,
-    mesh_slope_variance,
-    realise,
     wave_coefficients,
     wave_numbers,
 )
@@ -81,8 +79,8 @@ class NestedHeights:
     fraction of the last, so that the wavenumbers of all bands fill the plane without gap or overlap.
     """
 
-    bands: tuple[Band, ...]  #: All but the shortest waves, by decreasing period.
-    short_waves: PeriodicHeights
+    bands: tuple[Band, ...]  #: Waves by decreasing period, at least one band.
+    short_waves: PeriodicHeights | None  #: The waves of the shortest period, unless they are the last band.
 
     @property
     def cells(self) -> int:
@@ -96,11 +94,18 @@ class NestedHeights:
 
     def sample(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], shape (len(y), len(x)); see `PeriodicHeights.sample`."""
-        return sum((band.sample(x, y) for band in self.bands), self.short_waves.sample(x, y))
+        parts = [band.sample(x, y) for band in self.bands]
+        return sum(parts if self.short_waves is None else [*parts, self.short_waves.sample(x, y)], np.zeros(()))
 
 
 def realise_heights(
-    spectrum: WaveSpectrum, period: float, cell: float, seed: int, motion: Motion, axis: float
+    spectrum: WaveSpectrum,
+    period: float,
+    cell: float,
+    seed: int,
+    motion: Motion,
+    axis: float,
+    shortest_wave: float = 0.0,
 ) -> tuple[PeriodicHeights | NestedHeights, float, tuple[float, float]]:
     """Realise a sea for facets of a given size.
 
@@ -116,6 +121,8 @@ def realise_heights(
         Time, depth and current.
     axis
         Direction of the slope variances [rad], counter-clockwise from +x.
+    shortest_wave
+        Wavelength of the shortest waves [m]; shorter than two cells, the waves end there.
 
     Returns
     -------
@@ -124,16 +131,17 @@ def realise_heights(
         axis.
     """
     details = motion.time, motion.depth, motion.current
-    cells = even_cells(cell, period)
-    if cells <= _MOST_CELLS:
-        waves = PeriodicHeights(realise(spectrum, period, cells, seed, *details), period / cells)
-        return waves, period / cells, mesh_slope_variance(spectrum, period, cells, axis)
+
+    def grid_of_waves(part: float) -> int:
+        """Return the cells per period of the coarsest grid that holds all waves."""
+        finest = even_cells(cell, part)
+        return min(finest, 2 * int(part / shortest_wave) + 2) if shortest_wave > 0 else finest
 
     # The cell of the last grid is that of the facets of all bands.
     periods, limits = [period], [0]
-    while even_cells(cell, periods[-1]) > _MOST_CELLS:
+    while grid_of_waves(periods[-1]) > _MOST_CELLS:
         tiles = 3
-        while tiles < _MOST_TILES and even_cells(cell, periods[-1] / tiles) > _MOST_CELLS:
+        while tiles < _MOST_TILES and grid_of_waves(periods[-1] / tiles) > _MOST_CELLS:
             tiles += 2
         # Up to h wavelengths in this period, from j + 1 in the next: (h + 1/2)/period = (j + 1/2)/next period.
         limits.append((_LONG_WAVE_CELLS // 2 - 1 - tiles // 2) // tiles)
@@ -141,11 +149,12 @@ def realise_heights(
     cells = even_cells(cell, periods[-1])
     cell = periods[-1] / cells
 
-    bands = []
+    bands: list[Band] = []
+    short_waves = None
     resolved = np.zeros(2)
     for number, (part, inner) in enumerate(zip(periods, limits, strict=True)):
         is_last = number == len(periods) - 1
-        count = cells if is_last else _LONG_WAVE_CELLS
+        count = grid_of_waves(part) if is_last else _LONG_WAVE_CELLS
         ix, iy, dk = wave_numbers(part, count)
         if is_last:
             outer = count // 2 - 1
@@ -154,18 +163,22 @@ def realise_heights(
             outer = tiles * limits[number + 1] + tiles // 2
         furthest = np.maximum(np.abs(iy)[:, None], ix)
         is_missing = (furthest > outer) | (furthest <= inner) & (number > 0)
+        is_missing |= np.hypot(iy[:, None], ix) * shortest_wave > part
         # Each band has other random numbers: plugins allow seeds up to 2^53.
         coefficients = wave_coefficients(spectrum, part, count, seed + number * 2**54, *details)
         coefficients[is_missing] = 0
         variance = spectrum.mode_variances(ix, iy, dk)
         variance[is_missing] = 0
         resolved += facet_slope_variance(variance, ix, iy, part, part / cell, axis)
-        if is_last:
-            short_waves = PeriodicHeights(heights_of(coefficients), cell)
+        if is_last and cells <= _MOST_CELLS:
+            short_waves = PeriodicHeights(heights_of(coefficients, cells), cell)
         else:
             rows = np.roll(np.arange(count), count // 2)[count // 2 - outer : count // 2 + outer + 1]
             bands.append(Band(coefficients[rows, : outer + 1], part))
-    return NestedHeights(tuple(bands), short_waves), cell, (float(resolved[0]), float(resolved[1]))
+    found = float(resolved[0]), float(resolved[1])
+    if short_waves is not None and not bands:
+        return short_waves, cell, found
+    return NestedHeights(tuple(bands), short_waves), cell, found
 
 
 def even_cells(cell: float, period: float) -> int:

@@ -10,14 +10,20 @@ from typing import Any
 from mitransient_lidar.core.validation import finite, in_range, positive
 from mitransient_lidar.physics.lidar.divergence import read_divergence
 
-#: Sides of a cell and of the patch without a lidar [m].
-_DEFAULT_CELL, _DEFAULT_SIZE = 0.25, 32.0
+#: Shortest wave, and sides of a cell and of the patch without a lidar [m].
+_DEFAULT_WAVE, _DEFAULT_CELL, _DEFAULT_SIZE = 1.0, 0.125, 32.0
 
-#: Cells per standard deviation of the beam and per side of a pixel, and limits of the resulting cell size [m].
-_CELLS_PER_SPREAD, _CELLS_PER_PIXEL, _SMALLEST_CELL, _LARGEST_CELL = 4.0, 2.0, 0.02, 0.5
+#: Side of a pixel in the shortest waves, and limits of the latter [m].
+_PIXELS_PER_WAVE, _SMALLEST_WAVE, _LARGEST_WAVE = 4.0, 0.08, 2.0
 
-#: Largest number of cells per side of an automatic patch, and largest factor by which cells grow to respect it.
-_MOST_CELLS, _LARGEST_GROWTH = 1024, 4.0
+#: Cells in the shortest wave of a beam, fewer where the patch would have too many of them, and per side of a pixel.
+_CELLS_PER_WAVE, _FEWEST_CELLS_PER_WAVE, _CELLS_PER_PIXEL = 12.0, 4.0, 2.0
+
+#: Limits of automatic cells [m].
+_SMALLEST_CELL, _LARGEST_CELL = 0.02, 0.25
+
+#: Number of cells per side of an automatic patch above which waves have fewer cells, and largest number.
+_MANY_CELLS, _MOST_CELLS = 512, 1024
 
 #: Side of the patch: factor on the footprint, and margin [m] for scattered light.
 _SIZE_PER_FOOTPRINT, _SIZE_MARGIN = 1.25, 8.0
@@ -43,7 +49,7 @@ class Instrument:
     off_nadir: float  #: Angle of the axis from the vertical, at most 89.9 degrees [rad].
     is_laser: bool
     half_angle: float  #: Half of the full angle of the light or the field of view [rad].
-    detail: float  #: Angle that a cell may span at most [rad].
+    detail: float  #: Standard deviation of the beam, or side of a pixel [rad].
 
     @classmethod
     def laser(
@@ -51,19 +57,25 @@ class Instrument:
     ) -> Instrument:
         """Return a laser whose beam has the given narrowest and widest standard deviation [rad]."""
         narrow, wide = spreads
-        return cls(aim, altitude, off_nadir, True, _BEAM_HALF_WIDTH * wide, narrow / _CELLS_PER_SPREAD)
+        return cls(aim, altitude, off_nadir, True, _BEAM_HALF_WIDTH * wide, narrow)
 
     @classmethod
     def receiver(
         cls, aim: tuple[float, float], altitude: float, off_nadir: float, field_of_view: float, pixel: float
     ) -> Instrument:
         """Return a receiver of a full angle and a typical side of a pixel [rad]."""
-        return cls(aim, altitude, off_nadir, False, 0.5 * field_of_view, pixel / _CELLS_PER_PIXEL)
+        return cls(aim, altitude, off_nadir, False, 0.5 * field_of_view, pixel)
 
     @property
-    def cell(self) -> float:
-        """Side of the cells that resolve its beam or its pixels [m]."""
-        return self.altitude / math.cos(self.off_nadir) * self.detail
+    def wave(self) -> float:
+        """Shortest wave that it needs [m]: the beam's standard deviation on the sea, or four pixels."""
+        return self.altitude / math.cos(self.off_nadir) * self.detail * (1.0 if self.is_laser else _PIXELS_PER_WAVE)
+
+    def cell(self, patch: float) -> float:
+        """Return the side of the cells that it needs [m] in a patch of a side [m]."""
+        if not self.is_laser:
+            return self.wave / (_PIXELS_PER_WAVE * _CELLS_PER_PIXEL)
+        return max(self.wave / _CELLS_PER_WAVE, min(self.wave / _FEWEST_CELLS_PER_WAVE, patch / _MANY_CELLS))
 
     @property
     def half_side(self) -> float:
@@ -84,9 +96,8 @@ class Resolution:
     cell_size: float  #: Largest side of the patch's cells.
     refined_size: float  #: Side of the patch.
     size: float  #: Side of the whole surface.
-    cells_per_beam_cell: float = (
-        1.0  #: Length of the cells that the beam alone needs, over that of the cells; 1 or more.
-    )
+    shortest_wave: float  #: Wavelength of the shortest waves.
+    beam_wave: float  #: The shortest waves that the beam alone needs, not shorter than those.
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument]) -> Resolution:
@@ -106,8 +117,7 @@ class Resolution:
             If a value is not positive or out of range.
         """
         cell, side = read_length(get, "cell_size"), read_length(get, "refined_size")
-        explicit = cell is not None
-        size = read_length(get, "size")
+        size, wave = read_length(get, "size"), read_length(get, "shortest_wave")
         found = _with_own_values(get, instruments)
         areas = [_square(found), _square([each for each in found if each.is_laser] or found)]
         centre = tuple(
@@ -117,9 +127,14 @@ class Resolution:
         )
         everything, lit = (_SIZE_PER_FOOTPRINT * area[2] + _SIZE_MARGIN for area in areas)
         size = size or max(_LEAST_SURFACE, _SURFACE_PER_SIZE * everything)
-        wanted = min((each.cell for each in found), default=_DEFAULT_CELL)
+        waves, lit_waves = (
+            min((each.wave for each in some), default=_DEFAULT_WAVE)
+            for some in (found, [each for each in found if each.is_laser] or found)
+        )
         # A beam must not lie within one facet.
-        longest = _LARGEST_GROWTH * min((each.cell for each in found if each.is_laser), default=math.inf)
+        longest = min((each.wave for each in found if each.is_laser), default=math.inf)
+        wanted = min((each.cell(side or everything) for each in found), default=_DEFAULT_CELL)
+        wanted = min(wanted, math.inf if wave is None else wave / _CELLS_PER_WAVE)
         finest = cell or min(max(wanted, _SMALLEST_CELL), _LARGEST_CELL, longest)
         # Too many cells: the patch gives up the view beyond the beam, then cells grow, then the patch shrinks.
         patch = side or min(everything, max(lit, _MOST_CELLS * finest))
@@ -127,9 +142,9 @@ class Resolution:
         if side is None and cell > longest:
             cell = max(finest, longest)
             patch = min(patch, _MOST_CELLS * cell)
-        beam = min((each.cell for each in found if each.is_laser), default=cell)
-        beam = cell if explicit else min(max(beam, _SMALLEST_CELL), _LARGEST_CELL, longest)
-        return cls((centre[0], centre[1]), cell, patch, size, max(1.0, beam / cell))
+        # The waves do not depend on the cells: finer cells show the same sea.
+        own, beam = (wave or min(max(one, _SMALLEST_WAVE), _LARGEST_WAVE) for one in (waves, lit_waves))
+        return cls((centre[0], centre[1]), cell, patch, size, own, beam)
 
 
 def _square(instruments: Sequence[Instrument]) -> tuple[float, float, float]:

@@ -64,7 +64,8 @@ class SeaSurface:
     resolved_variance: tuple[float, float]  #: Slope variances of the facets.
     ripple_variance: tuple[float, float]  #: Slope variances of the ripples.
     wake: Wake | None  #: Heights of a ship's wake [m] on grid lines x and y [m], None without a ship.
-    beam_cell_size: float  #: Side of the cells that the beam alone needs [m], the cells' or more.
+    shortest_wave: float  #: Wavelength of the shortest waves [m], that of two cells in coarse ones.
+    beam_wave: float  #: Wavelength of the shortest waves that the beam alone needs [m], that of the sea or more.
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
@@ -114,7 +115,8 @@ class SeaSurface:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
                 _check_number_of_cells(refined_size, cell)
-                waves, cell, resolved = realise_heights(state, period, cell, seed, motion, wind_direction)
+                shortest = resolution.shortest_wave
+                waves, cell, resolved = realise_heights(state, period, cell, seed, motion, wind_direction, shortest)
             elif wake is None:
                 cell = math.inf
         elif spectrum == "height_map":
@@ -134,10 +136,12 @@ class SeaSurface:
         kind = spectrum if waves is not None else "flat"
         size = resolution.size
         patch = min(refined_size, size)
-        beam_cell = cell * resolution.cells_per_beam_cell
+        lengths = (0.0, 0.0) if spectrum == "height_map" else (resolution.shortest_wave, resolution.beam_wave)
+        shortest, beam_wave = (max(wave, 2 * cell) for wave in lengths)
         ripples = along, across
         return cls(
-            kind, wind_speed, wind_direction, waves, cell, centre, patch, size, resolved, ripples, wake, beam_cell
+            *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
+            *(resolved, ripples, wake, shortest, beam_wave),
         )
 
     @property
