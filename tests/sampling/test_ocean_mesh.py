@@ -194,13 +194,14 @@ def test_far_rays_meet_the_sea_from_above_and_below():
 
 @pytest.mark.slow
 def test_cells_are_chosen_by_footprint_and_range():
-    """A quarter of the beam's standard deviation: 1.06 m at 200 m and 20 degrees."""
+    """A twelfth of the beam's standard deviation: 1.06 m at 200 m and 20 degrees."""
     lidar = {"altitude": 200.0, "off_nadir_deg": 20.0, "divergence_mrad": 10.0, "field_of_view_mrad": 30.0}
     sea = surface(**lidar)[1].sea
-    assert 0.8 * 0.25 * 1.064 < sea.cell_size <= 0.25 * 1.064
+    assert 0.8 * 1.064 / 12 < sea.cell_size <= 1.064 / 12
     assert 2 * 3.44 < sea.refined_size < 32
     near = surface(**lidar | {"altitude": 20.0})[1].sea
-    assert 0.8 * 0.25 * 0.1064 < near.cell_size <= 0.25 * 0.1064
+    assert 0.016 < near.cell_size <= 0.02  # the smallest
+    assert near.shortest_wave == pytest.approx(0.1064, rel=1e-3)
     mast = surface(**lidar | {"altitude": 10.0, "off_nadir_deg": 84.6, "field_of_view_mrad": 10.0})[1].sea
     # The field of view reaches from 97 to 116 m, and 1.5 times the beam's divergence from 93 to 126 m.
     assert 2 * 20 < mast.refined_size < 80
@@ -314,14 +315,14 @@ def test_sea_takes_its_automatic_values_from_the_lidar(lidar_scene):
         names = ("vertex_positions", "vertex_texcoords", "faces", "bsdf.alpha_u.value", "bsdf.alpha_v.value")
         rays = mi.Ray3f(mi.Point3f(mi.Float(np.linspace(-3, 12, 31)), 0.3, 20.0), mi.Vector3f(0, 0, -1))
         parts.append([*(np.array(parameters[name]) for name in names), np.array(loaded.ray_intersect(rays).t)])
-        assert shape.cell_size < 0.25 * 2.5e-3 * 107 < before
+        assert shape.cell_size < 2.5e-3 * 107 / 12 < before
     for first, second in zip(*parts, strict=True):
         np.testing.assert_array_equal(first, second)
 
 
 def test_seas_with_all_values_of_their_own_stay_as_loaded(lidar_scene):
     own = {"spectrum": "elfouhaily", "refined_size": 8.0, "cell_size": 0.5, "centre_x": 1.0, "centre_y": 2.0}
-    loaded = lidar_scene(sea={**own, "size": 50.0})
+    loaded = lidar_scene(sea={**own, "shortest_wave": 1.0, "size": 50.0})
     shape = next(shape for shape in loaded.shapes() if hasattr(shape, "sea"))
     sea = shape.sea
     load_scene(loaded)

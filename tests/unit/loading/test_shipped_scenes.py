@@ -18,7 +18,8 @@ TABLE = {
     **{"time_start_ns": "1390", "bin_width_ns": "1", "bin_count": "150"},
     **{"wind_speed": "3", "wind_direction_deg": "0", "spectrum": "elfouhaily", "slope_variance": "cox_munk"},
     **{"surface_seed": "1", "surface_time": "0"},
-    **{"surface_refined_size": "auto", "surface_cell_size": "auto", "surface_size": "auto"},
+    **{"surface_refined_size": "auto", "surface_cell_size": "auto"},
+    **{"surface_shortest_wave": "auto", "surface_size": "auto"},
     **{"refractive_index": "1.34", "group_index": "1.364", "layer_tops": "0"},
     **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "0"},
     **dict.fromkeys(("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure", "profile"), ""),
@@ -30,7 +31,7 @@ INDEX = {"group_index": "1.34"}
 SPHERE = {"target_y": "0", "target_size": "1", "target_reflectance": "0.1"}
 SHOT = {**INDEX, "field_of_view_mrad": "15", "wind_speed": "6", "bottom_depth": "5"}
 FINE = {"time_start_ns": "1400", "bin_width_ns": "0.25"}
-PLACES = (("25.15", "-47.56"), ("42.42", "-57.40"), ("20.35", "-32.63"))
+PLACES = (("25.15", "-47.56"), ("42.42", "-57.60"), ("20.35", "-32.63"))
 SQUARE = {
     **{**INDEX, "field_of_view_mrad": "35", "bin_count": "175", "surface_seed": "8", "bottom_depth": "12"},
     **{"target_x": "0", "target_y": "0", "target_depth": "8", "target_size": "1.5", "target_reflectance": "0.1"},
@@ -41,7 +42,8 @@ LAYERS = {
 }
 GATES = {
     **{**INDEX, "divergence_mrad": "12", "field_of_view_mrad": "20", "layout": "128x128", "bin_width_ns": "0.5"},
-    **{"blur_mrad": "0", "gate_rise_ns": "0", "gate_fall_ns": "0", "pulses": "1", "surface_cell_size": "0.06"},
+    **{"blur_mrad": "0", "gate_rise_ns": "0", "gate_fall_ns": "0", "pulses": "1"},
+    **{"surface_cell_size": "0.03", "surface_shortest_wave": "0.13"},
 }
 
 #: Parameters of each scene that table1 lacks or has with another value.
@@ -89,7 +91,7 @@ OWN = {
     "passive_sea": {
         **{**INDEX, "divergence_mrad": "160", "field_of_view_mrad": "240", "layout": "128x128", "off_nadir_deg": "35"},
         **{"time_start_ns": "1490", "bin_width_ns": "10", "bin_count": "42", "wind_speed": "6"},
-        **{"surface_refined_size": "100", "surface_cell_size": "0.2", "bottom_reflectance": "0.3"},
+        **{"surface_refined_size": "100", "surface_cell_size": "0.2", "surface_shortest_wave": "0.8", "bottom_reflectance": "0.3"},
         **{"sun_zenith_deg": "40", "sun_azimuth_deg": "70"},
         **{"plate_x": "3", "plate_y": "10", "plate_depth": "7.9", "plate_size": "8", "plate_reflectance": "0.9"},
         **{"sphere_x": "1", "sphere_y": "-10", "sphere_depth": "4", "sphere_size": "4", "sphere_reflectance": "0.03"},

@@ -50,21 +50,39 @@ def test_total_slope_variance_is_that_of_cox_and_munk(wind, divergence, altitude
     assert min(sea.ripple_variance) >= 1e-5
 
 
-def test_cells_follow_the_beam_or_the_pixels():
-    """A quarter of 1.064 m; half of a pixel of 0.156 mrad at 213 m; never finer than 2 cm for pixels."""
+def test_waves_and_cells_follow_the_beam_or_the_pixels():
+    """Waves from 1.064 m or four pixels of 0.085 m at 213 m; never finer than 8 cm and 2 cm, nor for wide beams."""
     slant = 200.0 / math.cos(TILT)
-    assert choose(lidar()).cell_size == pytest.approx(0.25 * 5e-3 * slant)
-    assert choose(lidar(field_of_view=0.01, pixel=4e-4)).cell_size == pytest.approx(0.5 * 4e-4 * slant)
-    assert choose(lidar(field_of_view=0.01, pixel=1e-5)).cell_size == 0.02
-    assert choose(lidar(5000.0)).cell_size == 0.5
+    beam = choose(lidar())
+    assert (beam.shortest_wave, beam.cell_size) == pytest.approx((5e-3 * slant, 5e-3 * slant / 12))
+    image = choose(lidar(field_of_view=0.01, pixel=2e-4))
+    assert (image.shortest_wave, image.cell_size) == pytest.approx((8e-4 * slant, 1e-4 * slant))
+    finest, coarsest = choose(lidar(field_of_view=0.01, pixel=1e-5)), choose(lidar(5000.0))
+    assert (finest.shortest_wave, finest.cell_size) == (0.08, 0.02)
+    assert (coarsest.shortest_wave, coarsest.cell_size) == (2.0, 0.25)
+    assert choose(lidar(), shortest_wave=0.48).cell_size == pytest.approx(0.04)
 
 
-def test_cells_for_pixels_count_as_those_for_the_beam():
-    """Cells of merging follow the beam: at 0.02 m they would be 13 times finer than needed, and as noisy."""
-    fine = choose(lidar(field_of_view=0.01, pixel=1e-5))
-    assert fine.cells_per_beam_cell * fine.cell_size == pytest.approx(choose(lidar()).cell_size)
-    for same in (choose(lidar()), choose(lidar(), cell_size=0.02), choose(lidar(5e5, 1e-4)), choose([])):
-        assert same.cells_per_beam_cell == 1.0
+def test_large_patches_have_fewer_cells_in_a_wave():
+    """42 m from a mast of 15 m at grazing angles: 512 cells a side instead of 1280."""
+    mast = choose(lidar(15.0, 5e-3, 10e-3, off_nadir=math.radians(84.6)))
+    assert mast.refined_size / mast.cell_size == pytest.approx(512)
+    assert 4 * mast.cell_size < mast.shortest_wave == pytest.approx(2.5e-3 * 15 / math.cos(math.radians(84.6)))
+
+
+def test_the_waves_do_not_depend_on_the_cells():
+    instruments = lidar(field_of_view=0.01, pixel=1e-4)
+    automatic = choose(instruments)
+    for cell in (0.01, 0.3):
+        other = choose(instruments, cell_size=cell)
+        assert (other.shortest_wave, other.beam_wave) == (automatic.shortest_wave, automatic.beam_wave)
+
+
+def test_waves_for_pixels_count_as_those_for_the_beam():
+    """Cells of merging follow the beam: for waves of 8 cm they would be 13 times finer than needed, and as noisy."""
+    assert choose(lidar(field_of_view=0.01, pixel=1e-5)).beam_wave == choose(lidar()).shortest_wave
+    for same in (choose(lidar()), choose(lidar(), shortest_wave=0.3), choose(lidar(5e5, 1e-4)), choose([])):
+        assert same.beam_wave == same.shortest_wave
 
 
 def test_narrow_beams_have_a_patch_of_many_fine_cells_and_wide_views_fewer():
@@ -92,8 +110,8 @@ def test_own_values_of_the_sea_win():
     # Without a lidar in the scene the same values describe one.
     assert choose([], **own) == expected
     explicit = {"cell_size": 0.3, "refined_size": 20.0, "centre_x": 3.0, "centre_y": -2.0, "size": 400.0}
-    assert choose(lidar(), **explicit) == Resolution((3.0, -2.0), 0.3, 20.0, 400.0)
-    assert choose([]) == Resolution((0.0, 0.0), 0.25, 32.0, 1000.0)
+    assert choose(lidar(), shortest_wave=0.5, **explicit) == Resolution((3.0, -2.0), 0.3, 20.0, 400.0, 0.5, 0.5)
+    assert choose([]) == Resolution((0.0, 0.0), 0.125, 32.0, 1000.0, 1.0, 1.0)
 
 
 def test_one_definition_of_the_divergence_may_be_given():
