@@ -138,8 +138,8 @@ def test_parameters_of_gates_out_of_range(film, words):
 
 def image(lidar_scene, layout, film=None, **integrator):
     """Return an imager of a square field of view over a wavy sea, with eight gates from the surface to the bottom."""
-    # Automatic cells would be finer for more pixels: another sea.
-    cells = {"cell_size": 0.25, "refined_size": 32.0}
+    # Automatic waves would be shorter for more pixels: another sea.
+    cells = {"cell_size": 0.125, "shortest_wave": 1.0, "refined_size": 32.0}
     gates = {"gate_start_ns": 1410.0, "gate_width_ns": 10.0, "gate_count": 8, "bin_width_ns": 8.0, "bin_count": 20}
     return lidar_scene(
         integrator={"type": "lidar_merging", "paths_per_pass": 2**16, **integrator},
@@ -168,6 +168,44 @@ def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
         z = (first.mean(axis=0) - second.mean(axis=0)) / error
         assert np.all(np.abs(z) < largest_z(6, z.size)), z
         assert np.all(error < 0.02 * second.mean(axis=0))
+
+
+@pytest.mark.slow
+def test_images_do_not_show_the_cells_of_the_sea(lidar_scene, passes):
+    """The pattern of light on a bottom at 2 m, in automatic cells, is that in cells of half the size.
+
+    The mean square of the difference is estimated without bias from products of different passes. Cells of a quarter of
+    a metre, a quarter of the beam's standard deviation, leave their triangles in the image.
+    """
+    pose = {"altitude": 200.0, "off_nadir_deg": 0.0}
+    images = {}
+    for first_seed, cell in enumerate(("auto", 0.03, 0.25)):
+        scene = lidar_scene(
+            integrator={"type": "lidar_merging", "paths_per_pass": 2**17, "cell_size": 0.015},
+            tx={**pose, "divergence_mrad": 12.0},
+            rx={**pose, "layout": "32x32", "field_of_view_mrad": 20.0, "field_of_view_shape": "square"},
+            film={"time_start_ns": 1345.0, "bin_width_ns": 15.0, "bin_count": 1},
+            sea={
+                **{"spectrum": "elfouhaily", "wind_speed": 4.0, "slope_variance": "cox_munk"},
+                **{"cell_size": cell, "refined_size": 10.0, "size": 40.0},
+            },
+            bottom=2.0,
+            rho=0.5,
+        )
+        images[cell] = passes(scene, 12, 100 * first_seed)[..., 0]
+        (sea,) = (shape.sea for shape in scene.shapes() if hasattr(shape, "sea"))
+        assert sea.shortest_wave == pytest.approx(4 * 200.0 * 20e-3 / 32, rel=1e-3) or cell == 0.25
+        assert cell != "auto" or 0.05 < sea.cell_size <= 200.0 * 10e-3 / 32
+    visible = {}
+    for cell in ("auto", 0.25):
+        difference = ((images[cell] - images[0.03]) / images[0.03].mean()).reshape(12, -1)
+        products = difference @ difference.T / difference.shape[1]
+        others = products[~np.eye(12, dtype=bool)].reshape(12, 11).mean(axis=1)
+        visible[cell] = others.mean(), 2 * others.std(ddof=1) / np.sqrt(12)
+    # Root mean squares of 3 % and 5 % of the mean of the image.
+    assert visible["auto"][0] < 0.03**2 + largest_z(12) * visible["auto"][1]
+    assert visible["auto"][1] < 0.03**2
+    assert visible[0.25][0] - largest_z(12) * visible[0.25][1] > 0.05**2
 
 
 def test_paths_go_with_the_pixels(lidar_scene):

@@ -16,7 +16,7 @@ HEIGHT = 2000.0
 SEAS = 10
 
 
-def surface_echoes(wind, angle, cell):
+def surface_echoes(wind, angle, wave):
     """Return the received surface echoes [J] of some seas, and the variances of facets and ripples."""
     lidar = {"altitude": HEIGHT, "off_nadir_deg": angle}
     film = {"type": "time_gated_film", "time_start_ns": 12000.0, "bin_width_ns": 6000.0, "bin_count": 1}
@@ -25,7 +25,8 @@ def surface_echoes(wind, angle, cell):
         sea = {
             "type": "ocean_surface",
             "wind_speed": wind,
-            "cell_size": cell,
+            "cell_size": 0.25,
+            "shortest_wave": wave,
             "refined_size": 96.0,
             "surface_seed": seed,
         }
@@ -49,14 +50,14 @@ def surface_echoes(wind, angle, cell):
 def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle):
     """Within 5 % of Gaussian slopes but in the tail at light wind, where ripples on facets are 20 % brighter.
 
-    The same seas in cells of half the size have the same echo: slopes move from the ripples to the facets, and none is
-    counted twice.
+    The same seas with waves of half the length have the same echo: slopes move from the ripples to the facets, and none
+    is counted twice.
     """
     lidar = LidarSystem(HEIGHT, np.radians(angle), 5e-3 * 0.81 * 0.9, 0.025, 1.34, 1.34)
     water = WaterColumn.from_text(0.0, 0.3, 0.15, 0.006)
     means = []
-    for cell in (0.5, 0.25):
-        energy, facets, ripples = surface_echoes(wind, angle, cell)
+    for wave in (1.5, 0.75):
+        energy, facets, ripples = surface_echoes(wind, angle, wave)
         total = tuple(np.add(facets, ripples))
         gaussian = echo_energies(lidar, 5e-3, water, 1e-3, 8.0, 0.1, total).surface
         ratio, error = energy.mean() / gaussian, energy.std(ddof=1) / np.sqrt(SEAS) / gaussian

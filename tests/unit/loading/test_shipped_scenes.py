@@ -91,7 +91,12 @@ OWN = {
     "passive_sea": {
         **{**INDEX, "divergence_mrad": "160", "field_of_view_mrad": "240", "layout": "128x128", "off_nadir_deg": "35"},
         **{"time_start_ns": "1490", "bin_width_ns": "10", "bin_count": "42", "wind_speed": "6"},
-        **{"surface_refined_size": "100", "surface_cell_size": "0.2", "surface_shortest_wave": "0.8", "bottom_reflectance": "0.3"},
+        **{
+            "surface_refined_size": "100",
+            "surface_cell_size": "0.2",
+            "surface_shortest_wave": "0.8",
+            "bottom_reflectance": "0.3",
+        },
         **{"sun_zenith_deg": "40", "sun_azimuth_deg": "70"},
         **{"plate_x": "3", "plate_y": "10", "plate_depth": "7.9", "plate_size": "8", "plate_reflectance": "0.9"},
         **{"sphere_x": "1", "sphere_y": "-10", "sphere_depth": "4", "sphere_size": "4", "sphere_reflectance": "0.03"},
