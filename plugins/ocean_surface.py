@@ -46,8 +46,8 @@ class OceanSurface(mi.Mesh):
     wake_x, wake_y            float    Centre of the ship [m]. Default: 0
     refined_size              float    Side of the finely resolved patch [m], or ``auto``. Default: ``auto``
     cell_size                 float    Side of its cells [m], or ``auto``. Default: ``auto``
-    shortest_wave             float    Length of the shortest waves of the mesh [m], or ``auto``; shorter ones are ripples.
-                                       At least that of two cells. Default: ``auto``
+    shortest_wave             float    Length of the shortest waves of the mesh [m], at least two cells, or ``auto``;
+                                       shorter waves are ripples. Default: ``auto``
     centre_x, centre_y        float    Centre of the patch [m], or ``auto``: where the lidar's axis meets the sea, or
                                        the centre of a height map. Default: ``auto``
     size                      float    Side of the surface [m], or ``auto``: 1000 or more. Cells grow outside the patch.
@@ -72,14 +72,15 @@ class OceanSurface(mi.Mesh):
     The mesh represents the waves from the shortest one up. The rest of the total slope variance, along and across the
     wind, is an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of Gaussian
     slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With
-    ``cox_munk`` and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The variance of the ripples is at least 1e-5,
-    so that a point laser can be connected; `slope_variance` of the loaded object is the total. Waves shorter than a
-    sixteenth of the period are needed for a mesh: where automatic cells are longer, all slopes are ripples.
+    ``cox_munk`` and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The variance of the
+    ripples is at least 1e-5, so that a point laser can be connected; `slope_variance` of the loaded object is the
+    total. Waves shorter than a sixteenth of the period are needed for a mesh: where automatic cells are longer, all
+    slopes are ripples.
 
     Finer cells show the same waves with smoother facets: halving automatic cells changes the surface echo by less than
-    the error of 3 % to which renders go by default. The shortest wave divides the sea into waves, drawn by the seed, and
-    ripples, the mean over all shorter ones: the mean echo over many seas does not depend on it, but that of one place
-    does. Changes of the echo of a beam of 10 mrad from 200 m, rms over 64 places:
+    the error of 3 % to which renders go by default. The shortest wave divides the sea into waves, drawn by the seed,
+    and ripples, the mean over all shorter ones: the mean echo over many seas does not depend on it, but that of one
+    place does. Changes of the echo of a beam of 10 mrad from 200 m, rms over 64 places:
 
     ===============  ===========================  ==========================================
     Angle            0, 10, 20 deg: cells halved  0, 10, 20 deg: shortest wave halved
@@ -90,13 +91,13 @@ class OceanSurface(mi.Mesh):
     ===============  ===========================  ==========================================
 
     Light also returns from the water through the waves that focused it on its way down. Shorter waves do so at smaller
-    depths: at 3 m/s, with waves from 0.5 and 0.25 m instead of 1.06 m, the echoes of the uppermost 5 m of ``table1`` rise
-    by up to 4 and 15 %, equally in both integrators; with cells halved they change by 0.2 % or less. Give
+    depths: at 3 m/s, with waves from 0.5 and 0.25 m instead of 1.06 m, the echoes of the uppermost 5 m of ``table1``
+    rise by up to 4 and 15 %, equally in both integrators; with cells halved they change by 0.2 % or less. Give
     ``shortest_wave`` for shallow columns, and to compare images with receivers of few pixels on exactly the same sea.
 
-    With more than 1024 of the shortest waves (or of pairs of cells) per period the waves are a sum of bands. The longest
-    waves are the same as in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31) of the
-    last one's period.
+    With more than 1024 of the shortest waves (or of pairs of cells) per period the waves are a sum of bands. The
+    longest waves are the same as in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31)
+    of the last one's period.
 
     Outside the patch the facets are longer and resolve fewer slopes, with the ripples of the patch, for light that has
     scattered far. Light beyond ``size`` is lost and reported after rendering.
