@@ -1,4 +1,8 @@
-"""The published effects of waves on echoes (figures 10 and 11), in the scenes that ship."""
+"""The published effects of waves on echoes (figures 10 and 11), in the scenes that ship.
+
+They hold at the places of these scenes, on automatic cells, and for the highest points of the waveforms: at other places
+of the same slopes a few facets make other echoes.
+"""
 
 import numpy as np
 import pytest
@@ -38,6 +42,7 @@ def bottom_echoes():
 
 
 def test_face_towards_the_lidar_is_four_to_five_times_brighter(surface_echoes):
+    """The sum of the pixels' largest powers: 4.4 and 4.8; by energy of the surface echo it is 5.4 and 6.8."""
     first, second, third = (peak for peak, _ in surface_echoes)
     assert 4 < first / second < 5
     assert 4 < first / third < 5
@@ -58,6 +63,7 @@ def test_red_comes_before_green_as_the_sideways_slope_says(surface_echoes):
 
 
 def test_bottom_echo_of_shot_3_is_stronger_and_a_tenth_of_a_metre_shallower(bottom_echoes):
+    """In the red pixel alone, as the publication shows it: by 0.11 and 0.08 m; others by 0.05 to -0.12 m."""
     (first, first_ns), (second, second_ns), (third, third_ns) = bottom_echoes
     assert third > 1.05 * max(first, second)
     shallower = METRES_PER_NS * (np.mean([first_ns, second_ns]) - third_ns)
