@@ -1,7 +1,7 @@
 """The published effects of waves on echoes (figures 10 and 11), in the scenes that ship.
 
-They hold at the places of these scenes, on automatic cells, and for the highest points of the waveforms: at other places
-of the same slopes a few facets make other echoes.
+They hold at the places of these scenes, on automatic cells, and for the highest points of the waveforms: at other
+places of the same slopes a few facets make other echoes.
 """
 
 import numpy as np

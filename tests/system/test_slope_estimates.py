@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from oracles.lidar_equation import column_power
+from scipy.stats import chi2
+from significance import FALSE_ALARM, largest_z
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -72,28 +74,45 @@ def test_correction_halves_what_slope_does_to_the_bottom(planes):
     np.testing.assert_allclose(found["reflectance"].sel(correction=["slope", "column"]), 0.3, rtol=0.2)
 
 
-@pytest.fixture(scope="module")
-def sea():
-    params = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15, "layout": "1x4"}
-    return shot_series.render_shots("fig09_2x2", params, count=20, passes=2)
+@pytest.fixture(scope="module", params=["2x2", "1x4"])
+def sea(request):
+    params = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15, "layout": request.param}
+    return shot_series.render_shots("fig09_2x2", params, count=24, passes=2)
 
 
 def test_slopes_on_a_sea(sea):
-    """200 shots had a correlation of 0.83: with 20, Fisher's z lies 4.3 of its standard errors below once in 1e5."""
-    found = retrieve.surface_slopes(sea, slope_deviation=tuple(sea.attrs["slope_deviation"]))
-    truth, guess = sea["true_slope_along"].values, found["slope_along"].values
-    correlation = float(np.corrcoef(truth, guess)[0, 1])
-    assert math.atanh(correlation) > math.atanh(0.83) - 4.3 / math.sqrt(20 - 3)
-    # The slopes of the sea are 3.1 degrees RMS, which is the error of an estimate of 0.
-    assert np.sqrt(np.mean((guess - truth) ** 2)) < np.sqrt(np.mean(truth**2))
-    assert np.isfinite(guess).all()
-    assert np.allclose(found["slope_across"], 0)
+    """Correlation with the truth, and errors as stated.
+
+    In 200 shots on four other seas the correlations along were 0.917 and 0.943, and the root mean squares of error over
+    stated error 0.93 and 0.88 along, 1.00 and 1.01 across. Times alone had correlations of 0.62 and 0.87; in 2x2 pixels
+    their errors are twice as large. Statistics of a sea of 3 or 12 m/s make errors 2.7 to 3.2 times the stated ones.
+    """
+    found = retrieve.surface_slopes(sea)
+    names = ("along", "across")
+    truth, slope, error = (
+        np.stack([table[f"{start}slope_{name}{end}"].values for name in names])
+        for table, start, end in ((sea, "true_", ""), (found, "", ""), (found, "", "_stderr"))
+    )
+    count = truth.shape[1]
+    expected = {"2x2": 0.917, "1x4": 0.943}[sea.attrs["layout"]]
+    # Fisher's z of a correlation has the standard error 1/sqrt(count - 3).
+    below = math.atanh(expected) - math.atanh(np.corrcoef(truth[0], slope[0])[0, 1])
+    assert below < largest_z(1000) * math.sqrt(1 / (count - 3) + 1 / 197)
+    # Stated errors may be 10 % too large or too small.
+    squares = np.sum(((slope - truth) / error) ** 2)
+    assert 0.9**2 * chi2.ppf(FALSE_ALARM, truth.size) < squares < 1.1**2 * chi2.isf(FALSE_ALARM, truth.size)
+    plane = retrieve.surface_slopes(sea, slope_deviation=tuple(sea.attrs["slope_deviation"]))
+    if sea.attrs["layout"] == "2x2":
+        assert np.std(slope[0] - truth[0]) < np.std(plane["slope_along"].values - truth[0])
 
 
 def test_the_column_takes_out_what_the_sea_does_to_the_bottom(sea):
-    """Its energy varies by 8 %, by focusing more than by slope; the ratio to the column was left with 1.4 %."""
-    slopes = retrieve.surface_slopes(sea, slope_deviation=tuple(sea.attrs["slope_deviation"]))
-    found = retrieve.bottom(sea, slopes)
+    """Its energy varies by 10 % in 200 shots, by focusing more than by slope.
+
+    The scatter of the reflectance was 9.1 % for a level sea, 8.0 (2x2) and 7.6 % (1x4) for the slope, and 1.6 % for the
+    column.
+    """
+    found = retrieve.bottom(sea, retrieve.surface_slopes(sea))
     spread = float(np.log(found["bottom_energy"]).std())
     assert float(np.log(found["reflectance"].sel(correction="column")).std()) < 0.5 * spread
     assert float(found["reflectance"].sel(correction="column").mean()) == pytest.approx(0.1, rel=0.1)
