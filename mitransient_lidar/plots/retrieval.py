@@ -26,14 +26,13 @@ def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | No
 
     Examples
     --------
-    ``docs/slope.png``, in about five minutes on two cores::
+    ``docs/slope.png``, in about eight minutes on two cores::
 
         found = {}
         for layout in ("2x2", "1x4"):
             sea = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15, "layout": layout}
-            shots = shot_series.render_shots("fig09_2x2", sea, count=200)
-            slopes = retrieve.surface_slopes(shots, slope_deviation=shots.attrs["slope_deviation"])
-            found[layout] = slopes.merge(shots[["true_slope_along", "true_slope_across"]])
+            shots = shot_series.render_shots("fig09_2x2", sea, count=200, passes=2)
+            found[layout] = retrieve.surface_slopes(shots)
         plot_slopes(found, "slope.png")
     """
     figure = drawing.new_figure(path, 4.6 * max(len(receivers), 1), 4.8)
@@ -57,7 +56,7 @@ def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | No
         ax.set_aspect("equal")
         drawing.add_grid(ax)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize="small", handletextpad=0.2)
-    axes[0].set_ylabel("slope retrieved from the surface echoes of one shot (deg)")
+    axes[0].set_ylabel("slope retrieved from one shot (deg)")
     return drawing.save(figure, path)
 
 
