@@ -303,6 +303,12 @@ def slopes_on_sea(echoes: PixelEchoes, shots: SeaShots, scale: float | None) -> 
     The errors of the fits are 0.25 of the energy and e; in time 0.03 widths of an echo, and 1.5 spreads of the light
     over the pixel for echoes far fainter than 0.4 energies of the column. These were measured at one sea (6 m/s, pulses
     of 5 ns, column of c = 0.3 1/m); e scales with the column of other waters.
+
+    Stated errors hold over all shots of a sea: in 200 others each at 3, 6 and 10 m/s, 20 degrees off nadir, the root
+    mean square of error over stated error was 0.88 to 1.06 along and 0.89 to 1.04 across. The correlation with the true
+    slope along was 0.63, 0.88 to 0.92 and 0.96 for 2x2 pixels, and 0.71, 0.92 to 0.94 and 0.97 for 1x4. They do not
+    hold for each slope: at 6 m/s, faces away by more than 5 degrees, whose echoes the column hides, are estimated as
+    about 4 degrees, with errors of 1.6 to 1.9 times the stated ones.
     """
     truth = np.stack([shots.along, shots.across, shots.height], axis=1)
     energy = np.maximum(np.nan_to_num(echoes.energy), 0)
