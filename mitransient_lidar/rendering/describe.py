@@ -45,6 +45,9 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
         "obscuration": optics.obscuration,
         "response_time_ns": optics.response_time_ns,
         "pulse_energy_mj": 1e3 * transmitter.pulse_energy,
+        "two_way_efficiency": (
+            transmitter.optical_efficiency * optics.optical_efficiency * optics.two_way_atmospheric_transmittance
+        ),
         "pulse_fwhm_ns": transmitter.pulse.fwhm_ns,
         "beam_profile": transmitter.beam_profile,
         "divergence_mrad": 1e3 * profile.divergence[0],

@@ -135,7 +135,7 @@ class LidarGeometry:
         """Return the system of the lidar equation, with the pulse energy inside the receiver's field of view.
 
         The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default
-        it follows from the scene's parameters ``optical_efficiency`` and ``two_way_atmospheric_transmittance``.
+        it is the attribute ``two_way_efficiency``.
 
         Raises
         ------
@@ -298,14 +298,17 @@ def _fraction_in_view(attributes: Attributes) -> float:
 
 
 def two_way_efficiency(attributes: Attributes, given: float | None = None) -> float:
-    """Return a given efficiency of optics and atmosphere, or that of the scene's parameters; see `lidar_system`."""
+    """Return a given efficiency of optics and atmosphere, or that of the lidar; see `lidar_system`."""
     if given is not None:
         return in_range("efficiency", given, 0, 1)
+    if "two_way_efficiency" in attributes:
+        return required_number(attributes, "two_way_efficiency")
+    # Results of earlier versions have the scene's parameters alone.
     names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
     try:
         optics, atmosphere = (float(attributes[name]) for name in names)
     except (KeyError, ValueError):
-        raise UserError(f"efficiency must be given: the dataset has no attributes {' and '.join(names)}") from None
+        raise UserError("efficiency must be given: the dataset has no attribute two_way_efficiency") from None
     return optics**2 * atmosphere
 
 

@@ -178,7 +178,7 @@ def bottom(
         Output of `surface_slopes`. An unknown slope is replaced by 0, an unknown range by that of the mean sea.
     efficiency : float, optional
         Efficiencies of transmitter and receiver times the two-way transmittance of the atmosphere, 0 to 1. By default,
-        from the scene's parameters ``optical_efficiency`` and ``two_way_atmospheric_transmittance``.
+        from the attribute ``two_way_efficiency``.
     relative_error : float
         Relative error of the scale of the reflectance, for the classes [1], 0 to 1.
     classes : dict of str to float, optional

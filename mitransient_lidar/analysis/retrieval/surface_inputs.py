@@ -74,7 +74,8 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
 def energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
     """Return the pulse energy times efficiencies and aperture [J m^2], None if echoes are not in J or it is unknown."""
     names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
-    known = efficiency is not None or all(name in dataset.attrs for name in names)
+    of_scene = all(name in dataset.attrs for name in names)
+    known = efficiency is not None or "two_way_efficiency" in dataset.attrs or of_scene
     if "signal" in dataset or not known:
         return None
     energy, aperture = (required_number(dataset.attrs, name) for name in ("pulse_energy_mj", "aperture_area"))

@@ -12,6 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.waveforms import deconvolution, echo_estimators, echo_fits
 from mitransient_lidar.analysis.waveforms.column_fits import ColumnFit, change_points, column_fit
+from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.analysis.waveforms.echo_detection import (
     DetectedEchoes,
     Echoes,
@@ -32,8 +33,6 @@ ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of a surface echo that is distinct from the column
-_OF_DEPTH = 0.005  # error of a depth by multiple scattering, relative to it
-_OF_SPREAD = 0.4  # error of a surface time by the light's distribution, relative to the spread of the arrival
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
     "time_ns": "arrival of the echo",
@@ -292,6 +291,7 @@ def _with_depths(
     variance = optional_number(dataset.attrs, "surface_slope_variance")
     lowest, highest = dataset.attrs.get("surface_heights_m", (-np.inf, np.inf))
     time, error, peak = table["time_ns"], table["time_ns_stderr"], table.pop("peak_ns")
+    errors = DepthErrors.of(dataset.attrs, lines, shots, waveforms.geometry, waveforms.template.fwhm_ns)
     zero, zero_error, by_light = (np.empty(time.shape[:2]) for _ in range(3))
     for number, estimator in enumerate(settings.estimators):
         measured = time[:, number, 0]
@@ -316,7 +316,7 @@ def _with_depths(
             for column in (name, f"{name}_stderr"):
                 table[column][faint, number, 0] = np.nan
         time[absent, number, 0] = error[absent, number, 0] = np.nan
-        by_light[:, number] = np.where(own, _OF_SPREAD * lines.surface_spread, 0)
+        by_light[:, number] = errors.of_surface(own, faint)
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
     table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error}
     if settings.depth_from == "echo":
@@ -328,10 +328,13 @@ def _with_depths(
         delay, spread = time - lines.surface_time[:, np.newaxis, np.newaxis], error
         layer_zero = lines.surface_time
     table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
-    # The surface, from which depths count, has no error of depth.
-    counted = (settings.depth_from == "echo") * (np.arange(len(ECHOES)) > 0)
-    by_light = lines.depth_of_delay(by_light)[..., np.newaxis] * counted
-    table["depth_m_method_error"] = np.hypot(_OF_DEPTH * table["depth_m"], by_light)
+    from_mean = settings.depth_from == "mean"
+    by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], from_mean=from_mean)
+    # The surface is where depths count from, or an echo of its own.
+    by_water[..., 0] = 0
+    of_surface = np.array([index == 0 if from_mean else index > 0 for index in range(len(ECHOES))])
+    method = np.hypot(by_water, lines.depth_of_delay(by_light)[..., np.newaxis] * of_surface)
+    table["depth_m_method_error"] = np.where(np.isfinite(table["depth_m"]), method, np.nan)
     if "layer_time_ns" in table:
         table["layer_depth_m"] = lines.depth_of_delay(table.pop("layer_time_ns") - layer_zero[:, np.newaxis])
     return table
