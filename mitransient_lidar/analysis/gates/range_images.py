@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer
-from mitransient_lidar.results.geometry import LinesOfSight
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
 _SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most significant gate
+_FIRST_ECHOES = 1.0  # percentile of the echoes' times before which all pixels see the column
 _BLOCK = 8192  # pixels computed at once
 
 
@@ -35,6 +38,20 @@ class RangeImage(NamedTuple):
 
     depth: FloatArray
     sigma: FloatArray
+    confidence: FloatArray
+
+
+class DepthImage(NamedTuple):
+    """Depth of the echo in every pixel below the mean sea level [m], with two errors, and confidence.
+
+    `sigma` is the standard error by noise. `method_error` is the typical error by scattering, by the light's
+    distribution in the pixel and by waves, of `depth_errors.DepthErrors`; NaN without the geometry of the lidar. Both
+    are NaN where no gate exceeds the column. `confidence` is that of `RangeImage`.
+    """
+
+    depth: FloatArray
+    sigma: FloatArray
+    method_error: FloatArray
     confidence: FloatArray
 
 
@@ -138,11 +155,10 @@ def range_from_gates(
     for start in range(0, flat.shape[0], _BLOCK):
         pixels = slice(start, start + _BLOCK)
         found[:, pixels] = _ranges(flat[pixels], flat_error[pixels], column)
-    depth, sigma, confidence = found.reshape(3, *e.shape[:-1])
-    return RangeImage(depth, sigma, confidence)
+    return RangeImage(*found.reshape(3, *e.shape[:-1]))
 
 
-def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> RangeImage:
+def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
     """Find the depth of the strongest echo of every pixel in a gate stack, along the pixel's line of sight.
 
     Parameters
@@ -154,8 +170,8 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> RangeImage:
 
     Returns
     -------
-    RangeImage
-        Depths below the mean sea level and their standard errors [m], shape (row, column) or (pixel,).
+    DepthImage
+        Arrays of shape (row, column) or (pixel,).
 
     Raises
     ------
@@ -172,22 +188,52 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> RangeImage:
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
     found = range_from_gates(energy, stderr, middles, reach=reach)
-    zero, per_ns = (values.reshape(energy.shape[:-1]) for values in _depth_scale(stack, middles))
-    return found._replace(depth=(found.depth - zero) * per_ns, sigma=found.sigma * per_ns)
-
-
-def _depth_scale(stack: xr.Dataset, middles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the time of the surface [ns] and the depth per delay [m/ns] of every pixel, flattened."""
     try:
         lines = LinesOfSight.from_dataset(stack)
+        geometry = LidarGeometry.from_attributes(stack.attrs)
     except UserError:
         if "gate_depth" not in stack.coords:
             raise
         # A stack of other origin has one scale for all pixels.
         per_ns, offset = np.polyfit(middles, stack["gate_depth"].values, 1)
-        pixels = stack["gate_energy"].size // middles.size
-        return np.full(pixels, -offset / per_ns), np.full(pixels, per_ns)
-    return lines.surface_time, lines.depth_per_ns
+        depth = found.depth * per_ns + offset
+        return DepthImage(depth, found.sigma * per_ns, np.full_like(depth, np.nan), found.confidence)
+    zero, per_ns = (values.reshape(energy.shape[:-1]) for values in (lines.surface_time, lines.depth_per_ns))
+    depth = (found.depth - zero) * per_ns
+    pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
+    errors = DepthErrors.of(stack.attrs, lines, 1, geometry, pulse)
+    attenuation, level = _column(stack, found, lines, geometry, pulse)
+    method = errors.of_echoes(found.depth.ravel(), depth.ravel(), attenuation, level, from_mean=True)
+    method = np.where(np.isfinite(depth), method.reshape(depth.shape), np.nan)
+    return DepthImage(depth, found.sigma * per_ns, method, found.confidence)
+
+
+def _column(
+    stack: xr.Dataset, found: RangeImage, lines: LinesOfSight, geometry: LidarGeometry, pulse_ns: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the attenuation of the column [1/m] and its power at the surface [W] of the pixels, NaN where unknown.
+
+    Single pixels have too little light: an exponential is fitted to the sum of the pixels, in the gates before the
+    first echoes. Columns that begin at other times have the same decay.
+    """
+    unknown = np.full(lines.beam_share.size, np.nan)
+    width, middles = stack["gate_width"].values, stack["gate_start"].values + 0.5 * stack["gate_width"].values
+    sure = (found.confidence > 0.5) & np.isfinite(found.depth)
+    if not sure.any() or not np.isfinite(lines.beam_share).all():
+        return unknown, unknown
+    total = stack["gate_energy"].values.reshape(-1, middles.size).sum(axis=0)
+    first = np.percentile(found.depth[sure], _FIRST_ECHOES) - 2 * pulse_ns
+    used = (middles + 0.5 * width < first) & (total > 0)
+    if np.count_nonzero(used) < 3:
+        return unknown, unknown
+    slope, start = np.polyfit(middles[used], np.log(total[used]), 1)
+    if slope >= 0:
+        return unknown, unknown
+    # The sum of the pixels' columns from their surfaces on has this logarithm at time 0.
+    gathered = np.log(np.sum(lines.beam_share * np.exp(-slope * (lines.surface_time - middles[0]))))
+    open_s = 1e-9 * float(width[0]) * float(stack.attrs.get("pulses", 1))
+    level = math.exp(start + slope * middles[0] - gathered) / open_s
+    return np.full(unknown.size, -0.5 * slope / geometry.metres_per_ns), lines.beam_share * level
 
 
 class _ColumnModel:

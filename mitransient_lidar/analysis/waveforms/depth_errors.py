@@ -8,20 +8,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.refraction import snell
-from mitransient_lidar.results.geometry import Attributes, LidarGeometry, LinesOfSight, optional_number
+from mitransient_lidar.results.geometry import (
+    Attributes,
+    LidarGeometry,
+    LinesOfSight,
+    optional_number,
+    required_number,
+    two_way_efficiency,
+)
 
 # Constants from 40 random level seas (1 to 10 mrad, 100 to 400 m, 0 to 30 degrees off nadir, absorption 0.04 to 0.25,
 # scattering 0.02 to 0.6 1/m, 3 to 15 m deep), and of waves from shots at 4, 6 and 9 m/s.
-_LEAST = 0.001  # relative to the depth
-_OF_DELAY = 0.02  # of a scattered echo, relative to depth, times attenuation times width of the beam
+_LEAST = 0.0005  # relative to the depth
+_OF_RIPPLES = 0.032  # of an echo through ripples, relative to the depth, times their slope variance
+_OF_DELAY = 0.09  # of a scattered echo, relative to the depth, times sqrt(K bb) and the beam's width
 _OF_NEIGHBOURS = 0.1  # share of a pixel's echo that arrives with those of the pixels about it
 _OF_SKEW = 0.25  # of a resolved echo, relative to the spread of the arrival over the light of the pixel
 _OF_LEVEL_SURFACE, _OF_WAVES, _OF_COLUMN = 0.4, 0.85, 1.0  # of the time of a surface, relative to this spread
-_OF_PULSE, _OF_LOST_PULSE = 0.03, 0.15  # of the time of a surface, distinct and not, relative to the pulse
+_OF_PULSE, _OF_LOST_PULSE = 0.05, 0.15  # of the time of a surface, distinct and not, relative to the pulse
+_LEAST_SHARE = 0.05  # of the beam in a pixel whose column counts, relative to the brightest pixel
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
+_TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
+_TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 _MEAN_SLOPE = 0.4  # slope of waves averaged over a pixel, relative to the standard deviation of all slopes
 _HEIGHTS = 8.0  # standard deviations from the lowest to the highest point of a sea
 
@@ -46,6 +60,10 @@ class DepthErrors:
         Standard deviation of the slopes averaged over a pixel [1], 0 for a level sea with ripples.
     height
         Standard deviation of the sea's height [m].
+    slope_variance
+        Variance of all slopes [1].
+    gain
+        Power of the column at the surface per backscattering coefficient [W m], NaN if unknown.
     """
 
     lines: LinesOfSight
@@ -56,6 +74,8 @@ class DepthErrors:
     group_index: float
     slope: float
     height: float
+    slope_variance: float
+    gain: float
 
     @classmethod
     def of(
@@ -67,9 +87,12 @@ class DepthErrors:
         lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
         variance = optional_number(attributes, "surface_slope_variance")
         level = highest - lowest < 1e-6
-        slope = 0.0 if level else _MEAN_SLOPE * math.sqrt(0.5 * (0.04 if variance is None else variance))
+        variance = _TYPICAL_SLOPE_VARIANCE if variance is None else variance
+        slope = 0.0 if level else _MEAN_SLOPE * math.sqrt(0.5 * variance)
         height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
-        return cls(lines, shots, width, pulse_ns, geometry.refractive_index, geometry.group_index, slope, height)
+        n, group = geometry.refractive_index, geometry.group_index
+        gain = _column_gain(attributes, geometry)
+        return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain)
 
     def of_surface(self, own: BoolArray, faint: BoolArray) -> FloatArray:
         """Return the errors of surface times [ns], shape (n,), 0 where the time is not the pixel's own.
@@ -83,7 +106,13 @@ class DepthErrors:
         return np.asarray(np.where(own, np.hypot(share * self.lines.surface_spread, overlap), 0))
 
     def of_echoes(
-        self, time_ns: FloatArray, depth: FloatArray, attenuation: FloatArray, *, from_mean: bool
+        self,
+        time_ns: FloatArray,
+        depth: FloatArray,
+        attenuation: FloatArray,
+        level: FloatArray,
+        *,
+        from_mean: bool,
     ) -> FloatArray:
         """Return the errors of depths [m] except those of the surface times.
 
@@ -91,8 +120,8 @@ class DepthErrors:
         ----------
         time_ns, depth : ndarray, shape (n, ...)
             Arrival times [ns] and depths [m] of the echoes.
-        attenuation : ndarray, shape (n,)
-            Attenuation of the columns along the path [1/m], NaN if unknown.
+        attenuation, level : ndarray, shape (n,)
+            Attenuation K of the columns along the path [1/m], and their power at the surface [W]; NaN if unknown.
         from_mean : bool
             Whether depths are from the mean sea level.
 
@@ -100,7 +129,9 @@ class DepthErrors:
         -----
         Root of the sum of the squares of:
 
-        - the delay of scattered light, which increases with the beam's width, and at least 0.1 % of the depth;
+        - the delay of scattered light, 0.09 sqrt(K bb) times the width of the beam, relative to the depth. The
+          backscattering bb follows from the level of the column, of a signal in volts it is 0.05 K;
+        - the longer paths through ripples, 0.032 times the variance of the slopes, relative to the depth;
         - light scattered from other pixels: a tenth of the deviation of the arrival from that of all pixels, weighted
           with the beam;
         - the skew of an echo that is longer than the pulse because of the pixel's extent;
@@ -112,11 +143,13 @@ class DepthErrors:
         lines = self.lines
         cos_air = np.cos(lines.off_nadir)
         water = snell(lines.off_nadir, self.refractive_index)
-        known = np.where(np.isfinite(attenuation), np.maximum(attenuation, 0), _TYPICAL_ATTENUATION)
+        scattering = np.sqrt(self._attenuation_times_backscattering(attenuation, level))
         turned = self.slope * np.tan(water) * (1 - cos_air / (self.refractive_index * np.cos(water)))
-        relative = np.hypot(np.hypot(_LEAST, _OF_DELAY * known * self.beam_width), turned)
+        by_water = _OF_DELAY * scattering * self.beam_width + _OF_RIPPLES * self.slope_variance
+        relative = np.hypot(np.hypot(_LEAST, by_water), turned)
         pulse = self.pulse_ns / FWHM_PER_SIGMA
-        skew = _OF_SKEW * lines.surface_spread**2 / np.hypot(lines.surface_spread, pulse)
+        resolved = np.hypot(lines.surface_spread, max(pulse, 1e-9))
+        skew = _OF_SKEW * lines.surface_spread**2 / resolved
         constant = lines.depth_of_delay(skew)
         if from_mean:
             by_height = self.height * (1 - np.cos(water) / (self.group_index * cos_air))
@@ -126,6 +159,21 @@ class DepthErrors:
         of_pixel = np.hypot(relative.reshape(shape) * depth, constant.reshape(shape))
         return np.asarray(np.hypot(of_pixel, neighbours))
 
+    def _attenuation_times_backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
+        """Return K bb of the columns [1/m^2], shape (n,), with one bb for all pixels of a shot."""
+        known = np.where(np.isfinite(attenuation), np.maximum(attenuation, 0), _TYPICAL_ATTENUATION)
+        share = self.lines.beam_share.reshape(self.shots, -1)
+        power = level.reshape(share.shape)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lit = np.isfinite(power) & (share >= _LEAST_SHARE * share.max(axis=1, keepdims=True))
+            measured = np.where(lit, power / (share * self.gain), np.nan)
+        # The median, as levels of faint columns may be wrong by orders of magnitude.
+        some = np.where(np.isfinite(measured).any(axis=1, keepdims=True), measured, 0)
+        median = np.nanmedian(some, axis=1, keepdims=True)
+        backscattering = np.broadcast_to(np.where(median > 0, median, np.nan), share.shape).ravel()
+        backscattering = np.where(np.isfinite(backscattering), backscattering, _TYPICAL_BACKSCATTERING * known)
+        return np.asarray(known * backscattering)
+
     def _from_all_pixels(self, time_ns: FloatArray) -> FloatArray:
         """Return the deviations of arrivals from their mean over the pixels of a shot, weighted with the beam [ns]."""
         time = time_ns.reshape(self.shots, -1, *time_ns.shape[1:])
@@ -134,3 +182,17 @@ class DepthErrors:
         total = weight.sum(axis=1, keepdims=True)
         mean = np.sum(weight * np.nan_to_num(time), axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
         return np.asarray(np.where(total > 0, time - mean, 0).reshape(time_ns.shape))
+
+
+def _column_gain(attributes: Attributes, geometry: LidarGeometry) -> float:
+    """Return the power of the column at the surface per backscattering coefficient [W m], NaN if it is unknown.
+
+    The phase function at 180 degrees is taken as bb/(2 pi b); see `column_retrieval.backscatter_of_level`.
+    """
+    try:
+        energy, aperture = (required_number(attributes, name) for name in ("pulse_energy_mj", "aperture_area"))
+        energy *= 1e-3 * two_way_efficiency(attributes)
+        system = LidarSystem(geometry.height, geometry.off_nadir, energy, aperture, geometry.refractive_index)
+    except UserError:
+        return math.nan
+    return float(system.water_gain(0.0, geometry.off_nadir)) * C0 / (2 * geometry.group_index) / (2 * math.pi)

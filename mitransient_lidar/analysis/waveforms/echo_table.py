@@ -329,7 +329,9 @@ def _with_depths(
         layer_zero = lines.surface_time
     table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
     from_mean = settings.depth_from == "mean"
-    by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], from_mean=from_mean)
+    level = table["amplitude"][:, 0, ECHOES.index("column")]
+    level = np.where(waveforms.unit == "W", level, np.nan)
+    by_water = errors.of_echoes(time, table["depth_m"], table["attenuation"], level, from_mean=from_mean)
     # The surface is where depths count from, or an echo of its own.
     by_water[..., 0] = 0
     of_surface = np.array([index == 0 if from_mean else index > 0 for index in range(len(ECHOES))])

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from mitransient_lidar.analysis.gates.range_images import RangeImage, contrast, depth_image
+from mitransient_lidar.analysis.gates.range_images import DepthImage, contrast, depth_image
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gates.images import SIGNIFICANT, known_depths, reached_by_surface
@@ -127,7 +127,7 @@ def _reach(stack: xr.Dataset) -> int | None:
     return min(max(1, math.ceil(half / step - 0.5)), (stack.sizes["gate"] - 3) // 2)
 
 
-def _draw_depth_image(figure: Figure, stack: xr.Dataset, found: RangeImage) -> None:
+def _draw_depth_image(figure: Figure, stack: xr.Dataset, found: DepthImage) -> None:
     depth, confidence = found.depth, np.clip(np.nan_to_num(found.confidence), 0.0, 1.0)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     sure = np.isfinite(depth) & (confidence >= 0.5)
@@ -141,20 +141,26 @@ def _draw_depth_image(figure: Figure, stack: xr.Dataset, found: RangeImage) -> N
     bar.ax.invert_yaxis()
     image = drawing.draw_image(right, confidence, stack, cmap="gray", vmin=0, vmax=1)
     figure.colorbar(image, ax=right, aspect=25, shrink=0.9, label="confidence")
-    error = f"; standard error {100 * np.median(found.sigma[sure]):.2g} cm" if sure.any() else ""
+    error = ""
+    if sure.any():
+        parts = [(found.sigma, "noise"), (found.method_error, "method")]
+        medians = [(float(np.median(one[sure])), by) for one, by in parts]
+        known = [f"{100 * value:.2g} cm by {by}" for value, by in medians if math.isfinite(value)]
+        error = f"\nstandard error (median) {', '.join(known)}"
     left.set_title(f"depth, pale where uncertain{error}", fontsize=10)
     right.set_title("confidence that there is an echo", fontsize=10)
     right.set_ylabel("")
 
 
-def _draw_pixel_depths(figure: Figure, stack: xr.Dataset, found: RangeImage) -> None:
+def _draw_pixel_depths(figure: Figure, stack: xr.Dataset, found: DepthImage) -> None:
     names = [str(name) for name in stack["pixel"].values]
     confidence = np.clip(np.nan_to_num(found.confidence), 0.0, 1.0)
     figure.set_figheight(4.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     for place, colour in enumerate(drawing.pixel_colours(len(names))):
         style = {"color": colour, "alpha": max(float(confidence[place]), 0.15)}
-        upper.errorbar(place, found.depth[place], found.sigma[place], fmt="o", capsize=4, **style)
+        stated = np.hypot(found.sigma[place], np.nan_to_num(found.method_error[place]))
+        upper.errorbar(place, found.depth[place], stated, fmt="o", capsize=4, **style)
         lower.bar(place, confidence[place], width=0.3, color=colour)
     upper.invert_yaxis()
     upper.set_ylabel("depth (m), pale where uncertain")
