@@ -31,7 +31,7 @@ _OF_DELAY = 0.09  # of a scattered echo, relative to the depth, times sqrt(K bb)
 _OF_NEIGHBOURS = 0.1  # share of a pixel's echo that arrives with those of the pixels about it
 _OF_SKEW = 0.25  # of a resolved echo, relative to the spread of the arrival over the light of the pixel
 _OF_LEVEL_SURFACE, _OF_WAVES, _OF_COLUMN = 0.4, 0.85, 1.0  # of the time of a surface, relative to this spread
-_OF_PULSE, _OF_LOST_PULSE = 0.05, 0.15  # of the time of a surface, distinct and not, relative to the pulse
+_OF_PULSE, _OF_LOST_PULSE = 0.03, 0.15  # of the time of a surface, distinct and not, relative to the pulse
 _LEAST_SHARE = 0.05  # of the beam in a pixel whose column counts, relative to the brightest pixel
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
 _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
@@ -64,6 +64,8 @@ class DepthErrors:
         Variance of all slopes [1].
     gain
         Power of the column at the surface per backscattering coefficient [W m], NaN if unknown.
+    bin_ns
+        Width of the bins in which light was recorded before pulse and response [ns], 0 if it was not rendered.
     """
 
     lines: LinesOfSight
@@ -76,6 +78,7 @@ class DepthErrors:
     height: float
     slope_variance: float
     gain: float
+    bin_ns: float
 
     @classmethod
     def of(
@@ -92,18 +95,23 @@ class DepthErrors:
         height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
         gain = _column_gain(attributes, geometry)
-        return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain)
+        bin_ns = optional_number(attributes, "bin_width_ns") or 0.0
+        return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
     def of_surface(self, own: BoolArray, faint: BoolArray) -> FloatArray:
         """Return the errors of surface times [ns], shape (n,), 0 where the time is not the pixel's own.
 
         The light of a surface echo comes from few places in the pixel, and its time is that of these places. Without a
         distinct (`faint`) echo, it is that of the column's onset. Echo and column overlap by a pulse, which limits the
-        accuracy even of a narrow beam.
+        accuracy even of a narrow beam. Light of a short spread s that is rendered into one bin of the width w has the
+        time of its middle: the error is w/sqrt(12), times exp(-2 pi^2 (s/w)^2), as the error of the centroid of a
+        Gaussian in bins.
         """
         share = np.where(faint, _OF_COLUMN, _OF_LEVEL_SURFACE if self.slope == 0 else _OF_WAVES)
         overlap = np.where(faint, _OF_LOST_PULSE, _OF_PULSE) * self.pulse_ns
-        return np.asarray(np.where(own, np.hypot(share * self.lines.surface_spread, overlap), 0))
+        spread = self.lines.surface_spread
+        rounding = self.bin_ns / math.sqrt(12) * np.exp(-2 * (math.pi * spread / max(self.bin_ns, 1e-9)) ** 2)
+        return np.asarray(np.where(own, np.hypot(np.hypot(share * spread, overlap), rounding), 0))
 
     def of_echoes(
         self,
