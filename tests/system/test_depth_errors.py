@@ -1,0 +1,147 @@
+"""Depths of a survey, end to end: their stated errors hold against rays traced through the true scene.
+
+Noise is small here, so that the errors are those of the method, which the pixels of a render share in part: the root
+mean square of error over stated error must lie between 0.8 and 1.25 over several waters, bottoms or places. The
+constants of the errors are from other seas, waters and instruments.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from oracles.traced_depths import depths_under_beam
+
+import mitransient_lidar
+from mitransient_lidar.analysis.gates.range_images import depth_image
+from mitransient_lidar.analysis.waveforms.echo_table import extract
+from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.scenes import load_scene
+from mitransient_lidar.plots.gates.images import reached_by_surface
+from mitransient_lidar.studies.shot_series import render_shots
+
+pytestmark = pytest.mark.slow
+
+SURVEY = (Path(__file__).parents[2] / "docs" / "survey_lidar.xml").read_text("utf-8")
+WATERS = {"jerlov": "1C", "petzold": "coastal", "kd": "0.15"}
+BOTTOMS = {"level": 0, "rises": 10, "falls": -10}
+PLATE = """<shape type="rectangle" id="plate"><transform name="to_world"><scale value="100"/>
+<translate x="-97.6" z="-7.5"/></transform>
+<bsdf type="diffuse"><spectrum name="reflectance" value="0.15"/></bsdf></shape>
+"""
+
+SLOPE = """<shape type="seabed"><float name="depth" value="$bottom_depth"/><float name="slope_x_deg" value="8"/>
+<float name="reflectance" value="0.2"/></shape>"""
+GATES = """<float name="gate_start_depth" value="3"/><float name="gate_width_ns" value="5"/>
+<float name="gate_step_ns" value="2"/><integer name="gate_count" value="34"/>"""
+SQUARE = '<string name="field_of_view_shape" value="square"/>'
+
+
+def ratios(dataset, truth, depth_from):
+    """Errors over stated errors of the pixels with light, for depths below the surface echo or the mean sea level."""
+    depth, height, share = truth
+    bottom = extract(dataset, depth_from=depth_from).sel(echo="bottom")
+    found, *errors = (bottom[f"depth_m{name}"].values.ravel() for name in ("", "_stderr", "_method_error"))
+    error = found - depth - (height if depth_from == "echo" else 0)
+    return (error / np.hypot(*errors))[share > 0.05 * share.max()]
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def traced(scene, params, dataset):
+    pose = dataset.attrs["receiver_pose"]
+    return depths_under_beam(load_scene(scene, params)[0], dataset, pose)
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory):
+    """Results of the survey lidar in three waters over level and tilted bottoms and a step, with the true depths."""
+    folder, found = tmp_path_factory.mktemp("survey"), []
+    for number, (kind, value) in enumerate(WATERS.items()):
+        text = SURVEY.replace('name="jerlov" value="$jerlov"', f'name="{kind}" value="{value}"')
+        text = text.replace('<default name="jerlov"           value="1C"/>', "")
+        for bottom, slope in BOTTOMS.items():
+            path = folder / f"{kind}_{bottom}.xml"
+            path.write_text(text, "utf-8")
+            params = {"spectrum": "flat", "bottom_slope_deg": slope}
+            dataset = mitransient_lidar.render(path, params=params, passes=4, seed=100 * number + 7)
+            found.append((dataset, traced(path, params, dataset)))
+        path = folder / f"{kind}_step.xml"
+        path.write_text(text.replace("</scene>", PLATE + "</scene>"), "utf-8")
+        params = {"spectrum": "flat"}
+        dataset = mitransient_lidar.render(path, params=params, passes=4, seed=100 * number + 8)
+        depth, height, share = traced(path, params, dataset)
+        # A pixel on the edge of the step has two echoes.
+        whole = (np.abs(depth - 7.5) < 0.05) | (np.abs(depth - 9) < 0.05)
+        found.append((dataset, (depth, height, np.where(whole, share, 0))))
+    return found
+
+
+@pytest.mark.parametrize("depth_from", ["echo", "mean"])
+def test_hexagonal_survey_lidar(survey, depth_from):
+    z = np.concatenate([ratios(dataset, truth, depth_from) for dataset, truth in survey])
+    assert 70 < z.size <= 84
+    assert 0.8 < rms(z) < 1.25
+    assert np.abs(z).max() < 4
+
+
+@pytest.fixture(scope="module")
+def slope(tmp_path_factory):
+    """Waveforms and gates of 32 x 32 pixels over a bottom that rises away from the lidar by 8 degrees."""
+    path = tmp_path_factory.mktemp("slope") / "slope.xml"
+    text = catalogue.scene_text("table1")
+    first = text.index('<shape type="rectangle" id="bottom">')
+    last = text.index("</shape>", first) + len("</shape>")
+    text = text[:first] + SLOPE + text[last:]
+    text = text.replace("</film>", GATES + "</film>")
+    path.write_text(text.replace('<string name="layout"', SQUARE + '<string name="layout"'), "utf-8")
+    params = {"spectrum": "flat", "slope_variance": 0.02, "layout": "32x32", "field_of_view_mrad": 20}
+    params |= {"divergence_mrad": 12, "bin_count": 170, "attenuation": 0.2, "scattering": 0.1, "backscattering": 0.002}
+    dataset = mitransient_lidar.render(path, params=params, passes=10, seed=11)
+    return dataset, traced(path, params, dataset)
+
+
+@pytest.mark.parametrize("depth_from", ["echo", "mean"])
+def test_waveforms_of_an_imager_over_a_slope(slope, depth_from):
+    z = ratios(*slope, depth_from)
+    # A bottom is not found in each of the faint pixels.
+    assert np.mean(np.isfinite(z)) > 0.98
+    assert 0.8 < rms(z[np.isfinite(z)]) < 1.25
+
+
+def test_gates_of_an_imager_over_a_slope(slope):
+    dataset, (depth, _, share) = slope
+    stack = dataset.transpose(..., "gate")
+    stack = stack.isel(gate=~reached_by_surface(stack))
+    found = depth_image(stack, reach=4)
+    error = found.depth.ravel() - depth
+    z = (error / np.hypot(found.sigma, found.method_error).ravel())[share > 0.05 * share.max()]
+    assert np.isfinite(z).all()
+    assert 0.8 < rms(z) < 1.25
+    # The slope of the rows is that of the bottom: on the axis's scale of depth, rows would fall away from the lidar.
+    rows = np.median(found.depth, axis=1)
+    assert np.median(np.diff(rows)) == pytest.approx(
+        np.median(np.diff(np.nanmean(depth.reshape(32, 32), axis=1))), rel=0.15
+    )
+
+
+@pytest.mark.parametrize("layout", ["2x2", "1x4"])
+def test_twenty_shots_at_6_m_s(layout):
+    """Waves tilt and lift every pixel; the surface echo is that of few facets in it."""
+    params = {"wind_speed": 6, "layout": layout}
+    series = render_shots("fig09_2x2", params, count=20, passes=3, seed=4)
+    found = {"echo": [], "mean": []}
+    for number in range(20):
+        shot = series.isel(shot=number)
+        place = {**params, "aim_x": float(shot["aim_x"]), "aim_y": float(shot["aim_y"])}
+        scene = load_scene("fig09_2x2", place)[0]
+        pose = scene.emitters()[0].pose
+        truth = depths_under_beam(
+            scene, shot, np.concatenate([pose.origin, pose.axis, pose.far, pose.left]), rays=100_000
+        )
+        for depth_from, z in found.items():
+            z.append(ratios(shot, truth, depth_from))
+    for z in found.values():
+        assert np.concatenate(z).size == 80
+        assert 0.8 < rms(np.concatenate(z)) < 1.25

@@ -1,0 +1,120 @@
+"""Method errors of depths, against rays through tilted and lifted planes, and centroids of light in bins."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.analysis.waveforms import depth_errors
+from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight
+
+N, GROUP, C0 = 1.34, 1.364, 0.299792458
+ANGLE = math.radians(20)
+UNKNOWN = np.full(2, np.nan)
+ATTRIBUTES = {"surface_slope_variance": 0.04, "divergence_mrad": 10.0, "field_of_view_mrad": 30.0}
+
+
+def water(angle):
+    return math.asin(math.sin(angle) / N)
+
+
+def errors(**attributes):
+    """Two pixels of one shot on one line of sight, without any spread, of a level sea unless heights are given."""
+    per_ns = C0 / (2 * GROUP) * math.cos(water(ANGLE))
+    zero, half = np.zeros(2), np.full(2, 0.5)
+    lines = LinesOfSight(zero, zero, zero + ANGLE, zero + 1420, zero, zero + per_ns, half)
+    geometry = LidarGeometry.level(200.0, ANGLE, N, GROUP)
+    known = {**ATTRIBUTES, "surface_heights_m": (0.0, 0.0), **attributes}
+    return DepthErrors.of(known, lines, 1, geometry, 5.0)
+
+
+def of_depth(one, from_mean=False, depth=(8.0, 8.0), attenuation=0.0):
+    depth = np.array(depth)
+    time = 1420 + depth / one.lines.depth_per_ns
+    return one.of_echoes(time, depth, np.full(2, attenuation), UNKNOWN, from_mean=from_mean)
+
+
+def test_refraction_by_a_slope_is_that_of_a_ray_through_a_tilted_plane():
+    slope = 1e-3
+    bent = ANGLE - math.atan(slope)
+    angle = math.atan(slope) + math.asin(math.sin(bent) / N)
+    # The path to a depth D is D / cos(angle), and is read as that of a level sea.
+    expected = abs(8 * math.cos(water(ANGLE)) / math.cos(angle) - 8)
+    still = of_depth(errors())[0]
+    tilted = of_depth(replace(errors(), slope=slope * 100))[0]
+    assert math.sqrt(tilted**2 - still**2) == pytest.approx(100 * expected, rel=0.01)
+
+
+def test_height_of_a_sea_changes_depths_below_the_mean_level():
+    height = 0.1
+    lifted = 2 * ((200 - height) / math.cos(ANGLE) + GROUP * (8 + height) / math.cos(water(ANGLE))) / C0
+    level = 2 * (200 / math.cos(ANGLE) + GROUP * 8 / math.cos(water(ANGLE))) / C0
+    expected = (lifted - level) * C0 / (2 * GROUP) * math.cos(water(ANGLE))
+    one = replace(errors(), height=height)
+    assert math.sqrt(of_depth(one, from_mean=True)[0] ** 2 - of_depth(one)[0] ** 2) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.2, 0.3, 1.0])
+def test_light_in_bins_has_the_error_of_its_centroid(spread):
+    """Centroids of a Gaussian in bins of 1 ns, whose middle takes 400 places in a bin."""
+    from scipy.special import ndtr
+
+    edges = np.arange(-8.0, 9.0)
+    places = (np.arange(400) + 0.5) / 400
+    shares = np.diff(ndtr((edges - places[:, np.newaxis]) / max(spread, 1e-9)), axis=1)
+    expected = np.std(shares @ (0.5 * (edges[1:] + edges[:-1])) - places)
+    one = errors(bin_width_ns=1.0)
+    one = replace(one, lines=replace(one.lines, surface_spread=np.full(2, spread)))
+    own, faint = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
+    found = one.of_surface(own, faint)[0] ** 2 - replace(one, bin_ns=0.0).of_surface(own, faint)[0] ** 2
+    # Harmonics beyond the first one count for nothing but a point.
+    assert math.sqrt(max(found, 0)) == pytest.approx(expected, rel=0.3, abs=2e-3)
+
+
+def test_surface_times_of_waves_and_of_lost_echoes_are_less_certain():
+    level, waves = errors(), errors(surface_heights_m=(-0.6, 0.6))
+    unknown = errors(surface_heights_m=(math.nan, math.nan))
+    assert (level.slope, level.height) == (0.0, 0.0)
+    assert (waves.slope, waves.height) == (pytest.approx(0.4 * math.sqrt(0.02)), 0.15)
+    assert (unknown.slope, unknown.height) == (waves.slope, 0.0)
+    wide = replace(level.lines, surface_spread=np.array([2.0, 2.0]))
+    own, faint = np.array([True, True]), np.array([False, True])
+    for one, share in ((level, 0.4), (waves, 0.85)):
+        found = replace(one, lines=wide).of_surface(own, faint)
+        np.testing.assert_allclose(found, [math.hypot(2 * share, 0.03 * 5), math.hypot(2, 0.15 * 5)])
+        assert not replace(one, lines=wide).of_surface(~own, faint).any()
+
+
+def test_backscattering_of_the_column_is_that_of_its_level():
+    """The lidar equation just below the surface, of pixels of unequal light; without the level, 0.05 of the column."""
+    one = errors(pulse_energy_mj=5.0, aperture_area=0.025, two_way_efficiency=0.7)
+    below = water(ANGLE)
+    reflected = [math.sin(ANGLE - below) / math.sin(ANGLE + below), math.tan(ANGLE - below) / math.tan(ANGLE + below)]
+    passed = 1 - sum(part**2 for part in reflected) / 2
+    solid = 0.025 * (math.cos(ANGLE) / 200) ** 2 * math.cos(ANGLE) / (N**2 * math.cos(below))
+    power = 5e-3 * 0.7 * passed**2 * solid * 1e9 * C0 / (2 * GROUP) / (2 * math.pi)
+    assert one.gain == pytest.approx(power, rel=1e-6)
+    lines = replace(one.lines, beam_share=np.array([0.6, 0.3]))
+    one = replace(one, lines=lines)
+    level = 0.006 * one.gain * lines.beam_share
+    found = one._attenuation_times_backscattering(np.array([0.2, 0.2]), level)
+    np.testing.assert_allclose(found, 0.2 * 0.006)
+    unknown = one._attenuation_times_backscattering(np.array([0.2, np.nan]), UNKNOWN)
+    np.testing.assert_allclose(unknown, [0.05 * 0.2**2, 0.05 * depth_errors._TYPICAL_ATTENUATION**2])
+
+
+def test_other_pixels_pull_an_echo_to_their_mean_arrival():
+    one = errors()
+    alike, apart = of_depth(one), of_depth(one, depth=(7.0, 9.0))
+    own = np.array([of_depth(one, depth=(at, at))[0] for at in (7.0, 9.0)])
+    np.testing.assert_allclose(np.sqrt(apart**2 - own**2), 0.1)
+    assert alike[0] < 0.02
+
+
+def test_scattered_light_counts_with_the_beam_inside_the_view():
+    wide = of_depth(errors(), attenuation=0.2)[0]
+    assert of_depth(errors(field_of_view_mrad=5.0), attenuation=0.2)[0] < 0.6 * wide
+    # A tenth of a percent to two percent of the depth, as measured for waters of this attenuation.
+    assert 0.001 < wide / 8 < 0.02
