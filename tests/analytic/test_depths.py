@@ -167,6 +167,6 @@ def test_rendered_gates_give_the_depth_of_each_pixel(lidar_scene, bottom):
     truth, lit = truth_and_light(dataset, bottom)
     found = depth_image(dataset.transpose(..., "gate"), reach=4)
     off = (found.depth.ravel() - truth)[lit]
-    stated = np.hypot(found.sigma.ravel(), 0.005 * truth)[lit]
+    stated = np.hypot(found.sigma, found.method_error).ravel()[lit]
     assert abs(np.median(off)) < 0.06
     assert 0.5 < np.sqrt(np.mean((off / stated) ** 2)) < 1.5

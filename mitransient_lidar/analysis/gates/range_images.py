@@ -203,7 +203,7 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
     pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
     errors = DepthErrors.of(stack.attrs, lines, 1, geometry, pulse)
     attenuation, level = _column(stack, found, lines, geometry, pulse)
-    method = errors.of_echoes(found.depth.ravel(), depth.ravel(), attenuation, level, from_mean=True)
+    method = errors.of_echoes(found.depth.ravel(), depth.ravel(), attenuation, level, from_mean=True, gated=True)
     method = np.where(np.isfinite(depth), method.reshape(depth.shape), np.nan)
     return DepthImage(depth, found.sigma * per_ns, method, found.confidence)
 

@@ -28,7 +28,9 @@ from mitransient_lidar.results.geometry import (
 _LEAST = 0.0005  # relative to the depth
 _OF_RIPPLES = 0.032  # of an echo through ripples, relative to the depth, times their slope variance
 _OF_DELAY = 0.09  # of a scattered echo, relative to the depth, times sqrt(K bb) and the beam's width
-_OF_NEIGHBOURS = 0.1  # share of a pixel's echo that arrives with those of the pixels about it
+# Share of a pixel's echo that arrives with those of the other pixels. A centroid in gates includes more of its tail.
+_OF_NEIGHBOURS, _OF_GATED_NEIGHBOURS = 0.12, 0.2
+_FARTHEST_NEIGHBOUR = 1.5  # largest deviation of arrivals that counts, in pulses
 _OF_SKEW = 0.25  # of a resolved echo, relative to the spread of the arrival over the light of the pixel
 _OF_LEVEL_SURFACE, _OF_WAVES, _OF_COLUMN = 0.4, 0.85, 1.0  # of the time of a surface, relative to this spread
 _OF_PULSE, _OF_LOST_PULSE = 0.03, 0.15  # of the time of a surface, distinct and not, relative to the pulse
@@ -121,6 +123,7 @@ class DepthErrors:
         level: FloatArray,
         *,
         from_mean: bool,
+        gated: bool = False,
     ) -> FloatArray:
         """Return the errors of depths [m] except those of the surface times.
 
@@ -132,6 +135,8 @@ class DepthErrors:
             Attenuation K of the columns along the path [1/m], and their power at the surface [W]; NaN if unknown.
         from_mean : bool
             Whether depths are from the mean sea level.
+        gated : bool
+            Whether times are centroids of energies in gates.
 
         Notes
         -----
@@ -140,8 +145,8 @@ class DepthErrors:
         - the delay of scattered light, 0.09 sqrt(K bb) times the width of the beam, relative to the depth. The
           backscattering bb follows from the level of the column, of a signal in volts it is 0.05 K;
         - the longer paths through ripples, 0.032 times the variance of the slopes, relative to the depth;
-        - light scattered from other pixels: a tenth of the deviation of the arrival from that of all pixels, weighted
-          with the beam;
+        - light scattered from other pixels: 0.12 of the deviation of the arrival from that of all pixels, weighted with
+          the beam, or 0.2 in gates;
         - the skew of an echo that is longer than the pulse because of the pixel's extent;
         - refraction by waves: a slope s turns the ray by s (1 - cos(theta)/(n cos(theta_w))), and the depth changes by
           tan(theta_w) times this angle, to first order;
@@ -163,7 +168,8 @@ class DepthErrors:
             by_height = self.height * (1 - np.cos(water) / (self.group_index * cos_air))
             constant = np.hypot(constant, by_height)
         shape = (-1, *(1,) * (depth.ndim - 1))
-        neighbours = lines.depth_of_delay(_OF_NEIGHBOURS * self._from_all_pixels(time_ns))
+        share = _OF_GATED_NEIGHBOURS if gated else _OF_NEIGHBOURS
+        neighbours = lines.depth_of_delay(share * self._from_all_pixels(time_ns))
         of_pixel = np.hypot(relative.reshape(shape) * depth, constant.reshape(shape))
         return np.asarray(np.hypot(of_pixel, neighbours))
 
@@ -183,13 +189,17 @@ class DepthErrors:
         return np.asarray(known * backscattering)
 
     def _from_all_pixels(self, time_ns: FloatArray) -> FloatArray:
-        """Return the deviations of arrivals from their mean over the pixels of a shot, weighted with the beam [ns]."""
+        """Return the deviations of arrivals from their mean over the pixels of a shot, weighted with the beam [ns].
+
+        They are limited to 1.5 pulses, beyond which echoes do not overlap.
+        """
         time = time_ns.reshape(self.shots, -1, *time_ns.shape[1:])
         share = np.nan_to_num(self.lines.beam_share).reshape(time.shape[:2] + (1,) * (time.ndim - 2))
         weight = np.where(np.isfinite(time), share, 0)
         total = weight.sum(axis=1, keepdims=True)
         mean = np.sum(weight * np.nan_to_num(time), axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
-        return np.asarray(np.where(total > 0, time - mean, 0).reshape(time_ns.shape))
+        farthest = _FARTHEST_NEIGHBOUR * self.pulse_ns
+        return np.asarray(np.where(total > 0, np.clip(time - mean, -farthest, farthest), 0).reshape(time_ns.shape))
 
 
 def _column_gain(attributes: Attributes, geometry: LidarGeometry) -> float:

@@ -137,7 +137,7 @@ def extract(
     echo samples at few places, and by waves; see `depth_errors.DepthErrors`. Its constants are from 40 random level
     seas and 36 shots on waves. In renders that they were not taken from, root mean squares of error over both errors
     together were 1.0 to 1.2: seven hexagonal pixels over level, tilted and stepped bottoms in seven waters, imagers of
-    32x32 and 128x128 pixels over a slope of 8 degrees, and 40 shots at 6 m/s. The error has the sign of the biases
+    32x32 and 128x128 pixels over a slope of 8 degrees, and 60 shots at 6 m/s. The error has the sign of the biases
     below: over bottoms that rise away from the lidar by 8 to 10 degrees the ratio was 1.2 to 1.4, over falling ones
     0.7 to 0.8. The other estimators have the biases below.
 

@@ -107,10 +107,12 @@ def test_backscattering_of_the_column_is_that_of_its_level():
 
 def test_other_pixels_pull_an_echo_to_their_mean_arrival():
     one = errors()
-    alike, apart = of_depth(one), of_depth(one, depth=(7.0, 9.0))
-    own = np.array([of_depth(one, depth=(at, at))[0] for at in (7.0, 9.0)])
-    np.testing.assert_allclose(np.sqrt(apart**2 - own**2), 0.1)
-    assert alike[0] < 0.02
+    per_ns = one.lines.depth_per_ns[0]
+    assert of_depth(one)[0] < 0.02
+    # Half a metre from the mean, and beyond the overlap of two pulses of 5 ns.
+    for depth, expected in (((7.5, 8.5), 0.12 * 0.5), ((5.0, 11.0), 0.12 * 7.5 * per_ns)):
+        own = np.array([of_depth(one, depth=(at, at))[0] for at in depth])
+        np.testing.assert_allclose(np.sqrt(of_depth(one, depth=depth) ** 2 - own**2), expected)
 
 
 def test_scattered_light_counts_with_the_beam_inside_the_view():
