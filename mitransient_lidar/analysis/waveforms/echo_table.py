@@ -135,11 +135,11 @@ def extract(
     ``depth_m_stderr`` is the error by noise. The method errs by more: ``depth_m_method_error`` states for ``gaussian``
     the typical error by scattered light that arrives later, by the light's distribution in the pixel, which the surface
     echo samples at few places, and by waves; see `depth_errors.DepthErrors`. Its constants are from 40 random level
-    seas and 36 shots on waves. In renders that they were not taken from, root mean squares of error over both errors
-    together were 1.0 to 1.2: seven hexagonal pixels over level, tilted and stepped bottoms in seven waters, imagers of
-    32x32 and 128x128 pixels over a slope of 8 degrees, and 60 shots at 6 m/s. The error has the sign of the biases
-    below: over bottoms that rise away from the lidar by 8 to 10 degrees the ratio was 1.2 to 1.4, over falling ones
-    0.7 to 0.8. The other estimators have the biases below.
+    seas and 36 shots on waves, its dependence on sqrt(K bb) also from one lidar in Jerlov waters. In other renders the
+    root mean squares of error over both errors together were 1.0 to 1.2: seven hexagonal pixels over level and tilted
+    bottoms in six waters, imagers of 32x32 and 128x128 pixels over a slope of 8 degrees, and 60 shots at 6 m/s (1.0 to
+    1.3 in each 20 of them). The error has the sign of the biases below: over bottoms that rise away from the lidar by 8
+    to 10 degrees the ratio was 1.2 to 1.4, over falling ones 0.7 to 0.8. The other estimators have the biases below.
 
     Biases by method over a flat bottom, measured with three renders each of ``table1`` with 1x1 pixels, ``spectrum``
     flat and bins of 0.5 ns; positive is too deep [m]. The first number of each pair is that of the surface, the second
