@@ -153,7 +153,7 @@ def plugin_parameters(plugin: str) -> list[str]:
         rules = list(re.finditer(r"^ *(=+)  =[= ]+$", page, re.MULTILINE))
         if f"``{plugin}``" in page and len(rules) >= 3:
             start, width = rules[0].start(1) - page.rfind("\n", 0, rules[0].start(1)) - 1, len(rules[0][1])
-            rows = page[rules[1].end() : rules[-1].start()].splitlines()
+            rows = page[rules[1].end() : rules[2].start()].splitlines()
             cells = ", ".join(row[start : start + width] for row in rows)
             names += re.findall(r"(?<![\w(.])[a-z]\w*(?![\w).])", cells)
     return list(dict.fromkeys(names))

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 #: Parameters that name files.
-FILE_PARAMETERS = (*("filename", "pixel_map", "blur_file", "profile_file", "pulse_file", "profile", "gate_profile"),)
+FILE_PARAMETERS = ("filename", "pixel_map", "blur_file", "profile_file", "pulse_file", "profile", "gate_profile")
 
 #: Largest array of a Mitsuba object whose values are stored; others, such as vertices, are in the files.
 _MOST_VALUES = 16

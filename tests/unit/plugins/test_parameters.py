@@ -68,7 +68,7 @@ def _table(plugin):
     rules = list(re.finditer(r"^ *(=+)  =[= ]+$", page, re.MULTILINE))
     start, width = 4, len(rules[0][1])
     rows, names = {}, ()
-    for line in page[rules[1].end() : rules[-1].start()].splitlines():
+    for line in page[rules[1].end() : rules[2].start()].splitlines():
         cell = tuple(re.findall(r"[a-z]\w*", line[start : start + width]))
         names = cell or names
         rows[names] = f"{rows.get(names, '')} {' '.join(line[start + width :].split())}"

@@ -1,7 +1,6 @@
 """Tables of echoes: dimensions, units, flags, noise, files, the command, and echoes of rendered results."""
 
 import csv
-import time
 
 import numpy as np
 import pytest
@@ -459,16 +458,6 @@ def test_invalid_input(dataset, options, sentence):
     with pytest.raises(UserError, match=sentence) as refused:
         echo_table.extract(dataset, **options)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.slow
-def test_thousands_of_shots_take_seconds():
-    """10 000 shots of 4 pixels and 512 bins must take less than 30 s with a receiver's simulation: a tenth of them."""
-    clean = np.stack([waveform(SURFACE + shift) for shift in (2.3, 2.1, -1.8, -2.2)])
-    dataset = recorded(clean, 1000, 0.05)
-    start = time.perf_counter()
-    echo_table.extract(dataset)
-    assert time.perf_counter() - start < 4.0
 
 
 @pytest.mark.slow
