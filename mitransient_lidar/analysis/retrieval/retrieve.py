@@ -189,8 +189,8 @@ def bottom(
     xarray.Dataset
         Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
         (``level``), through the plane of the shot (``slope``), and from the ratio of the echo to the column
-        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr`` by slope
-        and height of the sea, noise and method, NaN where the sea is unknown; ``reflectance_corrected`` and
+        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr`` by noise,
+        method, slope and height of the sea; ``reflectance_corrected`` and
         ``depth_corrected``, whether the correction was applied: otherwise the value is the one before it. Also
         ``bottom_energy`` [J], and for the last reflectance ``reflectance_stderr`` from noise, an upper bound, and
         ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN without a column,
@@ -233,11 +233,13 @@ def bottom(
     mean_level, mean_attenuation = (_mean(values) for values in (power, attenuation))
     if math.isnan(mean_attenuation):
         _LOG.warning("no waveform has a column long enough for a fit: the reflectance of the bottom is unknown")
-    helpful, by_sea = _helpful(lidar, time, mean_attenuation, slopes)
+    helpful, by_waves, by_estimate = _helpful(lidar, time, mean_attenuation, slopes)
     depth_corrected = helpful["depth"] & np.isfinite(depth[1])
     depth[1] = np.where(depth_corrected, depth[1], depth[0])
-    by_time = np.hypot(seabed["depth_m_stderr"].values, seabed["depth_m_method_error"].values)
-    depth_error = [np.hypot(one, by_time) for one in (by_sea[0], np.where(depth_corrected, by_sea[1], by_sea[0]))]
+    # The error through a level sea includes that by typical waves, which estimated slope and height replace.
+    level_error = np.hypot(seabed["depth_m_stderr"].values, seabed["depth_m_method_error"].values)
+    others = np.maximum(level_error**2 - np.where(np.isfinite(by_waves), by_waves, 0), 0)
+    depth_error = [level_error, np.where(depth_corrected, np.sqrt(others + by_estimate), level_error)]
     received = system.energy * system.aperture_area
     reflectance = []
     for distance, path, one in surfaces:
@@ -291,10 +293,10 @@ def bottom(
 
 def _helpful(
     lidar: LidarGeometry, time: FloatArray, attenuation: float, slopes: xr.Dataset
-) -> tuple[dict[str, npt.NDArray[np.bool_]], list[FloatArray]]:
+) -> tuple[dict[str, npt.NDArray[np.bool_]], FloatArray, FloatArray]:
     """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance.
 
-    Also return the standard deviations of the depth without and with them [m], NaN where the sea is unknown.
+    Also return the variances of the depth without and with them [m^2]; the former is infinite if the sea is unknown.
     """
 
     def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:
@@ -319,11 +321,8 @@ def _helpful(
         helpful[name] = np.reshape(corrected < without, time.shape)
     # A slope that is not estimated is as uncertain as on the sea.
     known = [np.where(np.isnan(error), deviation, error) for error, deviation in zip(errors, before, strict=True)]
-    spread = [
-        np.sqrt(np.reshape(np.broadcast_to(one, time.size), time.shape))
-        for one in variances(depth, lidar.slant_range, before, known)
-    ]
-    return helpful, [np.where(np.isfinite(one), one, np.nan) for one in spread]
+    without, corrected = variances(depth, lidar.slant_range, before, known)
+    return helpful, np.broadcast_to(without, time.size).reshape(time.shape), corrected.reshape(time.shape)
 
 
 def _scatter(reflectance: FloatArray) -> float:

@@ -275,14 +275,18 @@ def test_errors_of_depths_hold_slope_and_range():
         return retrieve.bottom(shot, slopes)["depth_m_stderr"].sel(correction=["level", "slope"]).values
 
     exact = LEVEL.assign(dict.fromkeys([*deviations, "slope_across_stderr"], 0.0))
-    by_time = errors(exact.assign_attrs(slope_prior_deviation=[0.0, 0.0, 0.0]))
-    found = errors(exact.assign(deviations).assign_attrs(sea))
-    expected = [math.hypot(0.2 * turn, 0.4 * per_range), math.hypot(0.05 * turn, 0.2 * per_range)]
-    np.testing.assert_allclose(np.sqrt(found**2 - by_time**2), expected, rtol=0.01)
-    # A slope that is not estimated is as uncertain as on the sea; an unknown sea leaves the error unknown.
-    unseen = exact.assign(slope_along_stderr=np.nan, surface_range_stderr=0.0)
-    np.testing.assert_allclose(errors(unseen.assign_attrs(sea))[1] ** 2 - by_time[1] ** 2, (0.2 * turn) ** 2, rtol=0.02)
-    assert np.isnan(errors(unseen.assign_attrs(slope_prior_deviation=[math.inf] * 3))).all()
+    level, others = errors(exact.assign_attrs(slope_prior_deviation=[1e-6, 0.0, 0.0]))
+    assert others == pytest.approx(level)
+    found = errors(exact.assign(deviations).assign_attrs(slope_prior_deviation=[math.inf] * 3))
+    np.testing.assert_allclose(found**2 - level**2, [0, (0.05 * turn) ** 2 + (0.2 * per_range) ** 2], rtol=0.02)
+    # The error through a level sea includes that by typical waves: with a known sea, less is left.
+    sea = {"slope_prior_deviation": [0.01, 0.0, 0.0]}
+    found = errors(exact.assign_attrs(sea))
+    np.testing.assert_allclose(level**2 - found**2, [0, (0.01 * turn) ** 2], rtol=0.02, atol=1e-12)
+    # A slope that is not estimated is as uncertain as on the sea.
+    unseen = exact.assign(slope_along_stderr=np.nan, surface_range_stderr=0.1)
+    found = errors(unseen.assign_attrs(slope_prior_deviation=[0.01, 0.0, 1.0]))[1]
+    assert found == pytest.approx(math.hypot(0.01 * turn, 0.1 * per_range), rel=0.02)
 
 
 def test_estimate_has_all_known_quantities():
