@@ -28,7 +28,9 @@ def add_and_interrupt(statistics, values):
             sys.stdin.readline()  # until the terminal is closed
         else:
             os.kill(os.getpid(), number)
+# Where the tests run in the background or under nohup, these are ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 accuracy.PassStatistics.add = add_and_interrupt
 app.main()
 """
