@@ -58,6 +58,7 @@ class _GroupedCommands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Parse the options of the subcommand, and run it."""
+        # One context alone: the exit code of a signal is known to the one that handles it.
         with _short_usage_errors():
             return super().invoke(ctx)
 
@@ -131,12 +132,12 @@ def _common(
 def _scenes(context: typer.Context) -> None:
     """List, show or copy the shipped scenes."""
     if context.invoked_subcommand is None:
-        exit_on_error()(scenes.list_scenes)()
+        scenes.list_scenes()
 
 
 for _heading, _functions in _COMMANDS.items():
     for _function in _functions:
-        app.command(rich_help_panel=_heading)(exit_on_error()(_function))
+        app.command(rich_help_panel=_heading)(_function)
 for _name, _function in (("list", scenes.list_scenes), ("show", scenes.show_scene), ("copy", scenes.copy_scene)):
-    _scenes_app.command(_name)(exit_on_error()(_function))
+    _scenes_app.command(_name)(_function)
 app.add_typer(_scenes_app, name="scenes", rich_help_panel="Scenes and system")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from significance import largest_z
 
-WAVY = {"spectrum": "elfouhaily", "slope_variance": "cox_munk"}
+#: Cells and shortest wave are the same for every beam and view.
+WAVY = {"spectrum": "elfouhaily", "slope_variance": "cox_munk", "cell_size": 0.1, "shortest_wave": 1.0}
 ROUGH = {"slope_variance": "0.01836"}
 
 
