@@ -140,7 +140,7 @@ def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple
         raise UserError(f"{name} has the dimensions {dims}; they must be (pixel, time) or (row, column, time){after}")
     if missing := [dim for dim in dims if dim not in dataset.coords]:
         raise UserError(f"the dataset has no coordinate {missing[0]}; {name} over {dims} needs it")
-    _check_axes("the dataset", dataset, dims)
+    check_axes("the dataset", dataset, name)
     return dims
 
 
@@ -260,15 +260,15 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
         raise UserError(f"{path} holds signals of a receiver; give the result that they were recorded from.")
     if any(name not in dataset for name in _VARIABLES):
         raise UserError(f"{path} is a NetCDF file, but not a result of mitransient-lidar.")
-    dims = tuple(str(dim) for dim in dataset["waveform"].dims)
-    if "time" not in dims or "time" not in dataset.coords:
-        raise UserError(f"{path} has no coordinate time: its waveform has the dimensions {', '.join(dims)}.")
-    _check_axes(path, dataset, dims)
+    check_axes(path, dataset, "waveform")
     return dataset
 
 
-def _check_axes(place: object, dataset: xr.Dataset, dims: tuple[str, ...]) -> None:
-    """Reject a record without pixels or bins, or whose times are no numbers, not finite or not increasing."""
+def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
+    """Raise `UserError` if a variable has no times, pixels or bins, or times that are not finite or not increasing."""
+    dims = tuple(str(dim) for dim in dataset[name].dims)
+    if "time" not in dims or "time" not in dataset.coords:
+        raise UserError(f"{place} has no coordinate time: its {name} has the dimensions {', '.join(dims)}.")
     if empty := [dim for dim in dims if dataset.sizes[dim] == 0]:
         raise UserError(f"{place} is empty: its dimension {empty[0]} has the length 0, but must have at least 1.")
     times = dataset["time"].values

@@ -19,6 +19,7 @@ from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results import netcdf
+from mitransient_lidar.results.dataset import check_axes
 from mitransient_lidar.results.formats import input_format
 from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, required_number
 
@@ -33,7 +34,7 @@ def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises
     ------
     UserError
-        If the file is missing or damaged, or has neither variable.
+        If the file is missing or damaged, has neither variable, or its times are invalid.
     """
     if input_format(path) == "exr":
         return results.open(path)
@@ -43,8 +44,10 @@ def open_waveforms(path: str | os.PathLike[str]) -> xr.Dataset:
         raise
     except ValueError as error:
         raise UserError(f"{path} is not of mitransient-lidar: {error}") from error
-    if not {"signal", "waveform"} & set(dataset):
+    name = next((name for name in ("signal", "waveform") if name in dataset), None)
+    if name is None:
         raise UserError(f"{path} holds neither a signal nor a waveform over time.")
+    check_axes(path, dataset, name)
     return dataset
 
 
