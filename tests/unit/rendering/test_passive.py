@@ -34,7 +34,7 @@ def scene(layout="4x4", **parts):
             "film": {"type": "time_gated_film"},
         },
         "sea": {"type": "ocean_surface", "wind_speed": 4.0, "refined_size": 12.0, "cell_size": 0.5,
-                "interior": {"type": "layered_water"}},
+                "shortest_wave": 1.0, "interior": {"type": "layered_water"}},
         "bottom": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).scale(500),
