@@ -77,7 +77,7 @@ def check_suffix(option: str, path: Path, suffix: str) -> None:
 
 @contextlib.contextmanager
 def announced() -> Iterator[None]:
-    """Let the files that are written in this context appear together at its end, and print their paths."""
+    """Move all files of this context to their places at its end, and print their paths."""
     with together() as written:
         yield
     for path in written:

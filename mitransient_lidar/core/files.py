@@ -75,7 +75,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def together() -> Iterator[list[Path]]:
-    """Let all files that `replacing` writes in this context appear together at its end, or none of them.
+    """Move all files that `replacing` writes in this context to their places at its end; on a failure, none of them.
 
     Yields a list that holds their paths, in order, after the context; a context within another one joins it, and its
     list stays empty. On any failure the former files stay. If the process is killed while the files are moved, the next

@@ -179,7 +179,7 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
 
 
 def fit_seas(scene: mi.Scene) -> None:
-    """Let each ``ocean_surface`` choose its automatic values for the lasers and receivers of the scene, once.
+    """Set the automatic values of each ``ocean_surface`` from the lasers and receivers of the scene, once.
 
     A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used.
     """
