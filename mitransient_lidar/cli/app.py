@@ -40,7 +40,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         waveforms.waveforms,
         retrieve.retrieve,
     ),
-    "Scenes and system": (scenes.info, scenes.bench),
+    "Scenes and system": (scenes.instruments, scenes.info, scenes.bench),
 }
 
 

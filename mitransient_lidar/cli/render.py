@@ -36,6 +36,9 @@ def render(
     scene: SceneOrResult,
     define: Define = None,
     output: Folder = Path("."),
+    instrument: Annotated[
+        str | None, typer.Option(help="Instrument instead of the scene's lidar, from the list of instruments.")
+    ] = None,
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     target_error: TargetError = None,
     target_quantile: TargetQuantile = None,
@@ -73,6 +76,7 @@ def render(
         dataset = (again.render_again if again.is_result(scene) else rendering.render)(
             scene,
             params=params,
+            instrument=instrument,
             integrator=integrator,
             target_error=target_error,
             target_quantile=target_quantile,

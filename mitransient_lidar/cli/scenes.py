@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from mitransient_lidar.core.errors import UserError
+
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]
 
 
@@ -35,6 +37,36 @@ def copy_scene(
     from mitransient_lidar.loading import catalogue
 
     typer.echo(catalogue.copy_scene(name, destination))
+
+
+def instruments(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Name of an instrument.")] = None,
+    xml: Annotated[bool, typer.Option("--xml", help="Print XML of laser and receiver, to be included.")] = False,
+) -> None:
+    """List the instruments, or print the parameters of one with their sources.
+
+    Parameters that are not published are assumed, and listed as such. Use with render SCENE --instrument NAME.
+    """
+    from mitransient_lidar.loading import instruments as shipped
+
+    if name is None:
+        if xml:
+            raise UserError("--xml needs the name of an instrument")
+        names = shipped.instrument_names()
+        width = max(map(len, names), default=0)
+        for known in map(shipped.read_instrument, names):
+            count = len(known.channels)
+            typer.echo(f"{known.name:{width}}  {known.title}; {count} channel{'s' * (count > 1)}")
+        return
+    if xml:
+        typer.echo(shipped.instrument_text(name), nl=False)
+        return
+    known = shipped.read_instrument(name)
+    typer.echo(f"{known.title}\n\n{known.description}\n\nchannels: {', '.join(known.channels)}\n")
+    parameters = [parameter for parameter in known.parameters if parameter.value]
+    widths = [max(len(getattr(parameter, field)) for parameter in parameters) for field in ("name", "value")]
+    for parameter in parameters:
+        typer.echo(f"{parameter.name:{widths[0]}}  {parameter.value:>{widths[1]}}  {parameter.source}")
 
 
 def info(

@@ -64,9 +64,11 @@ def flat_text(path: Path) -> str:
         If a file is missing, unreadable, not well-formed XML, or includes itself.
     """
     text = read_scene(path)
-    if "<include" not in text:
-        return text
-    root = expanded(path)
+    return text_of(expanded(path)) if "<include" in text else text
+
+
+def text_of(root: minidom.Element) -> str:
+    """Return the text of a scene without includes in the format of `flat_text`."""
     assert root.parentNode is not None
     head = [node.toxml() for node in root.parentNode.childNodes if isinstance(node, minidom.Comment)]
     defaults: list[_Default] = []

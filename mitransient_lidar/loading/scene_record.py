@@ -6,6 +6,8 @@ A result has these attributes:
     Text of an XML scene with included files in place; the attributes ``scene.NAME`` are the values of its parameters.
 ``scene_dict``
     Instead, a scene given as a dict, as JSON: a transform is {"matrix": 4x4, "inverse_transpose": 4x4}.
+``instrument``
+    Name of the instrument whose laser and receiver the XML holds in place of the scene's own.
 ``scene_files``
     JSON list of the files that the scene names: ``plugin``, ``name`` as in the scene, absolute ``path``, ``sha256``.
 ``plugin_parameters``
@@ -59,6 +61,8 @@ class SceneRecord:
         Parameters of an XML scene with their values as text.
     files
         Absolute path and SHA-256 of each file, by the plugin that reads it and its name in the scene.
+    instrument
+        Name of the instrument of an XML scene; empty if its laser and receiver are its own.
     """
 
     name: str
@@ -66,14 +70,21 @@ class SceneRecord:
     is_xml: bool
     parameters: Mapping[str, str]
     files: Mapping[tuple[str, str], tuple[str, str]]
+    instrument: str = ""
 
     @classmethod
     def of_xml(
-        cls, name: str, text: str, root: minidom.Element, parameters: Mapping[str, str], folder: Path
+        cls,
+        name: str,
+        text: str,
+        root: minidom.Element,
+        parameters: Mapping[str, str],
+        folder: Path,
+        instrument: str = "",
     ) -> SceneRecord:
         """Return the record of an XML scene, whose text and root have no includes, in a folder."""
         references = ((plugin, value) for plugin, value, _, _ in _files_of_xml(root, parameters))
-        return cls(name, text, True, dict(parameters), _found(references, folder))
+        return cls(name, text, True, dict(parameters), _found(references, folder), instrument)
 
     @classmethod
     def of_dict(cls, scene: Mapping[str, Any]) -> SceneRecord | None:
@@ -105,12 +116,15 @@ class SceneRecord:
             (file["plugin"], file["name"]): (file["path"], file["sha256"])
             for file in (json_attribute(attributes, "scene_files") if "scene_files" in attributes else [])
         }
-        return cls(str(attributes["scene"]), attributes[f"scene_{kinds[0]}"], kinds[0] == "xml", parameters, files)
+        text, instrument = attributes[f"scene_{kinds[0]}"], str(attributes.get("instrument", ""))
+        return cls(str(attributes["scene"]), text, kinds[0] == "xml", parameters, files, instrument)
 
     def attributes(self) -> dict[str, str]:
         """Return the attributes of a result from which `from_attributes` returns this record."""
         described = {f"scene.{name}": value for name, value in self.parameters.items()}
         described["scene_xml" if self.is_xml else "scene_dict"] = self.text
+        if self.instrument:
+            described["instrument"] = self.instrument
         if self.files:
             rows = [
                 {"plugin": plugin, "name": name, "path": path, "sha256": digest}

@@ -18,7 +18,8 @@ from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_o
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.checks import check_dict, check_elements, unknown_parameters
-from mitransient_lidar.loading.includes import flat_text, parse_scene
+from mitransient_lidar.loading.includes import flat_text, parse_scene, text_of
+from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.scene_record import SceneRecord
 
 if TYPE_CHECKING:
@@ -48,13 +49,15 @@ class LoadedScene:
     record: SceneRecord | None
 
 
-def load_scene(scene: Any, params: Mapping[str, Any] | None = None) -> tuple[mi.Scene, str, dict[str, str]]:
+def load_scene(
+    scene: Any, params: Mapping[str, Any] | None = None, instrument: str | None = None
+) -> tuple[mi.Scene, str, dict[str, str]]:
     """Return scene, name and parameters of `load`, which also gives parameters and errors."""
-    loaded = load(scene, params)
+    loaded = load(scene, params, instrument)
     return loaded.scene, loaded.name, loaded.parameters
 
 
-def load(scene: Any, params: Mapping[str, Any] | None = None) -> LoadedScene:
+def load(scene: Any, params: Mapping[str, Any] | None = None, instrument: str | None = None) -> LoadedScene:
     """Load a scene.
 
     Parameters
@@ -63,13 +66,15 @@ def load(scene: Any, params: Mapping[str, Any] | None = None) -> LoadedScene:
         Name of a shipped scene, path of an XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the record of a
         scene.
     params
-        Values for the ``<default>`` parameters of an XML scene.
+        Values for the ``<default>`` parameters of an XML scene, and of the instrument.
+    instrument
+        Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
 
     Raises
     ------
     UserError
-        If there is no such scene, a parameter is unknown, not used or empty, a value is invalid, a part is missing, or
-        a file of a record is missing or has changed.
+        If there is no such scene or instrument, a parameter is unknown, not used or empty, a value is invalid, a part
+        is missing, or a file of a record is missing or has changed.
     """
     import mitsuba as mi
 
@@ -77,16 +82,16 @@ def load(scene: Any, params: Mapping[str, Any] | None = None) -> LoadedScene:
 
     check_params(params)
     if isinstance(scene, mi.Scene):
-        _no_parameters(params, "a loaded scene")
+        _no_parameters(params, instrument, "a loaded scene")
         loaded = LoadedScene(scene, scene.id() or "scene", {}, None)
     elif isinstance(scene, Mapping) or (isinstance(scene, SceneRecord) and not scene.is_xml):
-        _no_parameters(params, "a dict")
+        _no_parameters(params, instrument, "a dict")
         loaded = _load_dict(scene)
     elif isinstance(scene, SceneRecord):
-        loaded = _load_xml(scene.name, scene.text, params, scene)
+        loaded = _load_xml(scene.name, scene.text, params, scene, instrument)
     elif isinstance(scene, (str, os.PathLike)):
         path = catalogue.scene_path(scene)
-        loaded = _load_xml(path.stem, flat_text(path), params, path)
+        loaded = _load_xml(path.stem, flat_text(path), params, path, instrument)
     else:
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
     fit_seas(loaded.scene)
@@ -105,31 +110,41 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     return LoadedScene(loaded, "scene", {}, record)
 
 
-def _load_xml(name: str, text: str, params: Mapping[str, Any] | None, source: Path | SceneRecord) -> LoadedScene:
-    """Load an XML scene, whose text has no includes, from its file or its record."""
+def _load_xml(
+    name: str, text: str, params: Mapping[str, Any] | None, source: Path | SceneRecord, instrument: str | None
+) -> LoadedScene:
+    """Load an XML scene, whose text has no includes, from its file or its record, with an instrument or its own one."""
     import mitsuba as mi
 
     root = parse_scene(text, source if isinstance(source, Path) else name)
+    former = source.instrument if isinstance(source, SceneRecord) else ""
+    own: dict[str, str] = {}
+    if instrument is not None:
+        own = mount(instrument, root)
+        text = text_of(root)
     known = catalogue.parameters_of(root)
     if isinstance(source, SceneRecord):
-        known |= source.parameters
-    parameters, given = _filled(name, known, params)
+        known = {key: source.parameters.get(key, value) for key, value in known.items()} | own
+    _empty_alternatives(known, own)
+    parameters, given = _filled(f"{name} with instrument {instrument}" if instrument else name, known, params)
     used = check_elements(root, parameters)
     if unused := [key for key in given if key not in used]:
         raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {name}")
     folder = source.parent if isinstance(source, Path) else Path()
-    record = SceneRecord.of_xml(name, text, root, parameters, folder)
+    record = SceneRecord.of_xml(name, text, root, parameters, folder, instrument or former)
     if isinstance(source, SceneRecord):
         # Files that given parameters name are found as in any scene.
         kept = {file: found for file, found in source.files.items() if file[1] not in given.values()}
         record = replace(record, files={**record.files, **kept})
+    is_file = isinstance(source, Path) and instrument is None
+    if not is_file:
         record.place_files(root, parameters)
     # Mitsuba refuses parameters that nothing uses; a part that is missing is told instead.
-    referred = used if isinstance(source, Path) else check_elements(root, parameters)
+    referred = used if is_file else check_elements(root, parameters)
     values = {key: value for key, value in parameters.items() if key in referred}
     with as_user_error({key: value for key, value in given.items() if key in used}, root), _placeholder_seas():
         # Optimisation would merge a bottom and a target of one material into a shape without a name.
-        if isinstance(source, Path):
+        if is_file:
             loaded = mi.load_file(str(source), optimize=False, **values)
         else:
             loaded = mi.load_string(root.toxml(), optimize=False, **values)
@@ -249,6 +264,8 @@ def _text(name: str, value: Any) -> str:
     return str(value)
 
 
-def _no_parameters(params: Mapping[str, Any] | None, what: str) -> None:
+def _no_parameters(params: Mapping[str, Any] | None, instrument: str | None, what: str) -> None:
+    if instrument is not None:
+        raise UserError(f"instrument = {shown(instrument)} needs an XML scene, not {what}")
     if params:
         raise UserError(f"params = {sorted(params)} need an XML scene; {what} has no <default> parameters to fill")

@@ -41,6 +41,7 @@ def render(
     scene: str | Path | Mapping[str, Any] | mi.Scene,
     *,
     params: Mapping[str, Any] | None = None,
+    instrument: str | None = None,
     integrator: str | Mapping[str, Any] | mi.Integrator | None = None,
     target_error: float | None = None,
     target_quantile: float | None = None,
@@ -60,7 +61,10 @@ def render(
         Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the
         record of a scene. `again.render_again` takes a result.
     params
-        Values for the ``<default>`` parameters of an XML scene.
+        Values for the ``<default>`` parameters of an XML scene; they have priority over those of an instrument.
+    instrument
+        Name of the instrument whose laser and receiver replace those of an XML scene, as `loading.instruments` lists
+        them.
     integrator
         Name or dict of an integrator plugin, or an integrator; by default that of the scene.
     target_error
@@ -111,7 +115,7 @@ def render(
     max_memory = _DEFAULT_MAX_MEMORY_GB if max_memory is None else positive("max_memory", max_memory)
     if pass_share is not None:
         pass_share = in_range("pass_share", pass_share, SMALLEST_SHARE, 1.0)
-    session = open_scene(scene, params, variant)
+    session = open_scene(scene, params, variant, instrument)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     lidar: LidarScene = renderer.scene

@@ -50,7 +50,9 @@ class Session:
         return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
 
 
-def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str | None = None) -> Session:
+def open_scene(
+    scene: Any, params: Mapping[str, Any] | None = None, variant: str | None = None, instrument: str | None = None
+) -> Session:
     """Load a scene as `loading.scenes.load`, with a Mitsuba variant as for `loading.variants.set_variant`.
 
     Raises
@@ -59,7 +61,7 @@ def open_scene(scene: Any, params: Mapping[str, Any] | None = None, variant: str
         If the scene cannot be loaded, or has no sensor.
     """
     variants.set_variant(variant)
-    loaded = load(scene, params)
+    loaded = load(scene, params, instrument)
     sensors = loaded.scene.sensors()
     if not sensors:
         raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")

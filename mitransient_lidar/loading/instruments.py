@@ -1,0 +1,205 @@
+"""Instruments: transmitters and receivers of real lidars by name, with the source of each parameter.
+
+An instrument is an XML file in ``scenes/instruments``, a part of a scene: parameters (``<default>``), emitter and
+sensor. The first line of its first comment is the title; the rest describes the instrument and numbers its sources as
+[1], [2], ... The comment on the line of a parameter refers to a source, or says "assumed" if there is none.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib.resources
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.dom import minidom
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
+from mitransient_lidar.loading.catalogue import parameters_of
+from mitransient_lidar.loading.checks import with_values
+from mitransient_lidar.loading.includes import expanded, flat_text, parse_scene, read_scene, text_of
+
+#: Parameters that place the record in time: an instrument in another geometry needs another record.
+_RECORD = ("time_start_ns", "bin_count")
+
+
+@dataclass(frozen=True)
+class InstrumentParameter:
+    """Parameter of an instrument: its name and value as in XML, and the comment that gives unit and source."""
+
+    name: str
+    value: str
+    source: str
+
+    @property
+    def is_assumed(self) -> bool:
+        """Whether the value is not published."""
+        return "assumed" in self.source
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Transmitter and receiver of a lidar.
+
+    `description` holds the sources; `channels` are the names of the pixels.
+    """
+
+    name: str
+    title: str
+    description: str
+    parameters: tuple[InstrumentParameter, ...]
+    channels: tuple[str, ...]
+
+
+def instrument_names() -> list[str]:
+    """Return the names of the instruments in alphabetical order."""
+    return sorted(path.stem for path in _folder().glob("*.xml"))
+
+
+def read_instrument(name: str) -> Instrument:
+    """Return an instrument by its name; raise UserError if there is none."""
+    path = _path(name)
+    root = parse_scene(read_scene(path), path)
+    assert root.parentNode is not None
+    comment = next(node.data for node in root.parentNode.childNodes if isinstance(node, minidom.Comment))
+    title, _, description = comment.strip().partition("\n")
+    parameters = tuple(_parameters(root))
+    pixels = [tag for tag in root.getElementsByTagName("sensor") if tag.getAttribute("type") == "pixel_fov"]
+    names = [tag.getAttribute("value") for pixel in pixels for tag in _named(pixel, "pixel_name")]
+    if not names:
+        from mitransient_lidar.transport.sensor.pixels import LayoutPixels
+
+        layout = next(parameter.value for parameter in parameters if parameter.name == "layout")
+        names = LayoutPixels(layout, 1e-3, "circle").names
+    return Instrument(
+        name=path.stem,
+        title=title,
+        description="\n".join(line.strip() for line in description.strip().splitlines()),
+        parameters=parameters,
+        channels=tuple(names),
+    )
+
+
+def instrument_text(name: str) -> str:
+    """Return the XML of an instrument, self-contained, to be included by a scene; raise UserError if there is none."""
+    path = _path(name)
+    root = parse_scene(flat_text(path), path)
+    _drop_unused(root)
+    return text_of(root)
+
+
+def mount(name: str, root: minidom.Element) -> dict[str, str]:
+    """Replace laser and receiver of an XML scene without includes by those of an instrument.
+
+    The scene keeps its film, with the instrument's time bins, its integrator, the point at which the lidar aims, and
+    its other emitters. Parameters that nothing uses any longer are removed.
+
+    Parameters
+    ----------
+    name
+        Name of the instrument.
+    root
+        Root element of the scene, which is changed.
+
+    Returns
+    -------
+    dict of str to str
+        Values of the parameters that the instrument sets, in place of those of the scene.
+
+    Raises
+    ------
+    UserError
+        If there is no such instrument.
+    """
+    path = _path(name)
+    own, part = parse_scene(read_scene(path), path), expanded(path)
+    shared = parameters_of(part)
+    values = {record: shared[record] for record in _RECORD} | parameters_of(own)
+    films = root.getElementsByTagName("film")
+    for child in list(root.childNodes):
+        if isinstance(child, minidom.Element) and (
+            child.tagName == "sensor" or child.getAttribute("type") == "lidar_transmitter"
+        ):
+            root.removeChild(child)
+    if films:
+        _keep_film(films[0], part.getElementsByTagName("film")[0])
+    # Of several defaults of a parameter, the first one counts.
+    first = root.firstChild
+    for parameter in [*(InstrumentParameter(record, values[record], "") for record in _RECORD), *_parameters(own)]:
+        default = minidom.Element("default")
+        default.ownerDocument = root.ownerDocument
+        default.setAttribute("name", parameter.name)
+        default.setAttribute("value", parameter.value)
+        root.insertBefore(default, first)
+        if parameter.source:
+            comment = minidom.Comment(f" {parameter.source} ")
+            comment.ownerDocument = root.ownerDocument
+            root.insertBefore(comment, first)
+    has_integrator = any(tag.parentNode is root for tag in root.getElementsByTagName("integrator"))
+    for child in list(part.childNodes):
+        if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):
+            root.appendChild(child)
+    _drop_unused(root)
+    return values
+
+
+def _keep_film(film: minidom.Element, own: minidom.Element) -> None:
+    """Replace the film of an instrument by the one of a scene, with the parameters of the instrument's."""
+    for child in [node for node in own.childNodes if isinstance(node, minidom.Element)]:
+        for former in _named(film, child.getAttribute("name")):
+            film.removeChild(former)
+        film.appendChild(child)
+    assert own.parentNode is not None
+    own.parentNode.replaceChild(film, own)
+
+
+def _named(parent: minidom.Element, name: str) -> list[minidom.Element]:
+    """Return the children of an element that set a parameter."""
+    children = (child for child in parent.childNodes if isinstance(child, minidom.Element))
+    return [child for child in children if child.getAttribute("name") == name]
+
+
+def _parameters(root: minidom.Element) -> Iterator[InstrumentParameter]:
+    """Yield the parameters of an instrument's file, with the comments on their lines."""
+    for default in root.getElementsByTagName("default"):
+        comment = _comment(default)
+        text = "" if comment is None else " ".join(comment.data.split())
+        yield InstrumentParameter(default.getAttribute("name"), default.getAttribute("value"), text)
+
+
+def _comment(element: minidom.Element) -> minidom.Comment | None:
+    """Return the comment behind an element on its line."""
+    node = element.nextSibling
+    if isinstance(node, minidom.Text) and "\n" not in node.data:
+        node = node.nextSibling
+    return node if isinstance(node, minidom.Comment) else None
+
+
+def _drop_unused(root: minidom.Element) -> None:
+    """Remove the parameters of a scene that no element refers to, with the comments on their lines."""
+    parameters = parameters_of(root)
+    elements = [tag for tag in root.getElementsByTagName("*") if tag.tagName != "default"]
+    values = [value for tag in elements for _, value in tag.attributes.items()]
+    used = {name for value in values for name in with_values(value, parameters)[1]}
+    for default in root.getElementsByTagName("default"):
+        if default.getAttribute("name") not in used:
+            assert default.parentNode is not None
+            if (comment := _comment(default)) is not None:
+                default.parentNode.removeChild(comment)
+            default.parentNode.removeChild(default)
+
+
+def _path(name: str) -> Path:
+    """Return the path of an instrument's file; raise UserError if there is none."""
+    names = instrument_names()
+    if not isinstance(name, str) or name not in names:
+        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(close)}" if close else f"instruments are {', '.join(names)}"
+        raise UserError(f"instrument = {shown(name)} is not known; {hint}")
+    return _folder() / f"{name}.xml"
+
+
+def _folder() -> Path:
+    """Return the folder of the instruments."""
+    return Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments"
