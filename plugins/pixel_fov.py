@@ -61,7 +61,13 @@ class PixelFov(ReceiverSensor):
     def __init__(self, props: mi.Properties) -> None:
         self.field = _field(props)
         self.pixel_name = str(props.get("pixel_name", ""))
-        super().__init__(props, ShapedPixels([self.field], [self.pixel_name or "pixel"]))
+        level = mi.log_level()
+        # Mitsuba gives a sensor without film, as a nested one, its own and warns of its format.
+        mi.set_log_level(mi.LogLevel.Error)
+        try:
+            super().__init__(props, ShapedPixels([self.field], [self.pixel_name or "pixel"]))
+        finally:
+            mi.set_log_level(level)
 
     def to_string(self) -> str:
         """Return a description."""

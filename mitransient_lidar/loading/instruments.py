@@ -20,8 +20,9 @@ from mitransient_lidar.loading.catalogue import parameters_of
 from mitransient_lidar.loading.checks import with_values
 from mitransient_lidar.loading.includes import expanded, flat_text, parse_scene, read_scene, text_of
 
-#: Parameters that place the record in time: an instrument in another geometry needs another record.
+#: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
 _RECORD = ("time_start_ns", "bin_count")
+_SEA = ("surface_refined_size", "surface_cell_size", "surface_shortest_wave")
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,7 @@ def read_instrument(name: str) -> Instrument:
     """Return an instrument by its name; raise UserError if there is none."""
     path = _path(name)
     root = parse_scene(read_scene(path), path)
-    assert root.parentNode is not None
-    comment = next(node.data for node in root.parentNode.childNodes if isinstance(node, minidom.Comment))
-    title, _, description = comment.strip().partition("\n")
+    title, _, description = _head(root).data.strip().partition("\n")
     parameters = tuple(_parameters(root))
     pixels = [tag for tag in root.getElementsByTagName("sensor") if tag.getAttribute("type") == "pixel_fov"]
     names = [tag.getAttribute("value") for pixel in pixels for tag in _named(pixel, "pixel_name")]
@@ -93,7 +92,8 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
     """Replace laser and receiver of an XML scene without includes by those of an instrument.
 
     The scene keeps its film, with the instrument's time bins, its integrator, the point at which the lidar aims, and
-    its other emitters. Parameters that nothing uses any longer are removed.
+    its other emitters. Place of the record and resolution of the sea, which fit the scene's own lidar, return to their
+    defaults, and parameters that nothing uses any longer are removed.
 
     Parameters
     ----------
@@ -115,7 +115,8 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
     path = _path(name)
     own, part = parse_scene(read_scene(path), path), expanded(path)
     shared = parameters_of(part)
-    values = {record: shared[record] for record in _RECORD} | parameters_of(own)
+    values = {record: shared[record] for record in _RECORD}
+    values |= dict.fromkeys(parameters_of(root).keys() & set(_SEA), "auto") | parameters_of(own)
     films = root.getElementsByTagName("film")
     for child in list(root.childNodes):
         if isinstance(child, minidom.Element) and (
@@ -124,18 +125,18 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
             root.removeChild(child)
     if films:
         _keep_film(films[0], part.getElementsByTagName("film")[0])
+    document, first = root.ownerDocument, root.firstChild
+    assert document is not None
+    document.insertBefore(document.createComment(_head(own).data), root)
     # Of several defaults of a parameter, the first one counts.
-    first = root.firstChild
-    for parameter in [*(InstrumentParameter(record, values[record], "") for record in _RECORD), *_parameters(own)]:
-        default = minidom.Element("default")
-        default.ownerDocument = root.ownerDocument
-        default.setAttribute("name", parameter.name)
-        default.setAttribute("value", parameter.value)
+    sources = {parameter.name: parameter.source for parameter in _parameters(own)}
+    for key, value in values.items():
+        default = document.createElement("default")
+        default.setAttribute("name", key)
+        default.setAttribute("value", value)
         root.insertBefore(default, first)
-        if parameter.source:
-            comment = minidom.Comment(f" {parameter.source} ")
-            comment.ownerDocument = root.ownerDocument
-            root.insertBefore(comment, first)
+        if sources.get(key):
+            root.insertBefore(document.createComment(f" {sources[key]} "), first)
     has_integrator = any(tag.parentNode is root for tag in root.getElementsByTagName("integrator"))
     for child in list(part.childNodes):
         if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):
@@ -152,6 +153,12 @@ def _keep_film(film: minidom.Element, own: minidom.Element) -> None:
         film.appendChild(child)
     assert own.parentNode is not None
     own.parentNode.replaceChild(film, own)
+
+
+def _head(root: minidom.Element) -> minidom.Comment:
+    """Return the comment at the head of an instrument's file."""
+    assert root.parentNode is not None
+    return next(node for node in root.parentNode.childNodes if isinstance(node, minidom.Comment))
 
 
 def _named(parent: minidom.Element, name: str) -> list[minidom.Element]:

@@ -31,6 +31,7 @@ OTHER_COMMANDS = {
     "water": ["jerlov", "II"],
     "info": [],
     "scenes": ["list"],
+    "instruments": ["teledyne_czmil"],
     "passive": ["passive_sea", "-D", "layout=4x4", "-D", "surface_cell_size=2", "--passes", 2],
 }
 

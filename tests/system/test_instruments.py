@@ -1,0 +1,122 @@
+"""Instruments by name: listed, rendered over a shipped scene, recorded in the result and rendered again."""
+
+import re
+
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+
+import mitransient_lidar
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.loading import instruments
+
+FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
+
+
+def record(name):
+    """Return parameters of a record that begins before the surface echo of the scene table1 and ends below 8 m."""
+    given = {each.name: each.value for each in instruments.read_instrument(name).parameters}
+    altitude, angle = float(given["altitude"]), np.radians(float(given["off_nadir_deg"]))
+    # The footprint of the mast's beam is 16 m long.
+    before, length = (90, 300) if name == "published_mast" else (40, 170)
+    start = 2e9 * altitude / np.cos(angle) / C0 - before
+    return {"time_start_ns": start, "bin_count": round(length / float(given["bin_width_ns"]))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", instruments.instrument_names())
+def test_every_instrument_renders(name):
+    """Surface and bottom return light at their times, in every channel that sees the beam."""
+    result = mitransient_lidar.render("table1", instrument=name, params=record(name), passes=2)
+    assert result.attrs["instrument"] == name
+    assert tuple(result["pixel"].values) == instruments.read_instrument(name).channels
+    energy = result["impulse_response"].sum("pixel")
+    assert np.isfinite(result["waveform"]).all()
+    assert (result["impulse_response"].sum("time") > 0).all()
+    if name != "published_mast":
+        # 8 m of water at this angle, timed with the group index.
+        angle = np.arcsin(np.sin(np.radians(float(result.attrs["scene.off_nadir_deg"]))) / 1.34)
+        bottom = result.attrs["surface_time_ns"] + 2e9 * 8 / np.cos(angle) * 1.364 / C0
+        near = abs(energy["time"] - bottom) < 6
+        above = abs(energy["time"] - bottom + 20) < 6
+        assert energy[near].sum() > 3 * energy[above].sum()
+
+
+def few(scene, **options):
+    """Render a few paths over a flat sea."""
+    params = {"spectrum": "flat", **options.pop("params", {})}
+    return mitransient_lidar.render(scene, params=params, integrator=FEW, passes=2, **options)
+
+
+@pytest.mark.parametrize(("name", "scene"), [("published_airborne", "table1"), ("published_mast", "fig04_mast")])
+def test_the_published_instruments_are_those_of_the_published_scenes(name, scene):
+    """The instrument in another scene of the same sea and targets gives the bits of the scene's own lidar."""
+    params = record(name)
+    own, mounted = few(scene, params=params), few(scene, params=params, instrument=name)
+    assert own["impulse_response"].values.any()
+    assert mounted["impulse_response"].values.tobytes() == own["impulse_response"].values.tobytes()
+    assert "instrument" not in own.attrs
+
+
+def test_a_result_names_its_instrument_and_gives_the_same_bits():
+    params = {**record("teledyne_czmil"), "bin_width_ns": 4, "bin_count": 40, "altitude": 380}
+    first = few("table1", instrument="teledyne_czmil", params=params)
+    again = mitransient_lidar.render(first)
+    for name in ("impulse_response", "waveform"):
+        assert first[name].values.tobytes() == again[name].values.tobytes()
+    assert first.attrs["instrument"] == again.attrs["instrument"] == "teledyne_czmil"
+    assert first.attrs["scene.altitude"] == again.attrs["scene.altitude"] == "380"
+
+
+@pytest.mark.slow
+def test_a_result_again_with_another_instrument():
+    first = few("table1", instrument="published_airborne", params={**record("published_airborne"), "altitude": 210})
+    other = mitransient_lidar.render(first, instrument="riegl_vq880g2", params=record("riegl_vq880g2"))
+    direct = few("table1", instrument="riegl_vq880g2", params=record("riegl_vq880g2"))
+    assert other.attrs["instrument"] == "riegl_vq880g2"
+    assert other["impulse_response"].values.tobytes() == direct["impulse_response"].values.tobytes()
+
+
+def test_listing():
+    listed = run("instruments").stdout.splitlines()
+    assert [line.split()[0] for line in listed] == instruments.instrument_names()
+    czmil = next(line for line in listed if line.startswith("teledyne_czmil"))
+    assert czmil.endswith("; 8 channels")
+    shown = run("instruments", "teledyne_czmil").stdout
+    assert "channels: shallow1, shallow2" in shown
+    assert "[1] G. Mandlburger" in shown
+    assert re.search(r"^pulse_energy_mj +4  \[1\]$", shown, re.MULTILINE)
+    assert re.search(r"^deep_view_mrad +40  assumed: ", shown, re.MULTILINE)
+    xml = run("instruments", "riegl_vq840g", "--xml").stdout
+    assert xml == instruments.instrument_text("riegl_vq840g")
+
+
+@pytest.mark.slow
+def test_the_command_render_takes_an_instrument(tmp_path):
+    options = [f"-D{name}={value}" for name, value in record("riegl_vq840g").items()]
+    options += ["-Dspectrum=flat", "--integrator", "lidar_volpath", "--passes", 2, "--no-plot", "-q", "-o", tmp_path]
+    done = run("render", "table1", "--instrument", "riegl_vq840g", *options)
+    assert done.exit_code == 0, done.stderr
+    assert mitransient_lidar.open(tmp_path / "table1.nc").attrs["instrument"] == "riegl_vq840g"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["instruments", "czmil"], "instrument = 'czmil' is not known; did you mean teledyne_czmil"),
+        (["instruments", "--xml"], "--xml needs the name of an instrument"),
+        (["render", "table1", "--instrument", "eye"], "instrument = 'eye' is not known; instruments are icesat2_atlas"),
+        (
+            ["render", "table1", "--instrument", "teledyne_czmil", "-D", "layout=1x1"],
+            "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil",
+        ),
+        (
+            ["render", "table1", "--instrument", "riegl_vq840g", "-D", "aperture=1"],
+            "parameter 'aperture' is not one of scene table1 with instrument riegl_vq840g: did you mean aperture_area",
+        ),
+    ],
+)
+def test_wrong_input_is_refused(arguments, sentence, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(run(*arguments), sentence)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,217 @@
+"""Instruments: their data, the scenes that they are mounted in, and the table in the documentation."""
+
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading import instruments, scenes
+
+NAMES = (
+    *("icesat2_atlas", "leica_chiroptera4x", "leica_hawkeye4x_deep", "published_airborne", "published_mast"),
+    *("riegl_vq840g", "riegl_vq840gl", "riegl_vq880g2", "teledyne_czmil", "usgs_eaarl_b"),
+)
+
+#: Parameters that every instrument has; beam and view may be given in several ways.
+NEEDED = {
+    *("altitude", "off_nadir_deg", "wavelength_nm", "pulse_energy_mj", "pulse_fwhm_ns", "bin_width_ns"),
+    *("aperture_area", "optical_efficiency", "response_time_ns"),
+}
+
+FLAT = {"spectrum": "flat"}
+
+#: A sea alone, to which an instrument adds the lidar.
+SEA = """<scene version="3.0.0">
+    <default name="wind_speed" value="3"/>
+    {lidar}
+    <shape type="ocean_surface">
+        <string name="spectrum" value="flat"/>
+        <float name="wind_speed" value="$wind_speed"/>
+        <medium type="layered_water" name="interior"/>
+    </shape>
+</scene>"""
+
+
+def parts(loaded):
+    """Return transmitter and receiver of a scene."""
+    transmitter = next(each for each in loaded.emitters() if hasattr(each, "pulse"))
+    (sensor,) = loaded.sensors()
+    return transmitter, sensor.receiver
+
+
+def values(name):
+    """Return the values of an instrument by their names, without empty ones."""
+    return {each.name: each.value for each in instruments.read_instrument(name).parameters if each.value}
+
+
+def test_names():
+    assert tuple(instruments.instrument_names()) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_value_has_a_source_or_is_assumed(name):
+    instrument = instruments.read_instrument(name)
+    assert instrument.title
+    listed = set(re.findall(r"^\[(\d)\]", instrument.description, re.MULTILINE))
+    cited = set()
+    for parameter in instrument.parameters:
+        if parameter.value:
+            references = set(re.findall(r"\[(\d)\]", parameter.source))
+            assert references or parameter.is_assumed, parameter
+            cited |= references
+    cited |= set(re.findall(r"\[(\d)\]", re.sub(r"^\[\d\]", "", instrument.description, flags=re.MULTILINE)))
+    cited |= set(re.findall(r"as in \[(\d)\]", instruments.instrument_text(name)))
+    assert cited == listed
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_needed_parameters(name):
+    given = values(name)
+    assert given.keys() >= NEEDED
+    assert len([key for key in given if key.startswith("divergence")]) == 1
+    assert "field_of_view_mrad" in given or "shallow_view_mrad" in given
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_loaded_lidar_has_the_values_of_the_file(name):
+    given = {key: float(value) for key, value in values(name).items() if key != "layout"}
+    transmitter, receiver = parts(scenes.load_scene("table1", FLAT, name)[0])
+    assert transmitter.pulse_energy == pytest.approx(1e-3 * given["pulse_energy_mj"])
+    assert transmitter.wavelength_nm == given["wavelength_nm"]
+    assert transmitter.pulse.fwhm_ns == pytest.approx(given["pulse_fwhm_ns"])
+    beam = given.get("divergence_mrad", given.get("divergence_1e2_mrad", 0) / 2)  # 2 sigma, and 4 sigma
+    assert transmitter.divergence == pytest.approx(1e-3 * beam)
+    view = max(value for key, value in given.items() if key.endswith("view_mrad"))
+    assert receiver.pixels.field_of_view == pytest.approx(1e-3 * view)
+    assert tuple(receiver.pixels.names) == instruments.read_instrument(name).channels
+    for pose in (transmitter.pose, receiver.pose):
+        assert pose.origin[2] == pytest.approx(given["altitude"])
+        assert np.degrees(np.arccos(-pose.axis[2])) == pytest.approx(given["off_nadir_deg"], abs=1e-3)
+
+
+def test_segments_of_czmil_have_equal_areas():
+    given = {key: float(value) for key, value in values("teledyne_czmil").items()}
+    assert given["shallow_view_mrad"] ** 2 / given["central_view_mrad"] ** 2 == pytest.approx(7, rel=0.01)
+
+
+def test_values_of_the_user_win():
+    own = {**FLAT, "altitude": 90, "divergence_mrad": 3, "shallow_view_mrad": 10}
+    loaded, _, parameters = scenes.load_scene("table1", own, "teledyne_czmil")
+    transmitter, receiver = parts(loaded)
+    assert transmitter.divergence == pytest.approx(3e-3)
+    assert parameters["divergence_1e2_mrad"] == ""
+    assert receiver.pose.origin[2] == pytest.approx(90)
+    assert receiver.pixels.fields[1].outer == pytest.approx(5e-3)
+
+
+def test_the_scene_keeps_gates_integrator_place_and_target():
+    params = {"aim_y": 3, "target_depth": 5, **FLAT}
+    loaded = scenes.load("gated_mine", params, "riegl_vq840g")
+    assert loaded.parameters["gate_count"] == "20"
+    assert loaded.parameters["aim_y"] == "3"
+    assert loaded.record.instrument == "riegl_vq840g"
+    assert loaded.scene.integrator().parameters["cell_size"] == 0.015
+    assert {"blur_mrad", "field_of_view_shape"}.isdisjoint(loaded.parameters)
+    film = loaded.scene.sensors()[0].film()
+    assert film.parameters["gate_count"] == 20
+    assert film.parameters["bin_width_ns"] == 0.5
+
+
+def test_a_scene_fitted_to_its_own_lidar_returns_to_defaults():
+    parameters = scenes.load_scene("passive_sea", FLAT, "riegl_vq840g")[2]
+    shared = scenes.load_scene("table1", FLAT, "riegl_vq840g")[2]
+    for name in ("time_start_ns", "bin_count", "surface_refined_size", "surface_cell_size", "surface_shortest_wave"):
+        assert parameters[name] == shared[name]
+    assert parameters["wind_speed"] == "6"
+
+
+def test_a_scene_without_a_lidar_gets_one(tmp_path):
+    path = tmp_path / "sea.xml"
+    path.write_text(SEA.format(lidar=""))
+    loaded, _, parameters = scenes.load_scene(path, {"wind_speed": 4}, "usgs_eaarl_b")
+    assert parameters["wind_speed"] == "4"
+    assert parts(loaded)[1].pixels.names == ["shallow", "deep"]
+    assert loaded.integrator().plugin == "lidar_merging"
+
+
+@pytest.mark.parametrize("name", ["riegl_vq880g2", "teledyne_czmil"])
+def test_the_printed_xml_is_included_by_a_scene(name, tmp_path):
+    (tmp_path / "instrument.xml").write_text(instruments.instrument_text(name))
+    path = tmp_path / "sea.xml"
+    path.write_text(SEA.format(lidar='<include filename="instrument.xml"/>'))
+    ours, plain = scenes.load_scene(path)[0], mi.load_file(str(path), optimize=False)
+    mounted = scenes.load_scene("table1", FLAT, name)[0]
+    for loaded in (ours, plain):
+        for part, expected in zip(parts(loaded), parts(mounted), strict=True):
+            assert part.pose.origin == pytest.approx(expected.pose.origin)
+        assert str(loaded.sensors()[0]) == str(mounted.sensors()[0])
+
+
+def test_files_of_the_scene_are_found_with_an_instrument(tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir()
+    sphere = mi.load_dict({"type": "cube"})
+    sphere.write_ply(str(tmp_path / "own" / "rock.ply"))
+    rock = '<shape type="ply" id="rock"><string name="filename" value="rock.ply"/></shape>'
+    path = tmp_path / "own" / "sea.xml"
+    path.write_text(SEA.format(lidar=rock))
+    monkeypatch.chdir(tmp_path)
+    loaded = scenes.load_scene(path, None, "riegl_vq840g")[0]
+    assert "rock" in [shape.id() for shape in loaded.shapes()]
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("riegl_vq840", "instrument = 'riegl_vq840' is not known; did you mean riegl_vq840g"),
+        ("zzz", "instrument = 'zzz' is not known; instruments are icesat2_atlas, .*, usgs_eaarl_b"),
+        (5, "instrument = 5 is not known"),
+        ("../instruments/riegl_vq840g", "is not known"),
+    ],
+)
+def test_unknown_instruments_are_refused(name, sentence):
+    for call in (instruments.read_instrument, instruments.instrument_text):
+        with pytest.raises(UserError, match=sentence):
+            call(name)
+    with pytest.raises(UserError, match=sentence):
+        scenes.load_scene("table1", None, name)
+
+
+def test_parameters_that_the_instrument_replaces_are_refused():
+    sentence = "parameter 'layout' is not one of scene table1 with instrument teledyne_czmil"
+    with pytest.raises(UserError, match=sentence):
+        scenes.load_scene("table1", {"layout": "1x1"}, "teledyne_czmil")
+
+
+def test_scenes_of_python_take_no_instrument():
+    with pytest.raises(UserError, match="instrument = 'riegl_vq840g' needs an XML scene, not a dict"):
+        scenes.load_scene({"type": "scene"}, None, "riegl_vq840g")
+    with pytest.raises(UserError, match="not a loaded scene"):
+        scenes.load_scene(mi.load_dict({"type": "scene"}), None, "riegl_vq840g")
+
+
+def table():
+    """Return the table of the instruments, and their descriptions, in Markdown."""
+    heading = ("name", "altitude (m)", "off nadir (°)", "beam (mrad)", "view (mrad)", "channels", "energy (mJ)")
+    heading = (*heading, "FWHM (ns)", "bin (ns)")
+    rows, sources = [heading, ("---",) * len(heading)], []
+    for name in NAMES:
+        instrument = instruments.read_instrument(name)
+        marked = {each.name: each.value + "*" * each.is_assumed for each in instrument.parameters if each.value}
+        beam = marked.get("divergence_mrad", marked.get("divergence_1e2_mrad"))
+        beam += " (e^-1/2)" if "divergence_mrad" in marked else " (e^-2)"
+        views = ", ".join(value for key, value in marked.items() if key.endswith("view_mrad"))
+        columns = [marked[key] for key in ("pulse_energy_mj", "pulse_fwhm_ns", "bin_width_ns")]
+        place = [marked[key] for key in ("altitude", "off_nadir_deg")]
+        rows.append((f"`{name}`", *place, beam, views, str(len(instrument.channels)), *columns))
+        sources.append(f"**`{name}`**: {instrument.title}.\n\n```text\n{instrument.description}\n```\n")
+    lines = [f"| {' | '.join(cells)} |" for cells in rows]
+    return "\n".join(lines) + "\n", "\n".join(sources)
+
+
+def test_the_documentation_lists_the_instruments():
+    text = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
+    for part in table():
+        assert part in text
