@@ -115,9 +115,10 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
     path = _path(name)
     own, part = parse_scene(read_scene(path), path), expanded(path)
     shared = parameters_of(part)
+    former = parameters_of(root)
     values = {record: shared[record] for record in _RECORD}
-    values |= dict.fromkeys(parameters_of(root).keys() & set(_SEA), "auto") | parameters_of(own)
-    films = root.getElementsByTagName("film")
+    values |= {size: "auto" for size in _SEA if size in former} | parameters_of(own)
+    films = [tag for tag in root.getElementsByTagName("film") if tag.getAttribute("type") == "time_gated_film"]
     for child in list(root.childNodes):
         if isinstance(child, minidom.Element) and (
             child.tagName == "sensor" or child.getAttribute("type") == "lidar_transmitter"

@@ -48,6 +48,7 @@ def few(scene, **options):
     return mitransient_lidar.render(scene, params=params, integrator=FEW, passes=2, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "scene"), [("published_airborne", "table1"), ("published_mast", "fig04_mast")])
 def test_the_published_instruments_are_those_of_the_published_scenes(name, scene):
     """The instrument in another scene of the same sea and targets gives the bits of the scene's own lidar."""

@@ -137,6 +137,13 @@ def test_a_scene_without_a_lidar_gets_one(tmp_path):
     assert loaded.integrator().plugin == "lidar_merging"
 
 
+def test_a_camera_of_the_scene_is_replaced(tmp_path):
+    path = tmp_path / "sea.xml"
+    path.write_text(SEA.format(lidar='<sensor type="perspective"><film type="hdrfilm"/></sensor>'))
+    (sensor,) = scenes.load_scene(path, None, "riegl_vq840g")[0].sensors()
+    assert sensor.film().parameters["type"] == "time_gated_film"
+
+
 @pytest.mark.parametrize("name", ["riegl_vq880g2", "teledyne_czmil"])
 def test_the_printed_xml_is_included_by_a_scene(name, tmp_path):
     (tmp_path / "instrument.xml").write_text(instruments.instrument_text(name))

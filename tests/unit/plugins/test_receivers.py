@@ -203,3 +203,12 @@ def test_rays_of_the_laser_leave_its_point_with_all_its_energy():
         assert abs(np.mean(g**2) / 25e-6 - 1) < 4 * np.sqrt(2 / 4096)
     assert np.all(np.array(cosine) > 0.99)
     assert float(laser.intensity(mi.Vector3f((-laser.pose.axis).tolist()))[0]) == 0
+
+
+def test_nested_pixels_load_without_warnings(capfd):
+    """Mitsuba gives them a film of its own, and warned of its format."""
+    level = mi.log_level()
+    film = {"type": "time_gated_film"}
+    mi.load_dict({"type": "multipixel_receiver", "pixel": {"type": "pixel_fov"}, "film": film})
+    assert mi.log_level() == level
+    assert "HDRFilm" not in "".join(capfd.readouterr())
