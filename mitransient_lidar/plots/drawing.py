@@ -75,8 +75,9 @@ def si_prefix(largest: float) -> tuple[float, str]:
 
 
 def scene_name(attributes: Mapping[str, Any]) -> str:
-    """Return the name of the scene without the suffix of its file; empty if unknown."""
-    return Path(str(attributes.get("scene", ""))).stem
+    """Return the name of the scene without the suffix of its file, and of its instrument; empty if unknown."""
+    names = Path(str(attributes.get("scene", ""))).stem, str(attributes.get("instrument", ""))
+    return ", ".join(filter(None, names))
 
 
 def titled(attributes: Mapping[str, Any], text: str) -> str:

@@ -84,6 +84,14 @@ def test_time_limits_contain_the_window_of_the_echoes(attributes, limits):
     assert drawing.time_limits(record) == pytest.approx(limits)
 
 
+@pytest.mark.parametrize(
+    ("attributes", "name"),
+    [({}, ""), ({"scene": "a/table1.xml"}, "table1"), ({"scene": "sea", "instrument": "eaarl"}, "sea, eaarl")],
+)
+def test_titles_name_scene_and_instrument(attributes, name):
+    assert drawing.scene_name(attributes) == name
+
+
 def test_figures_replace_a_file_only_on_success(tmp_path):
     path = tmp_path / "a.png"
     path.write_text("before")
