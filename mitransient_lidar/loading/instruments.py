@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,7 +75,7 @@ def read_instrument(name: str) -> Instrument:
     return Instrument(
         name=path.stem,
         title=title,
-        description="\n".join(line.strip() for line in description.strip().splitlines()),
+        description=textwrap.dedent(description).strip(),
         parameters=parameters,
         channels=tuple(names),
     )
