@@ -8,7 +8,7 @@ from command_line import assert_refused, run
 
 import mitransient_lidar
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.loading import instruments
+from mitransient_lidar.loading import catalogue, instruments
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 
@@ -121,3 +121,11 @@ def test_wrong_input_is_refused(arguments, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert_refused(run(*arguments), sentence)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", catalogue.scene_names())
+def test_every_scene_takes_an_instrument(scene):
+    result = few(scene, instrument="riegl_vq840g", params=record("riegl_vq840g"))
+    assert result.attrs["instrument"] == "riegl_vq840g"
+    assert (result["impulse_response"].sum("time") > 0).all()
