@@ -7,12 +7,15 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
-from mitransient_lidar.core.validation import integer
+from mitransient_lidar.core.validation import finite, integer
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GatePlan, GateTrain
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.lidar.time_axis import MOST_BINS, TimeAxis
 from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.transport.histogram import TransientHistogram
+
+#: Value of a parameter that is chosen for the scene.
+_AUTO = "auto"
 
 _GATE_START = ("gate_start_ns", "gate_start_depth")
 _GATE_SHAPE = ("gate_width_ns", "gate_rise_ns", "gate_fall_ns")
@@ -25,9 +28,10 @@ class TimeGatedFilm(mi.Film):
     Parameter         Type     Meaning
     ================  =======  =========================================================================================
     time_start_ns     float    Start of the first bin [ns] after the pulse's peak leaves the transmitter, up to
-                               1e9 before or after. Default: 1390
+                               1e9 before or after, or ``auto``: before the first light. Default: ``auto``
     bin_width_ns      float    Width of a bin [ns], 1e-6 to 1e6. Default: 0.5
-    bin_count         integer  Number of bins, 1 to 1 000 000. Default: 320
+    bin_count         integer  Number of bins, 1 to 1 000 000, or ``auto``: until after the last light.
+                               Default: ``auto``
     gate_count        integer  Number of gates, 0 (none) to 100 000. Default: 0
     gate_start_ns     float    Half height of the first gate's rising edge [ns]
     gate_start_depth  float    Instead: depth of the echoes that arrive at that time [m], on the receiver's axis
@@ -40,9 +44,17 @@ class TimeGatedFilm(mi.Film):
     pulses            integer  Number of pulses that each gate accumulates, 1 to 10^9. Default: 1
     ================  =======  =========================================================================================
 
+    With ``auto`` the record is chosen once the scene is loaded, and a result lists it under ``used`` in the attribute
+    ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
+    before the first light of any pixel from the highest crest or a target above it. It ends as much, and 12 times the
+    response time, after the last light of any pixel from a bottom or target, for which multiple scattering is given up
+    to 40 ns and a quarter of the echo's time in the water; or, where no bottom is seen, after that from the depth at
+    which the column signal has fallen to 1e-6, by the system attenuation of Gordon (1982): the beam attenuation
+    coefficient in a narrow view, the diffuse one in a wide one. A bottom below 1e-12 counts as not seen. A film with
+    gates holds these and all direct echoes.
+
     From a height H [m] at the angle theta off nadir, the echo of the sea arrives after 2 H/(0.2998 cos(theta)) ns; each
-    metre of depth adds 9.1 ns at nadir and 9.4 ns at 20 degrees. The time start should be earlier by some pulse widths
-    and by half the spread of the arrival over the field of view.
+    metre of depth adds 9.1 ns at nadir and 9.4 ns at 20 degrees.
 
     Bins are half open, [start, start + width). After a render with a lidar integrator, ``develop`` returns the energy
     [J] of that pass as a tensor (pixel, time), or (row, column, time) for imagers. Energies are summed as integers, so
@@ -55,28 +67,44 @@ class TimeGatedFilm(mi.Film):
     .. code-block:: xml
 
         <film type="time_gated_film">
-            <float name="time_start_ns" value="1390"/>
             <float name="bin_width_ns" value="0.5"/>
-            <integer name="bin_count" value="320"/>
         </film>
 
     .. code-block:: python
 
-        {'type': 'time_gated_film', 'time_start_ns': 1390.0, 'bin_width_ns': 0.5, 'bin_count': 320}
+        {'type': 'time_gated_film', 'time_start_ns': 1390.0, 'bin_width_ns': 0.5, 'bin_count': 'auto'}
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        #: Time bins of the record.
-        self.axis = TimeAxis(
-            ranged("time_start_ns", props.get("time_start_ns", 1390.0)),
-            ranged("bin_width_ns", props.get("bin_width_ns", 0.5)),
-            integer("bin_count", props.get("bin_count", 320), 1, 1_000_000),
-        )
+        start, count = (props.get(name, _AUTO) for name in ("time_start_ns", "bin_count"))
+        #: Parameters of the record; None for a start [ns] or a number of bins that is chosen.
+        self.time_start_ns = None if start == _AUTO else ranged("time_start_ns", start)
+        self.bin_width_ns = ranged("bin_width_ns", props.get("bin_width_ns", 0.5))
+        self.bin_count = None if count == _AUTO else _bin_count(count)
+        #: Time bins of the record, None until `fit`.
+        self.axis: TimeAxis | None = None
+        #: What the last light of the record comes from where its end is chosen.
+        self.end = ""
+        if self.time_start_ns is not None and self.bin_count is not None:
+            self.axis = TimeAxis(self.time_start_ns, self.bin_width_ns, self.bin_count)
         #: Gates of the scene, or None.
         self.gates = _gate_plan(props)
-        props["width"], props["height"] = self.axis.bin_count, 1
+        props["width"], props["height"] = self.bin_count or 1, 1
         super().__init__(props)
         self._pass: TransientHistogram | None = None
+
+    def fit(self, axis: TimeAxis, end: str = "") -> None:
+        """Set the time bins of a record of automatic start or length, once, and the reason for its end."""
+        if self.axis is None:
+            self.axis, self.end = axis, end if self.bin_count is None else ""
+
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values used for the parameters that are automatic, once they are known."""
+        if self.axis is None:
+            return {}
+        start = {} if self.time_start_ns is not None else {"time_start_ns": self.axis.start_ns}
+        return {**start, **({} if self.bin_count is not None else {"bin_count": self.axis.bin_count})}
 
     def store(self, histogram: TransientHistogram) -> None:
         """Keep the histogram of the last pass, for `develop`, `bitmap` and `write`."""
@@ -85,9 +113,10 @@ class TimeGatedFilm(mi.Film):
     def energy(self) -> np.ndarray:
         """Return the energy [J] of the last pass as float64, shape (pixel, time) or (row, column, time).
 
-        Bins are NaN where a value was not finite. Zeros of shape (1, time) before the first pass.
+        Bins are NaN where a value was not finite. Before the first pass zeros of shape (1, time), or
+        (1, 1) where the number of bins is automatic.
         """
-        return np.zeros((1, self.axis.bin_count)) if self._pass is None else self._pass.energy()
+        return np.zeros((1, self.bin_count or 1)) if self._pass is None else self._pass.energy()
 
     def develop(self, raw: bool = False) -> mi.TensorXf:
         """Return the energy [J] of the last pass, (pixel, time) or (row, column, time)."""
@@ -129,8 +158,16 @@ class TimeGatedFilm(mi.Film):
 
     def to_string(self) -> str:
         """Return a description."""
-        start, width, count = self.axis.start_ns, self.axis.bin_width_ns, self.axis.bin_count
-        return f"TimeGatedFilm[time_start_ns={start:g}, bin_width_ns={width:g}, bin_count={count}]"
+        known = {"time_start_ns": self.time_start_ns, "bin_count": self.bin_count, **self.used_values}
+        start, count = (_AUTO if value is None else f"{value:g}" for value in known.values())
+        return f"TimeGatedFilm[time_start_ns={start}, bin_width_ns={self.bin_width_ns:g}, bin_count={count}]"
+
+
+def _bin_count(value: object) -> int:
+    """Return a number of bins, or its text, as an integer."""
+    if isinstance(value, str):
+        value = int(value) if value.strip().isdecimal() else finite("bin_count", value)
+    return integer("bin_count", value, 1, MOST_BINS)
 
 
 def _gate_plan(props: mi.Properties) -> GatePlan | None:

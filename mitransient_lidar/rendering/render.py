@@ -15,6 +15,7 @@ from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Goal, ProgressCallback, check_seed, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
+    Session,
     choose_integrator,
     open_scene,
     pass_attributes,
@@ -38,7 +39,7 @@ _DEFAULT_MAX_MEMORY_GB = 2.0
 
 
 def render(
-    scene: str | Path | Mapping[str, Any] | mi.Scene,
+    scene: str | Path | Mapping[str, Any] | mi.Scene | Session,
     *,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
@@ -58,8 +59,8 @@ def render(
     Parameters
     ----------
     scene
-        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, or the
-        record of a scene. `again.render_again` takes a result.
+        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, the
+        record of a scene, or a session. `again.render_again` takes a result.
     params
         Values for the ``<default>`` parameters of an XML scene; they have priority over those of an instrument.
     instrument
@@ -119,6 +120,7 @@ def render(
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     lidar: LidarScene = renderer.scene
+    session.tell_record()
     from mitransient_lidar.rendering.describe import describe_lidar
     from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
     from mitransient_lidar.rendering.pass_size import fit_to_time

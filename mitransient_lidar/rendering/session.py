@@ -18,6 +18,8 @@ from mitransient_lidar.rendering.passes import PassLog
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
 logger = logging.getLogger(__name__)
 
 #: Share of the energy lost at the edge of the surface mesh above which a warning is given.
@@ -42,12 +44,28 @@ class Session:
     ) -> dict[str, Any]:
         """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
 
+        ``record_end`` is what the last light of a record of automatic length comes from.
+
         `used` are the values that were chosen for automatic parameters of the integrator.
         """
         recorded = {} if self.record is None else self.record.attributes()
         own = {} if integrator is None else {"integrator": integrator.plugin}
         recorded["plugin_parameters"] = plugin_values(self.scene, integrator, used)
+        end = getattr(self.sensor.film(), "end", "")
+        own |= {"record_end": end} if end else {}
         return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
+
+    def share_record(self, axis: TimeAxis) -> None:
+        """Use the time bins of other renders instead of automatic ones."""
+        self.sensor.film().fit(axis)
+
+    def tell_record(self, axis: TimeAxis | None = None) -> None:
+        """Log time bins, by default those of the film, where its start or length are automatic."""
+        film = self.sensor.film()
+        if film.used_values:
+            axis, end = axis or film.axis, f"; it ends {film.end}" if film.end else ""
+            text = f"record: {axis.start_ns:g} to {axis.end_ns:g} ns, {axis.bin_count} bins of {axis.bin_width_ns:g} ns"
+            logger.info("%s%s", text, end)
 
 
 def open_scene(
@@ -55,11 +73,15 @@ def open_scene(
 ) -> Session:
     """Load a scene as `loading.scenes.load`, with a Mitsuba variant as for `loading.variants.set_variant`.
 
+    A session without `params` is returned as it is.
+
     Raises
     ------
     UserError
         If the scene cannot be loaded, or has no sensor.
     """
+    if isinstance(scene, Session) and not params:
+        return scene
     variants.set_variant(variant)
     loaded = load(scene, params, instrument)
     sensors = loaded.scene.sensors()

@@ -18,7 +18,7 @@ from mitransient_lidar.core.validation import in_range, integer, non_negative
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
-from mitransient_lidar.rendering.session import choose_integrator, open_scene
+from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
 from mitransient_lidar.results.geometry import LidarGeometry
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
@@ -137,12 +137,17 @@ def detect(
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
         fixed = session.scene if place is None else open_scene(scene, moved).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
+        seas: Session | None = None
         for i in range(renders):
-            sea = {**moved, "surface_seed": int(float(session.parameters["surface_seed"])) + 1 + i} if clutter else None
+            if clutter:
+                number = int(float(session.parameters["surface_seed"])) + 1 + i
+                sea = open_scene(scene, {**moved, "surface_seed": number})
+                if seas is not None:
+                    sea.share_record(seas.sensor.film().axis)
+                seas = seas or sea
             found.append(
                 target_signal(
-                    scene if clutter else fixed,
-                    sea,
+                    sea if clutter else fixed,
                     seed=pass_seed(seed, i),
                     target_id=target_id,
                     passes=passes,

@@ -28,6 +28,7 @@ from mitransient_lidar.studies.find_shots import SeaMap, Shot
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
     from mitransient_lidar.transport.scene import LidarScene
 
 _LOG = logging.getLogger(__name__)
@@ -67,15 +68,20 @@ def rendered_shots(
     *,
     passes: int,
     target: tuple[float, float] | None = None,
+    axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
 ) -> Iterator[xr.Dataset]:
     """Yield the result of a shot at each place [m], shape (shots, 2); shot n is rendered with the seed n.
 
-    A `target` keeps this distance [m] from the aim, by the scene's parameters ``target_x`` and ``target_y``.
+    A `target` keeps this distance [m] from the aim, by the scene's parameters ``target_x`` and ``target_y``. An `axis`
+    replaces automatic time bins, which may differ between the shots.
     """
     pairs = np.asarray(places, dtype=np.float64)
     for number, (x, y) in enumerate(pairs):
-        yield render(scene, params=_at(params, x, y, target), passes=passes, seed=number)
+        session = open_scene(scene, _at(params, x, y, target))
+        if axis is not None:
+            session.share_record(axis)
+        yield render(session, passes=passes, seed=number)
         if progress is not None:
             progress(Progress(number + 1, len(pairs), "shot"))
 
@@ -117,6 +123,7 @@ def render_shots(
     move_target: bool = False,
     passes: int = 8,
     seed: int = 1,
+    axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at given or random places of one sea.
@@ -136,6 +143,8 @@ def render_shots(
         Passes of each shot, 2 to 10 000.
     seed
         Seed of random places, at least 0. Shot n is rendered with the seed n.
+    axis
+        Time bins instead of automatic ones, which by default hold the light of all shots.
     progress
         Called with a `passes.Progress` after every shot.
 
@@ -167,13 +176,16 @@ def render_shots(
     assert pairs is not None
     x, y = pairs[np.argmax(np.hypot(*pairs.T))]
     open_scene(scene, _at(params, x, y, target))  # before the first render
-    truth = _truth(session, pairs)
+    lidar: LidarScene = choose_integrator(session.scene, None).prepare(session.scene, session.sensor).scene
+    axis = axis or _common_record(session, lidar, pairs)
+    truth = _truth(session, lidar, pairs)
     if missed := np.count_nonzero(np.isnan(truth[-1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(pairs))
     found: list[xr.Dataset] = []
+    shots = rendered_shots(scene, params, pairs, passes=passes, target=target, axis=axis, progress=progress)
     try:
         with DeferredInterrupt() as interruption:
-            for result in rendered_shots(scene, params, pairs, passes=passes, target=target, progress=progress):
+            for result in shots:
                 if result.attrs["interrupted"]:
                     raise KeyboardInterrupt
                 found.append(_without_gates(result))
@@ -226,13 +238,15 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
     compare_versions(attributes)
     given = {name: value for name, value in options.items() if value is not None}
     check_params(given.get("params"))
+    # The bins of some shots are those of all of them.
+    same = {} if "params" in given or "places" in given else {"axis": results.time_axis(found)}
     params = {**json_attribute(attributes, "series_parameters"), **given.pop("params", {})}
     own = {
         "places": np.column_stack([found["aim_x"], found["aim_y"]]),
         "passes": int(attributes["passes"]),
         "move_target": bool(attributes["moved_target"]),
     }
-    return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **given})
+    return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:
@@ -311,9 +325,23 @@ def _has_waves(scene: mi.Scene) -> bool:
     return sea is not None and math.isfinite(sea.cell_size)
 
 
-def _truth(session: Session, places: FloatArray) -> tuple[FloatArray, ...]:
+def _common_record(session: Session, lidar: LidarScene, places: FloatArray) -> TimeAxis | None:
+    """Return time bins for the light of shots at places [m], None where the film has its own; log them."""
+    from mitransient_lidar.transport.scene import fitted_record
+
+    film = session.sensor.film()
+    if not film.used_values:
+        return None
+    aim = np.array([float(session.parameters[name]) for name in ("aim_x", "aim_y")])
+    # Also at the scene's own place, where a target that moves with the shots is.
+    shifts = [(0.0, 0.0), *map(tuple, places - aim)]
+    axis, _ = fitted_record(lidar, lidar.transmitter, film, shifts)
+    session.tell_record(axis)
+    return axis
+
+
+def _truth(session: Session, lidar: LidarScene, places: FloatArray) -> tuple[FloatArray, ...]:
     """Return the values of `_TRUTH` at places [m], shape (shots, 2)."""
-    lidar: LidarScene = choose_integrator(session.scene, None).prepare(session.scene, session.sensor).scene
     sea = np.array([footprint_means(_sea(session.scene), lidar.transmitter, x, y) for x, y in places])
     return *places.T, *sea.T, _bottom_depth(lidar, places)
 

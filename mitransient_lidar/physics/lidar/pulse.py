@@ -114,6 +114,13 @@ class Pulse:
             power = np.maximum(power, 0.0)
         return cls.sampled(times, power)
 
+    @property
+    def span_ns(self) -> tuple[float, float]:
+        """Time before and after the peak within which all of the energy but 1e-11 leaves the transmitter [ns]."""
+        if self.shape == "gaussian":
+            return 3 * self.fwhm_ns, 3 * self.fwhm_ns
+        return -float(self.times_ns[0]), float(self.times_ns[-1])
+
     def cumulative(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Fraction of the energy that has left the transmitter by the times `t_ns` [ns]."""
         from scipy.special import ndtr

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+
+#: Largest number of bins.
+MOST_BINS = 1_000_000
+
+#: Parts of a fitted record, at least, between the readable times at which it may start and end.
+_PARTS = 20
 
 
 @dataclass(frozen=True)
@@ -17,6 +26,41 @@ class TimeAxis:
     start_ns: float  #: Start of the first bin [ns].
     bin_width_ns: float  #: Width of a bin [ns], positive.
     bin_count: int  #: Number of bins, at least 1.
+
+    @classmethod
+    def covering(
+        cls,
+        first_ns: float,
+        last_ns: float,
+        bin_width_ns: float,
+        start_ns: float | None = None,
+        bin_count: int | None = None,
+    ) -> TimeAxis:
+        """Return the bins of a record of times from `first_ns` to `last_ns` [ns].
+
+        Start and number of bins, unless they are given, are multiples of 1, 2 or 5 times a power of ten of bins: at
+        most a twentieth of the record.
+
+        Raises
+        ------
+        UserError
+            If the record has more than 1 000 000 bins.
+        """
+        begin = first_ns if start_ns is None else start_ns
+        bins = max(last_ns - min(begin, first_ns), 0.0) / bin_width_ns
+        steps = (factor * 10**power for power in itertools.count() for factor in (1, 2, 5))
+        # The largest step of at most a twentieth of the record.
+        step = max([1, *itertools.takewhile(lambda each: each * _PARTS <= bins, steps)])
+        if start_ns is None:
+            start_ns = step * math.floor(first_ns / (step * bin_width_ns)) * bin_width_ns
+        if bin_count is None:
+            bin_count = step * max(math.ceil((last_ns - start_ns) / (step * bin_width_ns) - 1e-9), 1)
+        if bin_count > MOST_BINS:
+            raise UserError(
+                f"bin_width_ns = {bin_width_ns:g} divides the record from {start_ns:g} to {last_ns:g} ns into "
+                f"{bin_count} bins: it must be at least {(last_ns - start_ns) / MOST_BINS:.2g}, for at most {MOST_BINS}"
+            )
+        return cls(start_ns, bin_width_ns, bin_count)
 
     @property
     def centres_ns(self) -> FloatArray:

@@ -36,11 +36,14 @@ class BeamProfile(ABC):
         Azimuth of the first of these axes, from +angle_x towards +angle_y [rad].
     divergence
         Full angles along these axes [rad], as defined for the parameter ``divergence_mrad`` of the transmitter.
+    reach
+        Angle from the optical axis that contains all of the energy but 4e-6 [rad].
     """
 
     spreads: tuple[float, float]
     rotation: float
     divergence: tuple[float, float]
+    reach: float
 
     @abstractmethod
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
@@ -58,13 +61,15 @@ class BeamProfile(ABC):
 class _Ellipse(BeamProfile):
     """Elliptic beam of positive half angles [rad] along its first and its second axis."""
 
-    #: Root-mean-square angles over the half angles.
+    #: Root-mean-square angles, and the largest angle, over the half angles.
     _SPREAD: float
+    _REACH: float
 
     def __init__(self, along: float, across: float, rotation: float = 0.0) -> None:
         self.along, self.rotation = along, rotation
         self.divergence = 2 * along, 2 * across
         self.spreads = self._SPREAD * along, self._SPREAD * across
+        self.reach = self._REACH * max(along, across)
         self._ratio = across / along
         self._sin, self._cos = float(np.sin(rotation)), float(np.cos(rotation))
 
@@ -91,7 +96,7 @@ class _Ellipse(BeamProfile):
 class GaussianBeam(_Ellipse):
     """Gaussian beam: the half angles are standard deviations."""
 
-    _SPREAD = 1.0
+    _SPREAD, _REACH = 1.0, 5.0
 
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
@@ -113,7 +118,7 @@ class GaussianBeam(_Ellipse):
 class TopHatBeam(_Ellipse):
     """Beam of uniform irradiance within an ellipse: the half angles are its semi-axes."""
 
-    _SPREAD = 0.5
+    _SPREAD, _REACH = 0.5, 1.0
 
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
@@ -161,6 +166,7 @@ class ImageBeam(BeamProfile):
         self._share /= self._share.sum()
         self._rows, self._columns = image.shape
         self._cell = positive("side of the beam image", side) / self._columns
+        self.reach = 0.5 * self._cell * float(np.hypot(self._rows, self._columns))
         self._sampler = ImageSampler(self._share)
         self._density = mi.Float((self._share / self._cell**2).ravel())
         self._measure()

@@ -20,6 +20,9 @@ _WIDEST = 1000.0
 class PointSpread(ABC):
     """Displacement on the detector of the light of one direction, against the focus of sharp optics."""
 
+    #: Angle that contains all of the light but 4e-6 [rad].
+    reach: float
+
     @abstractmethod
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to displacements (angle_x, angle_y) [rad] that are distributed as the light is."""
@@ -54,7 +57,7 @@ class GaussianPointSpread(PointSpread):
     """Circular Gaussian, of a standard deviation [rad] along each axis."""
 
     def __init__(self, sigma: float) -> None:
-        self.sigma = sigma
+        self.sigma, self.reach = sigma, 5 * sigma
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to displacements (angle_x, angle_y) [rad].
@@ -81,6 +84,7 @@ class MeasuredPointSpread(PointSpread):
     def __init__(self, values: NDArray[np.float64], width: float) -> None:
         self._sampler = ImageSampler(values)
         self._cell = width / values.shape[1]
+        self.reach = 0.5 * self._cell * float(np.hypot(*values.shape))
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to displacements (angle_x, angle_y) [rad]."""

@@ -15,7 +15,7 @@ TABLE = {
     **{"optical_efficiency": "0.9", "field_of_view_mrad": "30", "layout": "2x2", "aperture_area": "0.025"},
     **{"two_way_atmospheric_transmittance": "0.9", "response_time_ns": "0"},
     **{"altitude": "200", "off_nadir_deg": "20", "aim_x": "0", "aim_y": "0"},
-    **{"time_start_ns": "1390", "bin_width_ns": "1", "bin_count": "150"},
+    **{"time_start_ns": "auto", "bin_width_ns": "1", "bin_count": "auto"},
     **{"wind_speed": "3", "wind_direction_deg": "0", "spectrum": "elfouhaily", "slope_variance": "cox_munk"},
     **{"surface_seed": "1", "surface_time": "0"},
     **{"surface_refined_size": "auto", "surface_cell_size": "auto"},
@@ -30,10 +30,10 @@ TABLE = {
 INDEX = {"group_index": "1.34"}
 SPHERE = {"target_y": "0", "target_size": "1", "target_reflectance": "0.1"}
 SHOT = {**INDEX, "field_of_view_mrad": "15", "wind_speed": "6", "bottom_depth": "5"}
-FINE = {"time_start_ns": "1400", "bin_width_ns": "0.25"}
+FINE = {"bin_width_ns": "0.25", "bin_count": "200"}
 PLACES = (("25.15", "-47.56"), ("42.42", "-57.60"), ("20.35", "-32.63"))
 SQUARE = {
-    **{**INDEX, "field_of_view_mrad": "35", "bin_count": "175", "surface_seed": "8", "bottom_depth": "12"},
+    **{**INDEX, "field_of_view_mrad": "35", "surface_seed": "8", "bottom_depth": "12"},
     **{"target_x": "0", "target_y": "0", "target_depth": "8", "target_size": "1.5", "target_reflectance": "0.1"},
 }
 LAYERS = {
@@ -50,12 +50,11 @@ GATES = {
 OWN = {
     "table1": {},
     "fig02_mine": {
-        **{**INDEX, **SPHERE, "layout": "1x1", "bin_count": "170"},
+        **{**INDEX, **SPHERE, "layout": "1x1"},
         **{"target_x": "2.4", "target_depth": "9", "bottom_depth": "12"},
     },
     "fig04_mast": {
         **{**INDEX, "divergence_mrad": "5", "field_of_view_mrad": "10", "altitude": "15", "off_nadir_deg": "84.6"},
-        **{"time_start_ns": "985", "bin_count": "240"},
         **{"target_depth": "1", "target_x": "1.11", "target_tilt_deg": "48", "target_reflectance": "0.3"},
     },
     "fig09_1x1": {**INDEX, "layout": "1x1"},
@@ -72,7 +71,7 @@ OWN = {
     },
     "gated_mine": {
         **{**GATES, "gate_start_depth": "4.4", "gate_width_ns": "5", "gate_step_ns": "2", "gate_count": "20"},
-        **{"bin_count": "260", "wind_speed": "1", "surface_refined_size": "12"},
+        **{"wind_speed": "1", "surface_refined_size": "12"},
         **{**SPHERE, "target_x": "1.5", "target_y": "-0.5", "target_depth": "6", "target_reflectance": "0.25"},
         **{"plate_x": "2.2", "plate_y": "1.2", "plate_size": "1.2", "plate_tilt_deg": "10", "plate_height": "0.2"},
         **{"plate_reflectance": "0.6", "bottom_reflectance": "0.3"},
@@ -80,7 +79,7 @@ OWN = {
     },
     "gated_waves": {
         **{**GATES, "gate_start_depth": "1.44", "gate_width_ns": "10", "gate_step_ns": "17.88", "gate_count": "3"},
-        **{"off_nadir_deg": "0", "time_start_ns": "1330", "bin_count": "200", "wind_speed": "4"},
+        **{"off_nadir_deg": "0", "wind_speed": "4"},
         **{"surface_refined_size": "10"},
         **{"depth_left": "2", "depth_middle": "4", "depth_right": "6", "step_reflectance": "0.5"},
     },
@@ -90,7 +89,7 @@ OWN = {
     },
     "passive_sea": {
         **{**INDEX, "divergence_mrad": "160", "field_of_view_mrad": "240", "layout": "128x128", "off_nadir_deg": "35"},
-        **{"time_start_ns": "1490", "bin_width_ns": "10", "bin_count": "42", "wind_speed": "6"},
+        **{"bin_width_ns": "10", "wind_speed": "6"},
         **{
             "surface_refined_size": "100",
             "surface_cell_size": "0.2",

@@ -1,6 +1,7 @@
 """Series of shots: places, truth, attributes, interruption and files, without renders."""
 
 import math
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -14,8 +15,10 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.session import Session
 from mitransient_lidar.studies import shot_series
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.scene import LidarScene
 
 FLAT = {"spectrum": "flat", "surface_size": 60}
+PLANE = {"spectrum": "flat"}
 PLACES = [(1.0, 2.0), (-3.0, 4.5), (10.0, -7.0)]
 TRUTH = ("aim_x", "aim_y", "true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth")
 
@@ -67,7 +70,9 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
     bottom = {"type": "rectangle", "to_world": turned, "bsdf": {"type": "diffuse"}}
     small = {"type": "sphere", "center": [0.0, 0.0, -4.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
     scene = lidar_scene(integrator={"type": "lidar_merging"}, bottom=None, extra={"floor": bottom, "target": small})
-    truth = shot_series._truth(Session(scene, scene.sensors()[0], "made", {}), np.array([*PLACES, (400.0, 0.0)]))
+    session = Session(scene, scene.sensors()[0], "made", {})
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    truth = shot_series._truth(session, lidar, np.array([*PLACES, (400.0, 0.0)]))
     sine = math.sin(math.radians(20)) / 1.34
     tangent = sine / math.sqrt(1 - sine**2)
     expected = [(8 - 0.1 * x) / (1 + 0.1 * tangent) for x, _ in PLACES]
@@ -89,14 +94,15 @@ def test_attributes_of_a_series():
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """Replace renders by made-up waveforms; return the parameters of all renders."""
+    """Replace renders by made-up waveforms; return places, options and time bins of all renders."""
     asked = []
 
-    def render(scene, *, params, passes, seed):
-        asked.append({**params, "passes": passes, "seed": seed})
+    def render(session, *, passes, seed):
+        params = {name: float(text) for name, text in session.parameters.items() if re.match("(aim|target)_[xy]", name)}
+        asked.append({**params, "passes": passes, "seed": seed, "axis": session.sensor.film().axis})
         power = np.full((2, 5), 1.0 + seed)
         attributes = {
-            "scene": scene,
+            "scene": session.name,
             "interrupted": 0,
             "surface_time_ns": 2.0 + seed,
             "scene.aim_x": str(params["aim_x"]),
@@ -132,6 +138,19 @@ def test_shots_at_given_places(rendered, tmp_path):
     with pytest.raises(UserError, match=r"shots\.exr: an EXR file holds a single shot; use a \.nc file"):
         results.save(series, tmp_path / "shots.exr")
     assert len(shot_series.describe_shots(series)) == 4
+
+
+def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
+    """The bottom lies 10 m deeper at x = -57 m: 9.4 ns of each metre, and a quarter more for scattered light."""
+    scene, slope = "docs/survey_lidar.xml", {**PLANE, "bottom_slope_deg": 10}
+    for places in ([(0, 0)], [(0, 0), (-57, 0)]):
+        shot_series.render_shots(scene, slope, places=places)
+    flat, deep = rendered[0]["axis"], rendered[1]["axis"]
+    assert rendered[2]["axis"] == deep
+    assert 85 < deep.end_ns - flat.end_ns < 145
+    assert deep.start_ns == pytest.approx(flat.start_ns, abs=5)
+    shot_series.render_shots(scene, slope, places=[(0, 0)], axis=deep)
+    assert rendered[3]["axis"] == deep
 
 
 def test_places_beside_the_bottom_are_told(rendered, caplog):
@@ -190,7 +209,7 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
     done = run("shots", "fig09_2x2", *arguments)
     assert done.exit_code == 130
     assert done.stdout.splitlines()[0] == str(tmp_path / "new" / "shots.nc")
-    assert done.stderr == "interrupted after 1 of the shots; their result is kept.\n"
+    assert done.stderr.splitlines()[-1] == "interrupted after 1 of the shots; their result is kept."
     assert results.open(tmp_path / "new" / "shots.nc")["aim_y"].values.tolist() == [2.0]
 
 

@@ -1,0 +1,326 @@
+"""Times of the first and the last light of a lidar, between which a record without given limits lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.validation import FloatArray
+
+#: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
+COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
+
+#: Time for light that is scattered several times after the last echo: the lesser of a multiple of the time that this
+#: echo spends in the water, for shallow water, and of a time [ns] and a share of it. Chosen with renders of longer
+#: records: less than 1e-4 of the energy arrives later.
+_SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
+
+#: Horizontal distance from the lines of sight, over the depth, within which waves and scattering light a solid.
+_REACH_PER_DEPTH = 0.3
+
+#: Largest number of times that the heights of a solid in view are narrowed.
+_NARROWINGS = 6
+
+#: Directions at the edge of a cone, and circles of such directions within it.
+_EDGE, _CIRCLES = 128, 8
+
+#: Share of its lines of sight that a bottom must end, for the water below it not to count.
+_COVERED = 0.98
+
+#: Largest height of the plane of the earliest light, relative to the altitude of the lower instrument.
+_HIGHEST = 0.9
+
+_NS_PER_M = 1e9 / C0
+
+
+@dataclass(frozen=True, eq=False)
+class Cone:
+    """Directions of a laser beam or of a field of view in the air.
+
+    Parameters
+    ----------
+    origin
+        Position [m], shape (3,), above the sea level.
+    frame
+        Unit vectors of the axis and of the tangent-plane angles, shape (3, 3).
+    half_angles
+        Half angles along the two tangent-plane angles [rad].
+    is_round
+        Whether the cross-section is an ellipse, or a rectangle.
+    """
+
+    origin: FloatArray
+    frame: FloatArray
+    half_angles: tuple[float, float]
+    is_round: bool = True
+
+    def places(self, z: float, reach: float) -> FloatArray:
+        """Return where its directions meet a height [m], x, y [m]; beyond `reach` [m] and above the horizon there."""
+        azimuth = np.linspace(0, 2 * np.pi, _EDGE, endpoint=False)
+        edge = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        if not self.is_round:
+            edge = edge / np.abs(edge).max(axis=1, keepdims=True)
+        angles = (np.linspace(0, 1, _CIRCLES + 1)[:, None, None] * edge).reshape(-1, 2) * self.half_angles
+        axis, *across = self.frame
+        direction = axis + angles @ np.array(across)
+        sine, down = np.hypot(direction[:, 0], direction[:, 1]), -direction[:, 2]
+        with np.errstate(divide="ignore"):
+            distance = np.where(down > 0, (self.origin[2] - z) * sine / np.maximum(down, 0), np.inf)
+        along = np.minimum(distance, reach) / np.where(sine > 0, sine, 1)
+        return np.asarray(self.origin[:2] + direction[:, :2] * along[:, None])
+
+    def holds(self, places: FloatArray, z: float) -> np.ndarray:
+        """Return whether places x, y [m] at a height [m] are in the cone."""
+        offset = np.column_stack([places, np.full(len(places), z)]) - self.origin
+        axis, far, left = self.frame
+        ahead = offset @ axis
+        scale = 1 / np.where(ahead > 0, ahead, np.inf)
+        x, y = (np.abs(offset @ side) * scale / half for side, half in zip((far, left), self.half_angles, strict=True))
+        # The edge of an equal cone is inside, whatever the rounding.
+        return np.asarray((ahead > 0) & ((np.hypot(x, y) if self.is_round else np.maximum(x, y)) <= 1 + 1e-9))
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A bottom or target: its name, and triangles with its highest and lowest points [m], shape (n, 3, 3)."""
+
+    name: str
+    triangles: FloatArray
+
+    @cached_property
+    def _corners(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates of each triangle."""
+        return self.triangles.min(axis=1), self.triangles.max(axis=1)
+
+    @property
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """Corners of the bounding box [m]."""
+        low, high = self._corners
+        return low.min(axis=0), high.max(axis=0)
+
+    def heights_in(self, low: FloatArray, high: FloatArray) -> tuple[float, float] | None:
+        """Return limits of the heights [m] between places (x, y) [m], None where there is no part of the solid."""
+        lows, highs = self._corners
+        here = np.all(lows[:, :2] <= high, axis=1) & np.all(highs[:, :2] >= low, axis=1)
+        if not here.any():
+            return None
+        lowest, highest, triangles = lows[here, 2], highs[here, 2], self.triangles[here]
+        normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        level = np.abs(normal[:, 2]) > 1e-6 * np.linalg.norm(normal, axis=1)
+        # A triangle that is larger than the view: its plane at the corners of the view.
+        slope = -normal[level, :2] / normal[level, 2:]
+        corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
+        first = triangles[level, 0]
+        planes = first[:, 2, None] + np.sum(slope[:, None] * (corners - first[:, None, :2]), axis=-1)
+        lowest[level] = np.maximum(lowest[level], planes.min(axis=1))
+        highest[level] = np.minimum(highest[level], planes.max(axis=1))
+        return float(lowest.min()), float(highest.max())
+
+
+@dataclass(frozen=True, eq=False)
+class Water:
+    """A level sea in layers, with the decay of its column signal.
+
+    Parameters
+    ----------
+    refractive_index, group_index
+        Indices of the index layers, shape (layers,).
+    boundaries
+        Depths between the index layers [m].
+    tops, attenuation
+        Upper edges of the water layers [m], the first one 0, and their system attenuation [1/m].
+    """
+
+    refractive_index: tuple[float, ...]
+    group_index: tuple[float, ...]
+    boundaries: tuple[float, ...]
+    tops: FloatArray
+    attenuation: FloatArray
+
+    def path(self, depth: float, sine: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return optical and horizontal length [m] down to a depth [m] of rays with the sine of their angle in air."""
+        edges = [0.0, *self.boundaries, np.inf]
+        thickness = np.clip(depth - np.array(edges[:-1]), 0, np.diff(edges))
+        tilt = sine[:, None] / np.array(self.refractive_index)
+        length = thickness / np.sqrt(1 - tilt**2)
+        return np.asarray(length @ np.array(self.group_index)), np.asarray(np.sum(length * tilt, axis=1))
+
+    def decay(self, depth: float) -> float:
+        """Return the integral of the attenuation down to a depth [1]."""
+        thickness = np.clip(depth - self.tops, 0, np.diff(self.tops, append=np.inf))
+        return float(thickness @ self.attenuation)
+
+    def depth_of(self, decay: float) -> float:
+        """Return the depth [m] at which the integral of the attenuation reaches a value, else that of its end."""
+        edges = np.array([self.decay(top) for top in self.tops])
+        layer = int(np.searchsorted(edges, decay, side="right")) - 1
+        if self.attenuation[layer] > 0:
+            return float(self.tops[layer] + (decay - edges[layer]) / self.attenuation[layer])
+        return float(self.tops[layer])
+
+
+@dataclass(frozen=True)
+class RecordLimits:
+    """First and last arrival of light over all pixels, for an ideal pulse."""
+
+    first_ns: float
+    last_ns: float
+    surface_ns: tuple[float, float]  #: First and last arrival from the sea surface.
+    end: str  #: What the last light comes from.
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Straight lines from an instrument to places at one height.
+
+    Attributes
+    ----------
+    places
+        x, y [m], shape (n, 2).
+    slope
+        Horizontal part of the unit directions, shape (n, 2).
+    length
+        Lengths [m], shape (n,).
+    """
+
+    places: FloatArray
+    slope: FloatArray
+    length: FloatArray
+
+    @classmethod
+    def between(cls, origin: FloatArray, places: FloatArray, z: float) -> Lines:
+        """Return the lines from a point to places at a height [m]."""
+        offset = places - origin[:2]
+        length = np.sqrt(np.sum(offset**2, axis=1) + (origin[2] - z) ** 2)
+        return cls(places, offset / length[:, None], length)
+
+    @property
+    def sine(self) -> FloatArray:
+        """Sine of the angle from the vertical."""
+        return np.asarray(np.hypot(*self.slope.T))
+
+
+@dataclass(frozen=True, eq=False)
+class LidarView:
+    """Geometry of a lidar over a sea.
+
+    Parameters
+    ----------
+    view, beam
+        Field of view with its blur, and beam.
+    water
+        Water below z = 0; by default none.
+    heights
+        Lowest and highest point of the sea [m].
+    reach
+        Horizontal distance to the end of the scene [m], where light towards the horizon ends.
+    column
+        Least depth to which water without a bottom is recorded [m], such as that of bubbles; None without water.
+    """
+
+    view: Cone
+    beam: Cone
+    water: Water
+    heights: tuple[float, float]
+    reach: float
+    column: float | None
+
+    def limits(self, solids: Sequence[Solid], direct: bool = False) -> RecordLimits:
+        """Find the first and the last arrival of light; of the last, `direct` echoes of surface and solids only.
+
+        Notes
+        -----
+        Light is that of directions in both view and beam. The first light is reflected at the height of the highest
+        crest, or of a solid above it. The last light is reflected by the deepest part of a solid in these directions,
+        or within 0.3 of its depth of them, and scattered several times, for up to four times its time in the water or
+        40 ns and a quarter of it. The sea is level there, at the height of the lowest trough. Where no solids end these
+        directions, the last light is that from the depth at which the column signal, exp(-2 K s) by Gordon's system
+        attenuation K (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
+        """
+        surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
+        steepest = float(self._sea[1].sine.min()) / self.water.refractive_index[0]
+        # Both ways, per vertical metre.
+        slant = 2 / np.sqrt(1 - steepest**2)
+        seen = self._footprint(self._sea[1], 0.0)
+        covered = np.zeros(len(seen), dtype=bool)
+        firsts, lasts = [], []
+        for solid in solids:
+            limits = self._heights_of(solid)
+            if limits is None:
+                continue
+            lowest, highest = limits
+            if self.column is None or highest > self.heights[1]:
+                firsts.append(self._earliest(highest))
+            if np.exp(-slant * self.water.decay(-lowest)) >= SOLID_LEVEL:
+                air, in_water = self._latest(lowest)
+                later = 0.0 if direct else min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water)
+                lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
+                low, high = solid.box
+                below = self._footprint(self._sea[1], lowest)
+                covered |= np.all((below >= low[:2]) & (below <= high[:2]), axis=1)
+        if self.column is not None or not firsts:
+            firsts.append(surface[0])
+            lasts.append((surface[1], "after the surface echo"))
+        if self.column is not None and not direct and np.mean(covered) < _COVERED:
+            depth = max(self.water.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
+            text = f"at a depth of {depth:.3g} m, where the signal of the water has fallen to {COLUMN_LEVEL:g}"
+            lasts.append((sum(self._latest(-depth)), text))
+        last, end = max(lasts)
+        return RecordLimits(min(firsts), last, surface, end)
+
+    @cached_property
+    def _sea(self) -> tuple[Lines, Lines]:
+        """Lines of laser and receiver to the mean sea level."""
+        return self._lines(0.0)[:2]
+
+    def _lines(self, z: float) -> tuple[Lines, Lines, bool]:
+        """Return the lines of laser and receiver to a height, and whether they meet in places lit and seen."""
+        of_view, of_beam = self.view.places(z, self.reach), self.beam.places(z, self.reach)
+        common = np.concatenate([of_view[self.beam.holds(of_view, z)], of_beam[self.view.holds(of_beam, z)]])
+        meet = len(common) > 0
+        laser, receiver = (common, common) if meet else (of_beam, of_view)
+        return Lines.between(self.beam.origin, laser, z), Lines.between(self.view.origin, receiver, z), meet
+
+    def _below_instruments(self, z: float) -> float:
+        return float(min(z, _HIGHEST * min(self.view.origin[2], self.beam.origin[2])))
+
+    def _earliest(self, z: float) -> float:
+        """Return the time of the first light from a height in the air [ns]."""
+        laser, receiver, meet = self._lines(self._below_instruments(z))
+        length = np.min(laser.length + receiver.length) if meet else laser.length.min() + receiver.length.min()
+        return float(_NS_PER_M * length)
+
+    def _latest(self, z: float) -> tuple[float, float]:
+        """Return the times of the last direct light from a height, through the air and in the water [ns]."""
+        total = in_water = 0.0
+        for lines in self._lines(self._below_instruments(max(z, self.heights[0])))[:2]:
+            optical, _ = self.water.path(-z, lines.sine)
+            total, in_water = total + float((lines.length + optical).max()), in_water + float(optical.max())
+        return _NS_PER_M * (total - in_water), _NS_PER_M * in_water
+
+    def _footprint(self, lines: Lines, z: float) -> FloatArray:
+        """Return where refracted lines to the sea level meet a height below it [m], shape (n, 2)."""
+        sine = lines.sine
+        _, across = self.water.path(-z, sine)
+        return np.asarray(lines.places + lines.slope * (across / np.where(sine > 0, sine, 1))[:, None])
+
+    def _heights_of(self, solid: Solid) -> tuple[float, float] | None:
+        """Return limits of the heights of the parts of a solid that may be lit and seen [m], None without such."""
+        heights = float(solid.box[0][2]), float(solid.box[1][2])
+        # Limits of the heights limit the places, and these the heights.
+        for _ in range(_NARROWINGS):
+            corners = []
+            for z in heights:
+                lines = self._sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
+                places = np.concatenate([self._footprint(one, min(z, 0.0)) for one in lines])
+                margin = _REACH_PER_DEPTH * max(-z, 0.0)
+                corners += [places.min(axis=0) - margin, places.max(axis=0) + margin]
+            narrower = solid.heights_in(np.min(corners, axis=0), np.max(corners, axis=0))
+            if narrower is None or narrower == heights:
+                return narrower
+            heights = narrower
+        return heights
