@@ -46,12 +46,12 @@ class TimeGatedFilm(mi.Film):
 
     With ``auto`` the record is chosen once the scene is loaded, and a result lists it under ``used`` in the attribute
     ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
-    before the first light of any pixel from the highest crest or a target above it. It ends as much, and 12 times the
-    response time, after the last light of any pixel from a bottom or target, for which multiple scattering is given up
-    to 40 ns and a quarter of the echo's time in the water; or, where no bottom is seen, after that from the depth at
-    which the column signal has fallen to 1e-6, by the system attenuation of Gordon (1982): the beam attenuation
-    coefficient in a narrow view, the diffuse one in a wide one. A bottom below 1e-12 counts as not seen. A film with
-    gates holds these and all direct echoes.
+    before the first light of any pixel, from the highest crest or a target above it. It ends as much, and 12 times the
+    response time, after the last light of any pixel. This comes from a bottom or target; light that is scattered
+    several times is given up to 40 ns, a quarter of the echo's time in the water, and the time of the way from the beam
+    to the edge of the view. Where no bottom is seen, or below 1e-12, it comes from the depth at which the column signal
+    has fallen to 1e-6 by the system attenuation of Gordon (1982): the beam attenuation coefficient in a narrow view,
+    the diffuse one in a wide one. A film with gates holds these and all direct echoes.
 
     From a height H [m] at the angle theta off nadir, the echo of the sea arrives after 2 H/(0.2998 cos(theta)) ns; each
     metre of depth adds 9.1 ns at nadir and 9.4 ns at 20 degrees.

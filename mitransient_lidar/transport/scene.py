@@ -201,12 +201,10 @@ def fitted_record(
     UserError
         If the bins are too many.
     """
-    shapes = [(shape.id(), _triangles(shape)) for shape in scene.solids]
-    solids = [Solid(name, triangles) for name, triangles in shapes]
+    solids = [Solid(shape.id() or shape.class_name(), _triangles(shape)) for shape in scene.solids]
     found = [_lidar_view(scene, transmitter, shift).limits(solids, film.gates is not None) for shift in shifts]
-    pulse, response_ns = transmitter.pulse, scene.receiver.optics.response_time_ns
-    lead, tail = (max(span, _MARGIN_NS) for span in pulse.span_ns)
-    tail += _RESPONSE_TIMES * response_ns
+    lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
+    tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
     last = max(found, key=lambda each: each.last_ns)
     limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
     if film.gates is not None:

@@ -19,6 +19,9 @@ COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
 #: records: less than 1e-4 of the energy arrives later.
 _SHALLOW, _LATER_NS, _LATER_SHARE = 4.0, 40.0, 0.25
 
+#: Largest distance from the beam at which the time of the way from it is added for the view [m].
+_FARTHEST = 10.0
+
 #: Horizontal distance from the lines of sight, over the depth, within which waves and scattering light a solid.
 _REACH_PER_DEPTH = 0.3
 
@@ -236,10 +239,11 @@ class LidarView:
         -----
         Light is that of directions in both view and beam. The first light is reflected at the height of the highest
         crest, or of a solid above it. The last light is reflected by the deepest part of a solid in these directions,
-        or within 0.3 of its depth of them, and scattered several times, for up to four times its time in the water or
-        40 ns and a quarter of it. The sea is level there, at the height of the lowest trough. Where no solids end these
-        directions, the last light is that from the depth at which the column signal, exp(-2 K s) by Gordon's system
-        attenuation K (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
+        or within 0.3 of its depth of them, below a level sea at the height of the lowest trough. Light that is
+        scattered several times follows it: for up to four times its time in the water or 40 ns and a quarter of it,
+        and the time of the way from the beam to the edge of the view, up to 10 m. Where no solids end these directions,
+        the last light is that from the depth at which the column signal, exp(-2 K s) by Gordon's system attenuation K
+        (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
         steepest = float(self._sea[1].sine.min()) / self.water.refractive_index[0]
@@ -257,7 +261,8 @@ class LidarView:
                 firsts.append(self._earliest(highest))
             if np.exp(-slant * self.water.decay(-lowest)) >= SOLID_LEVEL:
                 air, in_water = self._latest(lowest)
-                later = 0.0 if direct else min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water)
+                later = min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water) + self._crossing_ns
+                later = 0.0 if direct else later
                 lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
                 low, high = solid.box
                 below = self._footprint(self._sea[1], lowest)
@@ -276,6 +281,16 @@ class LidarView:
     def _sea(self) -> tuple[Lines, Lines]:
         """Lines of laser and receiver to the mean sea level."""
         return self._lines(0.0)[:2]
+
+    @cached_property
+    def _crossing_ns(self) -> float:
+        """Time of the way in the water from the beam to the edge of the view [ns]."""
+        view, beam = (cone.places(0.0, self.reach)[-_EDGE:] for cone in (self.view, self.beam))
+        outside = view[~self.beam.holds(view, 0.0)]
+        if len(outside) == 0:
+            return 0.0
+        away = np.linalg.norm(outside[:, None] - beam, axis=-1).min(axis=1)
+        return float(_NS_PER_M * self.water.group_index[0] * min(away.max(), _FARTHEST))
 
     def _lines(self, z: float) -> tuple[Lines, Lines, bool]:
         """Return the lines of laser and receiver to a height, and whether they meet in places lit and seen."""

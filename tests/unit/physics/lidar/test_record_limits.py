@@ -91,6 +91,14 @@ def test_a_receiver_beside_the_laser():
     assert NS * sum(lengths) - 0.5 < found.last_ns < NS * sum(lengths) + 25
 
 
+@pytest.mark.parametrize(("half_mrad", "distance"), [(20.0, 0.0), (35.0, 2.0), (125.0, 10.0)])
+def test_light_crosses_the_water_to_the_edge_of_the_view(half_mrad, distance):
+    """A beam of 5 m, and views of 4, 7 and 25 m from 200 m: the way to the edge of the view counts up to 10 m."""
+    found = [lidar(cone(0.0, half), cone(0.0, 25.0)).limits([plane(8.0)]).last_ns for half in (25.0, half_mrad)]
+    direct = [lidar(cone(0.0, half), cone(0.0, 25.0)).limits([plane(8.0)], True).last_ns for half in (25.0, half_mrad)]
+    assert found[1] - direct[1] - (found[0] - direct[0]) == pytest.approx(NS * GROUP * distance, abs=0.05)
+
+
 def test_beam_and_view_without_a_common_place():
     """The legs of both, without the way between them, which `scene_checks` compares with the record."""
     view, beam = cone(0.0, 5.0), cone(0.0, 5.0, x=30.0)
