@@ -284,7 +284,7 @@ INVALID_INPUT = [
     ({"params": {"backscattering": 0.2}}, "backscattering = 0.2 must not exceed scattering = 0.15"),
     ({"params": {"layer_tops": "0, 5, 3"}}, "layers out of order"),
     ({"params": {"bin_width_ns": 0}}, "bin_width_ns = 0 must lie between 1e-06 and"),
-    ({"params": {"time_start_ns": 100}}, "time_start_ns = 100.*surface echo"),
+    ({"params": {"time_start_ns": 100, "bin_count": 150}}, "time_start_ns = 100.*surface echo"),
     ({"params": {"field_of_view_mrad": 0}}, "field_of_view_mrad = 0 must lie between 0.001 and 3000"),
     ({"params": {"layout": "two"}}, "layout = 'two'"),
     ({"params": {"bin_count": "many"}}, "bin_count|many"),

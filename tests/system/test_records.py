@@ -1,0 +1,171 @@
+"""Records that fit by themselves: all light is within, attributes, gates, and numbers that win."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.rendering.echo_window import probe_echoes
+from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
+SMALL = {"surface_size": 60, "bin_width_ns": 4}
+TURBID = {"attenuation": 2.19, "scattering": 1.824, "backscattering": 0.03643}
+
+GEOMETRIES = [
+    {"altitude": 400},
+    {"off_nadir_deg": 45},
+    {"off_nadir_deg": 0, "altitude": 50, "wind_speed": 10},
+    {"bottom_depth": 30},
+    {"bottom_depth": 1},
+    {"field_of_view_mrad": 100},
+    {"altitude": 15, "off_nadir_deg": 85},
+    {"altitude": 20, "off_nadir_deg": 70, "wind_speed": 8},
+    {"altitude": 5, "off_nadir_deg": 10, "pulse_fwhm_ns": 1},
+    {"bottom_depth": 3, "field_of_view_mrad": 100, **TURBID},
+]
+
+#: Of these the ones whose rays are also traced in the quick tier.
+QUICK = [{"altitude": 400}, {"bottom_depth": 30}, {"altitude": 15, "off_nadir_deg": 85}]
+
+
+def prepared(scene, params=None):
+    session = open_scene(scene, params)
+    return LidarScene.from_scene(session.scene, session.sensor)
+
+
+def beside(offset, film=None):
+    """A scene whose receiver is beside the laser of table 1 [m] and looks at the same place."""
+    transform = mi.ScalarTransform4f()
+    origin = np.array([-200 * np.tan(np.radians(20)), 0, 200]) + offset
+    return {
+        "integrator": {"type": "lidar_merging"},
+        "tx": {"type": "lidar_transmitter"},
+        "rx": {
+            "type": "multipixel_receiver",
+            "to_world": transform.look_at(origin=origin.tolist(), target=[0, 0, 0], up=[0, 0, 1]),
+            "film": {"type": "time_gated_film", "bin_width_ns": 1.0, **(film or {})},
+        },
+        "sea": {"type": "ocean_surface", "wind_speed": 5.0, "interior": {"type": "layered_water"}},
+        "bottom": {"type": "seabed", "depth": 8.0},
+    }
+
+
+@pytest.mark.parametrize(
+    "params", [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in GEOMETRIES]
+)
+def test_echoes_of_rays_through_the_waves_are_within(params):
+    lidar = prepared("table1", params)
+    probe = probe_echoes(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    first, last = np.nanmin(probe.surface_ns), np.nanmax(probe.bottom_ns)
+    lead = 3 * lidar.transmitter.pulse.fwhm_ns
+    assert lidar.axis.start_ns < first - lead
+    assert lidar.axis.end_ns > last + lead
+    # No more than twice as long as its echoes, and 100 ns.
+    assert lidar.axis.end_ns - lidar.axis.start_ns < 2 * (last - first) + 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("params", GEOMETRIES)
+def test_less_than_1e_4_of_the_energy_is_outside(params):
+    outside(lambda film: ("table1", {**params, **film}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", [(0, 50, 0), (50, 0, 0), (-50, 0, -100)])
+def test_less_than_1e_4_of_the_energy_is_outside_of_a_receiver_beside_the_laser(offset):
+    outside(lambda film: (beside(offset, film), None))
+
+
+def outside(scene):
+    """Check that a far longer record holds no more energy; `scene` takes parameters of a film."""
+    axis = prepared(*scene({})).axis
+    before, after = (int(length / axis.bin_width_ns) for length in (300, 600))
+    film = {"time_start_ns": axis.start_ns - before * axis.bin_width_ns, "bin_count": before + axis.bin_count + after}
+    longer, params = scene(film)
+    power = mitransient_lidar.render(longer, params=params, passes=8, seed=1)["waveform"].values.sum(axis=0)
+    assert power[:before].sum() < 1e-6 * power.sum()
+    assert power[before + axis.bin_count :].sum() < 1e-4 * power.sum()
+
+
+def test_a_result_keeps_auto_and_lists_the_bins_used():
+    first = mitransient_lidar.render("table1", params=SMALL, integrator=FEW, passes=2)
+    assert (first.attrs["scene.time_start_ns"], first.attrs["scene.bin_count"]) == ("auto", "auto")
+    film = json.loads(first.attrs["plugin_parameters"])["receiver"]["time_gated_film"]
+    assert film["bin_count"] == "auto"
+    assert film["used"] == {"time_start_ns": first.attrs["time_start_ns"], "bin_count": first.sizes["time"]}
+    assert first.attrs["record_end"] == "after the echo of shape 'bottom'"
+    again = mitransient_lidar.render(first)
+    np.testing.assert_array_equal(again["time"], first["time"])
+    np.testing.assert_array_equal(again["waveform"], first["waveform"])
+
+
+def test_a_number_wins_each_on_its_own():
+    automatic = prepared("table1").axis
+    late = prepared("table1", {"time_start_ns": 1410.5})
+    assert late.axis.start_ns == 1410.5
+    assert automatic.end_ns <= late.axis.end_ns < automatic.end_ns + 10
+    short = prepared("table1", {"bin_count": 40})
+    assert (short.axis.start_ns, short.axis.bin_count) == (automatic.start_ns, 40)
+    both = prepared("table1", {"time_start_ns": 1390, "bin_count": 150})
+    assert (both.axis.start_ns, both.axis.bin_count) == (1390, 150)
+
+
+def test_water_without_a_visible_bottom():
+    """Until the column has fallen to 1e-6, in clear water later, and less far in a narrow view."""
+    scenes = ({}, {"jerlov": "I"}, {"field_of_view_mrad": 1, "divergence_mrad": 0.5})
+    ends = [prepared("table1", {"bottom_depth": 300, **params}).axis.end_ns for params in scenes]
+    assert ends[2] < ends[0] < ends[1] < 1420 + 300 * 9.6
+
+
+def test_the_record_holds_its_gates():
+    gates = {"gate_count": 4, "gate_width_ns": 30.0}
+    for start in (1300.0, 1900.0):
+        axis = prepared(beside((0, 0, 0), {**gates, "gate_start_ns": start})).axis
+        assert axis.start_ns < min(start, 1410) - 10
+        assert axis.end_ns > max(start + 120, 1500) + 10
+
+
+def test_a_scene_without_water():
+    """A plate in the air, 20 m above the lowest point, and no light of a sea."""
+    transform = mi.ScalarTransform4f()
+    plate = {"type": "rectangle", "to_world": transform.translate([0, 0, 20]).scale(50), "bsdf": {"type": "diffuse"}}
+    scene = {name: part for name, part in beside((0, 0, 0)).items() if name not in ("sea", "bottom")}
+    axis = prepared({**scene, "plate": plate}).axis
+    near, far = (2 * 180 / 0.299792458 / np.cos(np.radians(20) + side * 15e-3) for side in (-1, 1))
+    assert near - 20 < axis.start_ns < near - 15
+    assert far + 15 < axis.end_ns < far + 20
+
+
+@pytest.mark.slow
+def test_the_command_states_the_record(tmp_path):
+    small = [word for name, value in SMALL.items() for word in ("-D", f"{name}={value}")]
+    done = run("render", "table1", "-D", "altitude=400", *small, "--passes", 2, "--no-plot", "-o", tmp_path)
+    assert done.exit_code == 0
+    line = " ".join(done.stderr.split())
+    assert "bins of 4 ns; it ends after the echo of shape 'bottom'" in line
+    assert "record: 28" in line
+
+
+@pytest.mark.parametrize(
+    ("params", "sentence"),
+    [
+        ({"bin_width_ns": 1e-5}, "bin_width_ns = 1e-05 divides the record from 139"),
+        ({"bin_count": "some"}, "bin_count = 'some' must be a number"),
+        ({"time_start_ns": "early"}, "time_start_ns = 'early' must be a number"),
+        ({"bin_count": 5}, "bin_count = 5 bins of 1 ns end the record at 1400 ns: it must end after the surface echo"),
+        ({"time_start_ns": 3000}, "time_start_ns = 3000 starts the record after every echo"),
+    ],
+)
+def test_invalid_records_are_refused(params, sentence, tmp_path):
+    with pytest.raises(UserError, match=sentence):
+        mitransient_lidar.render("table1", params=params, passes=2)
+    words = [word for name, value in params.items() for word in ("-D", f"{name}={value}")]
+    assert_refused(run("render", "table1", "-q", "-o", tmp_path, *words), sentence)
+    assert list(tmp_path.iterdir()) == []
