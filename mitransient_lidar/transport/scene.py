@@ -175,8 +175,9 @@ class LidarScene(WaterScene):
         if receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
             raise UserError("altitude: transmitter and receiver must be above the mean sea level z = 0")
         _check_cells(surfaces, transmitters[0])
-        parts = WaterScene(scene, receiver, water, surfaces, variance)
         if film.axis is None:
+            # The record is that of the sensor, whatever replaces its receiver.
+            parts = WaterScene(scene, find_receiver(sensor), water, surfaces, variance)
             film.fit(*fitted_record(parts, transmitters[0], film))
         return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
 
