@@ -159,7 +159,7 @@ class TimeGatedFilm(mi.Film):
     def to_string(self) -> str:
         """Return a description."""
         known = {"time_start_ns": self.time_start_ns, "bin_count": self.bin_count, **self.used_values}
-        start, count = (_AUTO if value is None else f"{value:g}" for value in known.values())
+        start, count = (_AUTO if value is None else f"{value:.10g}" for value in known.values())
         return f"TimeGatedFilm[time_start_ns={start}, bin_width_ns={self.bin_width_ns:g}, bin_count={count}]"
 
 

@@ -68,8 +68,8 @@ class Cone:
         if not self.is_round:
             edge = edge / np.abs(edge).max(axis=1, keepdims=True)
         angles = (np.linspace(0, 1, _CIRCLES + 1)[:, None, None] * edge).reshape(-1, 2) * self.half_angles
-        axis, *across = self.frame
-        direction = axis + angles @ np.array(across)
+        axis, far, left = self.frame
+        direction = axis + angles[:, :1] * far + angles[:, 1:] * left
         sine, down = np.hypot(direction[:, 0], direction[:, 1]), -direction[:, 2]
         with np.errstate(divide="ignore"):
             distance = np.where(down > 0, (self.origin[2] - z) * sine / np.maximum(down, 0), np.inf)
