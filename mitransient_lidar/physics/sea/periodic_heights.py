@@ -183,6 +183,15 @@ def realise_heights(
 
 def even_cells(cell: float, period: float) -> int:
     """Return an even number of cells per period, not longer than `cell` [m], that is fast to transform."""
-    from scipy.fft import next_fast_len
+    half = max(2, math.ceil(0.5 * period / cell - 1e-9))
+    while not _is_product_of_small_primes(half):
+        half += 1
+    return 2 * half
 
-    return 2 * int(next_fast_len(max(2, math.ceil(0.5 * period / cell - 1e-9)), real=True))
+
+def _is_product_of_small_primes(number: int) -> bool:
+    """Return whether a number has no prime factors but 2, 3 and 5, so that Fourier transforms of its size are fast."""
+    for factor in (2, 3, 5):
+        while number % factor == 0:
+            number //= factor
+    return number == 1

@@ -127,20 +127,18 @@ def wave_coefficients(
 
 
 def heights_of(coefficients: npt.NDArray[np.complex128], cells: int = 0) -> FloatArray:
-    """Return the elevations [m] of `realise` from `wave_coefficients`, which are overwritten.
+    """Return the elevations [m] of `realise` from `wave_coefficients`.
 
     The grid has `cells` per side, even and not fewer than those of the coefficients, which is the default.
     """
-    from scipy.fft import fftshift, irfft2
-
     count = len(coefficients)
     cells = cells or count
     if cells > count:
         half = count // 2
         waves, coefficients = coefficients, np.zeros((cells, cells // 2 + 1), dtype=np.complex128)
         coefficients[:half, : half + 1], coefficients[-half:, : half + 1] = waves[:half], waves[half:]
-    heights = irfft2(coefficients, s=(cells, cells), norm="forward", overwrite_x=True)
-    return np.asarray(fftshift(heights), dtype=np.float64)
+    heights = np.fft.irfft2(coefficients, s=(cells, cells), norm="forward")
+    return np.asarray(np.fft.fftshift(heights), dtype=np.float64)
 
 
 def mesh_slope_variance(

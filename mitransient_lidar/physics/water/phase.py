@@ -16,6 +16,9 @@ from mitransient_lidar.physics.water.data_tables import PhaseFunction, log_log_p
 _SLOPE_RANGE = (3.0001, 4.9999)
 """Junge slopes mu of the one-parameter Fournier-Forand family."""
 
+_BISECTIONS = 52
+"""Halvings of this range that leave the rounding error."""
+
 
 def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
     """Fournier-Forand phase function.
@@ -109,14 +112,16 @@ def fournier_forand_parameters(backscatter_ratio: float) -> tuple[float, float]:
     -----
     The line is that of Mobley, Sundman and Boss (2002), Appl. Opt. 41, 1035, doi:10.1364/AO.41.001035.
     """
-    from scipy.optimize import brentq
 
     def ratio(mu: float) -> float:
         return fournier_forand_backscatter_ratio(_ffbb_index(mu), mu)
 
     low, high = _SLOPE_RANGE
     wanted = in_range("backscatter_ratio", backscatter_ratio, ratio(low), ratio(high))
-    mu = float(brentq(lambda x: ratio(x) - wanted, low, high, xtol=1e-13))
+    # Bisection: scipy.optimize would take longer to import than the scene to load.
+    for _ in range(_BISECTIONS):
+        mu = 0.5 * (low + high)
+        low, high = (mu, high) if ratio(mu) < wanted else (low, mu)
     return _ffbb_index(mu), mu
 
 
