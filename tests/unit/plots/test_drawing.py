@@ -103,3 +103,18 @@ def test_figures_replace_a_file_only_on_success(tmp_path):
     assert (path.read_text(), len(list(tmp_path.iterdir()))) == ("before", 1)
     with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
         drawing.new_figure(tmp_path / "a.gif", 2.0, 1.0)
+
+
+def test_saved_picture_is_that_of_matplotlib(tmp_path):
+    def drawn():
+        figure = drawing.new_figure(None, 3.0, 2.0)
+        ax = figure.subplots()
+        ax.plot([0, 1], [1e-3, 10])
+        ax.set(yscale="log", xlabel="time (ns)")
+        drawing.add_top_axis(ax, 1.0, 2.0, "depth (m)")
+        return figure
+
+    drawn().savefig(tmp_path / "expected.png", dpi=160)
+    figure = drawing.save(drawn(), tmp_path / "saved.png")
+    assert (tmp_path / "saved.png").read_bytes() == (tmp_path / "expected.png").read_bytes()
+    assert figure.dpi == drawn().dpi
