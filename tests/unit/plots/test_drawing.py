@@ -97,7 +97,7 @@ def test_figures_replace_a_file_only_on_success(tmp_path):
     path.write_text("before")
     figure = drawing.new_figure(path, 2.0, 1.0)
     figure.set_layout_engine("none")
-    figure.savefig = lambda *_, **__: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    figure.draw = lambda *_, **__: (_ for _ in ()).throw(OSError(28, "No space left on device"))
     with pytest.raises(UserError, match=r"cannot write .*a\.png: No space left on device"):
         drawing.save(figure, path)
     assert (path.read_text(), len(list(tmp_path.iterdir()))) == ("before", 1)
