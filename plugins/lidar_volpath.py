@@ -17,6 +17,9 @@ from mitransient_lidar.transport.volpath import CONNECTIONS, VolpathOptions, Vol
 class VolpathIntegrator(LidarIntegrator):
     """Integrator with the options of the path tracer; `guiding_probability` is the default."""
 
+    #: Default of the roulette's threshold.
+    roulette_threshold = 0.001
+
     def __init__(self, props: mi.Properties, guiding_probability: float, complement_only: bool = False) -> None:
         super().__init__(props)
         self.paths_per_pass = integer("paths_per_pass", props.get("paths_per_pass", 2**18), 1024, 2**28)
@@ -25,7 +28,7 @@ class VolpathIntegrator(LidarIntegrator):
             raise UserError(f"connection = {connection!r} must be one of {', '.join(CONNECTIONS)}")
         self.options = VolpathOptions(
             integer("max_scatterings", props.get("max_scatterings", -1), -1, 2**30),
-            in_range("roulette_threshold", props.get("roulette_threshold", 0.001), 0.0, 1.0),
+            in_range("roulette_threshold", props.get("roulette_threshold", self.roulette_threshold), 0.0, 1.0),
             in_range("guiding_probability", props.get("guiding_probability", guiding_probability), 0.0, 0.99),
             connection,
             complement_only,

@@ -65,7 +65,8 @@ def _save_png(figure: Figure, path: Path) -> None:
     resolution = figure.dpi
     figure.dpi = _DPI
     try:
-        FigureCanvasAgg(figure).print_png(path)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.print_png(path)
     finally:
         figure.dpi = resolution
 

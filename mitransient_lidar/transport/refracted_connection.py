@@ -179,8 +179,8 @@ class TopLayerRay:
     ----------
     ray
         The ray where it enters the top index layer, or starts in it.
-    optical_length, optical_depth
-        Optical length [m] and optical depth below the top index layer.
+    optical_length, optical_depth, absorption_depth
+        Optical length [m], optical depth and that of absorption alone below the top index layer.
     factor
         Factor of the radiance: square of the ratio of the refractive indices; 0 where the ray is blocked.
     """
@@ -188,12 +188,13 @@ class TopLayerRay:
     ray: mi.Ray3f
     optical_length: mi.Float
     optical_depth: mi.Float
+    absorption_depth: mi.Float
     factor: mi.Float
 
 
 def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, active: mi.Bool) -> TopLayerRay:
     """Trace rays from under water up to the top index layer."""
-    traced = TopLayerRay(ray, mi.Float(0), mi.Float(0), mi.Float(1))
+    traced = TopLayerRay(ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(1))
     layers: IndexLayers | None = scene.index_layers
     if layers is None:
         return traced
@@ -204,10 +205,12 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
         segment.maxt = distance
         blocked = scene.ray_test(segment, here)
         optical_depth = scene.water.optical_depth(segment.o, segment.d, distance)
+        absorption = scene.water.absorption_flight.optical_depth(-segment.o.z, -segment.d.z, distance)
         above = mi.UInt32(number - 1)
         direction, ratio, passes = layers.refract(segment.d, mi.UInt32(number), above)
         traced.optical_length += dr.select(here, distance * float(layers.group_index[number]), 0)
         traced.optical_depth += dr.select(here, optical_depth, 0)
+        traced.absorption_depth += dr.select(here, absorption, 0)
         traced.factor *= dr.select(here, dr.select(passes & ~blocked, ratio * ratio, 0), 1)
         origin = dr.select(here, segment.o + segment.d * distance, segment.o)
         traced.ray = mi.Ray3f(origin, dr.select(here, direction, segment.d))

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
@@ -29,6 +33,12 @@ from mitransient_lidar.transport.sensor.receiver import SensorSampler
 #: to 0.95 in clear and turbid water, with the default probability.
 _GUIDING_ASYMMETRY = 0.87
 
+#: Asymmetry of the lobe on solids where it has a probability of its own: closer to that of the sun's light under water.
+_SOLID_GUIDING_ASYMMETRY = 0.95
+
+#: Radiance under water over its mean that the roulette expects far from the emitter's direction.
+_DIFFUSE_RADIANCE = 0.5
+
 #: Number of the random streams within a pass.
 _STREAM = 3
 
@@ -38,13 +48,28 @@ CONNECTIONS = ("mis", "emitter", "phase")
 
 @dataclass(frozen=True)
 class VolpathOptions:
-    """Options of the path tracer; the plugin ``lidar_volpath`` documents them."""
+    """Options of the path tracer; the plugins ``lidar_volpath`` and ``passive_volpath`` document most of them.
+
+    Attributes
+    ----------
+    solid_guiding_probability
+        Guiding probability on solids below water that scatters all light; None is that of scattering events, with the
+        same lobe.
+    expects_emitter
+        Whether the roulette counts throughput times the radiance expected under water, which is largest about the
+        emitter's direction, instead of throughput alone.
+    weights_absorption
+        Whether absorption reduces the weight of paths, instead of the number of those that scatter or arrive.
+    """
 
     max_scatterings: int = -1
     roulette_threshold: float = 0.001
     guiding_probability: float = 0.4
     connection: str = "mis"
     complement_only: bool = False
+    solid_guiding_probability: float | None = None
+    expects_emitter: bool = False
+    weights_absorption: bool = False
 
 
 class PathLight:
@@ -139,6 +164,9 @@ class PathTracer:
     def __init__(self, scene: WaterScene, options: VolpathOptions, light: PathLight) -> None:
         self.scene, self.options, self.light = scene, options, light
         flight = scene.water.flight if scene.water is not None else None
+        self._absorption: LayeredFlight | None = None
+        if options.weights_absorption and scene.water is not None:
+            flight, self._absorption = scene.water.scattering_flight, scene.water.absorption_flight
         self._step = PathStep(scene, flight, mi.TransportMode.Radiance)
 
     def trace(self, path: ConnectedPath, rng: mi.PCG32) -> mi.Float64:
@@ -156,22 +184,26 @@ class PathTracer:
         first = path.length == 0
         vertex = self._step.next_vertex(path, rng)
         wet = path.active & path.in_water & dr.isfinite(vertex.reach)
-        transmittance = dr.exp(-self._optical_depth(path.point, path.direction, vertex.reach, wet))
+        # Probability that the path's own sampling crosses the segment.
+        transmittance = dr.exp(-self._sampled_depth(path.point, path.direction, vertex.reach, wet))
         self.light.escape(path, path.active & ~vertex.exists)
         path.active &= vertex.exists
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         if self.options.max_scatterings >= 0:
             path.active &= path.scatterings <= self.options.max_scatterings
+        if self._absorption is not None:
+            absorbed = self._absorption.optical_depth(path.depth, path.downward, vertex.length)
+            path.throughput *= dr.select(path.active & path.in_water, dr.exp(-absorbed), 1)
         self._step.arrive(path, vertex)
         event = self._step.scattering_event(path, vertex.scattered, rng)
-        if self.scene.water is not None:
+        if self.scene.water is not None and self._absorption is None:
             path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
         emitter = self.light.sampler.direction_from(path.point)
         self._connect(path, rng, vertex, event, emitter, transmittance, first)
         self._redirect(path, rng, vertex, event, emitter)
         path.emitter_ratio = dr.select(vertex.at_boundary, path.emitter_ratio / transmittance, path.emitter_ratio)
         self._step.cross_boundary(path, vertex.at_boundary & path.active)
-        self._roulette(path, rng)
+        self._roulette(path, rng, emitter)
         self.light.end_paths(path, rng)
 
     def _connect(
@@ -201,7 +233,12 @@ class PathTracer:
         distance = dr.select(lost, dr.maximum(-top.ray.o.z, 0) / top.ray.d.z, above.t)
         crossed = top.optical_depth + self._optical_depth(top.ray.o, top.ray.d, distance, met | lost)
         clear = dr.exp(-crossed)
-        combined = density + (pdf * clear if self.options.connection == "mis" else 0)
+        if self._absorption is None:
+            own = pdf * clear
+        else:
+            sampled_depth = self._sampled_depth(top.ray.o, top.ray.d, distance, met | lost)
+            own = pdf * dr.exp(top.absorption_depth - top.optical_depth - sampled_depth)
+        combined = density + (own if self.options.connection == "mis" else 0)
         connected = value * clear / combined * top.factor
         factor = dr.select(met, connected, self._own_weight(path, transmittance))
         crossing = dr.select(met, above, si)
@@ -236,13 +273,40 @@ class PathTracer:
             return mi.Float(0)
         return dr.select(active, self.scene.water.optical_depth(point, direction, length), 0)
 
+    def _sampled_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the optical depth from which paths draw the events on segments in water, 0 for inactive lanes."""
+        depth = self._optical_depth(point, direction, length, active)
+        if self._absorption is None:
+            return depth
+        return depth - dr.select(active, self._absorption.optical_depth(-point.z, -direction.z, length), 0)
+
+    def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> Any:
+        """Return the probability of the lobe towards the emitter.
+
+        On solids with a probability of their own it is that times the share of the emitter's light that is scattered
+        above them: what arrives unscattered is found by connections.
+        """
+        on_solids, water = self.options.solid_guiding_probability, self.scene.water
+        if on_solids is None or water is None:
+            return self.options.guiding_probability
+        depth, up = dr.maximum(-vertex.si.p.z, 0), emitter.in_water.z
+        scattered = 1 - dr.exp(-water.scattering_flight.optical_depth(depth, -up, depth / up))
+        return dr.select(vertex.scattered, mi.Float(self.options.guiding_probability), on_solids * scattered)
+
+    def _by_lobe(self, vertex: Vertex, formula: Callable[[mi.Float, float], mi.Float], value: mi.Float) -> mi.Float:
+        """Return a formula of a value and the asymmetry of the lobe towards the emitter."""
+        broad = formula(value, _GUIDING_ASYMMETRY)
+        if self.options.solid_guiding_probability is None:
+            return broad
+        return dr.select(vertex.scattered, broad, formula(value, _SOLID_GUIDING_ASYMMETRY))
+
     def _evaluate(
         self, emitter: EmitterDirection, vertex: Vertex, event: ScatteringEvent, active: mi.Bool, direction: mi.Vector3f
     ) -> tuple[mi.Float, mi.Float]:
         """Return phase function, or BSDF times cosine, of a direction and the density with which paths draw it."""
         value, pdf = mi.Float(0), mi.Float(0)
-        probability, si = self.options.guiding_probability, vertex.si
-        guided = henyey_greenstein(dr.dot(direction, emitter.in_water), _GUIDING_ASYMMETRY)
+        probability, si = self._guiding_probability(vertex, emitter), vertex.si
+        guided = self._by_lobe(vertex, henyey_greenstein, dr.dot(direction, emitter.in_water))
         if event.phase is not None:
             at_event = vertex.scattered & active
             context = mi.PhaseFunctionContext()
@@ -266,7 +330,7 @@ class PathTracer:
         self, path: ConnectedPath, rng: mi.PCG32, vertex: Vertex, event: ScatteringEvent, emitter: EmitterDirection
     ) -> None:
         """Draw the next direction; at scattering events and rough solids under water, some of them near the emitter."""
-        probability, si = self.options.guiding_probability, vertex.si
+        probability, si = self._guiding_probability(vertex, emitter), vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         submerged = self._submerged(vertex)
         mixed = vertex.scattered | (submerged & vertex.on_surface & _is_rough(si))
@@ -281,7 +345,7 @@ class PathTracer:
             context = mi.PhaseFunctionContext()
             natural, _, _ = event.phase.sample(context, event.interaction, rest, u, vertex.scattered)
             natural = dr.select(vertex.scattered, natural, direction)
-            cosine = sample_henyey_greenstein(u.x, _GUIDING_ASYMMETRY)
+            cosine = self._by_lobe(vertex, sample_henyey_greenstein, u.x)
             towards = deflect(mi.Frame3f(emitter.in_water), 0.5 * (1 - cosine), dr.two_pi * u.y)
             drawn = dr.select(guided, towards, natural)
             value, mixed_pdf = self._evaluate(emitter, vertex, event, mixed, drawn)
@@ -304,9 +368,14 @@ class PathTracer:
         reflected = vertex.at_sea & ~vertex.in_water & ~path.in_water
         path.reflected_by_sea = dr.select(turned, reflected, path.reflected_by_sea)
 
-    def _roulette(self, path: ConnectedPath, rng: mi.PCG32) -> None:
-        """End paths of little throughput at random, and compensate in the others."""
-        survival = dr.minimum(path.throughput / max(self.options.roulette_threshold, 1e-30), 1)
+    def _roulette(self, path: ConnectedPath, rng: mi.PCG32, emitter: EmitterDirection) -> None:
+        """End paths that are expected to find little light at random, and compensate in the others."""
+        expected = path.throughput
+        if self.options.expects_emitter:
+            # The lobe over its mean: paths guided to the emitter have little throughput and find much light.
+            lobe = 4 * np.pi * henyey_greenstein(dr.dot(path.direction, emitter.in_water), _GUIDING_ASYMMETRY)
+            expected = dr.select(path.in_water, expected * (_DIFFUSE_RADIANCE + lobe), expected)
+        survival = dr.minimum(expected / max(self.options.roulette_threshold, 1e-30), 1)
         path.active &= rng.next_float32() < survival
         path.throughput = dr.select(path.active, path.throughput / survival, path.throughput)
 

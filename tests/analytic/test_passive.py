@@ -115,6 +115,25 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, l
     assert agrees(passes(scene, 12), 1 - lost / 2, 3, bias=lost / 2) < 3e-3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("layers", [{}, {"layer_tops": "0, 2", "refractive_index": "1.33, 1.36"}])
+def test_sampling_does_not_change_the_image(layers):
+    """Guided directions, roulette and kinds of connections change only the noise."""
+    water = {"attenuation": 0.4, "scattering": 0.25, "backscattering": 0.01}
+    if layers:
+        water = {name: f"{value}, {1.5 * value}" for name, value in water.items()} | layers
+    sea = {"wind_speed": 4.0, "cell_size": 0.25}
+    plain = {"guiding_probability": 0.1, "solid_guiding_probability": 0.0, "roulette_threshold": 0.0}
+    found = [
+        passes(build(sun={"zenith_deg": 40.0}, water=water, sea=sea, depth=4.0, integrator=options), 12)[:, 0]
+        for options in ({}, plain, {"connection": "emitter"})
+    ]
+    for other in found[1:]:
+        error = np.hypot(*(samples.std(ddof=1) / np.sqrt(len(samples)) for samples in (found[0], other)))
+        assert abs(other.mean() - found[0].mean()) < largest_z(12, 4) * error, (other.mean(), found[0].mean(), error)
+        assert error < 0.03 * found[0].mean()
+
+
 # (c) sun glint
 
 

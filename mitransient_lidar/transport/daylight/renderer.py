@@ -136,7 +136,11 @@ class DaylightRenderer:
         dr.scatter_add(record.sampled, mi.Float64(weight), pixel, weight > 0)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         light = DaylightLight(self.scene, record, u, pixel, weight)
-        options = self.options if self.scene.sun is not None else replace(self.options, connection="phase")
+        options = self.options
+        if self.scene.sun is None:
+            # Nothing to be guided to.
+            options = replace(options, connection="phase", expects_emitter=False, solid_guiding_probability=None)
+            options = replace(options, guiding_probability=0.0)
         record.rays = PathTracer(self.scene, options, light).trace(path, rng)
         record.found = dr.select(light.invalid, dr.nan, record.found)
         dr.eval(record.found, record.sampled, record.edge_loss, record.rays)

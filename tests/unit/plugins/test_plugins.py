@@ -182,6 +182,10 @@ REFUSED = [
     ({"type": "lidar_volpath", "connection": "best"}, "connection = 'best' must be one of"),
     ({"type": "lidar_volpath", "paths_per_pass": 3}, "paths_per_pass = 3 must lie between 1024"),
     ({"type": "lidar_volpath", "guiding_probability": 1.0}, "guiding_probability = 1 must lie between"),
+    (
+        {"type": "passive_volpath", "solid_guiding_probability": -0.1},
+        "solid_guiding_probability = -0.1 must lie between",
+    ),
     ({"type": "lidar_volpat"}, "lidar_volpat"),
 ]
 
