@@ -119,7 +119,7 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, l
 @pytest.mark.parametrize("layers", [{}, {"layer_tops": "0, 2", "refractive_index": "1.33, 1.36"}])
 def test_sampling_does_not_change_the_image(layers):
     """Guided directions, roulette and kinds of connections change only the noise."""
-    water = {"attenuation": 0.4, "scattering": 0.25, "backscattering": 0.01}
+    water = {"attenuation": 0.2, "scattering": 0.12, "backscattering": 0.006}
     if layers:
         water = {name: f"{value}, {1.5 * value}" for name, value in water.items()} | layers
     sea = {"wind_speed": 4.0, "cell_size": 0.25}
