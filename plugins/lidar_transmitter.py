@@ -101,7 +101,10 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     def intensity(self, direction: mi.Vector3f) -> mi.Float:
         """Return the radiant intensity [J/sr] in a unit direction of the world."""
-        angle_x, angle_y, cos_axis = self.pose.tangent(direction)
+        return self.intensity_at(*self.pose.tangent(direction))
+
+    def intensity_at(self, angle_x: mi.Float, angle_y: mi.Float, cos_axis: mi.Float) -> mi.Float:
+        """Return the radiant intensity [J/sr] at a tangent-plane point whose direction has a cosine with the axis."""
         # d(omega) = cos^3 d(angle_x) d(angle_y).
         density = self.tangent_density(angle_x, angle_y) / (cos_axis * cos_axis * cos_axis)
         return dr.select(cos_axis > 0, self.energy * density, 0)

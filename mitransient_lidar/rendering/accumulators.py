@@ -175,7 +175,8 @@ class GateAccumulator(PassAccumulator):
             from mitransient_lidar.transport.histogram import GateWeights
 
             response = scene.receiver.optics.response_time_ns
-            self.gate_weights = GateWeights(train, train.response_weights(scene.transmitter.pulse, response))
+            table = train.response_weights(scene.transmitter.pulse, response)
+            self.gate_weights = GateWeights(train, table, scene.reference_length)
 
     @property
     def received(self) -> float:

@@ -13,7 +13,6 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.results.geometry import LinesOfSight
-from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
@@ -70,13 +69,14 @@ class EchoProbe:
 def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     """Trace rays through the facets of the surface, without ripples and scattering."""
     start = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
-    laser = opaque_point(scene.transmitter.pose.origin)
-    ray = mi.Ray3f(opaque_point(scene.receiver.pose.origin), start.direction)
+    laser, receiver = (scene.relative(each.pose) for each in (scene.transmitter, scene.receiver))
+    ray = mi.Ray3f(scene.first_points(scene.receiver.pose, start.angles, start.direction)[0], start.direction)
     first = scene.ray_intersect(ray, start.weight > 0)
     at_sea = first.is_valid() & scene.is_surface(first.shape)
-    of_laser = start.direction if _at_one_place(scene) else dr.normalize(first.p - laser)
-    beam = start.weight * scene.transmitter.intensity(of_laser)
-    air = first.t + dr.norm(laser - first.p)
+    of_laser = scene.transmitter.pose.tangent(start.direction) if _at_one_place(scene) else laser.tangent(first.p)
+    beam = start.weight * scene.transmitter.intensity_at(*of_laser)
+    # Relative to the reference length, as all lengths here.
+    air = laser.distance(first.p) + receiver.distance(first.p)
 
     # Refract at the facet.
     down = -dr.normalize(refract(-start.direction, first.n, 1 / scene.refractive_index))
@@ -90,10 +90,13 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     surface, pixels = np.array(at_sea), scene.receiver.pixels.count
     count = pixels if pixels <= _MOST_PIXELS else 1
     pixel = pixel if count > 1 else np.zeros_like(pixel)
-    per_ns = 1e9 / C0
+
+    def time_ns(length: mi.Float) -> FloatArray:
+        return np.asarray((np.array(length, dtype=np.float64) + scene.reference_length) * 1e9 / C0)
+
     arrivals = (
-        _quantiles(np.array(air) * per_ns, weight * surface, pixel, count, (_TAIL, None)),
-        _quantiles(np.array(air + water) * per_ns, weight * np.array(solid), pixel, count, (None, 1 - _TAIL)),
+        _quantiles(time_ns(air), weight * surface, pixel, count, (_TAIL, None)),
+        _quantiles(time_ns(air + water), weight * np.array(solid), pixel, count, (None, 1 - _TAIL)),
     )
     outside = ~surface if scene.surfaces else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
@@ -101,7 +104,7 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     met = dr.select(solid, below.shape, first.shape)
     length = air + dr.select(solid, water, 0)
     of_solid = solid | (first.is_valid() & ~at_sea)
-    solids = _solid_echoes(scene, met, np.array(length) * per_ns, weight * np.array(of_solid))
+    solids = _solid_echoes(scene, met, time_ns(length), weight * np.array(of_solid))
     return EchoProbe(surface_ns, bottom_ns, missed, _pierced(scene, first, below, at_sea, solid), solids)
 
 

@@ -29,10 +29,11 @@ _COARSE_BITS, _FINE_BITS, _COARSEST_FINE = 57, 32, 2.0**8
 class GateWeights:
     """Weights of an arrival in the gates that are open during its pulse.
 
-    `table` holds the weight of an arrival in the first gate of `train`, from `GateTrain.response_weights`.
+    `table` holds the weight of an arrival in the first gate of `train`, from `GateTrain.response_weights`. Path lengths
+    are relative to `reference_length` [m].
     """
 
-    def __init__(self, train: GateTrain, table: ResponseTable) -> None:
+    def __init__(self, train: GateTrain, table: ResponseTable, reference_length: float = 0.0) -> None:
         self.count = train.count
         kept = np.flatnonzero(table.values > _SMALLEST_WEIGHT)
         first, last = max(int(kept[0]) - 1, 0), min(int(kept[-1]) + 2, table.values.size)
@@ -41,7 +42,7 @@ class GateWeights:
         values[0] = 0.0
         self._values = mi.Float(values)
         self._last = values.size - 2
-        self._start = opaque((table.start_ns + first * table.step_ns) * 1e-9 * C0)
+        self._start = opaque((table.start_ns + first * table.step_ns) * 1e-9 * C0 - reference_length)
         self._per_metre = opaque(1 / (table.step_ns * 1e-9 * C0))
         self._per_gate = opaque(train.step_ns / table.step_ns)
         self._pulses = float(train.pulses)
@@ -86,6 +87,8 @@ class TransientHistogram:
         Energy that the laser emits [J], the most that a bin receives.
     gates
         Gates that are summed instead of the time bins, or None.
+    reference_length
+        Length that is left out of path lengths [m], so that they are accurate in single precision.
 
     Raises
     ------
@@ -97,7 +100,12 @@ class TransientHistogram:
     BYTES_PER_BIN = 20
 
     def __init__(
-        self, axis: TimeAxis, shape: tuple[int, ...], emitted: float, gates: GateWeights | None = None
+        self,
+        axis: TimeAxis,
+        shape: tuple[int, ...],
+        emitted: float,
+        gates: GateWeights | None = None,
+        reference_length: float = 0.0,
     ) -> None:
         self.axis, self.gates = axis, gates
         #: Number of sums of a pixel: time bins, or gates.
@@ -109,7 +117,7 @@ class TransientHistogram:
         #: Shape of `energy`: pixels, then time bins or gates.
         self.shape = (*shape, self.record_length)
         self._count = pixels * self.record_length
-        self._start = opaque(axis.start_ns * 1e-9 * C0)
+        self._start = opaque(axis.start_ns * 1e-9 * C0 - reference_length)
         self._per_metre = opaque(1 / (axis.bin_width_ns * 1e-9 * C0))
         self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
         self.clear()
@@ -124,7 +132,7 @@ class TransientHistogram:
         dr.eval(self._sums, self._invalid)
 
     def add(self, pixel: mi.UInt32, path_length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
-        """Add energy [J] that arrives after an optical path of `path_length` metres (group index included)."""
+        """Add energy [J] that arrives after an optical path (group index included) of a relative length [m]."""
         if self.gates is not None:
             self.gates.add(path_length, energy, active, lambda k, e, on: self._add(pixel, k, e, on))
             return

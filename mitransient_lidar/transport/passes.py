@@ -44,7 +44,7 @@ class PassRecord:
         energy: mi.Float,
         active: mi.Bool,
     ) -> None:
-        """Add the energy [J] of paths of an optical length [m], an order of scattering and a number of reversals."""
+        """Add the energy [J] of paths by relative optical length [m], order of scattering and number of reversals."""
         self.histogram.add(self.classes.index(pixel, order, reversals), length, energy, active)
 
     def lose(self, energy: mi.Float, active: mi.Bool) -> None:
@@ -92,7 +92,9 @@ class PassRenderer(ABC):
         """
         pixels = self.scene.receiver.pixels
         shape = (pixels.count * self.classes.count,) if self.classes.separate else pixels.grid or (pixels.count,)
-        histogram = TransientHistogram(self.scene.axis, shape, self.scene.transmitter.energy, gates)
+        scene = self.scene
+        emitted = scene.transmitter.energy
+        histogram = TransientHistogram(scene.axis, shape, emitted, gates, scene.reference_length)
         record = PassRecord(histogram, self.classes)
         with dr.suspend_grad():
             self.trace(record, seed, self.paths if paths is None else paths)

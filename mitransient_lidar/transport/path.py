@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.scene import WaterScene
 
 
 @dataclass
@@ -21,8 +23,11 @@ class Path:
         Last vertex [m] (offset from surfaces against self-intersection) and unit direction of the next segment.
     in_water
         Whether the next segment lies in water.
+    at_start
+        Whether the next segment is the first one.
     length
-        Optical length so far [m]: distance times group index, summed over the segments.
+        Optical length so far [m]: distance times group index, summed over the segments, less the distance from the
+        start to the scene's reference point (`RelativePose`).
     throughput
         Product of the path's factors so far.
     scatterings
@@ -42,6 +47,7 @@ class Path:
     point: mi.Point3f
     direction: mi.Vector3f
     in_water: mi.Bool
+    at_start: mi.Bool
     length: mi.Float
     throughput: mi.Float
     scatterings: mi.UInt32
@@ -66,13 +72,18 @@ class Path:
         return mi.Ray3f(self.point, self.direction)
 
     @staticmethod
-    def initial(origin: mi.Point3f, direction: mi.Vector3f, throughput: mi.Float, active: mi.Bool) -> dict[str, Any]:
-        """Return the fields of paths that start in the air."""
+    def initial(
+        scene: WaterScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, active: mi.Bool
+    ) -> dict[str, Any]:
+        """Return the fields of paths that start in the air, from a pose at tangent-plane angles."""
+        direction = pose.direction(angles.x, angles.y)
+        point, length = scene.first_points(pose, angles, direction)
         return {
-            "point": origin,
+            "point": point,
             "direction": direction,
             "in_water": mi.Bool(False),
-            "length": mi.Float(0),
+            "at_start": mi.Bool(True),
+            "length": length,
             "throughput": throughput,
             "scatterings": mi.UInt32(0),
             "reversals": mi.UInt32(0),
@@ -93,3 +104,4 @@ def advance(path: Path, index_layers: IndexLayers | None, distance: mi.Float, po
     length = distance * dr.select(path.in_water, group, 1)
     path.length = dr.select(path.active, path.length + length, path.length)
     path.point = dr.select(path.active, point, path.point)
+    path.at_start &= ~path.active

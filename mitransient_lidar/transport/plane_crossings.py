@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -236,18 +236,19 @@ class CrossingTracer:
 
     def trace(self, seed: int, number: int) -> tuple[PlaneCrossings, float]:
         """Return the crossings of a pass, and the share of the energy that passes outside the surface mesh."""
-        scene, count = self._scene, self._photons
+        scene, pose, count = self._scene, self._scene.transmitter.pose, self._photons
         while True:
             rng = pass_streams(seed, number, count)
             segments = Crossings(scene.water, self._depths, int(self._segments * count), self._longest)
-            direction, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
+            angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
             sent = np.broadcast_to(np.array(energy, dtype=np.float64), count)
-            path = CrossingPath.of(RandomWalkPath.start(scene.transmitter.pose, direction, energy, mi.Float(0)))
+            path = CrossingPath.of(RandomWalkPath.start(scene, pose, angles, energy, mi.Float(0)))
             # Infinite length: no record ends the paths.
             walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, np.inf)
             end = walk.run(path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False)
             outside = sent[np.array(end.outside_surface)].sum()
             crossings, wanted = segments.finalize()
             if wanted <= segments.capacity:
-                return crossings, float(outside / scene.transmitter.energy)
+                absolute = crossings.length + scene.relative(pose).range
+                return replace(crossings, length=absolute), float(outside / scene.transmitter.energy)
             self._segments = _CAPACITY_MARGIN * wanted / count

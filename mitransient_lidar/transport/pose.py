@@ -12,6 +12,13 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import in_range
+from mitransient_lidar.transport.opaque import opaque, opaque_point
+
+#: Vertical component of an axis below which it is taken as level.
+_SMALLEST_DESCENT = 1e-3
+
+#: Smallest sum of two distances [m], against division by zero.
+_SMALLEST_DISTANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -106,8 +113,60 @@ class Pose:
         slope = min(float(self.axis[2]), -1e-6)
         return self.origin + self.axis * (-float(self.origin[2]) / slope)
 
+    def nearby_point(self) -> NDArray[np.float64]:
+        """Return the point in view to which lengths of paths are relative [m]: on the mean sea level, or the origin."""
+        down = self.origin[2] > 0 and self.axis[2] < -_SMALLEST_DESCENT
+        return self.ground_point() if down else self.origin
+
     def tangent_of_point(self, point: NDArray[np.float64]) -> tuple[float, float]:
         """Return (angle_x, angle_y) in radians of a point [m], shape (3,)."""
         offset = point - self.origin
         along = float(offset @ self.axis)
         return float(offset @ self.far) / along, float(offset @ self.left) / along
+
+
+class RelativePose:
+    """A pose relative to a reference point in the scene: accurate from orbit in single precision.
+
+    Distances are relative to that of the reference point r. With the pose's origin o and a point p,
+    |p - o| - |r - o| = (p - r) . (p - r + 2 (r - o)) / (|p - o| + |r - o|). Single precision has rounding errors of
+    3 cm in coordinates and distances of 500 km, but of less than 0.1 mm in such differences to points within 100 m.
+
+    Parameters
+    ----------
+    pose
+        Transmitter or receiver.
+    reference
+        Reference point [m], shape (3,).
+    """
+
+    def __init__(self, pose: Pose, reference: NDArray[np.float64]) -> None:
+        away = reference - pose.origin
+        #: Distance to the reference point [m], in double precision.
+        self.range = float(np.linalg.norm(away))
+        self._reference, self._away = opaque_point(reference), mi.Vector3f(opaque_point(away))
+        self._range = opaque(self.range)
+        sides = (pose.far, pose.left, pose.axis)
+        self._sides = [(mi.Vector3f(side.tolist()), opaque(float(side @ away))) for side in sides]
+
+    def distance(self, point: mi.Point3f) -> mi.Float:
+        """Return the relative distances to points [m], negative for those nearer than the reference point."""
+        offset = point - self._reference
+        total = dr.norm(offset + self._away) + self._range
+        return dr.dot(offset, offset + 2 * self._away) / dr.maximum(total, _SMALLEST_DISTANCE)
+
+    def tangent(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return (angle_x, angle_y) of points and the cosine of their directions with the axis; see `Pose.tangent`."""
+        offset = point - self._reference
+        x, y, along = (dr.dot(offset, side) + constant for side, constant in self._sides)
+        return x / along, y / along, along / dr.norm(offset + self._away)
+
+    def at_height(self, angles: mi.Point2f, direction: mi.Vector3f, z: float) -> mi.Point3f:
+        """Return where rays at tangent-plane angles, with a direction that goes down, meet a height [m].
+
+        The reference point must be on the axis.
+        """
+        (far, _), (left, _), _ = self._sides
+        # Through the plane normal to the axis, where coordinates are accurate.
+        place = self._reference + self._range * (angles.x * far + angles.y * left)
+        return place + direction * ((opaque(z) - place.z) / direction.z)

@@ -13,7 +13,7 @@ from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.path_step import PathStep, Vertex
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.scene import WaterScene
+from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.snell import refract_level
 
 
@@ -43,10 +43,12 @@ class RandomWalkPath(Path):
         return dr.select(self.outside_surface, -self.throughput, self.throughput)
 
     @classmethod
-    def start(cls, pose: Pose, direction: mi.Vector3f, throughput: mi.Float, offset: mi.Float) -> RandomWalkPath:
-        """Return paths that start at the laser or at the receiver, without those of throughput 0."""
-        active = (throughput > 0) & dr.full(mi.Bool, True, dr.width(direction))
-        state = Path.initial(opaque_point(pose.origin), direction, throughput, active)
+    def start(
+        cls, scene: LidarScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, offset: mi.Float
+    ) -> RandomWalkPath:
+        """Return paths from laser or receiver at tangent-plane angles, without those of throughput 0."""
+        active = (throughput > 0) & dr.full(mi.Bool, True, dr.width(angles))
+        state = Path.initial(scene, pose, angles, throughput, active)
         return cls(**state, mis_partial_sum=mi.Float(0), outside_surface=mi.Bool(False), offset=offset)
 
 
@@ -79,11 +81,11 @@ class RandomWalk:
         Optical path length at which the record ends [m]: paths that cannot arrive before end.
     """
 
-    def __init__(self, scene: WaterScene, mode: mi.TransportMode, destination: Pose, path_end: float) -> None:
+    def __init__(self, scene: LidarScene, mode: mi.TransportMode, destination: Pose, path_end: float) -> None:
         self.scene = scene
-        self._water, self._path_end = scene.water, path_end
+        self._water, self._path_end = scene.water, path_end - scene.reference_length
         self._step = PathStep(scene, scene.water.scattering_flight, mode)
-        self._destination = opaque_point(destination.origin)
+        self._destination, self._to_go = opaque_point(destination.origin), scene.relative(destination)
 
     def run(
         self,
@@ -104,7 +106,7 @@ class RandomWalk:
         step = self._step
 
         def body(path: RandomWalkPath, rng: mi.PCG32) -> tuple[RandomWalkPath, mi.PCG32]:
-            first, wet = path.length == 0, path.active & path.in_water
+            first, wet = mi.Bool(path.at_start), path.active & path.in_water
             vertex = step.next_vertex(path, rng)
             path.rays += dr.select(path.active, mi.UInt32(1), 0)
             self._end_outside(path, vertex, first)
@@ -122,7 +124,7 @@ class RandomWalk:
             step.cross_boundary(path, vertex.at_boundary & path.active)
             if not past_solids:
                 path.active &= path.before_first_solid
-            path.active &= path.length + dr.norm(self._destination - path.point) < self._path_end
+            path.active &= path.length + self._to_go.distance(path.point) < self._path_end
             return path, rng
 
         path, _ = dr.while_loop((path, rng), lambda path, rng: path.active, body, label="random walk")
@@ -140,7 +142,7 @@ class RandomWalk:
         # The remaining distance to the destination decreases at most by the segment's component towards it.
         away = self._destination - path.point
         distance = dr.norm(away)
-        spare = self._path_end - path.length - distance
+        spare = self._path_end - path.length - self._to_go.distance(path.point)
         return spare / (self._water.index_layers.group(path.index_layer) - dr.dot(away, path.direction) / distance)
 
     def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.path import Path
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.snell import refract
 
@@ -165,9 +164,9 @@ class ConnectedPath(Path):
     reflected_by_sea: mi.Bool
 
     @classmethod
-    def start(cls, pose: Pose, direction: mi.Vector3f, active: mi.Bool) -> ConnectedPath:
-        """Return paths that start at the receiver in given directions."""
-        state = Path.initial(opaque_point(pose.origin), direction, mi.Float(1), active)
+    def start(cls, scene: WaterScene, angles: mi.Point2f, active: mi.Bool) -> ConnectedPath:
+        """Return paths that start at the receiver at tangent-plane angles."""
+        state = Path.initial(scene, scene.receiver.pose, angles, mi.Float(1), active)
         return cls(**state, emitter_ratio=mi.Float(0), specular=mi.Bool(True), reflected_by_sea=mi.Bool(False))
 
 
@@ -227,17 +226,17 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
         Energy per area and solid angle [J/(m^2 sr)] along ``si.wi``: intensity, BSDF with its cosine, and inverse
         square of the distance; 0 where the line is blocked or meets the wet side of the sea surface.
     length
-        Length of the line [m].
+        Length of the line [m], relative to the distance of the scene's reference point.
     """
-    laser = opaque_point(scene.transmitter.pose.origin)
+    laser, relative = opaque_point(scene.transmitter.pose.origin), scene.relative(scene.transmitter.pose)
     offset = laser - si.p
     distance = dr.norm(offset)
     direction = offset / distance
     bsdf = _bsdf_towards_air(scene, si, direction, active)
-    radiance = bsdf * scene.transmitter.intensity(-direction) / dr.square(distance)
+    radiance = bsdf * scene.transmitter.intensity_at(*relative.tangent(si.p)) / dr.square(distance)
     active &= radiance > 0
     active &= ~scene.ray_test(si.spawn_ray_to(laser), active)
-    return dr.select(active, radiance, 0), distance
+    return dr.select(active, radiance, 0), relative.distance(si.p)
 
 
 def connect_sun(

@@ -91,7 +91,7 @@ class PathLight:
     def connect(
         self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        """Connect surface points to the emitter; return radiance along ``si.wi`` and length of the connection [m]."""
+        """Connect surface points to the emitter; return radiance along ``si.wi`` and relative length [m]."""
 
     @abstractmethod
     def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
@@ -121,6 +121,8 @@ class LaserLight(PathLight):
     def __init__(self, scene: LidarScene, record: PassRecord, pixel: mi.UInt32, weight: mi.Float) -> None:
         self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
         self.sampler: RefractedLaserSampler = RefractedLaserSampler(scene)
+        self._to_laser = scene.relative(scene.transmitter.pose)
+        self._path_end = scene.axis.path_end - scene.reference_length
 
     def connect(
         self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
@@ -143,7 +145,7 @@ class LaserLight(PathLight):
 
     def end_paths(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """End paths whose light would arrive after the record."""
-        path.active &= path.length + dr.norm(self.sampler.laser - path.point) < self.scene.axis.path_end
+        path.active &= path.length + self._to_laser.distance(path.point) < self._path_end
 
 
 def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Float:
@@ -181,7 +183,7 @@ class PathTracer:
 
     def _extend(self, path: ConnectedPath, rng: mi.PCG32) -> None:
         """Go to the next vertex, connect it to the emitter, and choose the next direction."""
-        first = path.length == 0
+        first = mi.Bool(path.at_start)
         vertex = self._step.next_vertex(path, rng)
         wet = path.active & path.in_water & dr.isfinite(vertex.reach)
         # Probability that the path's own sampling crosses the segment.
@@ -391,7 +393,7 @@ def trace_connected(
     """Trace paths from the receiver and connect them to the laser, into a record."""
     rng = pass_streams(seed, _STREAM, paths)
     start = sampler.sample(dr.arange(mi.UInt32, paths), paths, rng)
-    path = ConnectedPath.start(scene.receiver.pose, start.direction, start.weight > 0)
+    path = ConnectedPath.start(scene, start.angles, start.weight > 0)
     light = LaserLight(scene, record, start.pixel, start.weight)
     record.rays += PathTracer(scene, options, light).trace(path, rng)
 

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracles.echo_times import bottom_time_ns
+from scipy.stats import norm
 from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
@@ -100,6 +101,73 @@ def test_layer_seen_by_its_scattering_begins_at_its_slanted_depth(lidar_scene, p
     edges = start + BIN_NS * np.arange(65)
     assert energy[edges[1:] < edge - 0.1].sum() < 1e-4 * energy.sum()
     assert energy[(edges[:-1] > edge) & (edges[:-1] < edge + 1)].min() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
+@pytest.mark.parametrize("angle", [0.0, 20.0])
+def test_echoes_reach_orbit_when_geometry_says(lidar_scene, passes, angle, integrator):
+    """From 500 km, to 1 mm of range; single precision resolves 3 cm in such distances, and 6 cm of the path."""
+    altitude, pixel = 5e5, {"altitude": 5e5, "off_nadir_deg": angle}
+    surface = float(surface_time_ns(altitude, np.radians(angle)))
+    bottom = float(bottom_time_ns(altitude, 8.0, np.radians(angle), 1.34, 1.364))
+    width = 0.02
+    # A shallow layer of a strong absorber leaves the echo of the surface alone.
+    seas = [
+        (surface, {"slope_variance": "0.05"}, {"attenuation": 100.0}, None),
+        (bottom, {}, {"attenuation": 0.1, "group_index": 1.364}, 8.0),
+    ]
+    for expected, sea, water, depth in seas:
+        start = width * round((expected - 8) / width)
+        scene = lidar_scene(
+            integrator={"type": integrator, "paths_per_pass": 2**14},
+            tx={**pixel, "divergence_mrad": 0.001},
+            rx={**pixel, "field_of_view_mrad": 0.006, "layout": "1x1"},
+            film={"time_start_ns": start, "bin_width_ns": width, "bin_count": round(16 / width)},
+            sea=sea,
+            water={**water, "scattering": 0.0, "backscattering": 0.0},
+            bottom=depth,
+        )
+        energy = passes(scene, 8).sum(axis=1)
+        times = start + width * (np.arange(energy.shape[1]) + 0.5)
+        means = energy @ times / energy.sum(axis=1)
+        error = means.std(ddof=1) / np.sqrt(8)
+        millimetre = 2e6 / C0
+        assert abs(means.mean() - expected) < millimetre + largest_z(8) * error
+        assert error < 0.7 * millimetre
+        assert energy.sum() > 0
+
+
+@pytest.mark.slow
+def test_surface_echo_from_orbit_has_the_shape_of_the_beam(lidar_scene, passes):
+    """A Gaussian beam of 2.5 m on the sea at 20 degrees: the echo is the Gaussian of its ranges.
+
+    In single precision such lengths have steps of 6 cm, or 0.2 ns, the width of a bin here.
+    """
+    altitude, theta, spread = 5e5, np.radians(20.0), 5e-6
+    pose = {"altitude": altitude, "off_nadir_deg": 20.0}
+    centre, width = float(surface_time_ns(altitude, theta)), 0.2
+    deviation = centre * spread * np.tan(theta)
+    start = width * round((centre - 3 * deviation) / width)
+    bins = round(6 * deviation / width)
+    scene = lidar_scene(
+        integrator={"paths_per_pass": 2**16},
+        tx={**pose, "divergence_mrad": 2e3 * spread},
+        rx={**pose, "field_of_view_mrad": 20e3 * spread, "layout": "1x1"},
+        film={"time_start_ns": start, "bin_width_ns": width, "bin_count": bins},
+        sea={"slope_variance": "0.05"},
+        water={"attenuation": 100.0, "scattering": 0.0, "backscattering": 0.0},
+        bottom=None,
+    )
+    energy = passes(scene, 16).sum(axis=1)
+    edges = start + width * np.arange(bins + 1)
+    shape = np.diff(norm.cdf(edges, centre, deviation))
+    shares = energy / energy.sum(axis=1, keepdims=True)
+    error = shares.std(axis=0, ddof=1) / 4
+    strong = shape > 0.1 * shape.max()
+    z = (shares.mean(axis=0) - shape / shape.sum())[strong] / error[strong]
+    assert np.abs(z).max() < largest_z(16, z.size), z
+    assert np.all(error[strong] < 0.06 * shape[strong])
 
 
 def test_tilted_bottom_arrives_by_its_own_distance(lidar_scene, passes):

@@ -320,8 +320,7 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     count, found = 2**14 if ratio > 0.1 else 2**17, []
     for seed in range(8):
-        pose = renderer.scene.receiver.pose
-        path = ConnectedPath.start(pose, mi.Vector3f(0, 0, -1), dr.full(mi.Bool, True, count))
+        path = ConnectedPath.start(renderer.scene, mi.Point2f(0, 0), dr.full(mi.Bool, True, count))
         path.point, path.in_water = mi.Point3f(0, 0, -depth), mi.Bool(True)
         weight = dr.full(mi.Float, 1 / count, count)
         record = renderer.follow(path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)

@@ -173,14 +173,13 @@ def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
     sampler = BeamSampler(beam, receiver)
     assert sampler.use_view == (view_mrad == 2.0)
     index = dr.arange(mi.UInt32, COUNT)
-    direction, energy = sampler.sample(index, COUNT, pass_streams(1, 0, COUNT))
+    angles, energy = sampler.sample(index, COUNT, pass_streams(1, 0, COUNT))
     energy = np.array(energy, dtype=np.float64) * np.ones(COUNT)
     assert np.isfinite(energy).all()
     assert energy.sum() == pytest.approx(4.5e-3, rel=3e-3)
     # And they stand for it where it is: the part beyond angle_x = 0 is the beam's own.
-    angle_x, angle_y, _ = beam.pose.tangent(direction)
     far, left = tangent_samples(beam.profile)
-    for seen, own in ((np.array(angle_x) > 0, far > 0), (np.array(angle_y) > 1e-3, left > 1e-3)):
+    for seen, own in ((np.array(angles.x) > 0, far > 0), (np.array(angles.y) > 1e-3, left > 1e-3)):
         assert energy[seen].sum() / 4.5e-3 == pytest.approx(own.mean(), abs=5e-3)
 
 

@@ -125,7 +125,7 @@ class DaylightRenderer:
         with dr.suspend_grad():
             rng = pass_streams(seed, _STREAM, count)
             start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
-            path = ConnectedPath.start(self.scene.receiver.pose, start.direction, start.weight > 0)
+            path = ConnectedPath.start(self.scene, start.angles, start.weight > 0)
             return self.follow(path, rng, start.pixel, start.weight)
 
     def follow(self, path: ConnectedPath, rng: mi.PCG32, pixel: mi.UInt32, weight: mi.Float) -> DaylightRecord:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.transport.daylight.scene import DaylightScene
-from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.rng import pass_streams, stratified_point
 from mitransient_lidar.transport.sensor.pixels import PixelArray, parse_layout
 from mitransient_lidar.transport.sensor.receiver import Receiver, SensorSample, solid_angle_factor
@@ -38,7 +37,7 @@ class FovSampler:
         angle_x, angle_y = px - dx, py - dy
         pixel, here = pixels.pixel_at(px, py, rng.next_float32())
         weight = pixels.area / count * solid_angle_factor(px, py)
-        return SensorSample(self.receiver.pose.direction(angle_x, angle_y), pixel, dr.select(here > 0, weight, 0))
+        return SensorSample.at(self.receiver.pose, angle_x, angle_y, pixel, dr.select(here > 0, weight, 0))
 
 
 def pixel_solid_angles(pixels: PixelArray) -> NDArray[np.float64]:
@@ -66,7 +65,8 @@ def share_outside_surface(scene: DaylightScene, sampler: FovSampler) -> float:
     if not scene.surfaces:
         return 0.0
     seen = sampler.sample(dr.arange(mi.UInt32, _RAYS), _RAYS, pass_streams(0, 0, _RAYS))
-    ray = mi.Ray3f(opaque_point(scene.receiver.pose.origin), seen.direction)
+    points, _ = scene.first_points(scene.receiver.pose, seen.angles, seen.direction)
+    ray = mi.Ray3f(points, seen.direction)
     si = scene.ray_intersect(ray, seen.weight > 0)
     outside = ~si.is_valid() & (seen.direction.z < 0)
     outside |= si.is_valid() & scene.outside_surface(si.p.z, mi.Bool(False))

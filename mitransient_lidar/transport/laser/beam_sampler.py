@@ -37,12 +37,12 @@ class BeamSampler:
     def _inside(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Bool:
         return self.view.contains(angle_x - self.centre[0], angle_y - self.centre[1])
 
-    def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
-        """Return unit directions of photons number `index` of `count`, and the energy [J] that each represents."""
+    def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> tuple[mi.Point2f, mi.Float]:
+        """Return tangent-plane angles of photons number `index` of `count`, and the energy [J] that each represents."""
         transmitter = self.transmitter
         if not self.use_view:
             angle_x, angle_y = transmitter.sample_tangent(stratified_point(index, count, rng))
-            return transmitter.pose.direction(angle_x, angle_y), mi.Float(transmitter.energy / count)
+            return mi.Point2f(angle_x, angle_y), mi.Float(transmitter.energy / count)
         point = stratified_point(index >> 1, (count + 1) // 2, rng)
         angle_x, angle_y = transmitter.sample_tangent(point)
         vx, vy = self.view.sample(point)
@@ -53,4 +53,4 @@ class BeamSampler:
         mixture = 0.5 * (density + dr.select(self._inside(angle_x, angle_y), mi.Float(1 / self.view.area), 0))
         # A sample of the beam's rim may lie outside both by rounding.
         share = dr.select(density > 0, density / mixture, 0)
-        return transmitter.pose.direction(angle_x, angle_y), transmitter.energy / count * share
+        return mi.Point2f(angle_x, angle_y), transmitter.energy / count * share

@@ -186,9 +186,9 @@ class MergingRenderer(PassRenderer):
         rng = pass_streams(seed, _LIGHT_STREAM, count)
         segments = SegmentBuffer(scene.water, self.classes, layout.spacing, int(layout.light_segments * count))
         hits = PhotonBuffer(int(layout.hits * count), self.classes)
-        direction, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
+        angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
-        path = RandomWalkPath.start(scene.transmitter.pose, direction, energy, offset)
+        path = RandomWalkPath.start(scene, scene.transmitter.pose, angles, energy, offset)
         walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end)
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
@@ -221,7 +221,7 @@ class MergingRenderer(PassRenderer):
         start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
         segments = SegmentBuffer(scene.water, self.classes, layout.spacing, int(layout.sensor_segments * count))
         offset = opaque(layout.spacing) * rng.next_float32()
-        path = RandomWalkPath.start(scene.receiver.pose, start.direction, start.weight, offset)
+        path = RandomWalkPath.start(scene, scene.receiver.pose, start.angles, start.weight, offset)
         walk = RandomWalk(scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end)
 
         def connect(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:

@@ -111,15 +111,21 @@ class SensorSample:
 
     Attributes
     ----------
-    direction, pixel
-        Unit direction of the ray, and index of the pixel that sees it.
+    angles, direction, pixel
+        Tangent-plane angles and unit direction of the ray, and index of the pixel that sees it.
     weight
         Energy per radiance [J / (J m^-2 sr^-1)] divided by the number of paths; 0 outside all pixels.
     """
 
+    angles: mi.Point2f
     direction: mi.Vector3f
     pixel: mi.UInt32
     weight: mi.Float
+
+    @classmethod
+    def at(cls, pose: Pose, x: mi.Float, y: mi.Float, pixel: mi.UInt32, weight: mi.Float) -> SensorSample:
+        """Return samples at tangent-plane angles of a pose."""
+        return cls(mi.Point2f(x, y), pose.direction(x, y), pixel, weight)
 
 
 class SensorSampler:
@@ -177,5 +183,5 @@ class SensorSampler:
         # A point in several pixels is assigned to one of them at random: weight by their number.
         collection = pixels_here * (self.receiver.optics.collection / count)
         weight = collection * solid_angle_factor(angle_x, angle_y) / density
-        direction = self.receiver.pose.direction(angle_x, angle_y)
-        return SensorSample(direction, pixel, dr.select(pixels_here > 0, weight, 0))
+        weight = dr.select(pixels_here > 0, weight, 0)
+        return SensorSample.at(self.receiver.pose, angle_x, angle_y, pixel, weight)
