@@ -14,7 +14,7 @@ _PER_METRE = (0.0, 1000.0)
 
 #: Lowest and highest value of each parameter, in the unit of its name, else in m, m^2, 1/m or s.
 RANGES: dict[str, tuple[float, float]] = {
-    "altitude": (0.1, 1e6),
+    "altitude": (-1000.0, 1e6),  # of a lidar; negative under water
     **dict.fromkeys(("aim_x", "aim_y", "centre_x", "centre_y", "plume_x", "plume_y", "wake_x", "wake_y"), _PLACE),
     "pulse_energy_mj": (1e-9, 1e6),
     "pulse_fwhm_ns": (1e-4, 1e6),

@@ -75,14 +75,19 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
     at_sea = first.is_valid() & scene.is_surface(first.shape)
     of_laser = scene.transmitter.pose.tangent(start.direction) if _at_one_place(scene) else laser.tangent(first.p)
     beam = start.weight * scene.transmitter.intensity_at(*of_laser)
-    # Relative to the reference length, as all lengths here.
+    # Relative to the reference length, as all lengths here. Under water the first hit is the sea's or a solid's echo.
     air = laser.distance(first.p) + receiver.distance(first.p)
+    if scene.submerged:
+        places = [mi.Point3f(each.pose.origin.tolist()) for each in (scene.transmitter, scene.receiver)]
+        air += (scene.group_index - 1) * (dr.norm(first.p - places[0]) + dr.norm(first.p - places[1]))
 
     # Refract at the facet.
     down = -dr.normalize(refract(-start.direction, first.n, 1 / scene.refractive_index))
     below = scene.ray_intersect(first.spawn_ray(down), at_sea)
     solid = at_sea & below.is_valid() & ~scene.is_surface(below.shape)
     water = 2 * below.t * scene.group_index
+    if scene.submerged:
+        below, solid, water = first, first.is_valid() & ~at_sea, mi.Float(0)
     # At once: each array that is read alone would trace all rays again.
     dr.eval(start, beam, first, below, at_sea, solid, air, water)
 
@@ -98,7 +103,7 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
         _quantiles(time_ns(air), weight * surface, pixel, count, (_TAIL, None)),
         _quantiles(time_ns(air + water), weight * np.array(solid), pixel, count, (None, 1 - _TAIL)),
     )
-    outside = ~surface if scene.surfaces else np.zeros_like(surface)
+    outside = ~surface if scene.surfaces and not scene.submerged else np.zeros_like(surface)
     missed = float(weight[outside].sum() / weight.sum()) if weight.sum() > 0 else 1.0
     surface_ns, bottom_ns = (np.broadcast_to(times, (pixels, 2)) for times in arrivals)
     met = dr.select(solid, below.shape, first.shape)
@@ -170,22 +175,36 @@ def _quantiles(
 def lines_of_sight(scene: LidarScene) -> LinesOfSight:
     """Return the lines of sight of the pixels over a level sea at z = 0, weighted with the beam.
 
+    Under water they are straight, and ``surface_time`` is where depths on their scale are 0, before the pulse is
+    emitted if the lidar looks down.
+
     Each pixel uses the better sampled one of two sets of points, those of the beam that are in the pixel, and points in
     the pixel with the beam's density. A pixel without either has the line of sight of its centre and no share.
     """
     pixels = scene.receiver.pixels
-    lowest = min(float(pose.origin[2]) for pose in (scene.receiver.pose, scene.transmitter.pose))
-    depth = min(_RELATIVE_DEPTH * lowest, _DEEPEST)
-    surface, below = (_mean_sight(scene, at) for at in (0.0, depth))
+    depths = _depths_of_scale(scene)
+    surface, below = (_mean_sight(scene, at) for at in depths)
     centres = pixels.centres()
     lit = (surface.share > 0) & (below.share > 0)
     x, y = (np.where(lit, seen, centre) for seen, centre in zip(surface.angles.T, centres.T, strict=True))
     time, deep = (
-        np.where(lit, sight.time, _by_receiver(scene, centres, at)[0]) for sight, at in ((surface, 0.0), (below, depth))
+        np.where(lit, sight.time, _by_receiver(scene, centres, at)[0])
+        for sight, at in zip((surface, below), depths, strict=True)
     )
     off_nadir = np.arccos(np.clip(-_directions(scene.receiver.pose, np.stack([x, y], axis=1))[:, 2], -1, 1))
     spread, share = (np.where(lit, values, 0.0) for values in (surface.spread, surface.share))
-    return LinesOfSight(x, y, off_nadir, time, spread, depth / (deep - time), share)
+    depth_per_ns = (depths[1] - depths[0]) / (deep - time)
+    return LinesOfSight(x, y, off_nadir, time - depths[0] / depth_per_ns, spread, depth_per_ns, share)
+
+
+def _depths_of_scale(scene: LidarScene) -> tuple[float, float]:
+    """Return two depths between which the scale of depth is taken [m]; under water ahead of both poses."""
+    heights = [float(pose.origin[2]) for pose in (scene.receiver.pose, scene.transmitter.pose)]
+    if not scene.submerged:
+        return 0.0, min(_RELATIVE_DEPTH * min(heights), _DEEPEST)
+    if scene.receiver.pose.axis[2] > 0:
+        return -0.5 * max(heights), 0.0
+    return _DEEPEST - min(heights), 2 * _DEEPEST - min(heights)
 
 
 @dataclass(frozen=True)
@@ -279,6 +298,12 @@ def _two_way(
     """
     n, group = scene.refractive_index, scene.group_index
     direction = _directions(start, angles)
+    if scene.submerged:
+        distance = (-depth - start.origin[2]) / np.where(direction[:, 2] != 0, direction[:, 2], np.nan)
+        distance = np.where(distance > 0, distance, np.nan)
+        offset = start.origin + direction * distance[:, np.newaxis] - end.origin
+        way_back = np.linalg.norm(offset, axis=1)
+        return 1e9 / C0 * group * (distance + way_back), _tangent(end, offset)
     down = np.where(direction[:, 2] < 0, -direction[:, 2], np.nan)
     sine = np.hypot(direction[:, 0], direction[:, 1])
     cosine = np.sqrt(1 - (sine / n) ** 2)

@@ -33,6 +33,9 @@ _REACH_PER_DEPTH = 0.3
 #: Distance of the axes that is told, over the radii of beam and view, whichever is larger.
 _APART_PER_BEAM, _APART_PER_VIEW = 0.5, 0.15
 
+#: Smallest range of records of a lidar under water [m].
+_NEAREST_RANGE = 0.05
+
 #: Heights at which the distance of the axes is compared.
 _HEIGHTS = 64
 
@@ -104,6 +107,9 @@ def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> 
         nothing in view reflects or scatters light, the record holds no echo, a bottom rises above the sea, or a target
         lies below the bottom.
     """
+    if scene.submerged:
+        _check_under_water(scene, probe)
+        return
     view, beam = _Rays.of_view(scene, sampler), _Rays.of_beam(scene)
     _check_rays(view, "no pixel sees the sea or a solid: the receiver")
     _check_rays(beam, "the beam misses the sea and every solid: the laser")
@@ -114,6 +120,20 @@ def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> 
     _warn_of_axes(scene, view, beam)
     for solid in scene.solids:
         _warn_of_place(solid, view, beam)
+    for echo in probe.solids:
+        _warn_of_time(scene, probe, echo)
+
+
+def _check_under_water(scene: LidarScene, probe: EchoProbe) -> None:
+    """Check the record of a lidar under water: it must not include the laser itself, and should hold every echo."""
+    axis = scene.axis
+    apart = float(np.linalg.norm(scene.transmitter.pose.origin - scene.receiver.pose.origin))
+    first_ns = 2e9 * scene.group_index * _NEAREST_RANGE / C0
+    if apart < _NEAREST_RANGE and axis.start_ns < first_ns:
+        raise UserError(
+            f"time_start_ns = {axis.start_ns:g} must be at least {first_ns:.2g} under water, {_NEAREST_RANGE:g} m from "
+            "the lidar: at one place, laser and receiver return without limit from less and less range"
+        )
     for echo in probe.solids:
         _warn_of_time(scene, probe, echo)
 

@@ -75,13 +75,13 @@ class Path:
     def initial(
         scene: WaterScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, active: mi.Bool
     ) -> dict[str, Any]:
-        """Return the fields of paths that start in the air, from a pose at tangent-plane angles."""
+        """Return the fields of paths that start from a pose at tangent-plane angles."""
         direction = pose.direction(angles.x, angles.y)
         point, length = scene.first_points(pose, angles, direction)
         return {
             "point": point,
             "direction": direction,
-            "in_water": mi.Bool(False),
+            "in_water": mi.Bool(pose.submerged),
             "at_start": mi.Bool(True),
             "length": length,
             "throughput": throughput,

@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import ranged
+from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque, opaque_point
+
+#: Smallest distance of a pose from the mean sea level [m].
+_NEAREST = 0.1
+
+#: Distance from a pose under water at which its axis stands for its beam or view [m].
+_UNDER_WATER_RANGE = 10.0
 
 #: Vertical component of an axis below which it is taken as level.
 _SMALLEST_DESCENT = 1e-3
@@ -44,23 +50,29 @@ class Pose:
 
     @classmethod
     def from_angles(cls, altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0) -> Pose:
-        """Return the pose whose axis lies in the x-z plane and points to +x and down.
+        """Return the pose whose axis lies in the x-z plane and points to +x, and down or, under water, up.
 
         Parameters
         ----------
         altitude
-            Height above the mean sea level [m], 0.1 to 1e6.
+            Height above the mean sea level [m], 0.1 to 1e6, or -1000 to -0.1 under water.
         off_nadir_deg
-            Angle of the axis from the vertical [deg], 0 to 89.9.
+            Angle of the axis from the downward vertical [deg], 0 to 89.9, or 0 to 180 under water.
         aim_x, aim_y
-            Point where the axis meets the mean sea level [m], -1e6 to 1e6.
+            Point where the axis meets the mean sea level [m], -1e6 to 1e6; under water the point above the pose.
 
         Values out of range raise UserError.
         """
         altitude = ranged("altitude", altitude)
-        angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9))
+        if abs(altitude) < _NEAREST:
+            raise UserError(
+                f"altitude = {altitude:g} must lie between {_NEAREST:g} and {RANGES['altitude'][1]:g}, or "
+                f"{RANGES['altitude'][0]:g} and {-_NEAREST:g} under water"
+            )
+        angle = np.deg2rad(in_range("off_nadir_deg", off_nadir_deg, 0.0, 89.9 if altitude > 0 else 180.0))
         sin, cos = np.sin(angle), np.cos(angle)
-        origin = np.array([ranged("aim_x", aim_x) - altitude * sin / cos, ranged("aim_y", aim_y), altitude])
+        back = altitude * sin / cos if altitude > 0 else 0.0
+        origin = np.array([ranged("aim_x", aim_x) - back, ranged("aim_y", aim_y), altitude])
         return cls(origin, np.array([sin, 0.0, -cos]), np.array([cos, 0.0, sin]), np.array([0.0, 1.0, 0.0]))
 
     @classmethod
@@ -108,8 +120,18 @@ class Pose:
         """Angle of the axis from the vertical [deg]."""
         return float(np.degrees(np.arccos(np.clip(-self.axis[2], -1, 1))))
 
+    @property
+    def submerged(self) -> bool:
+        """Whether the pose is under water."""
+        return float(self.origin[2]) < 0
+
     def ground_point(self) -> NDArray[np.float64]:
-        """Return where the axis meets the mean sea level z = 0 [m]; a distant point if it does not point down."""
+        """Return where the axis meets the mean sea level z = 0 [m]; a distant point if it does not point down.
+
+        For a pose under water it is the point 10 m ahead.
+        """
+        if self.submerged:
+            return self.origin + _UNDER_WATER_RANGE * self.axis
         slope = min(float(self.axis[2]), -1e-6)
         return self.origin + self.axis * (-float(self.origin[2]) / slope)
 

@@ -16,6 +16,9 @@ from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.snell import refract_level
 
+#: Smallest distance to the destination [m], against division by zero where paths start there.
+_SMALLEST_DISTANCE = 1e-9
+
 
 @dataclass
 class RandomWalkPath(Path):
@@ -101,7 +104,8 @@ class RandomWalk:
         """Walk until all paths have ended.
 
         Segments are stored with the label of their path. `on_solid` is called where a path meets a solid under water,
-        `on_first_hit` where its first segment ends. `past_solids` is whether paths continue beyond the first solid.
+        `on_first_hit` where its first segment ends on the sea or on a solid in the air. `past_solids` is whether paths
+        continue beyond the first solid.
         """
         step = self._step
 
@@ -117,7 +121,7 @@ class RandomWalk:
             path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
             step.arrive(path, vertex)
             if on_first_hit is not None:
-                on_first_hit(path, vertex.si, first & path.active & ~vertex.outside)
+                on_first_hit(path, vertex.si, first & (vertex.at_sea | (vertex.on_solid & ~wet)))
             on_solid(path, vertex.si, vertex.on_solid & wet)
             self._redirect(path, rng, vertex)
             self._enter_outside(path, vertex.outside)
@@ -132,7 +136,7 @@ class RandomWalk:
 
     def _end_outside(self, path: RandomWalkPath, vertex: Vertex, first: mi.Bool) -> None:
         """End the first segment of paths that miss the surface mesh at the mean sea level."""
-        outside = path.active & first & (path.downward > 0)
+        outside = path.active & first & ~path.in_water & (path.downward > 0)
         outside &= ~vertex.si.is_valid() | self.scene.outside_surface(vertex.si.p.z, mi.Bool(False))
         vertex.outside = outside
         vertex.length = dr.select(outside, -path.depth / path.downward, vertex.length)
@@ -141,7 +145,7 @@ class RandomWalk:
         """Return the length of the next segment in water beyond which its light arrives after the record [m]."""
         # The remaining distance to the destination decreases at most by the segment's component towards it.
         away = self._destination - path.point
-        distance = dr.norm(away)
+        distance = dr.maximum(dr.norm(away), _SMALLEST_DISTANCE)
         spare = self._path_end - path.length - self._to_go.distance(path.point)
         return spare / (self._water.index_layers.group(path.index_layer) - dr.dot(away, path.direction) / distance)
 

@@ -131,6 +131,23 @@ class RefractedLaserSampler(RefractedEmitterSampler):
         return self._level_direction(dr.normalize(self.laser - crossing))
 
 
+class SubmergedLaserSampler(RefractedEmitterSampler):
+    """Directions towards a laser under water, which straight lines reach: none is sampled through the surface."""
+
+    def __init__(self, scene: LidarScene) -> None:
+        super().__init__(scene)
+        self._laser = opaque_point(scene.transmitter.pose.origin)
+
+    def direction_from(self, point: mi.Point3f) -> EmitterDirection:
+        """Return the laser's direction from points under water."""
+        direction = dr.normalize(self._laser - point)
+        return EmitterDirection(direction, direction)
+
+    def pdf_in_layer(self, emitter: EmitterDirection, direction: mi.Vector3f, layer: mi.UInt32) -> mi.Float:
+        """Return the density 0."""
+        return mi.Float(0)
+
+
 class RefractedSunSampler(RefractedEmitterSampler):
     """Directions towards an emitter at infinity, in a unit direction from the surface, for all paths or one a path."""
 
@@ -217,26 +234,71 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
     return traced
 
 
+@dataclass
+class StraightConnection:
+    """Straight lines from points to the laser, in the medium of the laser; whether they are blocked is not known.
+
+    Attributes
+    ----------
+    direction
+        Unit direction to the laser.
+    irradiance
+        Energy per area normal to the line [J/m^2].
+    distance, length
+        Distance [m], and relative optical length [m].
+    """
+
+    direction: mi.Vector3f
+    irradiance: mi.Float
+    distance: mi.Float
+    length: mi.Float
+
+    @classmethod
+    def to_laser(cls, scene: LidarScene, point: mi.Point3f) -> StraightConnection:
+        """Return the connections of points."""
+        relative = scene.relative(scene.transmitter.pose)
+        offset = opaque_point(scene.transmitter.pose.origin) - point
+        distance = dr.norm(offset)
+        direction = offset / distance
+        irradiance = scene.transmitter.intensity_at(*relative.tangent(point)) / dr.square(distance)
+        length = relative.distance(point)
+        if scene.submerged:
+            irradiance *= dr.exp(-scene.water.optical_depth(point, direction, distance))
+            length += (scene.group_index - 1) * distance
+        return cls(direction, irradiance, distance, length)
+
+
+def connect_event_to_laser(
+    scene: LidarScene, point: mi.Point3f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    """Connect scattering events to a laser under water.
+
+    Return unit direction, energy per area normal to it [J/m^2], 0 where the line is blocked, and relative length [m].
+    """
+    line = StraightConnection.to_laser(scene, point)
+    ray = mi.Ray3f(point, line.direction)
+    ray.maxt = line.distance
+    lit = active & (line.irradiance > 0)
+    lit &= ~scene.ray_test(ray, lit)
+    return line.direction, dr.select(lit, line.irradiance, 0), line.length
+
+
 def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Connect surface points to the laser by straight lines in the air.
+    """Connect surface points to the laser by straight lines in the air, or in the water of a laser under water.
 
     Returns
     -------
     radiance
         Energy per area and solid angle [J/(m^2 sr)] along ``si.wi``: intensity, BSDF with its cosine, and inverse
-        square of the distance; 0 where the line is blocked or meets the wet side of the sea surface.
+        square of the distance; 0 where the line is blocked or meets the other side of the sea surface.
     length
         Length of the line [m], relative to the distance of the scene's reference point.
     """
-    laser, relative = opaque_point(scene.transmitter.pose.origin), scene.relative(scene.transmitter.pose)
-    offset = laser - si.p
-    distance = dr.norm(offset)
-    direction = offset / distance
-    bsdf = _bsdf_towards_air(scene, si, direction, active)
-    radiance = bsdf * scene.transmitter.intensity_at(*relative.tangent(si.p)) / dr.square(distance)
+    line = StraightConnection.to_laser(scene, si.p)
+    radiance = _bsdf_towards(scene, si, line.direction, active, wet=scene.submerged) * line.irradiance
     active &= radiance > 0
-    active &= ~scene.ray_test(si.spawn_ray_to(laser), active)
-    return dr.select(active, radiance, 0), relative.distance(si.p)
+    active &= ~scene.ray_test(si.spawn_ray_to(opaque_point(scene.transmitter.pose.origin)), active)
+    return dr.select(active, radiance, 0), line.length
 
 
 def connect_sun(
@@ -246,15 +308,16 @@ def connect_sun(
 
     Return the radiance along ``si.wi`` [irradiance / sr], for the irradiance on a plane normal to the emitter's rays.
     """
-    radiance = irradiance * _bsdf_towards_air(scene, si, direction, active)
+    radiance = irradiance * _bsdf_towards(scene, si, direction, active)
     lit = active & (radiance > 0)
     lit &= ~scene.ray_test(si.spawn_ray(direction), lit)
     return dr.select(lit, radiance, 0)
 
 
-def _bsdf_towards_air(
-    scene: WaterScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool
+def _bsdf_towards(
+    scene: WaterScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool, *, wet: bool = False
 ) -> mi.Float:
-    """Return BSDF times cosine [1/sr] for a direction in the air; 0 on the surface's wet side."""
-    active = active & ~(scene.is_surface(si.shape) & (dr.dot(direction, si.n) <= 0))
+    """Return BSDF times cosine [1/sr] for a direction in the air, or in the water; 0 on the sea's other side."""
+    cosine = dr.dot(direction, si.n)
+    active = active & ~(scene.is_surface(si.shape) & ((cosine >= 0) if wet else (cosine <= 0)))
     return dr.select(active, si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)[0], 0)

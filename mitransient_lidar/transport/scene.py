@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -26,6 +26,9 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
+
+#: Vertical component of an axis under water above which it looks up.
+_SMALLEST_RISE = 0.1
 
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
@@ -172,6 +175,11 @@ class LidarScene(WaterScene):
     gates: GatePlan | None
 
     @property
+    def submerged(self) -> bool:
+        """Whether laser and receiver are under water."""
+        return bool(self.transmitter.pose.submerged)
+
+    @property
     def reference_length(self) -> float:
         """Length from laser to receiver by the reference point [m], which all lengths of paths leave out."""
         return sum(self.relative(each.pose).range for each in (self.transmitter, self.receiver))
@@ -198,13 +206,15 @@ class LidarScene(WaterScene):
                 "allowed is exactly one lidar_transmitter, besides sun and sky"
             )
         water, surfaces, variance = find_water(scene)
-        if receiver.pose.origin[2] <= 0 or transmitters[0].pose.origin[2] <= 0:
-            raise UserError("altitude: transmitter and receiver must be above the mean sea level z = 0")
-        _check_cells(surfaces, transmitters[0])
+        parts = WaterScene(scene, receiver, water, surfaces, variance)
+        submerged = _check_place(parts, transmitters[0])
+        if not submerged:
+            _check_cells(surfaces, transmitters[0])
         if film.axis is None:
             # The record is that of the sensor, whatever replaces its receiver.
-            parts = WaterScene(scene, find_receiver(sensor), water, surfaces, variance)
-            film.fit(*fitted_record(parts, transmitters[0], film))
+            own = replace(parts, receiver=find_receiver(sensor))
+            fit = submerged_record if submerged else fitted_record
+            film.fit(*fit(own, transmitters[0], film))
         return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
 
 
@@ -313,23 +323,40 @@ def fit_seas(scene: mi.Scene) -> None:
     """
     instruments = []
     for emitter in scene.emitters():
-        if hasattr(emitter, "pulse_energy") and emitter.pose.origin[2] > 0:
+        if hasattr(emitter, "pulse_energy") and (place := _seen_sea(emitter.pose)):
             spreads = emitter.angular_spread, emitter.widest_angular_spread
-            instruments.append(Instrument.laser(*_above_sea(emitter.pose), spreads))
+            instruments.append(Instrument.laser(*place, spreads))
+        elif hasattr(emitter, "pulse_energy"):
+            instruments.append(_without_sea(emitter.pose))
     for sensor in scene.sensors():
         receiver = getattr(sensor, "receiver", None)
-        if isinstance(receiver, Receiver) and receiver.pose.origin[2] > 0:
+        if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
             pixels = receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
-            instruments.append(Instrument.receiver(*_above_sea(receiver.pose), pixels.field_of_view, side))
+            instruments.append(Instrument.receiver(*place, pixels.field_of_view, side))
     if any([shape.fit(instruments) for shape in scene.shapes() if hasattr(shape, "ripple_variance")]):
         scene.parameters_changed([])
 
 
-def _above_sea(pose: Pose) -> tuple[tuple[float, float], float, float]:
-    """Return where the axis meets the mean sea level [m], the altitude [m], and the off-nadir angle [rad]."""
-    spot = pose.ground_point()
-    return (float(spot[0]), float(spot[1])), float(pose.origin[2]), np.deg2rad(min(pose.off_nadir_deg, 89.9))
+def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
+    """Return where the axis meets the mean sea level [m], the height above or below it [m], and its slope [rad].
+
+    The slope is the angle from the vertical. None for a pose under water that does not look up.
+    """
+    height, off_vertical = abs(float(pose.origin[2])), pose.off_nadir_deg
+    if not pose.submerged:
+        spot = pose.ground_point()
+    elif pose.axis[2] > _SMALLEST_RISE:
+        spot, off_vertical = pose.origin + pose.axis * (height / float(pose.axis[2])), 180.0 - off_vertical
+    else:
+        return None
+    return (float(spot[0]), float(spot[1])), height, float(np.deg2rad(min(off_vertical, 89.9)))
+
+
+def _without_sea(pose: Pose) -> Instrument:
+    """Return an instrument that needs no waves: those above it when it looks down under water."""
+    place = float(pose.origin[0]), float(pose.origin[1])
+    return Instrument(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
 
 
 def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape], float]:
@@ -369,6 +396,33 @@ def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape], float]:
 def _solids(scene: mi.Scene, surfaces: list[mi.Shape]) -> list[mi.Shape]:
     """Return the shapes that are not among the surfaces of the water."""
     return [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
+
+
+def _check_place(scene: WaterScene, transmitter: Any) -> bool:
+    """Return whether laser and receiver are under water.
+
+    Refuse both on the sea level, on different sides of the sea, or in layers of different indices.
+    """
+    heights = [float(each.pose.origin[2]) for each in (transmitter, scene.receiver)]
+    if min(heights) > 0:
+        return False
+    if max(heights) >= 0 or scene.water is None:
+        raise UserError(
+            f"altitude: transmitter and receiver at z = {heights[0]:g} m and {heights[1]:g} m must both be above the "
+            "mean sea level z = 0, or both under water"
+        )
+    if scene.index_layers is not None and scene.index_layers.count > 1:
+        raise UserError("refractive_index changes with depth: a lidar under water needs one index")
+    trough = min(float(surface.bbox().min.z) for surface in scene.surfaces)
+    for each in (transmitter, scene.receiver):
+        origin = opaque_point(each.pose.origin)
+        above = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, 1)))
+        if each.pose.origin[2] > trough and not (above.is_valid() & scene.is_surface(above.shape))[0]:
+            raise UserError(
+                f"altitude = {each.pose.origin[2]:g} must be below the surface of the waves, whose lowest trough is at "
+                f"{trough:.3g} m"
+            )
+    return True
 
 
 def _check_cells(surfaces: list[mi.Shape], transmitter: Any) -> None:

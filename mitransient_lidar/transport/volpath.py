@@ -13,7 +13,7 @@ import numpy as np
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
-from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.opaque import opaque, opaque_point
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.path_step import PathStep, ScatteringEvent, Vertex
@@ -22,6 +22,8 @@ from mitransient_lidar.transport.refracted_connection import (
     EmitterDirection,
     RefractedEmitterSampler,
     RefractedLaserSampler,
+    SubmergedLaserSampler,
+    connect_event_to_laser,
     connect_laser,
     trace_to_top_layer,
 )
@@ -87,11 +89,18 @@ class PathLight:
     pixel: mi.UInt32
     weight: mi.Float
 
+    #: Whether the emitter is under water, where straight lines reach it.
+    submerged = False
+
     @abstractmethod
     def connect(
         self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Connect surface points to the emitter; return radiance along ``si.wi`` and relative length [m]."""
+
+    def connect_event(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+        """Connect scattering events to an emitter under water: see `connect_event_to_laser`."""
+        raise NotImplementedError
 
     @abstractmethod
     def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
@@ -120,7 +129,8 @@ class LaserLight(PathLight):
 
     def __init__(self, scene: LidarScene, record: PassRecord, pixel: mi.UInt32, weight: mi.Float) -> None:
         self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
-        self.sampler: RefractedLaserSampler = RefractedLaserSampler(scene)
+        self.submerged = scene.submerged
+        self.sampler = SubmergedLaserSampler(scene) if scene.submerged else RefractedLaserSampler(scene)
         self._to_laser = scene.relative(scene.transmitter.pose)
         self._path_end = scene.axis.path_end - scene.reference_length
 
@@ -130,10 +140,15 @@ class LaserLight(PathLight):
         """Connect surface points to the laser."""
         return connect_laser(self.scene, si, active)
 
+    def connect_event(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+        """Connect scattering events to a laser under water."""
+        return connect_event_to_laser(self.scene, point, active)
+
     def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy to the histogram."""
-        # The connection goes up: from a vertex that was reached downwards it is one more reversal.
-        reversals = path.reversals + dr.select(path.downward > 0, mi.UInt32(1), 0)
+        # The connection to a laser above goes up: from a vertex that was reached downwards it is one more reversal.
+        upward = opaque(self.scene.transmitter.pose.origin[2]) - path.point.z
+        reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
         self.record.receive(self.pixel, path.scatterings, reversals, length, energy, active)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
@@ -201,7 +216,10 @@ class PathTracer:
         if self.scene.water is not None and self._absorption is None:
             path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
         emitter = self.light.sampler.direction_from(path.point)
-        self._connect(path, rng, vertex, event, emitter, transmittance, first)
+        if self.light.submerged:
+            self._connect_straight(path, vertex, event, emitter, first)
+        else:
+            self._connect(path, rng, vertex, event, emitter, transmittance, first)
         self._redirect(path, rng, vertex, event, emitter)
         path.emitter_ratio = dr.select(vertex.at_boundary, path.emitter_ratio / transmittance, path.emitter_ratio)
         self._step.cross_boundary(path, vertex.at_boundary & path.active)
@@ -258,6 +276,22 @@ class PathTracer:
         # For the loss, the density of the sampled direction replaces that of the surface's BSDF.
         share = light.weight * path.throughput * connected * density
         light.lose(emitter, dr.select(lost, share, 0), top.ray(distance))
+
+    def _connect_straight(
+        self, path: ConnectedPath, vertex: Vertex, event: ScatteringEvent, emitter: EmitterDirection, first: mi.Bool
+    ) -> None:
+        """Connect scattering events and surfaces to an emitter under water by straight lines."""
+        light = self.light
+        direction, irradiance, event_length = light.connect_event(path.point, vertex.scattered)
+        value, _ = self._evaluate(emitter, vertex, event, vertex.scattered, direction)
+        radiance, length = light.connect(vertex.si, emitter, vertex.on_surface)
+        radiance = dr.select(vertex.scattered, value * irradiance, radiance)
+        length = dr.select(vertex.scattered, event_length, length)
+        energy = light.weight * path.throughput * radiance
+        if self.options.complement_only:
+            energy = dr.select(self._merged(path, vertex, first), 0, energy)
+        path.rays += dr.select(path.active, mi.UInt32(2), 0)
+        light.receive(path, path.length + length, energy, radiance > 0)
 
     @staticmethod
     def _submerged(vertex: Vertex) -> mi.Bool:

@@ -177,6 +177,25 @@ CASES = {
         "rx": {"to_world": mi.ScalarTransform4f().look_at([-40.0, 30.0, 200], [0, 0, 0], [0, 0, 1])},
         "film": {"time_start_ns": 1370.0},
     },
+    "50 m aside over waves": {
+        "rx": {"to_world": mi.ScalarTransform4f().look_at([-40.0, 50.0, 190.0], [0, 0, 0], [0, 0, 1])},
+        **{"sea": WAVES, "film": {"time_start_ns": 1370.0}},
+    },
+    "1 m aside over waves": {
+        "tx": {"altitude": 20.0, "off_nadir_deg": 15.0},
+        "rx": {"altitude": 20.0, "off_nadir_deg": 15.0, "aim_y": 1.0, "field_of_view_mrad": 120.0},
+        **{"sea": WAVES, "film": {"time_start_ns": 120.0, "bin_width_ns": 4.0, "bin_count": 40}},
+    },
+    "receiver straight down over waves": {
+        "rx": {"altitude": 180.0, "off_nadir_deg": 0.0, "field_of_view_mrad": 40.0},
+        **{"sea": WAVES, "film": {"time_start_ns": 1290.0}},
+    },
+    "axis 8 mrad aside over waves": {"rx": {"off_nadir_deg": 20.5, "aim_x": 1.86}, "sea": WAVES},
+    "from orbit over waves": {
+        "tx": {"altitude": 5e5, "off_nadir_deg": 20.0, "divergence_mrad": 0.004, "pulse_energy_mj": 1e3},
+        "rx": {"altitude": 5e5, "off_nadir_deg": 20.0, "field_of_view_mrad": 0.012, "aperture_area": 10.0},
+        **{"sea": WAVES, "film": {"time_start_ns": 3549700.0, "bin_width_ns": 4.0}},
+    },
     "turbid": {"water": {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016}, "bottom": 4.0},
 }
 #: Relative standard error of the reference's energy, from three sets of 16 passes.
@@ -193,6 +212,11 @@ TOTAL_ERROR = {
     "plate in the air": 0.00043,
     "through the surface": 0.0025,
     "receiver aside": 0.0025,
+    "50 m aside over waves": 0.0026,
+    "1 m aside over waves": 0.0094,
+    "receiver straight down over waves": 0.0006,
+    "axis 8 mrad aside over waves": 0.0027,
+    "from orbit over waves": 0.0040,
     "turbid": 0.0089,
 }
 

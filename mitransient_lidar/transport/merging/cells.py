@@ -164,6 +164,10 @@ class WaterGrid:
         """Number of buckets."""
         return 1 << (2 * self.bits_xy + self.bits_z)
 
+    def cells(self, shift: mi.Point3f) -> WaterCells:
+        """Return the cells of a pass, shifted by three uniform random numbers."""
+        return WaterCells(self, shift)
+
 
 class WaterCells:
     """The cells of one pass: a `WaterGrid` shifted by three uniform random numbers."""

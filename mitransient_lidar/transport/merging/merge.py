@@ -11,13 +11,16 @@ from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import Photon, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentPoints
+from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
 from mitransient_lidar.transport.scene import LidarScene
 
 
-def store_points(segments: SegmentBuffer, count: int, cells: WaterCells, classes: PathClasses) -> PhotonMap | None:
+def store_points(
+    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses
+) -> PhotonMap | None:
     """Store the `count` points of light paths by their cells; return None if there are none."""
     if count == 0:
         return None
@@ -34,7 +37,12 @@ def store_points(segments: SegmentBuffer, count: int, cells: WaterCells, classes
 
 
 def merge_in_water(
-    scene: LidarScene, record: PassRecord, points: SegmentPoints, cells: WaterCells, photons: PhotonMap, u: mi.Float
+    scene: LidarScene,
+    record: PassRecord,
+    points: SegmentPoints,
+    cells: WaterCells | SphericalCells,
+    photons: PhotonMap,
+    u: mi.Float,
 ) -> None:
     """Merge points of the receiver's paths with the light in their cells.
 

@@ -15,6 +15,7 @@ from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_s
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
+from mitransient_lidar.transport.merging.spherical_cells import SphericalCells, SphericalGrid, reach_under_water
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -41,6 +42,9 @@ _IMAGE_PIXELS = 4096
 
 #: Width of the cells at the surface, over the beam's standard deviation there and over the side of the sea's facets.
 _CELL_PER_FOOTPRINT, _CELL_PER_FACET = 0.0125, 0.05
+
+#: Width of the cells of a lidar under water, from which that of patches follows, over the beam's standard deviation.
+_CELL_PER_BEAM = 0.05
 
 #: Growth of the width with depth, over the width at the surface: per metre, for the blur of light patterns by ripples,
 #: and per scattering length, for that by scattering.
@@ -91,7 +95,7 @@ class MergingLayout:
 
     region: Region
     uneven: list[mi.Shape]
-    grid: WaterGrid
+    grid: WaterGrid | SphericalGrid
     spacing: float
     patch_width: float
     light_segments: float
@@ -101,9 +105,12 @@ class MergingLayout:
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler, options: MergingOptions) -> MergingLayout:
         """Choose points and cells for a scene."""
-        region = Region.of_scene(scene, sampler)
+        if scene.submerged:
+            region, reach, nearest = reach_under_water(scene, sampler)
+        else:
+            region = Region.of_scene(scene, sampler)
+            reach = region.track_length(scene)
         uneven = solids_of_several_levels(scene, region)
-        reach = region.track_length(scene)
         finest = options.point_spacing or reach / _POINTS_PER_PATH
         is_image = scene.receiver.pixels.count >= _IMAGE_PIXELS
         spacing = options.point_spacing or reach / (_POINTS_PER_IMAGE_PATH if is_image else _POINTS_PER_PATH)
@@ -112,13 +119,17 @@ class MergingLayout:
         attenuation, scattering = float(column.attenuation.max()), float(column.scattering.max())
         if attenuation > 0:
             thickness = min(thickness, _THICKNESS_PER_ATTENUATION / attenuation)
+        # Rounded, so that other shots use the same kernels.
+        segments = 0.5 * np.ceil(3 * (1 + scattering * reach)) + 1
         pose = scene.transmitter.pose
+        if scene.submerged:
+            width = options.cell_size or _CELL_PER_BEAM * scene.transmitter.angular_spread * nearest
+            grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
+            return cls(region, uneven, grid, spacing, _PATCH_PER_CELL * width, segments, segments)
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
         width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * scene.facet_size)
         growth = width * (_GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min()))
         grid = WaterGrid(scene, SurfaceHeights(scene, region), width, growth, thickness, reach)
-        # Rounded, so that other shots use the same kernels.
-        segments = 0.5 * np.ceil(3 * (1 + scattering * reach)) + 1
         return cls(region, uneven, grid, spacing, _PATCH_PER_CELL * width, segments, segments)
 
 
@@ -167,7 +178,7 @@ class MergingRenderer(PassRenderer):
         scene, layout = self.scene, self.layout
         common = np.random.default_rng([seed, _COMMON_STREAM]).random(5, np.float32)
         shifts = [dr.opaque(mi.Float, float(shift)) for shift in common]
-        cells = WaterCells(layout.grid, mi.Point3f(shifts[:3]))
+        cells = layout.grid.cells(mi.Point3f(shifts[:3]))
         patches = SolidPatches(scene, layout.region, layout.patch_width, mi.Point2f(shifts[3:]), layout.uneven)
         light = self._trace_light(record, seed, cells, patches)
         if light is None or not self._trace_sensor(record, seed, paths, cells, patches, *light):
@@ -179,7 +190,7 @@ class MergingRenderer(PassRenderer):
         return True
 
     def _trace_light(
-        self, record: PassRecord, seed: int, cells: WaterCells, patches: SolidPatches
+        self, record: PassRecord, seed: int, cells: WaterCells | SphericalCells, patches: SolidPatches
     ) -> tuple[PhotonMap | None, PhotonMap | None] | None:
         """Trace light from the laser; return photons in cells and on patches, or None when a buffer was too small."""
         scene, layout, count = self.scene, self.layout, self.photons
@@ -210,7 +221,7 @@ class MergingRenderer(PassRenderer):
         record: PassRecord,
         seed: int,
         count: int,
-        cells: WaterCells,
+        cells: WaterCells | SphericalCells,
         patches: SolidPatches,
         in_water: PhotonMap | None,
         on_patches: PhotonMap | None,

@@ -1,0 +1,126 @@
+"""Cells of water about a laser under water: shells cut into rings and sectors about its axis."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.transport.merging.cells import PROBE_RAYS, Region
+from mitransient_lidar.transport.opaque import opaque, opaque_point
+from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+#: Angular width of rings, over the beam's standard deviation within two of them, and over the angle farther outside.
+_RING_PER_SPREAD, _CORE_SPREADS = 0.1, 2.0
+
+#: Largest thickness of a shell over its radius: the light decreases by its square.
+_THICKNESS_PER_RADIUS = 0.04
+
+#: Smallest radius of shells [m].
+_SMALLEST_RADIUS = 1e-3
+
+#: Logarithm to base 2 of the number of buckets, and bits of the number of ring and sector.
+_BUCKET_BITS, _RING_BITS, _SECTOR_BITS = 20, 11, 9
+
+#: Margin of the region about the rays, over its size, and the least [m].
+_MARGIN, _LEAST_MARGIN = 0.15, 1.0
+
+
+class SphericalGrid:
+    """Layout of cells about the laser, which are small where its light is concentrated.
+
+    Angles from the axis are measured by the tangent of their half, up to the opposite direction. Rings are of equal
+    width in asinh(tan(theta / 2) / core), and shells in log(r) up to the radius where they have their final thickness.
+
+    Parameters
+    ----------
+    scene
+        Scene with laser and receiver under water.
+    thickness
+        Largest thickness of a shell [m].
+    """
+
+    #: Number of buckets.
+    buckets = 1 << _BUCKET_BITS
+
+    def __init__(self, scene: LidarScene, thickness: float) -> None:
+        pose, spread = scene.transmitter.pose, float(scene.transmitter.angular_spread)
+        self.origin = opaque_point(pose.origin)
+        self.sides = [mi.Vector3f(opaque_point(side)) for side in (pose.far, pose.left, pose.axis)]
+        core = min(np.tan(0.5 * _CORE_SPREADS * spread), 1.0)
+        self.core, self.ring = opaque(core), opaque(min(0.5 * _RING_PER_SPREAD * spread / core, 0.1))
+        self.thickness = opaque(thickness)
+        self.even = opaque(thickness / _THICKNESS_PER_RADIUS)
+
+    def cells(self, shift: mi.Point3f) -> SphericalCells:
+        """Return the cells of a pass, shifted by three uniform random numbers."""
+        return SphericalCells(self, shift)
+
+
+class SphericalCells:
+    """The cells of one pass: a `SphericalGrid` shifted by three uniform random numbers."""
+
+    def __init__(self, grid: SphericalGrid, shift: mi.Point3f) -> None:
+        self.grid = grid
+        self._shift = shift
+
+    def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
+        grid = self.grid
+        offset = point - grid.origin
+        radius = dr.maximum(dr.norm(offset), _SMALLEST_RADIUS)
+        x, y, along = (dr.dot(offset, side) for side in grid.sides)
+        across = dr.sqrt(x * x + y * y)
+        tangent = across / dr.maximum(radius + along, 1e-6 * radius)
+        # Rings: the innermost one is a disc.
+        ring = dr.floor(dr.asinh(tangent / grid.core) / grid.ring + self._shift.x)
+        inner, outer = (grid.core * dr.sinh(dr.maximum(ring + k - self._shift.x, 0) * grid.ring) for k in (0, 1))
+        sectors = dr.round(np.pi * (outer + inner) / (outer - inner))
+        turn = dr.atan2(y, x) * dr.inv_two_pi + 1 + self._shift.y
+        sector = dr.minimum(dr.floor((turn - dr.floor(turn)) * sectors), sectors - 1)
+        solid_angle = 4 * np.pi * (outer * outer - inner * inner)
+        solid_angle /= (1 + inner * inner) * (1 + outer * outer) * sectors
+        # Shells.
+        shell = dr.floor(self._shell_at(radius) + self._shift.z)
+        low, high = (self._radius_of(shell + k - self._shift.z) for k in (0, 1))
+        volume = solid_angle * (high - low) * (high * high + high * low + low * low) / 3
+        tag = mi.UInt32(mi.Int32(shell) + (1 << 10)) << (_RING_BITS + _SECTOR_BITS)
+        tag |= (mi.UInt32(ring) << _SECTOR_BITS) | mi.UInt32(sector)
+        # Fibonacci hashing (Knuth 1998, The Art of Computer Programming 3, section 6.4).
+        return (tag * 2654435769) >> (32 - _BUCKET_BITS), tag, volume
+
+    def _shell_at(self, radius: mi.Float) -> mi.Float:
+        """Return the coordinate of shells at a radius [m]."""
+        ratio = radius / self.grid.even
+        return dr.select(ratio < 1, dr.log(ratio), ratio - 1) / _THICKNESS_PER_RADIUS
+
+    def _radius_of(self, shell: mi.Float) -> mi.Float:
+        """Return the radius [m] at a coordinate of shells."""
+        along = shell * _THICKNESS_PER_RADIUS
+        return self.grid.even * dr.select(along < 0, dr.exp(along), 1 + along)
+
+
+def reach_under_water(scene: LidarScene, sampler: SensorSampler) -> tuple[Region, float, float]:
+    """Return the region of beam and view, the mean length of the beam's rays [m], and the shortest of those to solids.
+
+    Rays end at the first surface, or where their light returns at the end of the record.
+    """
+    seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+    beam = scene.transmitter.pose.direction(*scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
+    longest = max(scene.axis.path_end / (2 * scene.group_index), 0.1)
+    places, lengths = [], np.full(1, longest)
+    shortest = longest
+    for pose, direction in ((scene.receiver.pose, seen.direction), (scene.transmitter.pose, beam)):
+        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), direction))
+        length = dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), longest)
+        lengths = np.array(length, dtype=np.float64)
+        solid = si.is_valid() & ~scene.is_surface(si.shape)
+        shortest = min(shortest, float(np.min(np.where(np.array(solid), lengths, np.inf))))
+        places += [pose.origin[:2], np.array(opaque_point(pose.origin) + direction * length).T[:, :2]]
+    points = np.vstack(places)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = np.maximum(_MARGIN * (high - low), _LEAST_MARGIN)
+    x, y = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)
+    return Region((x[0], y[0]), (x[1], y[1])), float(lengths.mean()), shortest
