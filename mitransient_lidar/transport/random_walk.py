@@ -27,8 +27,9 @@ class RandomWalkPath(Path):
     Attributes
     ----------
     mis_partial_sum
-        Sum over the path's scattering events of 1 / (b p), the inverse of the scattering coefficient [1/m] times the
-        phase function [1/sr]: the density, up to a common factor, with which a merge at that event makes the same path.
+        Sum over the path's scattering events of v / (b p), the relative volume of the cell over the scattering
+        coefficient [1/m] times the phase function [1/sr]: the density, up to a common factor, with which a merge at
+        that event makes the same path.
     outside_surface
         Whether the path has entered the water outside the surface mesh, through level water: such paths measure the
         loss.
@@ -82,9 +83,19 @@ class RandomWalk:
         Pose of the receiver for light, of the laser for paths from the receiver.
     path_end
         Optical path length at which the record ends [m]: paths that cannot arrive before end.
+    relative_volume
+        Function of points that returns the relative volumes of their cells, by default 1.
     """
 
-    def __init__(self, scene: LidarScene, mode: mi.TransportMode, destination: Pose, path_end: float) -> None:
+    def __init__(
+        self,
+        scene: LidarScene,
+        mode: mi.TransportMode,
+        destination: Pose,
+        path_end: float,
+        relative_volume: Callable[[mi.Point3f], mi.Float] = lambda point: mi.Float(1),
+    ) -> None:
+        self._relative_volume = relative_volume
         self.scene = scene
         self._water, self._path_end = scene.water, path_end - scene.reference_length
         self._step = PathStep(scene, scene.water.scattering_flight, mode)
@@ -158,7 +169,7 @@ class RandomWalk:
         context = mi.PhaseFunctionContext()
         natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)
         b_p = self._water.coefficient(step.flight, event.scatterer) * weight[0] * pdf
-        path.mis_partial_sum += dr.select(vertex.scattered, dr.rcp(b_p), 0)
+        path.mis_partial_sum += dr.select(vertex.scattered, self._relative_volume(path.point) / b_p, 0)
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         direction = dr.select(vertex.scattered, dr.normalize(natural), si.to_world(bs.wo))
         factor = dr.select(vertex.scattered, weight[0], dr.select(vertex.on_surface, bsdf_weight[0], 1))

@@ -178,6 +178,11 @@ class WaterCells:
         # Thickness of the uppermost layer.
         self._top = grid.thickness * (0.5 + shift.z)
 
+    @staticmethod
+    def relative_volume(point: mi.Point3f) -> mi.Float:
+        """Return the relative volume of cells for the weights of merges: 1, as it changes little along a path."""
+        return mi.Float(1)
+
     def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
         grid = self.grid

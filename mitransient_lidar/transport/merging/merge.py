@@ -65,6 +65,7 @@ def merge_in_water(
     subpath = SensorSubpath(*record.classes.unpack(points.label), points.direction, points.weight)
     first, end, step = photons.sample(bucket, u, mi.Bool(True))
     weight = points.weight / volume * mi.Float(step)
+    relative_volume = cells.relative_volume(points.point)
 
     def merge(index: mi.UInt32) -> tuple[mi.UInt32]:
         active = index < end
@@ -73,7 +74,8 @@ def merge_in_water(
         shared = mi.Float(0)
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
-            shared += dr.rcp(dr.rcp(scattering * value[0]) + points.mis_partial_sum + photon.mis_partial_sum)
+            density = relative_volume / (scattering * value[0])
+            shared += relative_volume / (density + points.mis_partial_sum + photon.mis_partial_sum)
         # The photon continues to the plane through the point normal to its direction, so that times do not blur.
         beyond = dr.dot(points.point, photon.direction) - photon.position
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)

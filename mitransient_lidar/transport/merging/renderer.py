@@ -200,7 +200,9 @@ class MergingRenderer(PassRenderer):
         angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.transmitter.pose, angles, energy, offset)
-        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end)
+        walk = RandomWalk(
+            *(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, cells.relative_volume)
+        )
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             hits.add(path, patches.locate(si), active)
@@ -233,7 +235,9 @@ class MergingRenderer(PassRenderer):
         segments = SegmentBuffer(scene.water, self.classes, layout.spacing, int(layout.sensor_segments * count))
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.receiver.pose, start.angles, start.weight, offset)
-        walk = RandomWalk(scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end)
+        walk = RandomWalk(
+            *(scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end, cells.relative_volume)
+        )
 
         def connect(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             radiance, length = connect_laser(scene, si, active)

@@ -66,6 +66,10 @@ class SphericalCells:
         self.grid = grid
         self._shift = shift
 
+    def relative_volume(self, point: mi.Point3f) -> mi.Float:
+        """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
+        return self.locate(point)[2]
+
     def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
         grid = self.grid
