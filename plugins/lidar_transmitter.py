@@ -28,9 +28,12 @@ class LidarTransmitter(EmitterWithoutExtent):
     ======================  =========  =================================================================================
     Parameter               Type       Meaning
     ======================  =========  =================================================================================
-    altitude                float      Height above the mean sea level [m], 0.1 to 1e6. Default: 200
-    off_nadir_deg           float      Angle of the axis from the vertical, towards +x [deg], 0 to 89.9. Default: 20
-    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e6 to 1e6. Default: 0
+    altitude                float      Height above the mean sea level [m], 0.1 to 1e6, or, negative, under water, -1000
+                                       to -0.1. Default: 200
+    off_nadir_deg           float      Angle of the axis from nadir, towards +x [deg], 0 to 89.9; under water up to 180,
+                                       which is straight up. Default: 20
+    aim_x, aim_y            float      Point where the axis meets the mean sea level [m], -1e6 to 1e6; under water the
+                                       point of the mean sea level above the lidar. Default: 0
     to_world                transform  Instead of the four above: any position and direction, as from ``lookat``
     pulse_energy_mj         float      Energy of the emitted pulse [mJ], 1e-9 to 1e6. Default: 5
     optical_efficiency      float      Share of that energy which leaves the optics, above 0 to 1. Default: 0.9
@@ -64,6 +67,15 @@ class LidarTransmitter(EmitterWithoutExtent):
     (+angle_x is away from nadir, +angle_y along +y), with a sigma for each axis when it is elliptic; that of an image
     is even within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\,
     dg_y`. The pulse's shape is applied to waveforms, not in the transport.
+
+    Laser and receiver are both above the sea or both under water. Under water, angles are those in the water: behind a
+    flat window, the angles of beam and view in air divided by the refractive index. Radiance is that in the water and
+    the window's losses belong to the efficiencies; ``two_way_atmospheric_transmittance`` is a further factor, to be set
+    to 1. Water around such a lidar has one refractive and one group index. Light that reaches the surface from below
+    is reflected and refracted, and returns from targets in the air.
+
+    From orbit, lengths are relative to the distance of a point near the scene, and rays start just above it: times are
+    accurate to a millimetre of range in single precision.
 
     .. code-block:: xml
 

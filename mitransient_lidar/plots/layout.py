@@ -226,7 +226,10 @@ class _Ground:
 def _pose(attributes: dict[str, Any], name: str) -> FloatArray:
     """Return a pose; for a result without poses that of its altitude and off-nadir angle."""
     if len(attributes.get(name, ())) == 12:
-        return np.array(attributes[name], dtype=np.float64).reshape(4, 3)
+        pose = np.array(attributes[name], dtype=np.float64).reshape(4, 3)
+        if pose[0, 2] < 0:
+            raise UserError("the lidar is under water: it has no layout on the sea to draw.")
+        return pose
     altitude, off_nadir_deg = (optional_number(attributes, key) for key in ("altitude", "off_nadir_deg"))
     if altitude is None or off_nadir_deg is None:
         raise UserError("the result has no altitude and off_nadir_deg among its attributes: it has no layout to draw.")

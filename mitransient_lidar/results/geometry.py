@@ -49,7 +49,11 @@ class LidarGeometry:
 
     @classmethod
     def level(cls, height: float, off_nadir: float, refractive_index: float, group_index: float) -> LidarGeometry:
-        """Return the geometry whose surface echo arrives from the mean sea level along the axis."""
+        """Return the geometry whose surface echo arrives from the mean sea level along the axis.
+
+        A height below the sea level raises UserError.
+        """
+        _require_height(height)
         surface = float(refraction.surface_time_ns(height, off_nadir))
         return cls(height, off_nadir, refractive_index, group_index, surface)
 
@@ -71,11 +75,12 @@ class LidarGeometry:
         Raises
         ------
         UserError
-            If an attribute is missing or is not a number of at least 0.
+            If an attribute is missing or is not a number of at least 0, or the lidar is under water.
         """
         if surface == "measured":
             required_number(attributes, "surface_time_ns")
         names = ("altitude", "off_nadir_deg", "refractive_index", "group_index")
+        _require_height(optional_number(attributes, "altitude"))
         height, degrees, refractive_index, group_index = (required_number(attributes, name) for name in names)
         geometry = cls.level(height, math.radians(degrees), refractive_index, group_index)
         measured = None if surface == "level" else optional_number(attributes, "surface_time_ns")
@@ -282,6 +287,11 @@ class LinesOfSight:
         theta = self.off_nadir[:, np.newaxis]
         at, n = refraction.solid_angle_per_area, geometry.refractive_index
         return np.asarray(at(geometry.height, depth, theta, n) / at(geometry.height, 0.0, theta, n))
+
+
+def _require_height(height: float | None) -> None:
+    if height is not None and height < 0:
+        raise UserError(f"altitude = {height:g} is under water: this needs a lidar above the sea")
 
 
 def _columns(values: FloatArray, dimensions: int) -> FloatArray:

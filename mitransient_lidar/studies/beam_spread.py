@@ -127,6 +127,7 @@ def beam_spread(
     from mitransient_lidar.transport.scene import LidarScene
 
     lidar = LidarScene.from_scene(session.scene, session.sensor)
+    lidar.transmitter.pose.require_above_sea()
     if lidar.water is None:
         raise UserError("the scene has no water: give its surface a layered_water as interior medium")
     planes = _planes(lidar, wanted)

@@ -127,6 +127,7 @@ def detect(
     if clutter and session.parameters.get("spectrum") == "flat":
         raise UserError("clutter needs waves: spectrum = flat makes every sea the same")
     lidar: LidarScene = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
+    lidar.transmitter.pose.require_above_sea()
     if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
     for depth in depths:  # before the first render

@@ -73,6 +73,7 @@ class SeaMap:
         if sea is None or not math.isfinite(sea.cell_size):
             raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
         transmitter = _transmitter(scene)
+        transmitter.pose.require_above_sea()
         # Of a sea of several grids the coarsest.
         cell = getattr(sea.waves, "cell_size", sea.cell_size)
         count = min(getattr(sea.waves, "cells", int(sea.size / cell)), int(_LARGEST_SEARCH / cell)) // 2

@@ -125,6 +125,11 @@ class Pose:
         """Whether the pose is under water."""
         return float(self.origin[2]) < 0
 
+    def require_above_sea(self) -> None:
+        """Raise UserError for a pose under water."""
+        if self.submerged:
+            raise UserError(f"altitude = {self.origin[2]:g} is under water: this needs a lidar above the sea")
+
     def ground_point(self) -> NDArray[np.float64]:
         """Return where the axis meets the mean sea level z = 0 [m]; a distant point if it does not point down.
 

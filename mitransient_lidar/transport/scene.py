@@ -10,11 +10,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid, Water
+from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, Cone, LidarView, Solid, Water
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Instrument
@@ -22,6 +23,7 @@ from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.pose import Pose, RelativePose
+from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
@@ -35,6 +37,9 @@ _FAR, _CLEARANCE = 1e4, 1.0
 
 #: Length over which slopes change, over the shortest wavelength.
 _FACET_PER_WAVE = 0.25
+
+#: Rays of beam and view from which the record of a lidar under water follows.
+_RECORD_RAYS = 1024
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
 _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
@@ -253,6 +258,40 @@ def fitted_record(
             limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
     fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
     return TimeAxis.covering(limits[0] - lead, limits[1] + tail, *fixed), end
+
+
+def submerged_record(scene: WaterScene, transmitter: Any, film: Any) -> tuple[TimeAxis, str]:
+    """Return time bins of a film of a lidar under water, and what the last light comes from.
+
+    The record begins with the light scattered at the lidar. It ends after the farthest echo of beam and view, with a
+    quarter of its time and 40 ns more for light that is scattered several times, or at the range where the signal of
+    the water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
+
+    Raises
+    ------
+    UserError
+        If the bins are too many.
+    """
+    points, ranges, column = unit_points(_RECORD_RAYS), [], scene.water.column
+    for pose, angles in (
+        (scene.receiver.pose, scene.receiver.pixels.sample(points)),
+        (transmitter.pose, transmitter.sample_tangent(points)),
+    ):
+        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), pose.direction(*angles)))
+        ranges.append(np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64))
+    rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
+    least = min(InherentProperties(*map(float, row)).kd for row in rows)
+    visible = -0.5 * np.log(COLUMN_LEVEL) / max(least, 1e-9)
+    nearest, farthest = (float(np.max(each)) for each in (np.minimum(*ranges), np.concatenate(ranges)))
+    to_solid = farthest if np.isfinite(farthest) else nearest
+    apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
+    distance = min(to_solid, visible) + apart
+    echo = 2e9 / C0 * scene.group_index * distance
+    end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
+    lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
+    tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
+    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
+    return TimeAxis.covering(-lead, 1.25 * echo + 40.0 + tail, *fixed), end
 
 
 def _lidar_view(scene: WaterScene, transmitter: Any, shift: tuple[float, float]) -> LidarView:

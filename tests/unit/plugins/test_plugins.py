@@ -18,7 +18,8 @@ SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10], [0, 0
 CIRCLE = {"type": "pixel_fov", "field_of_view_mrad": 10.0}
 
 REFUSED = [
-    ({"type": "lidar_transmitter", "altitude": -1.0}, "altitude = -1 must be greater than 0"),
+    ({"type": "lidar_transmitter", "altitude": -0.05}, "altitude = -0.05 must lie between 0.1 and 1e+06, or -1000 and"),
+    ({"type": "lidar_transmitter", "altitude": -1.0, "off_nadir_deg": 181.0}, "must lie between 0 and 180"),
     ({"type": "lidar_transmitter", "off_nadir_deg": 95.0}, "off_nadir_deg = 95 must lie between 0 and 89.9"),
     ({"type": "lidar_transmitter", "pulse_energy_mj": 0.0}, "pulse_energy_mj = 0 must be greater than 0"),
     ({"type": "lidar_transmitter", "optical_efficiency": 1.1}, "optical_efficiency = 1.1 must lie between"),
@@ -267,6 +268,23 @@ def scene(**parts):
     )
 
 
+FILM = {"film": {"type": "time_gated_film"}}
+UNDER_WATER = {
+    "tx": {"type": "lidar_transmitter", "altitude": -0.2, "aim_x": 80.0},
+    "rx": {"type": "multipixel_receiver", "altitude": -0.2, "aim_x": 80.0, **FILM},
+}
+LAYERED = {
+    "type": "ocean_surface",
+    "interior": {
+        "type": "layered_water",
+        "layer_tops": "0, 5",
+        "refractive_index": "1.33, 1.34",
+        "group_index": "1.36",
+    },
+}
+#: A trough of 0.6 m above the lidar.
+HIGH_WAVES = {"type": "ocean_surface", "spectrum": "pierson_moskowitz", "wind_speed": 15.0}
+HIGH_WAVES["interior"] = {"type": "layered_water"}
 WRONG_SCENES = [
     ({"rx": {"type": "perspective"}}, "multipixel_receiver or pixel_fov"),
     ({"rx": {"type": "multipixel_receiver"}}, "time_gated_film"),
@@ -277,6 +295,12 @@ WRONG_SCENES = [
     ({"sea": {"type": "ocean_surface", "exterior": {"type": "layered_water"}}}, "interior medium"),
     ({"more": {"type": "sphere", "interior": {"type": "layered_water", "attenuation": 1.0}}}, "allowed is one"),
     ({"tx": {"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}}, "altitude"),
+    ({"tx": {"type": "lidar_transmitter", "altitude": -3.0}}, r"at z = -3 m and 200 m must both be above the mean sea"),
+    ({**UNDER_WATER, "sea": LAYERED}, "refractive_index changes with depth: a lidar under water needs one index"),
+    (
+        {**UNDER_WATER, "sea": HIGH_WAVES},
+        r"altitude = -0.2 must be below the surface of the waves, whose lowest trough",
+    ),
 ]
 
 

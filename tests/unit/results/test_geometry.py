@@ -77,7 +77,9 @@ def test_numbers_that_are_missing_or_invalid():
     missing = {name: value for name, value in ATTRIBUTES.items() if name != "refractive_index"}
     with pytest.raises(UserError, match="the dataset has no attribute refractive_index"):
         LidarGeometry.from_attributes(missing)
-    for value in ("high", -1.0, float("nan")):
+    with pytest.raises(UserError, match="altitude = -1 is under water: this needs a lidar above the sea"):
+        LidarGeometry.from_attributes({**ATTRIBUTES, "altitude": -1.0})
+    for value in ("high", float("nan")):
         with pytest.raises(UserError, match=r"the attribute altitude = .* must be a number of at least 0"):
             LidarGeometry.from_attributes({**ATTRIBUTES, "altitude": value})
     assert optional_number({"a": "x", "b": 3}, "a") is None

@@ -1,0 +1,147 @@
+"""Lidars under water: closed forms of bottom, column and surface, and agreement of the integrators."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from significance import largest_error, largest_z
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.water.phase import henyey_greenstein
+from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
+from mitransient_lidar.transport.scene import LidarScene
+
+GROUP = 1.34
+#: Pulse energy and area of the aperture with all losses [J m^2]: a factor of n^2 would be 1.8 or 0.56.
+SYSTEM = 5e-3 * 0.81 * 0.9 * 0.025
+START, BINS = 9.0, 96
+CLEAR = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0}
+INTEGRATORS = ["lidar_merging", "lidar_volpath"]
+
+
+@pytest.fixture
+def build(lidar_scene):
+    """Builder of scenes with a lidar under water."""
+
+    def scene(altitude, off_nadir_deg, integrator="lidar_merging", tx=None, rx=None, paths=2**15, **options):
+        pose = {"altitude": altitude, "off_nadir_deg": off_nadir_deg}
+        return lidar_scene(
+            integrator={"type": integrator, "paths_per_pass": paths},
+            tx={**pose, "divergence_mrad": 4.0, **(tx or {})},
+            rx={**pose, "layout": "1x1", "field_of_view_mrad": 40.0, **(rx or {})},
+            film={"time_start_ns": START, "bin_width_ns": 1.0, "bin_count": BINS},
+            **options,
+        )
+
+    return scene
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_bottom_below_a_boat(build, passes, z_score, integrator):
+    """A Lambertian bottom 7 m below a lidar at 1 m: E rho/pi A exp(-2 c d)/d^2, after 2 n_g d / c0."""
+    distance = 7.0
+    energy = passes(build(-1.0, 0.0, integrator, water=CLEAR), 8)[:, 0]
+    expected = SYSTEM * 0.1 / np.pi * np.exp(-0.2 * distance) / distance**2
+    z, error = z_score(energy.sum(axis=1), expected)
+    assert abs(z) < largest_z(8) + 1e-3 / error  # the beam's rim is 0.1 % weaker
+    assert error < largest_error(8, 0.003)
+    due = 2e9 * GROUP * distance / C0
+    assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("view", [40.0, 5.0])
+def test_single_scattering_below_a_boat(build, passes, integrator, view):
+    """E A beta(pi) exp(-2 c r) / r^2 times the share of the Gaussian beam in the view."""
+    scattering = 1.5e-5
+    water = {"attenuation": 0.4, "scattering": scattering, "backscattering": 3e-7}
+    water |= {"phase_function": "hg", "phase_g": 0.6}
+    scene = build(-1.0, 0.0, integrator, water=water, bottom=60.0, rx={"field_of_view_mrad": view})
+    energy = passes(scene, 12)[:, 0].reshape(12, -1, 8).sum(axis=2)[:, :8]
+    level = SYSTEM * scattering * float(henyey_greenstein(np.pi, 0.6)) * (1 - np.exp(-0.5 * (view / 4.0) ** 2))
+    edges = 1e-9 * C0 / (2 * GROUP) * (START + 8.0 * np.arange(9))
+    spans = pairwise(edges)
+    expected = np.array([quad(lambda r: level * np.exp(-0.8 * r) / r**2, *span)[0] for span in spans])
+    error = energy.std(axis=0, ddof=1) / np.sqrt(12)
+    z = (energy.mean(axis=0) - expected) / error
+    assert np.abs(z).max() < largest_z(12, z.size), z
+    assert np.all(error < largest_error(12, 0.012) * expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_surface_above_a_diver(build, passes, z_score, integrator):
+    """Gaussian slopes of variance s^2 seen from 5 m below: E A R(0) exp(-2 c d) / (4 pi s^2 d^2)."""
+    depth, variance = 5.0, 0.05
+    scene = build(-depth, 180.0, integrator, water=CLEAR, sea={"slope_variance": str(variance)}, bottom=None)
+    energy = passes(scene, 8)[:, 0]
+    reflectance = float(fresnel(0.0, 1 / 1.34)[0])
+    expected = SYSTEM * reflectance * np.exp(-0.2 * depth) / (4 * np.pi * variance * depth**2)
+    z, error = z_score(energy.sum(axis=1), expected)
+    assert abs(z) < largest_z(8) + 1e-3 / error
+    assert error < largest_error(8, 0.002)
+    due = 2e9 * GROUP * depth / C0
+    assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
+
+
+#: Scattering by a smooth phase function: the reference connects forward peaks to the laser with few large values.
+TURBID = {"attenuation": 0.4, "scattering": 0.3, "backscattering": 0.006, "phase_function": "hg", "phase_g": 0.6}
+WAVES = {"spectrum": "elfouhaily", "wind_speed": 4.0, "slope_variance": "cox_munk"}
+BALL = {"type": "sphere", "center": [0.1, 0.05, -4.0], "radius": 0.2, "bsdf": {"type": "diffuse"}}
+CASES = {
+    "down": (-1.0, 0.0, {}),
+    "slanted": (-1.0, 50.0, {"bottom": 6.0}),
+    "at a target": (-1.0, 0.0, {"extra": {"ball": BALL}}),
+    "up": (-5.0, 180.0, {}),
+    "up beyond the critical angle": (-4.0, 125.0, {}),
+    "beside": (-1.0, 0.0, {"rx": {"aim_x": 0.5, "field_of_view_mrad": 400.0}}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_both_integrators_agree_under_water(build, passes, case):
+    """Gates of 8 ns with scattering of all orders, under waves; the blur of cells is allowed 0.5 %."""
+    altitude, angle, options = CASES[case]
+    options = {**options, "tx": {"divergence_mrad": 60.0}, "rx": {"field_of_view_mrad": 150.0, **options.get("rx", {})}}
+    scenes = [
+        build(altitude, angle, integrator, water=TURBID, sea=WAVES, paths=paths, **options)
+        for integrator, paths in zip(INTEGRATORS, (2**15, 2**16), strict=True)
+    ]
+    merged, reference = (
+        passes(scene, count, seed)[:, 0].reshape(count, -1, 8).sum(axis=2)
+        for scene, count, seed in zip(scenes, (10, 24), (0, 1000), strict=True)
+    )
+    means = [samples.mean(axis=0) for samples in (merged, reference)]
+    errors = [samples.std(axis=0, ddof=1) / np.sqrt(len(samples)) for samples in (merged, reference)]
+    used = (errors[0] < 0.05 * means[0]) & (errors[1] < 0.05 * means[1])
+    z = (np.maximum(np.abs(means[0] - means[1]) - 0.005 * means[1], 0) / np.hypot(*errors))[used]
+    assert used.sum() >= 4
+    assert z.max() < largest_z(10, z.size), z
+    assert errors[1][used].min() < 0.01 * means[1][used].max()
+
+
+@pytest.mark.parametrize(("angle", "beside"), [(0.0, 0.0), (40.0, 0.0), (180.0, 0.0), (0.0, 0.5)])
+def test_lines_of_sight_give_depths_below_the_mean_sea_level(build, angle, beside):
+    """A point at 8 m below a lidar at 3 m, or the surface above it; a receiver aside meets it at its own distance."""
+    scene = build(-3.0, angle, rx={"aim_y": beside, "field_of_view_mrad": 400.0}, tx={"divergence_mrad": 0.1})
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    found = lines_of_sight(lidar)
+    depth = 8.0 if angle < 90 else 0.0
+    way = abs(depth - 3.0) / abs(np.cos(np.radians(angle)))
+    time = 1e9 * GROUP / C0 * (way + np.hypot(way, beside))
+    # Beside the laser, depth is linear in time to a few centimetres.
+    assert float(found.depth_of_time(np.array([[time]]))[0, 0]) == pytest.approx(depth, abs=0.05 if beside else 2e-3)
+
+
+def test_echoes_are_expected_when_geometry_says(build):
+    scene = build(-3.0, 20.0, bottom=8.0)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    probe = probe_echoes(renderer.scene, renderer.sampler)
+    assert probe.bottom_ns[0, 0] == pytest.approx(2e9 * GROUP * 5 / np.cos(np.radians(20)) / C0, rel=2e-3)
+    assert np.isnan(probe.surface_ns).all()
+    assert probe.missed_beam == 0
