@@ -48,6 +48,10 @@ class LidarMerging(LidarIntegrator):
     which is bounded by the event of the smallest :math:`b_i p_i`, so that the forward peak does not cause noise. Paths
     that meet a solid are merged only at the first one from the receiver.
 
+    About a laser under water, cells are shells cut into rings and sectors about its axis, thinner and narrower near the
+    laser, where light and view are concentrated. Their volumes differ along a path, and the merge at event *k* has the
+    weight :math:`(v_k / b_k p_k) / \sum_i v_i / (b_i p_i)` with the volume :math:`v_i` of the cell of each event.
+
     Echoes from the surface and from solids in the air are connected to the laser directly. ``lidar_volpath`` with
     ``complement_only`` adds all other paths, such as light that meets the sea twice without scattering, mirrors under
     water, and solids in the air seen by reflection.

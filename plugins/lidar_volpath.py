@@ -69,6 +69,10 @@ class LidarVolpath(VolpathIntegrator):
     connected, too. Both estimate the same paths and are combined by the balance heuristic (Veach and Guibas 1995,
     doi:10.1145/218380.218498).
 
+    A laser under water is connected by straight lines. Its light reaches a scattering event from one direction, so that
+    phase functions with a strong forward peak make rare, large values: in multiple scattering from a narrow beam, their
+    standard errors are too small and their means mostly too low. ``lidar_merging`` does not have this limit.
+
     Every segment is timed with the group index of the medium that it crosses. There are no derivatives.
 
     .. code-block:: xml

@@ -213,7 +213,7 @@ TOTAL_ERROR = {
     "through the surface": 0.0025,
     "receiver aside": 0.0025,
     "50 m aside over waves": 0.0026,
-    "1 m aside over waves": 0.0094,
+    "1 m aside over waves": 0.015,
     "receiver straight down over waves": 0.0006,
     "axis 8 mrad aside over waves": 0.0027,
     "from orbit over waves": 0.0040,
