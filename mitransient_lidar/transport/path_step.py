@@ -86,12 +86,15 @@ class PathStep:
     def next_vertex(self, path: Path, rng: mi.PCG32) -> Vertex:
         """Return where the next segment ends: at a scattering event, a boundary of index layers, or a surface."""
         scene, no = self.scene, mi.Bool(False)
-        si = scene.ray_intersect(path.ray(), path.active)
         in_water = mi.Bool(path.in_water)
         if scene.water is None:
+            si = scene.ray_intersect(path.ray(), path.active)
             return Vertex(si, si.t, si.t, no, no, no, in_water, no, no)
         wet = path.active & path.in_water
         distance = scene.water.free_flight(self.flight, path, rng)
+        end = dr.fma(path.direction.z, distance, path.point.z)
+        clear = wet & scene.is_clear(path.point.z) & scene.is_clear(end)
+        si = scene.ray_intersect(path.ray(), path.active & ~clear)
         reach, at_boundary = mi.Float(si.t), no
         layers = scene.water.index_layers
         if layers.count > 1:

@@ -27,17 +27,25 @@ class RandomWalkPath(Path):
     Attributes
     ----------
     mis_partial_sum
-        Sum over the path's scattering events of v / (b p), the relative volume of the cell over the scattering
-        coefficient [1/m] times the phase function [1/sr]: the density, up to a common factor, with which a merge at
-        that event makes the same path.
+        Sum of the densities, up to a common factor, with which merges and connections of the path so far make the same
+        path. With the scattering coefficient b [1/m] and the phase function p [1/sr] of events, it is V / (b p) for a
+        merge in cells of volume V, and d^2 / (T b p b' p') times a rate for a connection over the distance d with the
+        transmittance T of scattering.
     outside_surface
         Whether the path has entered the water outside the surface mesh, through level water: such paths measure the
         loss.
+    lane, points
+        Number of the path, and of its points in the water so far.
+    inverse
+        1 / (b p) of the last vertex if it is a scattering event in the water, else 0.
     offset
         Distance from the last vertex to the next point along the path [m].
     """
 
+    lane: mi.UInt32
+    points: mi.UInt32
     mis_partial_sum: mi.Float
+    inverse: mi.Float
     outside_surface: mi.Bool
     offset: mi.Float
 
@@ -51,9 +59,18 @@ class RandomWalkPath(Path):
         cls, scene: LidarScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, offset: mi.Float
     ) -> RandomWalkPath:
         """Return paths from laser or receiver at tangent-plane angles, without those of throughput 0."""
-        active = (throughput > 0) & dr.full(mi.Bool, True, dr.width(angles))
+        count = dr.width(angles)
+        active = (throughput > 0) & dr.full(mi.Bool, True, count)
         state = Path.initial(scene, pose, angles, throughput, active)
-        return cls(**state, mis_partial_sum=mi.Float(0), outside_surface=mi.Bool(False), offset=offset)
+        return cls(
+            **state,
+            lane=dr.arange(mi.UInt32, count),
+            points=mi.UInt32(0),
+            mis_partial_sum=mi.Float(0),
+            inverse=mi.Float(0),
+            outside_surface=mi.Bool(False),
+            offset=offset,
+        )
 
 
 class Segments(Protocol):
@@ -63,8 +80,22 @@ class Segments(Protocol):
         """Store the next segment of each path and return the offset of the first point beyond its end [m]."""
 
 
-#: Callback at hits: paths, interaction, active lanes.
-Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
+#: Callback at solids: paths, interaction, `edge` of the segment as in `SegmentPoints`, active lanes.
+Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Float, mi.Bool], None]
+
+#: Callback at first hits: paths, interaction, active lanes.
+FirstAction = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Bool], None]
+
+
+class EstimateRates(Protocol):
+    """Rates with which different estimates find the same path."""
+
+    @property
+    def in_water(self) -> mi.Float:
+        """Rate of connections between two scattering events."""
+
+    def volume(self, point: mi.Point3f) -> mi.Float:
+        """Return the rate of merges at scattering events [m^3]."""
 
 
 class RandomWalk:
@@ -83,8 +114,8 @@ class RandomWalk:
         Pose of the receiver for light, of the laser for paths from the receiver.
     path_end
         Optical path length at which the record ends [m]: paths that cannot arrive before end.
-    relative_volume
-        Function of points that returns the relative volumes of their cells, by default 1.
+    rates
+        Rates of the estimates at scattering events; without them `mis_partial_sum` stays 0.
     """
 
     def __init__(
@@ -93,10 +124,9 @@ class RandomWalk:
         mode: mi.TransportMode,
         destination: Pose,
         path_end: float,
-        relative_volume: Callable[[mi.Point3f], mi.Float] = lambda point: mi.Float(1),
+        rates: EstimateRates | None = None,
     ) -> None:
-        self._relative_volume = relative_volume
-        self.scene = scene
+        self.scene, self._rates = scene, rates
         self._water, self._path_end = scene.water, path_end - scene.reference_length
         self._step = PathStep(scene, scene.water.scattering_flight, mode)
         self._destination, self._to_go = opaque_point(destination.origin), scene.relative(destination)
@@ -109,7 +139,7 @@ class RandomWalk:
         segments: Segments,
         *,
         on_solid: Action,
-        on_first_hit: Action | None = None,
+        on_first_hit: FirstAction | None = None,
         past_solids: bool,
     ) -> RandomWalkPath:
         """Walk until all paths have ended.
@@ -130,11 +160,15 @@ class RandomWalk:
             path.offset = segments.add(path, in_record, label, wet & path.active & path.before_first_solid)
             absorption = self._water.absorption_flight.optical_depth(path.depth, path.downward, vertex.length)
             path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
+            depth = self._water.scattering_flight.optical_depth(path.depth, path.downward, vertex.length)
+            edge = dr.select(path.inverse > 0, path.inverse * dr.square(vertex.length) * dr.exp(depth), 0)
             step.arrive(path, vertex)
             if on_first_hit is not None:
                 on_first_hit(path, vertex.si, first & (vertex.at_sea | (vertex.on_solid & ~wet)))
-            on_solid(path, vertex.si, vertex.on_solid & wet)
-            self._redirect(path, rng, vertex)
+            hit = vertex.on_solid & wet
+            # Most segments end in the water: the action is skipped where no path of a packet meets a solid.
+            dr.if_stmt((path, vertex.si, edge, hit), hit, on_solid, lambda *_: None, label="solid")
+            self._redirect(path, rng, vertex, edge)
             self._enter_outside(path, vertex.outside)
             step.cross_boundary(path, vertex.at_boundary & path.active)
             if not past_solids:
@@ -160,7 +194,7 @@ class RandomWalk:
         spare = self._path_end - path.length - self._to_go.distance(path.point)
         return spare / (self._water.index_layers.group(path.index_layer) - dr.dot(away, path.direction) / distance)
 
-    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex) -> None:
+    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex, edge: mi.Float) -> None:
         """Draw the next direction."""
         step, si = self._step, vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -169,7 +203,10 @@ class RandomWalk:
         context = mi.PhaseFunctionContext()
         natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)
         b_p = self._water.coefficient(step.flight, event.scatterer) * weight[0] * pdf
-        path.mis_partial_sum += dr.select(vertex.scattered, self._relative_volume(path.point) / b_p, 0)
+        inverse = dr.select(vertex.scattered, dr.rcp(b_p), 0)
+        if self._rates is not None:
+            path.mis_partial_sum += inverse * (self._rates.volume(path.point) + self._rates.in_water * edge)
+        path.inverse = inverse
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         direction = dr.select(vertex.scattered, dr.normalize(natural), si.to_world(bs.wo))
         factor = dr.select(vertex.scattered, weight[0], dr.select(vertex.on_surface, bsdf_weight[0], 1))

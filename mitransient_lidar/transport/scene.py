@@ -75,6 +75,12 @@ class WaterScene:
         return _solids(self.mitsuba_scene, self.surfaces)
 
     @property
+    def clear_water(self) -> tuple[float, float]:
+        """Heights of the top of the highest solid and of the lowest point of the sea: no shape lies between [m]."""
+        highest = max((float(solid.bbox().max.z) for solid in self.solids), default=-np.inf)
+        return highest, min((float(surface.bbox().min.z) for surface in self.surfaces), default=-np.inf)
+
+    @property
     def has_specular_or_dry_solids(self) -> bool:
         """Whether a solid has a mirror-like part, or rises above the lowest point of the sea."""
         lowest = min((float(surface.bbox().min.z) for surface in self.surfaces), default=0.0)
@@ -155,6 +161,11 @@ class WaterScene:
         lowest, highest = min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)
         # A margin of a millimetre for points that lie on the surface to rounding.
         return dr.select(in_water, z > opaque(highest + 1e-3), z < opaque(lowest - 1e-3))
+
+    def is_clear(self, z: mi.Float) -> mi.Bool:
+        """Return whether heights [m] lie in `clear_water`: lines between two of them meet no shape."""
+        lowest, highest = (opaque(z) for z in self.clear_water)
+        return (z > lowest) & (z < highest)
 
     def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a shape bounds the water."""

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams, unit_points
@@ -27,6 +28,9 @@ _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 
 #: Logarithm to base 2 of the number of buckets.
 _BUCKET_BITS = 20
+
+#: Largest growth of the width of cells with depth.
+_MOST_GROWTH = 4.0
 
 #: Added to cell numbers so that they are positive.
 ORIGIN = 1 << 20
@@ -134,35 +138,53 @@ class SurfaceHeights:
 
 
 class WaterGrid:
-    """Layout of cells that follow the sea surface and are sheared along the refracted beam.
+    """Layout of cells that follow the sea surface and are arranged about the refracted beam.
 
-    Cells are horizontal squares in layers of the depth below the surface, so that the surface cuts none. They are
+    Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. They are
     sheared along the beam in still water, so that its light stays in one column of cells.
 
     Parameters
     ----------
-    width, thickness
-        Horizontal side of a cell at the surface, and its depth [m].
+    width
+        Horizontal side of a cell on the axis at the surface, over the core radius of the rings.
     growth
         Growth of the width with depth [m/m], as light patterns of the waves blur with depth.
+    thickness
+        Thickness of a cell [m].
     depth
         Depth within which different layers have different buckets [m].
     """
 
     def __init__(
-        self, scene: LidarScene, heights: SurfaceHeights, width: float, growth: float, thickness: float, depth: float
+        self,
+        rings: BeamRings,
+        heights: SurfaceHeights,
+        width: float,
+        growth: float,
+        thickness: float,
+        depth: float,
     ) -> None:
-        self.heights = heights
+        self.heights, self.rings = heights, rings
         self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)
-        sine = scene.transmitter.pose.axis[:2] / scene.refractive_index
-        self.shear = (sine / np.sqrt(1 - sine @ sine)).tolist()
         self.bits_z = int(np.clip(math.ceil(math.log2(depth / thickness + 1)), 2, 8))
-        self.bits_xy = (_BUCKET_BITS - self.bits_z) // 2
+        self.bits_ring = (_BUCKET_BITS - self.bits_z) // 2
+        self.bits_sector = _BUCKET_BITS - self.bits_z - self.bits_ring
+
+    def widths(self, depth: mi.Float) -> mi.Float:
+        """Return the widths of rings over the core radius at a depth [m]."""
+        return self.width * dr.minimum(dr.fma(depth, self.growth, 1), _MOST_GROWTH)
+
+    def volume(self, point: mi.Point3f) -> mi.Float:
+        """Return the approximate volume of the cells at points, a smooth function [m^3]."""
+        depth = dr.maximum(self.heights.at(point.x, point.y) - point.z, 0)
+        along, across = self.rings.offset(point.x, point.y, depth)
+        scale = dr.square(self.rings.core(depth)) + along * along + across * across
+        return self.thickness * dr.square(self.widths(depth)) * scale / self.rings.cosine
 
     @property
     def buckets(self) -> int:
         """Number of buckets."""
-        return 1 << (2 * self.bits_xy + self.bits_z)
+        return 1 << _BUCKET_BITS
 
     def cells(self, shift: mi.Point3f) -> WaterCells:
         """Return the cells of a pass, shifted by three uniform random numbers."""
@@ -178,27 +200,27 @@ class WaterCells:
         # Thickness of the uppermost layer.
         self._top = grid.thickness * (0.5 + shift.z)
 
-    @staticmethod
-    def relative_volume(point: mi.Point3f) -> mi.Float:
-        """Return the relative volume of cells for the weights of merges: 1, as it changes little along a path."""
-        return mi.Float(1)
+    def typical_volume(self, point: mi.Point3f) -> mi.Float:
+        """Return the approximate volume of cells at points, a smooth function, for the weights of merges [m^3]."""
+        return self.grid.volume(point)
 
     def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
-        grid = self.grid
+        grid, rings = self.grid, self.grid.rings
         depth = grid.heights.at(point.x, point.y) - point.z
         # The table of heights is approximate: points above it are just below the surface.
         layer = dr.maximum(dr.floor((depth - self._top) * (1 / grid.thickness)) + 1, 0)
-        width = dr.fma(layer, grid.growth * grid.thickness, grid.width)
-        u = (point.x - grid.shear[0] * depth) / width + self._shift.x
-        v = (point.y - grid.shear[1] * depth) / width + self._shift.y
-        i, j = mi.UInt32(mi.Int32(dr.floor(u)) + ORIGIN), mi.UInt32(mi.Int32(dr.floor(v)) + ORIGIN)
-        k = mi.UInt32(layer)
-        xy, z = grid.bits_xy, grid.bits_z
-        bucket = low_bits(i, xy) | (low_bits(j, xy) << xy) | (low_bits(k, z) << (2 * xy))
-        tag = low_bits(i >> xy, 12) | (low_bits(j >> xy, 12) << 12) | (low_bits(k >> z, 8) << 24)
+        along, across = rings.offset(point.x, point.y, depth)
+        upper = layer * grid.thickness
+        sector = rings.sector(along, across, rings.core(upper), grid.widths(upper), self._shift)
+        i, j, k = sector.ring, sector.number, mi.UInt32(layer)
+        of_ring, of_sector, z = grid.bits_ring, grid.bits_sector, grid.bits_z
+        bucket = (
+            low_bits(j, of_sector) | (low_bits(i, of_ring) << of_sector) | (low_bits(k, z) << (of_sector + of_ring))
+        )
+        tag = low_bits(i >> of_ring, 12) | (low_bits(j >> of_sector, 12) << 12) | (low_bits(k >> z, 8) << 24)
         thickness = dr.select(k == 0, self._top, grid.thickness)
-        return bucket, tag, thickness * width * width
+        return bucket, tag, thickness * rings.area(sector)
 
 
 def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches
-from mitransient_lidar.transport.merging.photon_map import Photon, PhotonMap
+from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL, Photon, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentPoints
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
@@ -26,12 +28,21 @@ def store_points(
         return None
     index = dr.arange(mi.UInt32, count)
     bucket, _, _ = cells.locate(segments.points(index).point)
-    photons = PhotonMap(cells.grid.buckets, bucket, classes.separate)
+    u = mi.sample_tea_float32(index, 0)
+    photons = PhotonMap(cells.grid.buckets, bucket, u, PHOTONS_OF_CELL, classes.separate)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     _, tag, _ = cells.locate(points.point)
     position = dr.dot(points.point, points.direction)
-    photon = Photon(points.direction, points.length, points.weight, points.mis_partial_sum, position, points.label)
+    photon = Photon(
+        points.direction,
+        points.length,
+        points.weight,
+        points.mis_partial_sum,
+        position,
+        points.edge,
+        points.label,
+    )
     photons.fill(photon, tag)
     return photons
 
@@ -42,14 +53,13 @@ def merge_in_water(
     points: SegmentPoints,
     cells: WaterCells | SphericalCells,
     photons: PhotonMap,
-    u: mi.Float,
+    connections: mi.Float,
 ) -> None:
     """Merge points of the receiver's paths with the light in their cells.
 
     A point represents a track of length s and throughput beta, a photon one of length s' and energy w. With the cell's
     volume V each pair adds beta s w s' / V times scattering coefficient and phase function, weighted among all merges
-    that make the same path; water and bubbles make different paths. The uniform random numbers `u` select photons in
-    cells with too many.
+    and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
     """
     water = scene.water
     bucket, cell, volume = cells.locate(points.point)
@@ -63,9 +73,9 @@ def merge_in_water(
     absorption = water.absorption_flight.attenuation(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
     subpath = SensorSubpath(*record.classes.unpack(points.label), points.direction, points.weight)
-    first, end, step = photons.sample(bucket, u, mi.Bool(True))
-    weight = points.weight / volume * mi.Float(step)
-    relative_volume = cells.relative_volume(points.point)
+    first, end = photons.find(bucket, mi.Bool(True))
+    typical = cells.typical_volume(points.point)
+    weight = points.weight / volume * typical
 
     def merge(index: mi.UInt32) -> tuple[mi.UInt32]:
         active = index < end
@@ -74,34 +84,41 @@ def merge_in_water(
         shared = mi.Float(0)
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
-            density = relative_volume / (scattering * value[0])
-            shared += relative_volume / (density + points.mis_partial_sum + photon.mis_partial_sum)
+            own = (typical + connections * (points.edge + photon.edge)) / (scattering * value[0])
+            shared += dr.rcp(own + points.mis_partial_sum + photon.mis_partial_sum)
         # The photon continues to the plane through the point normal to its direction, so that times do not blur.
         beyond = dr.dot(points.point, photon.direction) - photon.position
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + beyond * group
         subpath.add(record, photon, 1, length, energy, active)
-        return (index + step,)
+        return (index + 1,)
 
     dr.while_loop((first,), lambda index: index < end, merge, label="merge in the water")
 
 
 def merge_on_solids(
-    patches: SolidPatches, record: PassRecord, photons: PhotonMap | None, pixel: mi.UInt32, rng: mi.PCG32
+    patches: SolidPatches,
+    record: PassRecord,
+    photons: PhotonMap | None,
+    pixel: mi.UInt32,
+    connections: mi.Float,
+    rng: mi.PCG32,
 ) -> Action:
     """Return the action that merges the receiver's paths with the light on the solids that they meet.
 
-    A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF.
+    A path of throughput beta and a photon of energy w on a patch of area A add beta w / A times the BSDF, weighted
+    against `connections`, a share of all pairs, that make the same path.
     """
 
-    def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
+    def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
         if photons is None:
             return
-        patch = patches.locate(si)
-        first, end, step = photons.sample(patch.bucket, rng.next_float32(), active)
+        patch, random = patches.locate(si), mi.PCG32(rng)
+        first, end = photons.find(patch.bucket, active)
         subpath = SensorSubpath(pixel, path.scatterings, path.reversals, path.direction, path.weight)
-        weight = path.weight * patches.inverse_share(patch, si.shape, rng, active & (first < end)) / patch.area
-        weight *= mi.Float(step)
+        weight = path.weight * patches.inverse_share(patch, si.shape, random, active & (first < end)) / patch.area
+        typical = patches.typical_area(si)
+        connection = connections * edge / dr.abs(dr.dot(si.n, path.direction))
 
         def add(index: mi.UInt32) -> tuple[mi.UInt32]:
             within = index < end
@@ -112,9 +129,10 @@ def merge_on_solids(
             # the true surface, which is divided out.
             cosine = dr.abs(dr.dot(si.n, photon.direction))
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
-            energy = weight * photon.weight * bsdf
+            share = typical / dr.fma(connection, photon.edge, typical)
+            energy = weight * photon.weight * bsdf * share
             subpath.add(record, photon, 0, path.length + photon.length, energy, within & (bsdf > 0))
-            return (index + step,)
+            return (index + 1,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge on solids")
 
@@ -132,19 +150,29 @@ class SensorSubpath:
     weight: mi.Float
 
     def add(
-        self, record: PassRecord, photon: Photon, events: int, length: mi.Float, energy: mi.Float, active: mi.Bool
+        self,
+        record: PassRecord,
+        light: Photon | SegmentPoints,
+        events: int,
+        length: mi.Float,
+        energy: mi.Float,
+        active: mi.Bool,
+        between: Sequence[mi.Vector3f] = (),
     ) -> None:
-        """Add merged paths, with 0 or 1 scattering `events` at the merge, to a record.
+        """Add complete paths to a record, with a number of scattering `events` where the parts meet.
 
-        Paths of which one part lies outside the surface mesh count as lost.
+        `between` are the directions of segments between the receiver's part and the light's. Paths of which one part
+        lies outside the surface mesh count as lost.
         """
-        outside = (self.weight < 0) | (photon.weight < 0)
+        outside = (self.weight < 0) | (light.weight < 0)
         order, reversals = self.scatterings, self.reversals
         if record.classes.separate:
-            _, before, reversed_before = record.classes.unpack(photon.label)
-            # Light continues against the direction of the receiver's part: a reversal if both point down, or both up.
-            here = dr.select(photon.direction.z * self.direction.z > 0, mi.UInt32(1), 0)
-            reversals = reversals + reversed_before + here
+            _, before, reversed_before = record.classes.unpack(light.label)
+            # Light continues against the directions of the receiver's part.
+            course = [self.direction.z, *(direction.z for direction in between), -light.direction.z]
+            for here, following in pairwise(course):
+                reversals = reversals + dr.select(here * following < 0, mi.UInt32(1), 0)
+            reversals = reversals + reversed_before
             order = order + before + events
-        record.receive(self.pixel, order, reversals, length, energy, active & ~outside)
+        record.receive(self.pixel, order, reversals, length, dr.abs(energy), active & ~outside)
         record.lose(dr.abs(energy), active & outside)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import ORIGIN, PROBE_RAYS, Region, low_bits
+from mitransient_lidar.transport.merging.rings import BeamRings, Sector
 from mitransient_lidar.transport.opaque import is_one_of, opaque
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -34,9 +35,11 @@ class Patch:
     bucket, tag
         Bucket of its photons; patches of one bucket differ in tag.
     area
-        Area of the surface over the patch's square in projection, if it covers all of it [m^2].
+        Area of the surface over the patch's projection, if it covers all of it [m^2].
     corner
         Corner of that square, and height over it, in the coordinates (u, v, w) of the projection [m].
+    sector
+        Sector of rings that replaces the square in projections along z.
     axis
         Axis of the projection: 0, 1 or 2 for x, y or z.
     faces
@@ -47,6 +50,7 @@ class Patch:
     tag: mi.UInt32
     area: mi.Float
     corner: mi.Point3f
+    sector: Sector
     axis: mi.UInt32
     faces: mi.Float
 
@@ -68,14 +72,20 @@ def solids_of_several_levels(scene: LidarScene, region: Region) -> list[mi.Shape
 
 
 class SolidPatches:
-    """Patches of one pass: squares in projection along the axis nearest to the normal, shifted at random.
+    """Patches of one pass, in projection along the axis nearest to the normal, shifted at random.
+
+    Patches that look up or down are sectors of rings about the beam, others squares.
 
     Parameters
     ----------
     region
         Region that is lit or seen.
+    rings
+        Rings about the beam.
+    depth
+        Depth at which their centre lies on the beam [m].
     width
-        Side of a square [m].
+        Side of a square, and of a sector on the axis at the surface [m].
     shift
         Two uniform random numbers.
     uneven
@@ -86,10 +96,19 @@ class SolidPatches:
     buckets = 1 << (2 * _BUCKET_BITS)
 
     def __init__(
-        self, scene: LidarScene, region: Region, width: float, shift: mi.Point2f, uneven: Sequence[mi.Shape] = ()
+        self,
+        scene: LidarScene,
+        region: Region,
+        rings: BeamRings,
+        depth: float,
+        width: float,
+        shift: mi.Point2f,
+        uneven: Sequence[mi.Shape] = (),
     ) -> None:
-        self.scene = scene
-        self.width = opaque(width)
+        self.scene, self._rings = scene, rings
+        self.width, self._depth = opaque(width), opaque(depth)
+        self._core = rings.core(self._depth)
+        self._ring_width = self.width / rings.core(mi.Float(0))
         self._shift = shift
         self._bounded = [
             solid
@@ -109,6 +128,11 @@ class SolidPatches:
         w = dr.select(along_x, si.p.x, dr.select(along_y, si.p.y, si.p.z))
         cu, cv = dr.floor(u / self.width + self._shift.x), dr.floor(v / self.width + self._shift.y)
         i, j = mi.UInt32(mi.Int32(cu) + ORIGIN), mi.UInt32(mi.Int32(cv) + ORIGIN)
+        along, across = self._rings.offset(si.p.x, si.p.y, self._depth)
+        sector = self._rings.sector(along, across, self._core, self._ring_width, self._shift)
+        level_patch = axis == 2
+        i, j = dr.select(level_patch, sector.ring, i), dr.select(level_patch, sector.number, j)
+        projected = dr.select(level_patch, self._rings.area(sector), self.width * self.width)
         bits = _BUCKET_BITS
         side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
@@ -122,11 +146,22 @@ class SolidPatches:
             | (low_bits(level, 8) << 12)
             | (side << 20)
             | (low_bits(shape, 9) << 23),
-            area=self.width * self.width / dr.abs(normal),
+            area=projected / dr.abs(normal),
             corner=mi.Point3f((cu - self._shift.x) * self.width, (cv - self._shift.y) * self.width, w),
+            sector=sector,
             axis=axis,
             faces=dr.sign(normal),
         )
+
+    def typical_area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """Return the approximate area of the patches at points on solids, a smooth function on each face [m^2]."""
+        along, across = self._rings.offset(si.p.x, si.p.y, self._depth)
+        scale = dr.square(self._core) + along * along + across * across
+        sector = dr.square(self._ring_width) * scale / self._rings.cosine
+        up = dr.abs(si.n.z)
+        is_level = (up >= dr.abs(si.n.x)) & (up >= dr.abs(si.n.y))
+        area = dr.select(is_level, sector, self.width * self.width)
+        return area / dr.maximum(dr.maximum(dr.abs(si.n.x), dr.abs(si.n.y)), up)
 
     def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a solid may end inside the region."""
@@ -143,8 +178,10 @@ class SolidPatches:
         reach = 2 * self.width
 
         def probe(samples: mi.Float, rng: mi.PCG32, searching: mi.Bool) -> tuple[mi.Float, mi.PCG32, mi.Bool]:
-            u = patch.corner.x + self.width * rng.next_float32()
-            v = patch.corner.y + self.width * rng.next_float32()
+            along, across = rng.next_float32(), rng.next_float32()
+            u, v = patch.corner.x + self.width * along, patch.corner.y + self.width * across
+            x, y = self._rings.point(*self._rings.draw(patch.sector, self._shift, along, across), self._depth)
+            u, v = dr.select(patch.axis == 2, x, u), dr.select(patch.axis == 2, y, v)
             w = patch.corner.z + reach * patch.faces
             is_x, is_y = patch.axis == 0, patch.axis == 1
             origin = mi.Point3f(

@@ -11,9 +11,9 @@ from mitransient_lidar.transport.merging.patches import Patch
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 
-#: Largest number of photons of a bucket that are used for one point. Where a beam or field of view is no wider than a
-#: cell, thousands would take minutes and reduce the variance little; usually the fullest buckets hold fifteen.
-_MOST_PHOTONS = 32
+#: Number of photons that are kept of full buckets, of cells and of patches: more take time and reduce the variance
+#: little.
+PHOTONS_OF_CELL, PHOTONS_OF_PATCH = 8, 32
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class Photon:
         As in `RandomWalkPath`.
     position
         Scalar product of position and direction [m].
+    edge
+        As in `SegmentPoints`; on solids 1 for the first one of a path, which can be connected, else 0.
     label
         Scattering events and reversals of its path (`PathClasses.pack`).
     """
@@ -41,88 +43,133 @@ class Photon:
     weight: mi.Float
     mis_partial_sum: mi.Float
     position: mi.Float
+    edge: mi.Float
     label: mi.UInt32
 
 
 class PhotonMap:
-    """Photons sorted by bucket, by counting: `bucket` is that of each photon, `labelled` whether labels are kept."""
+    """Photons sorted by bucket, by counting.
 
-    def __init__(self, buckets: int, bucket: mi.UInt32, labelled: bool) -> None:
-        self.count = dr.width(bucket)
+    Of full buckets only some photons are kept, at random and with larger weights.
+
+    Parameters
+    ----------
+    buckets
+        Number of buckets.
+    bucket
+        Bucket of each photon.
+    u
+        Uniform random numbers that select photons.
+    most
+        Expected number of photons that are kept of a bucket with more.
+    labelled
+        Whether labels are kept.
+    """
+
+    def __init__(self, buckets: int, bucket: mi.UInt32, u: mi.Float, most: int, labelled: bool) -> None:
         counts = dr.zeros(mi.UInt32, buckets)
+        dr.scatter_add(counts, mi.UInt32(1), bucket)
         self._bucket = bucket
-        self._rank = dr.scatter_inc(counts, bucket, dr.full(mi.Bool, True, self.count))
-        dr.eval(self._rank, self._bucket, counts)
+        dr.eval(self._bucket, counts)
+        self._keep = most / mi.Float(dr.gather(mi.UInt32, counts, bucket))
+        self._kept = u < self._keep
+        counts = dr.zeros(mi.UInt32, buckets)
+        self._rank = dr.scatter_inc(counts, bucket, self._kept)
+        dr.eval(self._rank, self._kept, self._keep, counts)
         self._end = dr.cumsum(counts)
+        self.count = int(self._end[buckets - 1])
         self._record = mi.Float()
         self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
 
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
         """Store the photons in the order of their buckets, with their cells' tags."""
         place = dr.gather(mi.UInt32, self._end, self._bucket) - 1 - self._rank
+        weight = photon.weight / dr.minimum(self._keep, 1)
         self._record = dr.empty(mi.Float, 8 * self.count)
-        where = mi.Vector4f(photon.direction.x, photon.direction.y, photon.direction.z, photon.length)
-        rest = mi.Vector4f(photon.weight, photon.mis_partial_sum, dr.reinterpret_array(mi.Float, tag), photon.position)
-        dr.scatter(self._record, where, 2 * place)
-        dr.scatter(self._record, rest, 2 * place + 1)
+        # The sign bit of the sum is that of the direction's z component.
+        up = dr.select(photon.direction.z > 0, mi.UInt32(1 << 31), 0)
+        summed = dr.reinterpret_array(mi.Float, dr.reinterpret_array(mi.UInt32, photon.mis_partial_sum) | up)
+        where = mi.Vector4f(photon.direction.x, photon.direction.y, photon.edge, photon.length)
+        rest = mi.Vector4f(weight, summed, dr.reinterpret_array(mi.Float, tag), photon.position)
+        dr.scatter(self._record, where, 2 * place, self._kept)
+        dr.scatter(self._record, rest, 2 * place + 1, self._kept)
         if self._label is not None:
-            dr.scatter(self._label, photon.label, place)
+            dr.scatter(self._label, photon.label, place, self._kept)
         dr.eval(self._record, self._end, self._label)
-        self._bucket, self._rank = mi.UInt32(), mi.UInt32()
+        self._bucket, self._rank, self._keep, self._kept = mi.UInt32(), mi.UInt32(), mi.Float(), mi.Bool()
 
-    def sample(self, bucket: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return first photon, end and step of the photons of a bucket that are used; nothing where inactive.
-
-        The uniform number `u` selects each photon with a probability of one over the step.
-        """
+    def find(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        """Return the first photon of a bucket and the end of its photons; nothing where inactive."""
         end = dr.gather(mi.UInt32, self._end, bucket, active)
-        first = dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0))
-        step = (end - first) // (_MOST_PHOTONS + 1) + 1
-        return first + dr.minimum(mi.UInt32(u * mi.Float(step)), step - 1), end, step
+        return dr.gather(mi.UInt32, self._end, bucket - 1, active & (bucket > 0)), end
 
     def photon(self, index: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
         """Return photons and their tags."""
-        x, y, z, length = dr.gather(mi.Vector4f, self._record, 2 * index, active)
-        weight, mis_partial_sum, tag, position = dr.gather(mi.Vector4f, self._record, 2 * index + 1, active)
+        x, y, edge, length = dr.gather(mi.Vector4f, self._record, 2 * index, active)
+        weight, summed, tag, position = dr.gather(mi.Vector4f, self._record, 2 * index + 1, active)
+        up = (dr.reinterpret_array(mi.UInt32, summed) >> 31) > 0
+        z = dr.sqrt(dr.maximum(1 - x * x - y * y, 0))
+        z = dr.select(up, z, -z)
         label = mi.UInt32(0) if self._label is None else dr.gather(mi.UInt32, self._label, index, active)
-        photon = Photon(mi.Vector3f(x, y, z), length, weight, mis_partial_sum, position, label)
+        photon = Photon(mi.Vector3f(x, y, z), length, weight, dr.abs(summed), position, edge, label)
         return photon, dr.reinterpret_array(mi.UInt32, tag)
 
 
 class PhotonBuffer:
-    """Light on patches of solids, in any order; at most `capacity` photons are stored, but all are counted."""
+    """Light of `photons` paths on solids, in any order; at most `capacity` hits are stored, but all are counted.
 
-    def __init__(self, capacity: int, classes: PathClasses) -> None:
-        self.capacity = capacity
+    The first hit of each path is stored by the number of the path, too.
+    """
+
+    def __init__(self, capacity: int, photons: int, classes: PathClasses) -> None:
+        self.capacity, self.photons = capacity, photons
         self._classes = classes
         self._stored = dr.zeros(mi.UInt32, 1)
         self._patch = dr.empty(mi.UInt32, 2 * capacity)
         self._label = dr.empty(mi.UInt32, capacity if classes.separate else 1)
         self._record = dr.empty(mi.Float, 4 * capacity)
-        self._weight = dr.empty(mi.Float, capacity)
+        self._weight = dr.empty(mi.Float, 2 * capacity)
+        self._first_place = dr.zeros(mi.Float, 4 * photons)
+        self._first_record = dr.zeros(mi.Float, 4 * photons)
+        self._first_label = dr.zeros(mi.UInt32, photons if classes.separate else 1)
 
-    def add(self, path: RandomWalkPath, patch: Patch, active: mi.Bool) -> None:
-        """Store light that has met patches of solids."""
+    def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool) -> None:
+        """Store light that has met patches of solids at places [m]."""
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
         keep = active & (slot < self.capacity)
+        first = active & path.before_first_solid
         where = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
         dr.scatter(self._record, where, slot, keep)
-        dr.scatter(self._weight, path.weight, slot, keep)
+        dr.scatter(self._weight, mi.Vector2f(path.weight, dr.select(first, mi.Float(1), 0)), slot, keep)
+        dr.scatter(self._first_record, where, path.lane, first)
+        dr.scatter(self._first_place, mi.Vector4f(path.weight, place.x, place.y, place.z), path.lane, first)
         if self._classes.separate:
-            dr.scatter(self._label, self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals), slot, keep)
+            label = self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals)
+            dr.scatter(self._label, label, slot, keep)
+            dr.scatter(self._first_label, label, path.lane, first)
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, or None, and their number, stored or not."""
         dr.eval(self._stored, self._patch, self._record, self._weight, self._label)
+        dr.eval(self._first_record, self._first_place, self._first_label)
         wanted = int(self._stored[0])
         if wanted == 0:
             return None, 0
         index = dr.arange(mi.UInt32, min(wanted, self.capacity))
         bucket, tag = dr.gather(mi.Point2u, self._patch, index)
         x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
-        photons = PhotonMap(buckets, bucket, self._classes.separate)
+        u = mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, x), dr.reinterpret_array(mi.UInt32, length))
+        photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.separate)
         label = dr.gather(mi.UInt32, self._label, index) if self._classes.separate else mi.UInt32(0)
-        weight = dr.gather(mi.Float, self._weight, index)
-        photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, mi.Float(0), mi.Float(0), label), tag)
+        weight, first = dr.gather(mi.Vector2f, self._weight, index)
+        photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, mi.Float(0), mi.Float(0), first, label), tag)
         return photons, wanted
+
+    def first_hit(self, index: mi.UInt32) -> tuple[mi.Point3f, Photon]:
+        """Return where paths by number first met a solid [m], and the photons there, of weight 0 for none."""
+        x, y, z, length = dr.gather(mi.Vector4f, self._first_record, index)
+        weight, px, py, pz = dr.gather(mi.Vector4f, self._first_place, index)
+        label = dr.gather(mi.UInt32, self._first_label, index) if self._classes.separate else mi.UInt32(0)
+        zero = mi.Float(0)
+        return mi.Point3f(px, py, pz), Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, mi.Float(1), label)

@@ -11,9 +11,11 @@ import numpy as np
 
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.cells import Region, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids, store_points
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
+from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells, SphericalGrid, reach_under_water
 from mitransient_lidar.transport.opaque import opaque
@@ -23,25 +25,23 @@ from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.refracted_connection import connect_laser
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS, SensorSampler
 from mitransient_lidar.transport.volpath import VolpathOptions, trace_connected
 
-#: Numbers of the random streams within a pass; the path tracer has the next one.
+#: Numbers of the random streams within a pass; the path tracer has number 3.
 _COMMON_STREAM, _LIGHT_STREAM, _SENSOR_STREAM = 0, 1, 2
+_MERGE_STREAM, _CONNECTION_STREAM, _SOLID_CONNECTION_STREAM = 4, 5, 6
 
 #: Points from the surface to the bottom, or to the depth that the end of the record allows. In images, half as many
 #: points take a third less time and increase the water's variance by a half: more paths are better there.
-_POINTS_PER_PATH, _POINTS_PER_IMAGE_PATH = 20, 10
+_POINTS_PER_PATH, _POINTS_PER_IMAGE_PATH = 14, 10
 
 #: Default numbers of paths and photons of a pass.
 _PATHS, _PATHS_PER_PIXEL, _MOST_PATHS = 2**15, 16, 2**21
 _PHOTONS, _PHOTONS_FOR_IMAGES = 2**15, 2**16
 
-#: Number of pixels from which a receiver is an imager.
-_IMAGE_PIXELS = 4096
-
 #: Width of the cells at the surface, over the beam's standard deviation there and over the side of the sea's facets.
-_CELL_PER_FOOTPRINT, _CELL_PER_FACET = 0.0125, 0.05
+_CELL_PER_FOOTPRINT, _CELL_PER_FACET = 0.025, 0.05
 
 #: Width of the cells of a lidar under water, from which that of patches follows, over the beam's standard deviation.
 _CELL_PER_BEAM = 0.05
@@ -58,6 +58,9 @@ _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.35, 0.3
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
+
+#: Points of a light path that are expected, over those of a straight one, to scale the rate of connections.
+_POINTS_OF_LIGHT = 0.8
 
 #: Capacity for segments and hits over the need of the last pass.
 _CAPACITY_MARGIN = 1.25
@@ -85,10 +88,14 @@ class MergingLayout:
         Solids of several levels.
     grid
         Layout of the cells.
+    rings
+        Rings about the beam, for patches.
     spacing
         Distance between points along a path [m].
+    reach, depth
+        Mean distance in the water along the axis to a solid or to the record's end, and its depth [m].
     patch_width
-        Width of the patches of solids [m].
+        Width of the patches of solids on the axis at the surface [m].
     light_segments, sensor_segments, hits
         Capacities for segments and hits of solids of each path; they grow when a pass needs more.
     """
@@ -96,7 +103,10 @@ class MergingLayout:
     region: Region
     uneven: list[mi.Shape]
     grid: WaterGrid | SphericalGrid
+    rings: BeamRings
     spacing: float
+    reach: float
+    depth: float
     patch_width: float
     light_segments: float
     sensor_segments: float
@@ -112,7 +122,7 @@ class MergingLayout:
             reach = region.track_length(scene)
         uneven = solids_of_several_levels(scene, region)
         finest = options.point_spacing or reach / _POINTS_PER_PATH
-        is_image = scene.receiver.pixels.count >= _IMAGE_PIXELS
+        is_image = scene.receiver.pixels.count >= IMAGE_PIXELS
         spacing = options.point_spacing or reach / (_POINTS_PER_IMAGE_PATH if is_image else _POINTS_PER_PATH)
         column = scene.water.column
         thickness = _THICKNESS_PER_SPACING * finest
@@ -125,12 +135,18 @@ class MergingLayout:
         if scene.submerged:
             width = options.cell_size or _CELL_PER_BEAM * scene.transmitter.angular_spread * nearest
             grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
-            return cls(region, uneven, grid, spacing, _PATCH_PER_CELL * width, segments, segments)
+            rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0)
+            depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
+            return cls(region, uneven, grid, rings, spacing, reach, depth, _PATCH_PER_CELL * width, segments, segments)
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
+        rings = BeamRings(pose, footprint, scene.refractive_index)
         width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * scene.facet_size)
-        growth = width * (_GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min()))
-        grid = WaterGrid(scene, SurfaceHeights(scene, region), width, growth, thickness, reach)
-        return cls(region, uneven, grid, spacing, _PATCH_PER_CELL * width, segments, segments)
+        growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
+        core = CORE_PER_SPREAD * footprint
+        grid = WaterGrid(rings, SurfaceHeights(scene, region), width / core, growth, thickness, reach)
+        sine = np.hypot(*pose.axis[:2]) / scene.refractive_index
+        depth = reach * float(np.sqrt(1 - sine**2))
+        return cls(region, uneven, grid, rings, spacing, reach, depth, _PATCH_PER_CELL * width, segments, segments)
 
 
 def paths_of_pass(options: MergingOptions, pixels: int) -> int:
@@ -146,7 +162,7 @@ class MergingRenderer(PassRenderer):
     ) -> None:
         pixels = scene.receiver.pixels.count
         super().__init__(scene, classes, paths_of_pass(options, pixels))
-        photons = _PHOTONS_FOR_IMAGES if pixels >= _IMAGE_PIXELS else _PHOTONS
+        photons = _PHOTONS_FOR_IMAGES if pixels >= IMAGE_PIXELS else _PHOTONS
         self.photons = options.photons_per_pass or photons
         self.layout = layout or MergingLayout.of_scene(scene, self.sampler, options)
         self._beam = BeamSampler(scene.transmitter, scene.receiver)
@@ -179,9 +195,13 @@ class MergingRenderer(PassRenderer):
         common = np.random.default_rng([seed, _COMMON_STREAM]).random(5, np.float32)
         shifts = [dr.opaque(mi.Float, float(shift)) for shift in common]
         cells = layout.grid.cells(mi.Point3f(shifts[:3]))
-        patches = SolidPatches(scene, layout.region, layout.patch_width, mi.Point2f(shifts[3:]), layout.uneven)
-        light = self._trace_light(record, seed, cells, patches)
-        if light is None or not self._trace_sensor(record, seed, paths, cells, patches, *light):
+        patches = SolidPatches(
+            scene, layout.region, layout.rings, layout.depth, layout.patch_width, mi.Point2f(shifts[3:]), layout.uneven
+        )
+        points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
+        rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path)
+        light = self._trace_light(record, seed, cells, patches, rates)
+        if light is None or not self._trace_sensor(record, seed, paths, cells, patches, rates, light):
             return False
         # The path tracer adds the light that merging leaves out.
         if not scene.has_specular_or_dry_solids:
@@ -190,22 +210,25 @@ class MergingRenderer(PassRenderer):
         return True
 
     def _trace_light(
-        self, record: PassRecord, seed: int, cells: WaterCells | SphericalCells, patches: SolidPatches
-    ) -> tuple[PhotonMap | None, PhotonMap | None] | None:
-        """Trace light from the laser; return photons in cells and on patches, or None when a buffer was too small."""
+        self,
+        record: PassRecord,
+        seed: int,
+        cells: WaterCells | SphericalCells,
+        patches: SolidPatches,
+        rates: ConnectionRates,
+    ) -> _StoredLight | None:
+        """Trace light from the laser; return it, or None when a buffer was too small."""
         scene, layout, count = self.scene, self.layout, self.photons
         rng = pass_streams(seed, _LIGHT_STREAM, count)
-        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, int(layout.light_segments * count))
-        hits = PhotonBuffer(int(layout.hits * count), self.classes)
+        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, count, int(layout.light_segments * count))
+        hits = PhotonBuffer(int(layout.hits * count), count, self.classes)
         angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.transmitter.pose, angles, energy, offset)
-        walk = RandomWalk(
-            *(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, cells.relative_volume)
-        )
+        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, rates)
 
-        def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-            hits.add(path, patches.locate(si), active)
+        def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
+            hits.add(path, si.p, patches.locate(si), active)
 
         path = walk.run(path, rng, mi.UInt32(0), segments, on_solid=store, past_solids=True)
         record.rays = dr.sum(mi.Float64(path.rays))
@@ -216,7 +239,8 @@ class MergingRenderer(PassRenderer):
             layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * wanted / count)
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
-        return store_points(segments, points, cells, self.classes), on_patches
+        in_cells = store_points(segments, points, cells, self.classes)
+        return _StoredLight(in_cells, segments, points, on_patches, hits)
 
     def _trace_sensor(
         self,
@@ -225,19 +249,17 @@ class MergingRenderer(PassRenderer):
         count: int,
         cells: WaterCells | SphericalCells,
         patches: SolidPatches,
-        in_water: PhotonMap | None,
-        on_patches: PhotonMap | None,
+        rates: ConnectionRates,
+        light: _StoredLight,
     ) -> bool:
-        """Trace paths from the receiver and merge them with light; return False when a buffer was too small."""
+        """Trace paths from the receiver and join them with light; return False when a buffer was too small."""
         scene, layout = self.scene, self.layout
         rng = pass_streams(seed, _SENSOR_STREAM, count)
         start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
-        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, int(layout.sensor_segments * count))
+        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, count, int(layout.sensor_segments * count))
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.receiver.pose, start.angles, start.weight, offset)
-        walk = RandomWalk(
-            *(scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end, cells.relative_volume)
-        )
+        walk = RandomWalk(scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end, rates)
 
         def connect(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             radiance, length = connect_laser(scene, si, active)
@@ -246,7 +268,8 @@ class MergingRenderer(PassRenderer):
             # No scattering event, and one reversal.
             record.receive(start.pixel, mi.UInt32(0), mi.UInt32(1), path.length + length, energy, radiance > 0)
 
-        merge = merge_on_solids(patches, record, on_patches, start.pixel, rng)
+        of_merges = pass_streams(seed, _MERGE_STREAM, count)
+        merge = merge_on_solids(patches, record, light.on_patches, start.pixel, rates.on_solids, of_merges)
         path = walk.run(path, rng, start.pixel, segments, on_solid=merge, on_first_hit=connect, past_solids=False)
         record.rays += dr.sum(mi.Float64(path.rays))
         dr.schedule(record.rays)
@@ -254,8 +277,26 @@ class MergingRenderer(PassRenderer):
         if wanted > segments.capacity:
             layout.sensor_segments = max(layout.sensor_segments, _CAPACITY_MARGIN * wanted / count)
             return False
-        if in_water is not None and points > 0:
+        if points == 0:
+            return True
+        if light.in_cells is not None:
             index = dr.arange(mi.UInt32, points)
-            u = mi.sample_tea_float32(index, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
-            merge_in_water(scene, record, segments.points(index), cells, in_water, u)
+            merge_in_water(scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
+        if rates.connected:
+            connections = WaterConnections(scene, record, rates, segments)
+            if light.points > 0:
+                connections.to_light(points, light.segments, light.points, seed, _CONNECTION_STREAM)
+            if light.on_patches is not None:
+                connections.to_solids(points, light.hits, patches, seed, _SOLID_CONNECTION_STREAM)
         return True
+
+
+@dataclass(frozen=True)
+class _StoredLight:
+    """Light of a pass: its points in cells and by number, and its hits of solids on patches and by number."""
+
+    in_cells: PhotonMap | None
+    segments: SegmentBuffer
+    points: int
+    on_patches: PhotonMap | None
+    hits: PhotonBuffer

@@ -30,6 +30,9 @@ class SegmentPoints:
         surface mesh.
     mis_partial_sum
         As in `RandomWalkPath`.
+    edge
+        For the last scattering event, 1 / (b p) times the squared distance from it over the transmittance of scattering
+        on the way; 0 if the segment starts elsewhere.
     label
         Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
     """
@@ -39,27 +42,29 @@ class SegmentPoints:
     length: mi.Float
     weight: mi.Float
     mis_partial_sum: mi.Float
+    edge: mi.Float
     label: mi.UInt32
 
 
 class SegmentBuffer:
-    """Segments in the water of many paths, in any order, with points at equal distances `spacing` [m] along each path.
+    """Segments in the water of `paths` paths, with points at equal distances `spacing` [m] along each path.
 
-    At most `capacity` segments are stored, but all are counted.
+    At most `capacity` segments are stored, in any order, but all are counted. Points are numbered path by path.
     """
 
-    def __init__(self, water: Any, classes: PathClasses, spacing: float, capacity: int) -> None:
+    def __init__(self, water: Any, classes: PathClasses, spacing: float, paths: int, capacity: int) -> None:
         self._water, self._classes = water, classes
         self.spacing = opaque(spacing)
         self.capacity = capacity
         self._stored = dr.zeros(mi.UInt32, 1)
-        self._number = dr.zeros(mi.UInt32, capacity)
+        self._of_path = dr.zeros(mi.UInt32, paths)
+        self._place = dr.zeros(mi.UInt32, 2 * capacity)
         self._label = dr.empty(mi.UInt32, capacity)
         self._start = dr.empty(mi.Float, 4 * capacity)
         self._direction = dr.empty(mi.Float, 4 * capacity)
-        self._weight = dr.empty(mi.Float, 2 * capacity)
-        self._end = mi.UInt32()
-        self._segment = mi.UInt32()
+        self._weight = dr.empty(mi.Float, 4 * capacity)
+        self._first = mi.UInt32()
+        self._slot = mi.UInt32()
 
     def add(self, path: RandomWalkPath, length: mi.Float, label: mi.UInt32, active: mi.Bool) -> mi.Float:
         """Store the next segment of each path, of a length [m]; return the offset of the first point beyond it [m]."""
@@ -67,36 +72,46 @@ class SegmentBuffer:
         number = dr.select(active, number, 0)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
         keep = (number > 0) & (slot < self.capacity)
-        dr.scatter(self._number, number, slot, keep)
+        dr.scatter(self._place, mi.Point2u(path.lane, path.points), slot, keep)
         dr.scatter(self._label, self._classes.pack(label, path.scatterings, path.reversals), slot, keep)
         dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.offset), slot, keep)
         direction = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._direction, direction, slot, keep)
-        dr.scatter(self._weight, mi.Vector2f(path.weight, path.mis_partial_sum), slot, keep)
+        dr.scatter(self._weight, mi.Vector4f(path.weight, path.mis_partial_sum, path.inverse, 0), slot, keep)
+        path.points += number
+        dr.scatter(self._of_path, path.points, path.lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
 
     def finalize(self) -> tuple[int, int]:
         """Assign numbers to the points; return their number and that of the segments, stored or not."""
-        dr.eval(self._stored, self._number, self._label, self._start, self._direction, self._weight)
-        self._end = dr.cumsum(self._number)
-        count = int(self._end[self.capacity - 1])
-        segment = dr.zeros(mi.UInt32, max(count, 1))
-        dr.scatter(segment, dr.arange(mi.UInt32, self.capacity), self._end - self._number, self._number > 0)
+        dr.eval(self._stored, self._of_path, self._place, self._label, self._start, self._direction, self._weight)
+        end = dr.cumsum(self._of_path)
+        count, wanted = int(end[dr.width(end) - 1]), int(self._stored[0])
+        if wanted > self.capacity or count == 0:
+            return count, wanted
+        slot = dr.arange(mi.UInt32, wanted)
+        lane, before = dr.gather(mi.Point2u, self._place, slot)
+        first = dr.gather(mi.UInt32, end, lane) - dr.gather(mi.UInt32, self._of_path, lane) + before
+        begins, self._slot = dr.zeros(mi.UInt32, count), dr.empty(mi.UInt32, count)
+        dr.scatter(begins, first, first)
+        dr.scatter(self._slot, slot, first)
         # Every point belongs to the last segment that begins at or before it.
-        self._segment = dr.prefix_reduce(dr.ReduceOp.Max, segment, exclusive=False)
-        dr.eval(self._segment)
-        return count, int(self._stored[0])
+        self._first = dr.prefix_reduce(dr.ReduceOp.Max, begins, exclusive=False)
+        dr.eval(self._first, self._slot)
+        return count, wanted
 
     def points(self, index: mi.UInt32) -> SegmentPoints:
         """Return points by number."""
-        segment = dr.gather(mi.UInt32, self._segment, index)
+        first = dr.gather(mi.UInt32, self._first, index)
+        segment = dr.gather(mi.UInt32, self._slot, first)
         x, y, z, offset = dr.gather(mi.Vector4f, self._start, segment)
         dx, dy, dz, length = dr.gather(mi.Vector4f, self._direction, segment)
-        throughput, mis_partial_sum = dr.gather(mi.Vector2f, self._weight, segment)
-        first = dr.gather(mi.UInt32, self._end, segment) - dr.gather(mi.UInt32, self._number, segment)
+        throughput, mis_partial_sum, inverse, _ = dr.gather(mi.Vector4f, self._weight, segment)
         along = dr.fma(mi.Float(index - first), self.spacing, offset)
         direction = mi.Vector3f(dx, dy, dz)
         absorption = self._water.absorption_flight.optical_depth(-z, -dz, along)
+        scattering = self._water.scattering_flight.optical_depth(-z, -dz, along)
+        edge = dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0)
         # A segment lies in one index layer, and may begin on its boundary.
         layers = self._water.index_layers
         group = layers.group(layers.at(-z - 0.5 * dz * along))
@@ -106,5 +121,6 @@ class SegmentBuffer:
             length + along * group,
             throughput * dr.exp(-absorption) * self.spacing,
             mis_partial_sum,
+            edge,
             dr.gather(mi.UInt32, self._label, segment),
         )

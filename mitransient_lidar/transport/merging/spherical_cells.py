@@ -66,7 +66,7 @@ class SphericalCells:
         self.grid = grid
         self._shift = shift
 
-    def relative_volume(self, point: mi.Point3f) -> mi.Float:
+    def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
         return self.locate(point)[2]
 

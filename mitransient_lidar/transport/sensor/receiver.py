@@ -19,6 +19,15 @@ from mitransient_lidar.transport.sensor.point_spread import PointSpread
 #: The laser's footprint is sampled when the field of view contains more than this share of it.
 _SMALLEST_FOOTPRINT_SHARE = 0.05
 
+#: Radius of the core around the footprint's centre over the beam's standard deviation: samples are even within it.
+_CORE_PER_SPREAD = 2.0
+
+#: Of four samples, those that are drawn over the field of view, of few pixels and of many.
+_OF_VIEW, _OF_VIEW_IN_IMAGES = 1, 2
+
+#: Number of pixels from which a receiver is an imager.
+IMAGE_PIXELS = 4096
+
 #: Largest blocked share of the aperture.
 _LARGEST_OBSCURATION = 0.999
 
@@ -129,43 +138,59 @@ class SensorSample:
 
 
 class SensorSampler:
-    """Samples the receiver's rays, half of the paths over the field of view and half over the laser's footprint.
+    """Samples the receiver's rays: some paths over the field of view, the others around the laser's footprint.
 
-    Both halves are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
+    Around the footprint, directions beyond a core are equally many in each octave of their distance from its centre, as
+    scattering spreads the light of a narrow beam. Both parts are weighted by the balance heuristic. Samples are
+    stratified, and neighbours have similar directions.
 
-    With blur, the first half draws the place p on the detector and the direction p - delta, the second half the
+    With blur, directions over the view draw the place p on the detector and the direction p - delta, the others the
     direction g and the place g + delta. Both draw delta from the point-spread function, whose density cancels.
     """
 
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
         self.receiver = receiver
-        spot = transmitter.pose.ground_point()
-        self.centre = [opaque(angle) for angle in receiver.pose.tangent_of_point(spot)]
+        spot, pixels = transmitter.pose.ground_point(), receiver.pixels
+        centre = receiver.pose.tangent_of_point(spot)
+        self.centre = [opaque(angle) for angle in centre]
         ranges = (np.linalg.norm(spot - pose.origin) for pose in (transmitter.pose, receiver.pose))
-        self.sigma = opaque(transmitter.widest_angular_spread * float(next(ranges)) / float(next(ranges)))
+        spread = transmitter.widest_angular_spread * float(next(ranges)) / float(next(ranges))
+        core = _CORE_PER_SPREAD * spread
+        self.sigma, self._core = opaque(spread), opaque(core)
+        # The edge of the field of view, at most as far from its centre as the corner of a square.
+        corner = 1.0 if pixels.field_of_view_shape == "circle" else float(np.sqrt(2))
+        edge = 0.5 * corner * pixels.field_of_view + float(np.hypot(*centre))
+        self._edge, self._log_range = opaque(edge), opaque(np.log1p((edge / core) ** 2))
         self.use_footprint = self._footprint_share() > _SMALLEST_FOOTPRINT_SHARE
+        self._of_view = _OF_VIEW_IN_IMAGES if pixels.count >= IMAGE_PIXELS else _OF_VIEW
 
     def _footprint_share(self) -> float:
-        """Return the share of the footprint's samples that fall inside a pixel."""
-        angle_x, angle_y = self._sample_footprint(unit_points(4096))
+        """Return the share of a Gaussian footprint's samples that fall inside a pixel."""
+        u = unit_points(4096)
+        angle_x, angle_y = self._around(self.sigma * dr.sqrt(-2 * dr.log(1 - u.x)), u.y)
         dx, dy = self.receiver.displacement(pass_streams(0, 0, 4096))
         _, count = self.receiver.pixels.pixel_at(angle_x + dx, angle_y + dy, mi.Float(0.5))
         return float(dr.mean(dr.select(count > 0, mi.Float(1), 0))[0])
 
-    def _sample_footprint(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        radius = self.sigma * dr.sqrt(-2 * dr.log(1 - u.x))
-        sin, cos = dr.sincos(dr.two_pi * u.y)
+    def _around(self, radius: mi.Float, turn: mi.Float) -> tuple[mi.Float, mi.Float]:
+        sin, cos = dr.sincos(dr.two_pi * turn)
         return dr.fma(radius, cos, self.centre[0]), dr.fma(radius, sin, self.centre[1])
 
+    def _sample_footprint(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to directions of density 1 / (pi ln(1 + R^2 / q^2) (r^2 + q^2)) up to the edge R."""
+        return self._around(self._core * dr.sqrt(dr.maximum(dr.exp(u.x * self._log_range) - 1, 0)), u.y)
+
     def _footprint_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
-        x, y = (angle_x - self.centre[0]) / self.sigma, (angle_y - self.centre[1]) / self.sigma
-        return dr.exp(-0.5 * (x * x + y * y)) / (2 * np.pi * self.sigma * self.sigma)
+        """Return the density of `_sample_footprint` [1/rad^2]."""
+        radius2 = dr.square(angle_x - self.centre[0]) + dr.square(angle_y - self.centre[1])
+        density = dr.inv_pi / (self._log_range * (radius2 + self._core * self._core))
+        return dr.select(radius2 <= self._edge * self._edge, density, 0)
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> SensorSample:
         """Sample directions and pixels for paths number `index` of `count`."""
         if self.use_footprint:
-            of_footprint = (index & 1) == 1
-            point = stratified_point(index >> 1, (count + 1) // 2, rng)
+            of_footprint = (index & 3) >= self._of_view
+            point = stratified_point(index >> 2, (count + 3) // 4, rng)
         else:
             of_footprint, point = mi.Bool(False), stratified_point(index, count, rng)
         # Places on the detector (px, py), and directions (angle_x, angle_y) whose light falls on them.
@@ -179,7 +204,7 @@ class SensorSampler:
         pixel, pixels_here = self.receiver.pixels.pixel_at(px, py, rng.next_float32())
         density = pixels_here / self.receiver.pixels.area
         if self.use_footprint:
-            density = 0.5 * (density + self._footprint_density(angle_x, angle_y))
+            density = dr.lerp(self._footprint_density(angle_x, angle_y), density, 0.25 * self._of_view)
         # A point in several pixels is assigned to one of them at random: weight by their number.
         collection = pixels_here * (self.receiver.optics.collection / count)
         weight = collection * solid_angle_factor(angle_x, angle_y) / density

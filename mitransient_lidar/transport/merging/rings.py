@@ -1,0 +1,110 @@
+"""Sectors of rings about the beam: cells that are small where the light is narrow and large where it is spread."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.pose import Pose
+
+#: Growth of the core radius with depth [m/m], as light spreads by scattering.
+_CORE_PER_METRE = 0.05
+
+#: Core radius at the surface over the beam's standard deviation there.
+CORE_PER_SPREAD = 2.0
+
+
+@dataclass(frozen=True)
+class Sector:
+    """Sector of a ring.
+
+    Attributes
+    ----------
+    ring, number
+        Number of the ring, counted outwards, and of the sector in it.
+    inner, outer
+        Radii of the ring [m].
+    share
+        Inverse of the number of sectors of the ring.
+    """
+
+    ring: mi.UInt32
+    number: mi.UInt32
+    inner: mi.Float
+    outer: mi.Float
+    share: mi.Float
+
+
+class BeamRings:
+    """Rings about the refracted axis of the beam, cut into sectors that are about as long as wide.
+
+    With the core radius q, rings have equal widths in arsinh(r / q): nearly equal ones in the core, and widths
+    proportional to the radius r far from it. On a sea that is lit obliquely rings are ellipses, as footprints are.
+
+    Parameters
+    ----------
+    pose
+        Pose of the laser.
+    spread
+        Standard deviation of the beam where its axis meets the sea, across the axis [m].
+    index
+        Refractive index of the water.
+    """
+
+    def __init__(self, pose: Pose, spread: float, index: float) -> None:
+        self.spread = opaque(spread)
+        spot = pose.ground_point()
+        horizontal = pose.axis[:2]
+        sine = float(np.hypot(*horizontal))
+        azimuth = horizontal / sine if sine > 0 else np.array([1.0, 0.0])
+        self._spot = [opaque(x) for x in spot[:2]]
+        self._azimuth = [opaque(x) for x in azimuth]
+        in_water = horizontal / index
+        #: Horizontal displacement of the axis for each metre of depth.
+        self.shear = [opaque(x) for x in in_water / math.sqrt(1 - float(in_water @ in_water))]
+        #: Ratio of the axes of the ellipses.
+        self.cosine = opaque(max(-float(pose.axis[2]), 0.0))
+
+    def core(self, depth: mi.Float) -> mi.Float:
+        """Return the core radius at a depth [m]."""
+        return CORE_PER_SPREAD * self.spread + _CORE_PER_METRE * depth
+
+    def offset(self, x: mi.Float, y: mi.Float, depth: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Return offsets from the axis, scaled along it so that the ellipses are circles [m]."""
+        dx = x - self._spot[0] - self.shear[0] * depth
+        dy = y - self._spot[1] - self.shear[1] * depth
+        ax, ay = self._azimuth
+        return (ax * dx + ay * dy) * self.cosine, ax * dy - ay * dx
+
+    def point(self, along: mi.Float, across: mi.Float, depth: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Invert `offset`."""
+        ax, ay = self._azimuth
+        along = along / self.cosine
+        x = self._spot[0] + self.shear[0] * depth + ax * along - ay * across
+        return x, self._spot[1] + self.shear[1] * depth + ay * along + ax * across
+
+    def sector(self, along: mi.Float, across: mi.Float, core: mi.Float, width: mi.Float, shift: mi.Point2f) -> Sector:
+        """Return the sectors at offsets, of rings of a `width` over the core radius, shifted by random numbers."""
+        radius = dr.sqrt(along * along + across * across)
+        ring = dr.floor(dr.asinh(radius / core) / width + shift.x)
+        inner = core * dr.sinh(width * dr.maximum(ring - shift.x, 0))
+        outer = core * dr.sinh(width * (ring + 1 - shift.x))
+        count = dr.maximum(dr.round(dr.pi * (outer + inner) / (outer - inner)), 1)
+        turn = dr.atan2(across, along) * dr.inv_two_pi + shift.y
+        number = dr.minimum(dr.floor((turn - dr.floor(turn)) * count), count - 1)
+        return Sector(mi.UInt32(ring), mi.UInt32(number), inner, outer, dr.rcp(count))
+
+    def area(self, sector: Sector) -> mi.Float:
+        """Return the areas of sectors on the level sea [m^2]."""
+        return dr.pi * (sector.outer - sector.inner) * (sector.outer + sector.inner) * sector.share / self.cosine
+
+    def draw(self, sector: Sector, shift: mi.Point2f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers to offsets, uniform in sectors."""
+        radius = dr.sqrt(dr.lerp(dr.square(sector.inner), dr.square(sector.outer), u))
+        sin, cos = dr.sincos(dr.two_pi * ((mi.Float(sector.number) + v) * sector.share - shift.y))
+        return radius * cos, radius * sin
