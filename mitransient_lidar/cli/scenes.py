@@ -96,12 +96,19 @@ def bench(
     case: Annotated[str | None, typer.Option(help="Run only this case.")] = None,
     target_error: Annotated[float | None, typer.Option(help="Relative standard error to reach.")] = None,
     images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
+    beams: Annotated[
+        bool, typer.Option("--beams", help="Compare beams of 0.1 to 20 mrad in all views instead.")
+    ] = False,
 ) -> None:
     """Measure the time to a given accuracy."""
     from mitransient_lidar.studies import bench as benchmark
-    from mitransient_lidar.studies import bench_images
+    from mitransient_lidar.studies import bench_beams, bench_images
 
+    if images and beams:
+        raise UserError("--images and --beams: give one of them")
     if images:
         bench_images.run(json=json)
+    elif beams:
+        bench_beams.run(json=json)
     else:
         benchmark.run(quick=quick, json=json, case=case, target_error=target_error)

@@ -41,9 +41,23 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
             "field_of_view_mrad": "35",
         },
     ),
-    "target": ("fig09_2x2", {"field_of_view_mrad": "35", "bottom_depth": "12", "bin_count": "190"}),
+    "target": ("fig09_2x2", {"field_of_view_mrad": "35", "bottom_depth": "12"}),
     "imager": ("fig09_2x2", {"layout": "128x128", "bin_width_ns": "2", "bin_count": "64", "time_start_ns": "1400"}),
+    "narrow": ("fig09_2x2", {"divergence_mrad": "0.5"}),
+    "mast": ("fig04_mast", {}),
+    "space": (
+        "fig09_2x2",
+        {
+            "altitude": "500000",
+            "off_nadir_deg": "1",
+            "divergence_mrad": "0.01",
+            "field_of_view_mrad": "0.08",
+        },
+    ),
 }
+
+#: Scene and parameters in which instruments are measured: wind of 5 m/s and coastal water.
+INSTRUMENT_CASE = ("table1", {"wind_speed": "5", "petzold": "coastal"})
 
 #: Target of the case ``target``: a plate of 1.5 m x 1.5 m at a depth of 8 m.
 _TARGET = """
@@ -77,19 +91,23 @@ _COLUMNS = {
 
 
 def run(*, quick: bool = False, json: bool = False, case: str | None = None, target_error: float | None = None) -> None:
-    """Measure every case with every integrator; print a table or one JSON object to stdout.
+    """Measure every case with every integrator, and instruments with merging; print a table or one JSON object.
 
-    With `quick` only the cases ``flat`` and ``clear``, with few passes; with `case` only this one. With `target_error`,
-    above 0, renders end when the 95th percentile of the relative standard errors has reached it.
+    With `quick` only the cases ``flat`` and ``clear``, with few passes; with `case` only this one, which may be the
+    name of an instrument. With `target_error`, above 0, renders end when the 95th percentile of the relative standard
+    errors has reached it.
     """
-    if case is not None and case not in CASES:
-        raise UserError(f"case = {case!r} must be one of {', '.join(CASES)}")
+    from mitransient_lidar.loading.instruments import instrument_names
+
+    instruments = instrument_names()
+    if case is not None and case not in CASES and case not in instruments:
+        raise UserError(f"case = {case!r} must be one of {', '.join([*CASES, *instruments])}")
     if target_error is not None:
         positive("target_error", target_error)
     tasks: dict[tuple[str, ...], dict[str, Any]] = {
         (name, integrator): {"case": name, "integrator": integrator, "quick": quick, "target_error": target_error}
-        for name in ([case] if case else list(QUICK_CASES if quick else CASES))
-        for integrator in INTEGRATORS
+        for name in ([case] if case else list(QUICK_CASES if quick else (*CASES, *instruments)))
+        for integrator in INTEGRATORS[: None if name in CASES else 1]
     }
     run_processes("mitransient_lidar.studies.bench", ("case", "integrator"), tasks, _COLUMNS, json)
 
@@ -100,14 +118,16 @@ def run_processes(
     tasks: Mapping[tuple[str, ...], Mapping[str, Any]],
     columns: Mapping[str, str],
     as_json: bool,
+    group_heading: str | None = None,
 ) -> None:
     """Run a module for each task in its own process, and print the figures; tasks and figures are passed as JSON.
 
-    Tasks are given by their labels, whose headings are `heading`; `columns` are the headings of the figures.
+    Tasks are given by their labels, whose headings are `heading`; `columns` are the headings of the figures. With
+    `group_heading` a task returns the figures of several rows by their labels.
     """
     figures: dict[str, Any] = {}
     if not as_json:
-        print(_row(heading, columns.values()))
+        print(_row([*heading, *([group_heading] if group_heading else [])], columns.values()))
     for labels, task in tasks.items():
         command = [sys.executable, "-m", module, json_module.dumps(task)]
         done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True)
@@ -118,8 +138,9 @@ def run_processes(
         for label in labels[:-1]:
             group = group.setdefault(label, {})
         group[labels[-1]] = values
-        if not as_json:
-            print(_row(labels, (f"{values[key]:.4g}" for key in columns)), flush=True)
+        rows = {(*labels, label): row for label, row in values.items()} if group_heading else {labels: values}
+        for row_labels, row in rows.items() if not as_json else ():
+            print(_row(row_labels, (f"{row[key]:.4g}" for key in columns)), flush=True)
     if as_json:
         print(json_module.dumps(figures, indent=2))
 
@@ -172,6 +193,8 @@ def _load(case: str) -> mi.Scene:
     from mitransient_lidar.loading.catalogue import scene_text
     from mitransient_lidar.loading.scenes import load_scene
 
+    if case not in CASES:
+        return load_scene(*INSTRUMENT_CASE, case)[0]
     name, parameters = CASES[case]
     if case != "target":
         return load_scene(name, parameters)[0]
