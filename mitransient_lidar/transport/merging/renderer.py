@@ -140,7 +140,9 @@ class MergingLayout:
             return cls(region, uneven, grid, rings, spacing, reach, depth, _PATCH_PER_CELL * width, segments, segments)
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
         rings = BeamRings(pose, footprint, scene.refractive_index)
-        width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * scene.facet_size)
+        # Cells are longer along the azimuth of the beam.
+        facet = scene.facet_size * -float(pose.axis[2])
+        width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
         grid = WaterGrid(rings, SurfaceHeights(scene, region), width / core, growth, thickness, reach)

@@ -15,6 +15,9 @@ from mitransient_lidar.transport.pose import Pose
 #: Growth of the core radius with depth [m/m], as light spreads by scattering.
 _CORE_PER_METRE = 0.05
 
+#: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
+_SMALLEST_COSINE = 0.01
+
 #: Core radius at the surface over the beam's standard deviation there.
 CORE_PER_SPREAD = 2.0
 
@@ -53,22 +56,22 @@ class BeamRings:
     spread
         Standard deviation of the beam where its axis meets the sea, across the axis [m].
     index
-        Refractive index of the water.
+        Refractive index of the water over that at the laser.
     """
 
     def __init__(self, pose: Pose, spread: float, index: float) -> None:
         self.spread = opaque(spread)
-        spot = pose.ground_point()
-        horizontal = pose.axis[:2]
+        horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
+        spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
         azimuth = horizontal / sine if sine > 0 else np.array([1.0, 0.0])
-        self._spot = [opaque(x) for x in spot[:2]]
+        self._spot = [opaque(x) for x in spot]
         self._azimuth = [opaque(x) for x in azimuth]
-        in_water = horizontal / index
+        cosine = max(math.sqrt(max(1 - (sine / index) ** 2, 0.0)), _SMALLEST_COSINE)
         #: Horizontal displacement of the axis for each metre of depth.
-        self.shear = [opaque(x) for x in in_water / math.sqrt(1 - float(in_water @ in_water))]
+        self.shear = [opaque(x / (index * cosine)) for x in horizontal]
         #: Ratio of the axes of the ellipses.
-        self.cosine = opaque(max(-float(pose.axis[2]), 0.0))
+        self.cosine = opaque(down)
 
     def core(self, depth: mi.Float) -> mi.Float:
         """Return the core radius at a depth [m]."""
