@@ -274,9 +274,10 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     asked = []
     random = np.random.default_rng(3)
 
-    def signal(scene, params, **options):
-        asked.append((params["surface_seed"], params.get("target_depth"), options["seed"]))
-        light = experiment(levels=random.uniform(0.9, 1.1, 4), photons=1e5 if "target_depth" in params else 1e6)
+    def signal(session, **options):
+        own = session.parameters
+        asked.append((int(own["surface_seed"]), float(own["target_depth"]), options["seed"]))
+        light = experiment(levels=random.uniform(0.9, 1.1, 4), photons=1e5 if own["target_depth"] == "7" else 1e6)
         data = {"background": light.background[0], "difference": light.difference[0]}
         coords = {"pixel": ["red", "green", "blue", "black"], "time": 0.5 + T}
         return xr.Dataset({name: (("pixel", "time"), values) for name, values in data.items()}, coords)
@@ -287,7 +288,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     found = detection.detect(
         "fig13_2x2", depths=(7,), progress=lambda state: done.append((state.done, state.planned)), **count
     )
-    assert [(seed, depth) for seed, depth, _ in asked] == [(9 + i, d) for d in (None, 7) for i in range(4)]
+    assert [(seed, depth) for seed, depth, _ in asked] == [(9 + i, d) for d in (8, 7) for i in range(4)]
     # The same random numbers at each depth, others for each sea.
     assert len({seed for *_, seed in asked}) == 4
     assert done == [(i + 1, 8) for i in range(8)]
