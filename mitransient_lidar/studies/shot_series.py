@@ -327,7 +327,7 @@ def _has_waves(scene: mi.Scene) -> bool:
 
 def _common_record(session: Session, lidar: LidarScene, places: FloatArray) -> TimeAxis | None:
     """Return time bins for the light of shots at places [m], None where the film has its own; log them."""
-    from mitransient_lidar.transport.scene import fitted_record
+    from mitransient_lidar.transport.sensor.records import fitted_record
 
     film = session.sensor.film()
     if not film.used_values:

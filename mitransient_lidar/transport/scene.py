@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,21 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, Cone, LidarView, Solid, Water
-from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Instrument
-from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.pose import Pose, RelativePose
-from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.sensor.receiver import Receiver
+from mitransient_lidar.transport.sensor.records import fitted_record, submerged_record
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
@@ -37,12 +31,6 @@ _FAR, _CLEARANCE = 1e4, 1.0
 
 #: Length over which slopes change, over the shortest wavelength.
 _FACET_PER_WAVE = 0.25
-
-#: Rays of beam and view from which the record of a lidar under water follows.
-_RECORD_RAYS = 1024
-
-#: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
-_MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
 
 
 @dataclass(frozen=True)
@@ -240,130 +228,6 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
     if not isinstance(receiver, Receiver):
         raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
     return receiver
-
-
-def fitted_record(
-    scene: WaterScene, transmitter: Any, film: Any, shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),)
-) -> tuple[TimeAxis, str]:
-    """Return time bins of a film for all light that returns, and what the last light comes from.
-
-    `shifts` are horizontal displacements of the lidar [m]: the bins hold the light of all its positions.
-
-    Raises
-    ------
-    UserError
-        If the bins are too many.
-    """
-    solids = [Solid(shape.id() or shape.class_name(), _triangles(shape)) for shape in scene.solids]
-    found = [_lidar_view(scene, transmitter, shift).limits(solids, film.gates is not None) for shift in shifts]
-    lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
-    tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
-    last = max(found, key=lambda each: each.last_ns)
-    limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
-    if film.gates is not None:
-        sine = float(np.hypot(*scene.receiver.pose.axis[:2])) / scene.refractive_index
-        placed = (scene.group_index, float(np.sqrt(1 - sine**2)))
-        for time in (min(each.surface_ns[0] for each in found), max(each.surface_ns[1] for each in found)):
-            spans = film.gates.placed(time, *placed).spans_ns
-            end = "after the last gate" if spans[-1, 1] > limits[1] else end
-            limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
-    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    return TimeAxis.covering(limits[0] - lead, limits[1] + tail, *fixed), end
-
-
-def submerged_record(scene: WaterScene, transmitter: Any, film: Any) -> tuple[TimeAxis, str]:
-    """Return time bins of a film of a lidar under water, and what the last light comes from.
-
-    The record begins with the light scattered at the lidar. It ends after the farthest echo of beam and view, with a
-    quarter of its time and 40 ns more for light that is scattered several times, or at the range where the signal of
-    the water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
-
-    Raises
-    ------
-    UserError
-        If the bins are too many.
-    """
-    points, ranges, column = unit_points(_RECORD_RAYS), [], scene.water.column
-    for pose, angles in (
-        (scene.receiver.pose, scene.receiver.pixels.sample(points)),
-        (transmitter.pose, transmitter.sample_tangent(points)),
-    ):
-        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), pose.direction(*angles)))
-        ranges.append(np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64))
-    rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
-    least = min(InherentProperties(*map(float, row)).kd for row in rows)
-    visible = -0.5 * np.log(COLUMN_LEVEL) / max(least, 1e-9)
-    nearest, farthest = (float(np.max(each)) for each in (np.minimum(*ranges), np.concatenate(ranges)))
-    to_solid = farthest if np.isfinite(farthest) else nearest
-    apart = float(np.linalg.norm(transmitter.pose.origin - scene.receiver.pose.origin))
-    distance = min(to_solid, visible) + apart
-    echo = 2e9 / C0 * scene.group_index * distance
-    end = "after the farthest echo" if to_solid <= visible else f"at a range of {visible:.3g} m"
-    lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
-    tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
-    fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    return TimeAxis.covering(-lead, 1.25 * echo + 40.0 + tail, *fixed), end
-
-
-def _lidar_view(scene: WaterScene, transmitter: Any, shift: tuple[float, float]) -> LidarView:
-    """Return the geometry of a lidar, displaced horizontally [m], over the level sea of a scene."""
-    pixels, blur, pose = scene.receiver.pixels, scene.receiver.blur, scene.receiver.pose
-    sides = getattr(pixels, "sides", (pixels.field_of_view, pixels.field_of_view))
-    blurred = 0.0 if blur is None else blur.reach
-    half_angles = 0.5 * sides[0] + blurred, 0.5 * sides[1] + blurred
-    edge = transmitter.profile.reach
-    moved = np.array([*shift, 0.0])
-    view, beam = (
-        Cone(one.origin + moved, np.stack([one.axis, one.far, one.left]), angles, is_round)
-        for one, angles, is_round in (
-            (pose, half_angles, pixels.field_of_view_shape == "circle"),
-            (transmitter.pose, (edge, edge), True),
-        )
-    )
-    boxes = [shape.bbox() for shape in scene.mitsuba_scene.shapes()]
-    corners = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 3)[:, :2]
-    reach = max(
-        (float(np.hypot(*(np.abs(corners - one.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
-        default=float(pose.origin[2]),
-    )
-    if scene.water is None:
-        none = np.zeros(1)
-        return LidarView(view, beam, Water((1.0,), (1.0,), (), none, none), (0.0, 0.0), reach, None)
-    layers, column, plume = scene.water.index_layers, scene.water.column, scene.water.plume
-    rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
-    kd = [InherentProperties(*map(float, row)).kd for row in rows]
-    slant_range = float(np.linalg.norm(pose.ground_point() - pose.origin))
-    spot = slant_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
-    attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
-    n, group, boundaries = (
-        tuple(map(float, each)) for each in (layers.refractive_index, layers.group_index, layers.boundaries)
-    )
-    heights = [(float(surface.bbox().min.z), float(surface.bbox().max.z)) for surface in scene.surfaces]
-    return LidarView(
-        view,
-        beam,
-        Water(n, group, boundaries, column.layer_tops, attenuation),
-        (min(low for low, _ in heights), max(high for _, high in heights)),
-        reach,
-        0.0 if plume is None else plume.depth,
-    )
-
-
-def _triangles(shape: mi.Shape) -> FloatArray:
-    """Return the triangles of a mesh or rectangle, or of top and bottom of the bounding box of another shape [m]."""
-    known = mi.traverse(shape)
-    if "vertex_positions" in known:
-        vertices = np.array(known["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-        return np.asarray(vertices[np.array(known["faces"]).reshape(-1, 3)])
-    square = np.array([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1], [-1, 1, 0, 1]])
-    if "Rectangle" in shape.class_name():
-        matrix = np.array(known["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-        corners = (square @ matrix.T)[None, :, :3]
-    else:
-        low, high = (np.array(corner, dtype=np.float64) for corner in (shape.bbox().min, shape.bbox().max))
-        middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        corners = np.array([middle + (square[:, :3] + [0, 0, side]) * half for side in (-1.0, 1.0)])
-    return np.asarray(corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3))
 
 
 def fit_seas(scene: mi.Scene) -> None:

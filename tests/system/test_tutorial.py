@@ -114,7 +114,7 @@ def test_cells_are_short(cells):
 
 def test_the_receiver_saturates_and_then_does_not(printed):
     shares = [number_after("at the limit of the amplifier:", text) for text in printed if "at the limit" in text]
-    assert shares[0] > 50
+    assert shares[0] > 40
     assert shares[1] == 0
 
 

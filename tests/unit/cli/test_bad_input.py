@@ -426,7 +426,7 @@ def test_python_calls(folder, call, sentence):
     ("params", "sentence"),
     [
         ({"altitude": 10, "time_start_ns": 1390}, "time_start_ns = 1390 starts the record after every echo"),
-        ({"altitude": 510, "bin_count": 5}, "end the record at 3585 ns: it must end after the surface echo"),
+        ({"altitude": 510, "bin_count": 5}, "end the record at 3555 ns: it must end after the surface echo"),
         ({"bin_width_ns": 1e-5}, "into 18500000 bins: it must be at least 0.00018"),
         ({"time_start_ns": 5000}, "time_start_ns = 5000 starts the record after every echo"),
     ],
