@@ -54,7 +54,7 @@ _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 _PATCH_PER_CELL = 3.2
 
 #: Thickness of the cells, over the distance of points and over the attenuation length.
-_THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.35, 0.3
+_THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.25, 0.3
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
@@ -140,8 +140,8 @@ class MergingLayout:
             return cls(region, uneven, grid, rings, spacing, reach, depth, _PATCH_PER_CELL * width, segments, segments)
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
         rings = BeamRings(pose, footprint, scene.refractive_index)
-        # Cells are longer along the azimuth of the beam.
-        facet = scene.facet_size * -float(pose.axis[2])
+        # Cells are longer along the azimuth of the beam: the mean of their sides counts.
+        facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint

@@ -34,7 +34,8 @@ def fitted_record(
 ) -> tuple[TimeAxis, str]:
     """Return time bins of a film for all light that returns, and what the last light comes from.
 
-    `scene` is a `transport.scene.WaterScene`; `shifts` are horizontal displacements of the lidar [m]: the bins hold the light of all its positions.
+    `scene` is a `transport.scene.WaterScene`. `shifts` are horizontal displacements of the lidar [m]: the bins hold the
+    light of all its positions.
 
     Raises
     ------
