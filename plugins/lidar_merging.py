@@ -25,10 +25,10 @@ class LidarMerging(LidarIntegrator):
                                (``spp``) is given to ``mi.render``. Default: 32768, or 16 a pixel up to 2^21
     photons_per_pass  integer  Paths from the laser in one pass, 1024 to 2^28. Default: 32768, or 65536 from 4096 pixels
                                on
-    cell_size         float    Horizontal width of the cells at the surface [m]; 0: from the footprint and the facets of
-                               the sea. Smaller cells have less bias and more noise. At most 1e4. Default: 0
-    point_spacing     float    Distance between points along a path [m]; 0: a twentieth of the distance to the bottom or
-                               to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
+    cell_size         float    Horizontal width of the cells on the beam's axis at the surface [m], at most 1e4; 0: from
+                               footprint and facets of the sea. Smaller cells have less bias and more noise. Default: 0
+    point_spacing     float    Distance between points along a path [m]; 0: a fourteenth of the distance to the bottom
+                               or to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
     ================  =======  =========================================================================================
 
     Nearly every echo has one vertical reversal, and both parts of its path are easy to sample from their own ends.
@@ -39,14 +39,29 @@ class LidarMerging(LidarIntegrator):
     mapping in a medium: Jensen and Christensen 1998, doi:10.1145/280814.280925; points at equal distances instead of
     collisions: the track-length estimator of Spanier 1966, doi:10.1137/0114057, at both ends).
 
-    A path with several scattering events can arise from a merge at each of them. The balance heuristic (Veach and
-    Guibas 1995, doi:10.1145/218380.218498) weights these merges: with coefficient :math:`b_i` and phase function
-    :math:`p_i` at each event, the merge at event *k* counts
+    Cells are sectors of rings about the refracted beam, in layers below the surface. With the distance *r* from the
+    axis and a core radius *q* of two standard deviations of the beam and 0.05 m for each metre of depth, rings have
+    equal widths in arsinh(*r*/*q*): cells are small where the light is concentrated, and grow with the distance from a
+    narrow beam. Patches of solids that look up or down are such sectors, too.
 
-    .. math:: b_k\, p_k\, \frac{1 / (b_k p_k)}{\sum_i 1 / (b_i p_i)} = \Big(\sum_i \frac{1}{b_i p_i}\Big)^{-1},
+    Some points of the receiver's paths are connected, over any distance, with a random point of a light path, or with
+    light on a solid, by a segment in the water. Light that is scattered into a narrow beam, or out of it, far from the
+    axis rarely meets a small cell, and is found by connections (Georgiev et al. 2012, doi:10.1145/2366145.2366211).
+
+    A path with several scattering events can arise from a merge at each of them, and from a connection between any two
+    that follow each other. The balance heuristic (Veach and Guibas 1995, doi:10.1145/218380.218498) weights all: with
+    coefficient :math:`b_i`, phase function :math:`p_i` and cell volume :math:`V_i` at each event, the length
+    :math:`d_i` and the transmittance of scattering :math:`T_i` of the segment to the next one, and the share
+    :math:`\kappa` of the pairs of points that are connected, each pair of points of weights *w* and *w'* adds
+
+    .. math::
+
+        w\, w' \Big(\sum_i \frac{V_i}{b_i p_i}
+        + \kappa \sum_i \frac{d_i^2}{b_i p_i\, T_i\, b_{i+1} p_{i+1}}\Big)^{-1},
 
     which is bounded by the event of the smallest :math:`b_i p_i`, so that the forward peak does not cause noise. Paths
-    that meet a solid are merged only at the first one from the receiver.
+    that meet a solid are merged only at the first one from the receiver, or connected to it from the last scattering
+    event before. There are no connections in water with bubbles or with several refractive indices, nor under water.
 
     About a laser under water, cells are shells cut into rings and sectors about its axis, thinner and narrower near the
     laser, where light and view are concentrated. Their volumes differ along a path, and the merge at event *k* has the
@@ -59,8 +74,8 @@ class LidarMerging(LidarIntegrator):
     Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
     follow the surface and are sheared along the beam; times and absorption are those of the receiver's point; patches
     cut by edges count by their covered share. With the default cells the bias of the water's signal in the published
-    geometry is -0.5 % in the first metre, -0.1 % below, and 0 at the bottom; it falls with ``cell_size``. There are no
-    derivatives.
+    geometry is -0.5 % in the first metre, -0.1 % below, and 0 at the bottom; it falls with ``cell_size``. At 75 degrees
+    over waves of 3 m/s the first metre is 1 to 2 % low. There are no derivatives.
 
     .. code-block:: xml
 

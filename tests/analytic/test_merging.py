@@ -20,7 +20,8 @@ from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MERGING = {"type": "lidar_merging"}
-SIGMA = 5e-3
+#: Standard deviations of a wide and a narrow beam [rad].
+SIGMA, NARROW = 5e-3, 1e-4
 LIDAR = LidarSystem(200.0, np.radians(20.0), 5e-3 * 0.81 * 0.9, 0.025, 1.34, 1.34)
 CLEAR = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0}
 #: Waves in the water that scatters most of the published scenes' light more than once.
@@ -69,16 +70,22 @@ def assert_same(first, second, *, floor=0.0, largest=0.1):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("sea", "water"),
-    [({}, CLEAR), ({}, {"layer_tops": "0, 2", "attenuation": "0.3, 0.05", "scattering": "0", "backscattering": "0"})],
+    ("sigma", "water"),
+    [
+        (SIGMA, CLEAR),
+        (SIGMA, {"layer_tops": "0, 2", "attenuation": "0.3, 0.05", "scattering": "0", "backscattering": "0"}),
+        (NARROW, CLEAR),
+    ],
 )
-def test_bottom_level(lidar_scene, passes, z_score, sea, water):
-    energy = passes(lidar_scene(integrator=MERGING, sea=sea, water=water, film={"time_start_ns": 1450.0}), 24).sum(-1)
+def test_bottom_level(lidar_scene, passes, z_score, sigma, water):
+    tx, film = {"divergence_mrad": 2e3 * sigma}, {"time_start_ns": 1450.0}
+    count = 24 if sigma == SIGMA else 48
+    energy = passes(lidar_scene(integrator=MERGING, tx=tx, water=water, film=film), count).sum(-1)
     column = WaterColumn.from_text(water.get("layer_tops", 0), water["attenuation"], 0, 0)
-    expected = np.array([echo_energies(LIDAR, SIGMA, column, 0.0, 8.0, 0.1, (1e-4, 1e-4), f).bottom for f in FIELDS])
+    expected = np.array([echo_energies(LIDAR, sigma, column, 0.0, 8.0, 0.1, (1e-4, 1e-4), f).bottom for f in FIELDS])
     z, relative = z_score(np.column_stack([energy, energy.sum(1)]), np.append(expected, expected.sum()))
     assert np.all(relative < 0.01)
-    assert np.all(np.abs(z) < largest_z(24, z.size)), z
+    assert np.all(np.abs(z) < largest_z(count, z.size)), z
 
 
 @pytest.mark.slow
@@ -97,12 +104,12 @@ def test_bottom_in_bins(lidar_scene, passes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("phase", ["fournier_forand", "hg"])
-def test_single_scattering_column(lidar_scene, passes, phase):
+@pytest.mark.parametrize(("phase", "sigma"), [("fournier_forand", SIGMA), ("fournier_forand", NARROW), ("hg", SIGMA)])
+def test_single_scattering_column(lidar_scene, passes, phase, sigma):
     """So little scattering that nothing scatters twice; attenuation 0.3 /m is absorption."""
     backward = {"fournier_forand": fournier_forand(np.pi, *fournier_forand_parameters(0.04))}
     backward["hg"] = henyey_greenstein(np.pi, 0.924)
-    check_column(lidar_scene, passes, {"phase_function": phase}, 0.3, 1.5e-5, 6e-7, float(backward[phase]))
+    check_column(lidar_scene, passes, {"phase_function": phase}, 0.3, 1.5e-5, 6e-7, float(backward[phase]), sigma)
 
 
 @pytest.mark.slow
@@ -112,16 +119,17 @@ def test_single_scattering_column_in_layers(lidar_scene, passes):
     check_column(lidar_scene, passes, {"layer_tops": "0, 3"}, *values, backward)
 
 
-def check_column(lidar_scene, passes, water, attenuation, scattering, backscattering, backward):
+def check_column(lidar_scene, passes, water, attenuation, scattering, backscattering, backward, sigma=SIGMA):
     edges = 1430.0 + 5.0 * np.arange(13)
     coefficients = {"attenuation": attenuation, "scattering": scattering, "backscattering": backscattering}
     film = {"time_start_ns": edges[0], "bin_width_ns": 5.0, "bin_count": 12}
-    scene = lidar_scene(integrator=MERGING, film=film, water={**water, **coefficients}, bottom=None)
+    tx = {"divergence_mrad": 2e3 * sigma}
+    scene = lidar_scene(integrator=MERGING, tx=tx, film=film, water={**water, **coefficients}, bottom=None)
     energy = passes(scene, 24)
     energy = np.concatenate([energy, energy.sum(axis=2, keepdims=True)], axis=2)
     mean, error = mean_and_error(energy)
     column = WaterColumn.from_text(water.get("layer_tops", 0), attenuation, scattering, backscattering)
-    expected = np.array([column_energy_per_bin(edges, LIDAR, SIGMA, column, backward, 30.0, f) for f in FIELDS])
+    expected = np.array([column_energy_per_bin(edges, LIDAR, sigma, column, backward, 30.0, f) for f in FIELDS])
     expected = np.concatenate([expected, expected.sum(axis=1, keepdims=True)], axis=1)
     assert np.all(error < 0.02 * mean)
     # The grid of the closed form adds 5e-4, the blur over cells 1e-3.
@@ -197,6 +205,18 @@ CASES = {
         "rx": {"altitude": 5e5, "off_nadir_deg": 20.0, "field_of_view_mrad": 0.012, "aperture_area": 10.0},
         **{"sea": WAVES, "film": {"time_start_ns": 3549700.0, "bin_width_ns": 4.0}},
     },
+    "narrow beam over waves": {
+        **{"tx": {"divergence_mrad": 0.5}, "rx": {"field_of_view_mrad": 20.0}, "sea": WAVES, "bottom": 4.0},
+    },
+    "narrow beam in turbid water": {
+        **{"tx": {"divergence_mrad": 0.5}, "rx": {"field_of_view_mrad": 20.0}, "bottom": 2.0},
+        "water": {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016},
+    },
+    "mast at 60 degrees": {
+        "tx": {"altitude": 20.0, "off_nadir_deg": 60.0, "divergence_mrad": 2.0},
+        "rx": {"altitude": 20.0, "off_nadir_deg": 60.0, "field_of_view_mrad": 20.0},
+        **{"sea": WAVES, "film": {"time_start_ns": 250.0}, "bottom": 3.0},
+    },
     "turbid": {"water": {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016}, "bottom": 4.0},
 }
 #: Relative standard error of the reference's energy, from three sets of 16 passes.
@@ -218,6 +238,9 @@ TOTAL_ERROR = {
     "receiver straight down over waves": 0.0006,
     "axis 8 mrad aside over waves": 0.0027,
     "from orbit over waves": 0.0040,
+    "narrow beam over waves": 0.0089,
+    "narrow beam in turbid water": 0.02,
+    "mast at 60 degrees": 0.01,
     "turbid": 0.0089,
 }
 

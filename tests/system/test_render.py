@@ -32,7 +32,8 @@ def small(scene="table1", **options):
 
 
 @pytest.mark.slow
-def test_intervals_cover_the_long_run_mean(lidar_scene):
+@pytest.mark.parametrize("divergence_mrad", [10.0, 0.5])
+def test_intervals_cover_the_long_run_mean(lidar_scene, divergence_mrad):
     """Intervals of eight passes (Student's t, 95 %) hold the mean of 60 seeds in 95 % of the bins and gates.
 
     Judged are those with errors below 10 %. With larger ones, light of few paths makes the distribution of a pass skew:
@@ -41,6 +42,7 @@ def test_intervals_cover_the_long_run_mean(lidar_scene):
     seeds, passes = 60, 8
     scene = lidar_scene(
         integrator={"type": "lidar_merging", "paths_per_pass": 2**12, "photons_per_pass": 2**12},
+        tx={"divergence_mrad": divergence_mrad},
         film={"gate_start_depth": 1.0, "gate_width_ns": 5.0, "gate_step_ns": 5.0, "gate_count": 12},
         sea={"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"},
         water={"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016},
