@@ -41,7 +41,7 @@ class ConnectionRates:
     cells
         Cells, whose volumes are the rates of merges.
     in_water, on_solids
-        Share of the pairs of points, and of points and photons on their first solid, that are connected.
+        Share of the pairs of points, and of points and photons on solids, that are connected.
     connected
         Whether there are connections at all.
     """
@@ -105,9 +105,9 @@ class WaterConnections:
         self._receive(point, other, direction, 2, point.length + other.length, distance, energy, active)
 
     def to_solids(self, count: int, light: PhotonBuffer, patches: SolidPatches, seed: int, stream: int) -> None:
-        """Connect some of `count` points of the receiver's paths with some photons where they first met a solid."""
+        """Connect some of `count` points of the receiver's paths with some photons on solids."""
         point, partner, exists = self._pairs(count, light.photons, seed, stream)
-        place, photon = light.first_hit(partner)
+        place, photon = light.connectable(partner)
         exists &= photon.weight != 0
         direction, distance, transmittance, pending = self._segment(point, place)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance

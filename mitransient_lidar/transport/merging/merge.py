@@ -21,14 +21,14 @@ from mitransient_lidar.transport.scene import LidarScene
 
 
 def store_points(
-    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses
+    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses, seed: int
 ) -> PhotonMap | None:
     """Store the `count` points of light paths by their cells; return None if there are none."""
     if count == 0:
         return None
     index = dr.arange(mi.UInt32, count)
     bucket, _, _ = cells.locate(segments.points(index).point)
-    u = mi.sample_tea_float32(index, 0)
+    u = mi.sample_tea_float32(index, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
     photons = PhotonMap(cells.grid.buckets, bucket, u, PHOTONS_OF_CELL, classes.separate)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)

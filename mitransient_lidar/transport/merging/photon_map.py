@@ -33,7 +33,7 @@ class Photon:
     position
         Scalar product of position and direction [m].
     edge
-        As in `SegmentPoints`; on solids 1 for the first one of a path, which can be connected, else 0.
+        As in `SegmentPoints`; on solids 1 for light that can be connected, else 0.
     label
         Scattering events and reversals of its path (`PathClasses.pack`).
     """
@@ -118,7 +118,7 @@ class PhotonMap:
 class PhotonBuffer:
     """Light of `photons` paths on solids, in any order; at most `capacity` hits are stored, but all are counted.
 
-    The first hit of each path is stored by the number of the path, too.
+    One hit of each path is stored by the number of the path, too, to be connected.
     """
 
     def __init__(self, capacity: int, photons: int, classes: PathClasses) -> None:
@@ -129,30 +129,29 @@ class PhotonBuffer:
         self._label = dr.empty(mi.UInt32, capacity if classes.separate else 1)
         self._record = dr.empty(mi.Float, 4 * capacity)
         self._weight = dr.empty(mi.Float, 2 * capacity)
-        self._first_place = dr.zeros(mi.Float, 4 * photons)
-        self._first_record = dr.zeros(mi.Float, 4 * photons)
-        self._first_label = dr.zeros(mi.UInt32, photons if classes.separate else 1)
+        self._place = dr.zeros(mi.Float, 4 * photons)
+        self._connectable = dr.zeros(mi.Float, 4 * photons)
+        self._connectable_label = dr.zeros(mi.UInt32, photons if classes.separate else 1)
 
-    def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool) -> None:
-        """Store light that has met patches of solids at places [m]."""
+    def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool, connectable: mi.Bool) -> None:
+        """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
         keep = active & (slot < self.capacity)
-        first = active & path.before_first_solid
         where = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
         dr.scatter(self._record, where, slot, keep)
-        dr.scatter(self._weight, mi.Vector2f(path.weight, dr.select(first, mi.Float(1), 0)), slot, keep)
-        dr.scatter(self._first_record, where, path.lane, first)
-        dr.scatter(self._first_place, mi.Vector4f(path.weight, place.x, place.y, place.z), path.lane, first)
+        dr.scatter(self._weight, mi.Vector2f(path.weight, dr.select(connectable, mi.Float(1), 0)), slot, keep)
+        dr.scatter(self._connectable, where, path.lane, connectable)
+        dr.scatter(self._place, mi.Vector4f(path.weight, place.x, place.y, place.z), path.lane, connectable)
         if self._classes.separate:
             label = self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals)
             dr.scatter(self._label, label, slot, keep)
-            dr.scatter(self._first_label, label, path.lane, first)
+            dr.scatter(self._connectable_label, label, path.lane, connectable)
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, or None, and their number, stored or not."""
         dr.eval(self._stored, self._patch, self._record, self._weight, self._label)
-        dr.eval(self._first_record, self._first_place, self._first_label)
+        dr.eval(self._connectable, self._place, self._connectable_label)
         wanted = int(self._stored[0])
         if wanted == 0:
             return None, 0
@@ -166,10 +165,10 @@ class PhotonBuffer:
         photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, mi.Float(0), mi.Float(0), first, label), tag)
         return photons, wanted
 
-    def first_hit(self, index: mi.UInt32) -> tuple[mi.Point3f, Photon]:
-        """Return where paths by number first met a solid [m], and the photons there, of weight 0 for none."""
-        x, y, z, length = dr.gather(mi.Vector4f, self._first_record, index)
-        weight, px, py, pz = dr.gather(mi.Vector4f, self._first_place, index)
-        label = dr.gather(mi.UInt32, self._first_label, index) if self._classes.separate else mi.UInt32(0)
+    def connectable(self, index: mi.UInt32) -> tuple[mi.Point3f, Photon]:
+        """Return the hits of paths by number that can be connected [m], and their photons, of weight 0 for none."""
+        x, y, z, length = dr.gather(mi.Vector4f, self._connectable, index)
+        weight, px, py, pz = dr.gather(mi.Vector4f, self._place, index)
+        label = dr.gather(mi.UInt32, self._connectable_label, index) if self._classes.separate else mi.UInt32(0)
         zero = mi.Float(0)
         return mi.Point3f(px, py, pz), Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, mi.Float(1), label)

@@ -230,7 +230,9 @@ class MergingRenderer(PassRenderer):
         walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, rates)
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
-            hits.add(path, si.p, patches.locate(si), active)
+            # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
+            once = ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
+            hits.add(path, si.p, patches.locate(si), active, active & once & path.before_first_solid)
 
         path = walk.run(path, rng, mi.UInt32(0), segments, on_solid=store, past_solids=True)
         record.rays = dr.sum(mi.Float64(path.rays))
@@ -241,7 +243,7 @@ class MergingRenderer(PassRenderer):
             layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * wanted / count)
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
-        in_cells = store_points(segments, points, cells, self.classes)
+        in_cells = store_points(segments, points, cells, self.classes, seed)
         return _StoredLight(in_cells, segments, points, on_patches, hits)
 
     def _trace_sensor(
