@@ -8,7 +8,7 @@ from mitransient_lidar.loading import catalogue
 
 #: The reference compiles one kernel, merging three.
 FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
-PARAMETERS = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
+PARAMETERS = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=95"]
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
