@@ -103,11 +103,13 @@ class LidarMerging(LidarIntegrator):
         classes: PathClasses | None = None,
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
+        connections: bool = True,
     ) -> PassRenderer:
         """Return the renderer of passes of a scene, by default with one class of light and the sensor's own receiver.
 
         `layout_of` is the renderer of another scene whose points and cells are used, so that the same seeds make the
-        same paths in scenes that differ by a target.
+        same paths in scenes that differ by a target. Without `connections` paths that do not meet the target return the
+        same light with and without it, but for light in cells that are full; the errors of narrow beams are larger.
 
         Raises
         ------
@@ -121,7 +123,7 @@ class LidarMerging(LidarIntegrator):
             paths = paths_of_pass(self.options, lidar.receiver.pixels.count)
             return VolpathRenderer(lidar, classes, paths, VolpathOptions())
         layout = layout_of.layout if isinstance(layout_of, MergingRenderer) else None
-        return MergingRenderer(lidar, classes, self.options, layout)
+        return MergingRenderer(lidar, classes, self.options, layout, connections)
 
     def to_string(self) -> str:
         """Return a description."""

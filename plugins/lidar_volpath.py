@@ -99,8 +99,9 @@ class LidarVolpath(VolpathIntegrator):
         classes: PathClasses | None = None,
         receiver: Receiver | None = None,
         layout_of: PassRenderer | None = None,
+        connections: bool = True,
     ) -> VolpathRenderer:
-        """Return the renderer of passes of a scene, as `LidarMerging.prepare`; `layout_of` is not used."""
+        """Return the renderer of passes of a scene, as `LidarMerging.prepare`, without use of the last two options."""
         lidar = LidarScene.from_scene(scene, sensor, receiver)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
 

@@ -79,8 +79,8 @@ def target_signal(
     session = open_scene(scene, params)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
-    with_target = chosen.prepare(session.scene, session.sensor)
-    without = chosen.prepare(bare, session.sensor, layout_of=with_target)
+    with_target = chosen.prepare(session.scene, session.sensor, connections=False)
+    without = chosen.prepare(bare, session.sensor, layout_of=with_target, connections=False)
     lidar = with_target.scene
     axis, pixels, pulse = lidar.axis, lidar.receiver.pixels, lidar.transmitter.pulse
     if pixels.grid is not None:

@@ -53,14 +53,15 @@ class ConnectionRates:
 
     @classmethod
     def of_pass(
-        cls, scene: LidarScene, cells: WaterCells | SphericalCells, photons: int, points_per_path: float
+        cls, scene: LidarScene, cells: WaterCells | SphericalCells, photons: int, points_per_path: float, wanted: bool
     ) -> ConnectionRates:
         """Return the rates for a number of photons, each with an expected number of points.
 
-        There are no connections in water with bubbles or with several refractive indices, nor for lidars under water.
+        There are connections if they are `wanted`, but not in water with bubbles or several refractive indices, nor for
+        lidars under water.
         """
         water = scene.water
-        connected = water.plume is None and water.index_layers.count == 1 and not scene.submerged
+        connected = wanted and water.plume is None and water.index_layers.count == 1 and not scene.submerged
         rate = 1 / (_POINTS_PER_CONNECTION * photons) if connected else 0.0
         return cls(cells, opaque(rate / points_per_path), opaque(rate), connected)
 

@@ -50,7 +50,7 @@ class Photon:
 class PhotonMap:
     """Photons sorted by bucket, by counting.
 
-    Of full buckets only some photons are kept, at random and with larger weights.
+    Of full buckets only some photons are kept, at random, with larger weights of the same sum if all are equal.
 
     Parameters
     ----------
@@ -71,12 +71,19 @@ class PhotonMap:
         dr.scatter_add(counts, mi.UInt32(1), bucket)
         self._bucket = bucket
         dr.eval(self._bucket, counts)
-        self._keep = most / mi.Float(dr.gather(mi.UInt32, counts, bucket))
-        self._kept = u < self._keep
-        counts = dr.zeros(mi.UInt32, buckets)
-        self._rank = dr.scatter_inc(counts, bucket, self._kept)
-        dr.eval(self._rank, self._kept, self._keep, counts)
-        self._end = dr.cumsum(counts)
+        found = mi.Float(dr.gather(mi.UInt32, counts, bucket))
+        keep = most / found
+        self._kept = u < keep
+        kept_counts = dr.zeros(mi.UInt32, buckets)
+        self._rank = dr.scatter_inc(kept_counts, bucket, self._kept)
+        dr.eval(self._rank, self._kept, kept_counts)
+        # The number of those that are kept is random: their weights add up to all light, and to that of the buckets of
+        # which nothing is kept.
+        some = 1 - dr.exp(found * dr.log(1 - keep))
+        scale = found / (some * mi.Float(dr.gather(mi.UInt32, kept_counts, bucket, self._kept)))
+        self._scale = dr.select(keep < 1, scale, 1)
+        dr.eval(self._scale)
+        self._end = dr.cumsum(kept_counts)
         self.count = int(self._end[buckets - 1])
         self._record = mi.Float()
         self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
@@ -84,7 +91,7 @@ class PhotonMap:
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
         """Store the photons in the order of their buckets, with their cells' tags."""
         place = dr.gather(mi.UInt32, self._end, self._bucket) - 1 - self._rank
-        weight = photon.weight / dr.minimum(self._keep, 1)
+        weight = photon.weight * self._scale
         self._record = dr.empty(mi.Float, 8 * self.count)
         # The sign bit of the sum is that of the direction's z component.
         up = dr.select(photon.direction.z > 0, mi.UInt32(1 << 31), 0)
@@ -96,7 +103,7 @@ class PhotonMap:
         if self._label is not None:
             dr.scatter(self._label, photon.label, place, self._kept)
         dr.eval(self._record, self._end, self._label)
-        self._bucket, self._rank, self._keep, self._kept = mi.UInt32(), mi.UInt32(), mi.Float(), mi.Bool()
+        self._bucket, self._rank, self._scale, self._kept = mi.UInt32(), mi.UInt32(), mi.Float(), mi.Bool()
 
     def find(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the first photon of a bucket and the end of its photons; nothing where inactive."""

@@ -53,6 +53,9 @@ _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 #: Width of the patches of solids, over the width of the cells at the surface.
 _PATCH_PER_CELL = 3.2
 
+#: Least width of the patches over the size of the largest solid, some ten times the rounding of positions on it.
+_PATCH_PER_SOLID = 2**-20
+
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.25, 0.3
 
@@ -135,9 +138,11 @@ class MergingLayout:
         if scene.submerged:
             width = options.cell_size or _CELL_PER_BEAM * scene.transmitter.angular_spread * nearest
             grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
-            rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0)
+            rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0, 0.0)
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
-            return cls(region, uneven, grid, rings, spacing, reach, depth, _PATCH_PER_CELL * width, segments, segments)
+            return cls(
+                region, uneven, grid, rings, spacing, reach, depth, _patch_width(scene, width), segments, segments
+            )
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
         rings = BeamRings(pose, footprint, scene.refractive_index)
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
@@ -148,7 +153,13 @@ class MergingLayout:
         grid = WaterGrid(rings, SurfaceHeights(scene, region), width / core, growth, thickness, reach)
         sine = np.hypot(*pose.axis[:2]) / scene.refractive_index
         depth = reach * float(np.sqrt(1 - sine**2))
-        return cls(region, uneven, grid, rings, spacing, reach, depth, _PATCH_PER_CELL * width, segments, segments)
+        return cls(region, uneven, grid, rings, spacing, reach, depth, _patch_width(scene, width), segments, segments)
+
+
+def _patch_width(scene: LidarScene, cell: float) -> float:
+    """Return the width of the patches of solids for a width of the cells at the surface [m]."""
+    sizes = [np.max(np.array(solid.bbox().max) - np.array(solid.bbox().min)) for solid in scene.solids]
+    return float(max(_PATCH_PER_CELL * cell, _PATCH_PER_SOLID * max(sizes, default=0.0)))
 
 
 def paths_of_pass(options: MergingOptions, pixels: int) -> int:
@@ -160,13 +171,19 @@ class MergingRenderer(PassRenderer):
     """Renders passes of a scene with water by merging, with its own layout or that of another scene."""
 
     def __init__(
-        self, scene: LidarScene, classes: PathClasses, options: MergingOptions, layout: MergingLayout | None = None
+        self,
+        scene: LidarScene,
+        classes: PathClasses,
+        options: MergingOptions,
+        layout: MergingLayout | None = None,
+        connections: bool = True,
     ) -> None:
         pixels = scene.receiver.pixels.count
         super().__init__(scene, classes, paths_of_pass(options, pixels))
         photons = _PHOTONS_FOR_IMAGES if pixels >= IMAGE_PIXELS else _PHOTONS
         self.photons = options.photons_per_pass or photons
         self.layout = layout or MergingLayout.of_scene(scene, self.sampler, options)
+        self._connections = connections
         self._beam = BeamSampler(scene.transmitter, scene.receiver)
 
     @property
@@ -201,7 +218,7 @@ class MergingRenderer(PassRenderer):
             scene, layout.region, layout.rings, layout.depth, layout.patch_width, mi.Point2f(shifts[3:]), layout.uneven
         )
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
-        rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path)
+        rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)
         light = self._trace_light(record, seed, cells, patches, rates)
         if light is None or not self._trace_sensor(record, seed, paths, cells, patches, rates, light):
             return False
@@ -243,7 +260,7 @@ class MergingRenderer(PassRenderer):
             layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * wanted / count)
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
-        in_cells = store_points(segments, points, cells, self.classes, seed)
+        in_cells = store_points(segments, points, cells, self.classes)
         return _StoredLight(in_cells, segments, points, on_patches, hits)
 
     def _trace_sensor(

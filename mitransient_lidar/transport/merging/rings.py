@@ -12,7 +12,7 @@ import numpy as np
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
 
-#: Growth of the core radius with depth [m/m], as light spreads by scattering.
+#: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
 _CORE_PER_METRE = 0.05
 
 #: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
@@ -57,10 +57,12 @@ class BeamRings:
         Standard deviation of the beam where its axis meets the sea, across the axis [m].
     index
         Refractive index of the water over that at the laser.
+    growth
+        Growth of the core radius with depth [m/m].
     """
 
-    def __init__(self, pose: Pose, spread: float, index: float) -> None:
-        self.spread = opaque(spread)
+    def __init__(self, pose: Pose, spread: float, index: float, growth: float = _CORE_PER_METRE) -> None:
+        self.spread, self._growth = opaque(spread), opaque(growth)
         horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
@@ -75,7 +77,7 @@ class BeamRings:
 
     def core(self, depth: mi.Float) -> mi.Float:
         """Return the core radius at a depth [m]."""
-        return CORE_PER_SPREAD * self.spread + _CORE_PER_METRE * depth
+        return CORE_PER_SPREAD * self.spread + self._growth * depth
 
     def offset(self, x: mi.Float, y: mi.Float, depth: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Return offsets from the axis, scaled along it so that the ellipses are circles [m]."""
