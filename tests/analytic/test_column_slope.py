@@ -88,7 +88,7 @@ def test_beam_and_view_may_be_exchanged(lidar_scene):
             sea={"slope_variance": "2e-5"},
             bottom=None,
         )
-        result = fov_sweep(scene, [narrow, view] if view > narrow else [view], passes=16, seed=seed)
+        result = fov_sweep(scene, [narrow, view] if view > narrow else [view], passes=32, seed=seed)
         return (float(result[name][-1]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
 
     (first, first_error), (second, second_error) = slope(wide, narrow, 5), slope(narrow, wide, 6)

@@ -43,7 +43,7 @@ def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scen
     arrival, expected = bottom_echo(attenuation=0.1, reflectance=0.1)
     narrow = {"divergence_mrad": 0.2}
     scene = lidar_scene(
-        integrator={"type": integrator, "paths_per_pass": 2**14},
+        integrator={"type": integrator, "paths_per_pass": 2**16},
         tx=narrow,
         rx={"field_of_view_mrad": 20.0, "layout": "1x1"},
         film={"bin_width_ns": 0.25, "bin_count": 640},

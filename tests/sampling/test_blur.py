@@ -65,9 +65,10 @@ def test_gaussian_blur_spreads_a_beam_as_its_integral_over_pixels(divergence, sh
 def test_what_leaves_the_field_of_view_is_lost_and_no_more():
     """A field of view of 8 sigma keeps everything; one whose edge is at the beam keeps half."""
     narrow = {"divergence_mrad": 0.2}
-    wide, _, _ = energies({"layout": "2x2", "field_of_view_mrad": 16.0, "blur_mrad": 1.0}, narrow)
-    assert wide.sum() == pytest.approx(1, rel=2e-3)
-    np.testing.assert_allclose(wide, 0.25, rtol=5e-3)
+    wide, error, _ = energies({"layout": "2x2", "field_of_view_mrad": 16.0, "blur_mrad": 1.0}, narrow)
+    assert wide.sum() == pytest.approx(1, rel=4e-3)
+    assert np.all(np.abs(wide - 0.25) < 4 * error)
+    assert np.all(error < 2e-3)
     edge = {
         "a": {"type": "pixel_fov", "shape": "rectangle", "width_mrad": 40.0, "height_mrad": 20.0, "angle_x_mrad": 10.0}
     }
@@ -105,8 +106,9 @@ def test_measured_blur_puts_light_where_the_image_does(tmp_path):
     np.save(tmp_path / "psf.npy", image)
     receiver = {"layout": "3x3", "field_of_view_mrad": 6.0, "field_of_view_shape": "square"}
     blur = {"blur_file": str(tmp_path / "psf.npy"), "blur_file_mrad": 5.5}
-    share, _, _ = energies({**receiver, **blur}, {"divergence_mrad": 0.01})
-    np.testing.assert_allclose(share, [0.75, 0, 0, 0, 0.25, 0, 0, 0, 0], rtol=5e-3, atol=1e-9)
+    share, error, _ = energies({**receiver, **blur}, {"divergence_mrad": 0.01})
+    assert np.all(np.abs(share - [0.75, 0, 0, 0, 0.25, 0, 0, 0, 0]) <= 4 * error)
+    assert np.all(error < 4e-3)
 
 
 def test_a_pixel_looks_where_its_light_comes_from(tmp_path):

@@ -13,8 +13,8 @@ pytestmark = pytest.mark.slow
 RECORD = {"time_start_ns", "bin_width_ns", "bin_count"}
 
 #: So fine that each pixel has 200 bins between surface echo and end of bottom echo; shorter where the bottom is at 5 m.
-BINS = {"bin_width_ns": 0.4, "bin_count": 375}
-SHORT_BINS = {"bin_width_ns": 0.25, "bin_count": 600}
+BINS = {"bin_width_ns": 0.4}
+SHORT_BINS = {"bin_width_ns": 0.25}
 
 #: Figure 10 zooms into the record of figure 11.
 ZOOMS = {f"fig10_shot{number}": f"fig11_shot{number}" for number in (1, 2, 3)}

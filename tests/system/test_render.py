@@ -1,5 +1,6 @@
 """Rendering: shipped scenes, options, files, warnings and invalid input."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -147,7 +148,9 @@ def test_dict_and_loaded_scenes_render_like_the_file():
 @pytest.mark.slow
 def test_plain_mitsuba_renders_the_scene():
     energy = np.array(mi.render(mi.load_file(str(catalogue.scene_path("table1"))), spp=2**12, seed=1))
-    assert energy.shape == (4, 150)
+    # Four pixels, and time bins from before the surface echo to after that of the bottom (1418 to 1490 ns).
+    assert energy.shape[0] == 4
+    assert 100 < energy.shape[1] < 300
     assert 3e-12 < energy.sum() < 7e-12  # closed forms of PHYSICS G bracket it: 2.1e-12 (K = c) to 5.4e-12 J
 
 
@@ -341,7 +344,7 @@ def test_invalid_option_is_exit_code_2_without_files(tmp_path):
 def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     """Wind 6 m/s has waves of half a metre; a pile of 0.6 m across stands in the beam."""
     with pytest.raises(UserError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
-        small(params={"wind_speed": 6, "bottom_depth": 0.1})
+        small(params={"wind_speed": 6, "bottom_depth": 0.1, "surface_seed": 2})
     pile = {"type": "cylinder", "p0": [0, 0, -2.0], "p1": [0, 0, 1.0], "radius": 0.3, "bsdf": {"type": "diffuse"}}
     scene = {
         "tx": {"type": "lidar_transmitter"},
@@ -365,7 +368,7 @@ def test_small_patch_warns_of_the_light_that_it_loses(caplog):
     assert "smaller than the spread of the light in the water" in caplog.text
     caplog.clear()
     small()
-    assert caplog.text == ""
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
 
 
 @pytest.mark.slow

@@ -38,6 +38,8 @@ def planes(tmp_path_factory):
     (folder / "plane.xml").write_text(text, "utf-8")
     params = {"spectrum": "height_map", "slope_variance": 0.1, "bottom_depth": 10, "bottom_reflectance": 0.3}
     params |= {"attenuation": 0.45, "scattering": 0.05, "backscattering": 0.0015, "divergence_mrad": 4}
+    # One record for all slopes.
+    params |= {"time_start_ns": 1370, "bin_count": 260}
     lines = np.linspace(-20, 20, 81)
     shots = []
     for along, across in TILTS:

@@ -53,7 +53,7 @@ class OnePixel:
     def __init__(self, pixels):
         self._pixels, self.names, self.grid = pixels, ["single"], None
         self.count, self.area, self.sample = 1, pixels.area, pixels.sample
-        self.field_of_view = pixels.field_of_view
+        self.field_of_view, self.field_of_view_shape = pixels.field_of_view, pixels.field_of_view_shape
 
     def pixel_at(self, angle_x, angle_y, u):
         return mi.UInt32(0), self._pixels.pixel_at(angle_x, angle_y, u)[1]

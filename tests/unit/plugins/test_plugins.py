@@ -346,6 +346,6 @@ def test_other_integrators_see_the_layers():
 def test_a_pixel_alone_is_a_receiver():
     alone = scene(rx={**CIRCLE, "film": {"type": "time_gated_film"}}, integrator={"type": "lidar_volpath"})
     energy = np.array(mi.render(alone, seed=1, spp=2**14))
-    assert energy.shape == (1, 320)
+    assert energy.shape[0] == 1
     assert energy.sum() > 0
     assert mitransient_lidar.render(alone, passes=2).pixel.values.tolist() == ["pixel"]
