@@ -69,41 +69,46 @@ class PhotonMap:
     def __init__(self, buckets: int, bucket: mi.UInt32, u: mi.Float, most: int, labelled: bool) -> None:
         counts = dr.zeros(mi.UInt32, buckets)
         dr.scatter_add(counts, mi.UInt32(1), bucket)
-        self._bucket = bucket
-        dr.eval(self._bucket, counts)
-        found = mi.Float(dr.gather(mi.UInt32, counts, bucket))
-        keep = most / found
-        self._kept = u < keep
-        kept_counts = dr.zeros(mi.UInt32, buckets)
-        self._rank = dr.scatter_inc(kept_counts, bucket, self._kept)
-        dr.eval(self._rank, self._kept, kept_counts)
-        # The number of those that are kept is random: their weights add up to all light, and to that of the buckets of
-        # which nothing is kept.
-        some = 1 - dr.exp(found * dr.log(1 - keep))
-        scale = found / (some * mi.Float(dr.gather(mi.UInt32, kept_counts, bucket, self._kept)))
-        self._scale = dr.select(keep < 1, scale, 1)
-        dr.eval(self._scale)
-        self._end = dr.cumsum(kept_counts)
+        self._bucket, self._most = bucket, most
+        dr.eval(self._bucket, counts, u)
+        self._found = dr.gather(mi.UInt32, counts, bucket)
+        self._kept = u * mi.Float(self._found) < most
+        self._counts = dr.zeros(mi.UInt32, buckets)
+        self._rank = dr.scatter_inc(self._counts, bucket, self._kept)
+        dr.eval(self._found, self._rank, self._kept, self._counts)
+        self._end = dr.cumsum(self._counts)
         self.count = int(self._end[buckets - 1])
-        self._record = mi.Float()
+        # Two arrays: a second write to the same one would compute all photons again.
+        self._course, self._rest = mi.Float(), mi.Float()
         self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
 
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
         """Store the photons in the order of their buckets, with their cells' tags."""
         place = dr.gather(mi.UInt32, self._end, self._bucket) - 1 - self._rank
-        weight = photon.weight * self._scale
-        self._record = dr.empty(mi.Float, 8 * self.count)
+        weight = photon.weight * self._scale()
+        self._course, self._rest = (dr.empty(mi.Float, 4 * self.count) for _ in range(2))
         # The sign bit of the sum is that of the direction's z component.
         up = dr.select(photon.direction.z > 0, mi.UInt32(1 << 31), 0)
         summed = dr.reinterpret_array(mi.Float, dr.reinterpret_array(mi.UInt32, photon.mis_partial_sum) | up)
-        where = mi.Vector4f(photon.direction.x, photon.direction.y, photon.edge, photon.length)
+        course = mi.Vector4f(photon.direction.x, photon.direction.y, photon.edge, photon.length)
         rest = mi.Vector4f(weight, summed, dr.reinterpret_array(mi.Float, tag), photon.position)
-        dr.scatter(self._record, where, 2 * place, self._kept)
-        dr.scatter(self._record, rest, 2 * place + 1, self._kept)
+        dr.scatter(self._course, course, place, self._kept)
+        dr.scatter(self._rest, rest, place, self._kept)
         if self._label is not None:
             dr.scatter(self._label, photon.label, place, self._kept)
-        dr.eval(self._record, self._end, self._label)
-        self._bucket, self._rank, self._scale, self._kept = mi.UInt32(), mi.UInt32(), mi.Float(), mi.Bool()
+        dr.eval(self._course, self._rest, self._end, self._label)
+        self._bucket = self._found = self._rank = self._counts = mi.UInt32()
+        self._kept = mi.Bool()
+
+    def _scale(self) -> mi.Float:
+        """Return the factors of the weights of the photons that are kept.
+
+        How many are kept of a full bucket is random: their weights add up to all of its light, and on average to that
+        of the buckets of which nothing is kept, too.
+        """
+        found, kept = mi.Float(self._found), dr.gather(mi.UInt32, self._counts, self._bucket, self._kept)
+        some = 1 - dr.exp(found * dr.log(1 - self._most / found))
+        return dr.select(found > self._most, found / (some * mi.Float(kept)), 1)
 
     def find(self, bucket: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the first photon of a bucket and the end of its photons; nothing where inactive."""
@@ -112,8 +117,8 @@ class PhotonMap:
 
     def photon(self, index: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
         """Return photons and their tags."""
-        x, y, edge, length = dr.gather(mi.Vector4f, self._record, 2 * index, active)
-        weight, summed, tag, position = dr.gather(mi.Vector4f, self._record, 2 * index + 1, active)
+        x, y, edge, length = dr.gather(mi.Vector4f, self._course, index, active)
+        weight, summed, tag, position = dr.gather(mi.Vector4f, self._rest, index, active)
         up = (dr.reinterpret_array(mi.UInt32, summed) >> 31) > 0
         z = dr.sqrt(dr.maximum(1 - x * x - y * y, 0))
         z = dr.select(up, z, -z)

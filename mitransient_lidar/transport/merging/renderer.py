@@ -57,7 +57,7 @@ _PATCH_PER_CELL = 3.2
 _PATCH_PER_SOLID = 2**-20
 
 #: Thickness of the cells, over the distance of points and over the attenuation length.
-_THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.25, 0.3
+_THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
