@@ -49,6 +49,9 @@ def render(
     max_memory: Annotated[
         float | None, typer.Option(help="Memory for histograms [GB], 2 by default. With less, only gates are kept.")
     ] = None,
+    components: Annotated[
+        bool, typer.Option("--components", help="Also separate the light of surface, water, bottom and targets.")
+    ] = False,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
     mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates; needs ffmpeg.")] = False,
@@ -58,8 +61,9 @@ def render(
     """Render the waveforms and gates of a scene.
 
     Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with gates
-    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. The files appear
-    together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second one on.
+    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by origin is in
+    the .nc file, and drawn in _components.png. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep
+    the completed passes, from the second one on.
     """
     params = parameters(define)
     name, text, _ = scene_of(scene, "render")
@@ -67,6 +71,7 @@ def render(
     if (gif or mp4 or html) and "gate_count" not in text:
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
+    targets += [output / f"{name}_components.png"] if plot and components else []
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
     check_targets(output, [*targets, *gates.names()], scene)
     from mitransient_lidar.rendering import again
@@ -84,6 +89,7 @@ def render(
             passes=passes,
             **({} if seed is None else {"seed": seed}),
             max_memory=max_memory,
+            components=components or None,
             variant=variant,
             progress=progress,
         )
@@ -106,9 +112,13 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
     from mitransient_lidar.results import gate_files
 
     if target.suffix == ".exr":
-        results.save(dataset.drop_dims("gate", errors="ignore"), target)
+        results.save(dataset.drop_dims(["gate", "origin"], errors="ignore"), target)
     elif target.suffix == ".nc":
         (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
+    elif target.stem.endswith("_components"):
+        from mitransient_lidar.plots.waveforms import plot_components
+
+        plot_components(dataset, target)
     elif not target.stem.endswith("_layout"):
         from mitransient_lidar.plots.waveforms import plot_waveforms
 

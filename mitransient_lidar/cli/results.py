@@ -24,6 +24,9 @@ def plot(
     log: Annotated[bool, typer.Option("--log", help="Logarithmic power axis only.")] = False,
     linear: Annotated[bool, typer.Option("--linear", help="Linear power axis only.")] = False,
     shot: Annotated[int | None, typer.Option(help="Number of a shot of a series; by default the mean of all.")] = None,
+    components: Annotated[
+        bool, typer.Option("--components", help="Draw the light by origin instead, to FILE_components.png.")
+    ] = False,
     layout: Annotated[
         bool, typer.Option("--layout", help="Draw pixels, beam and targets on the sea instead, to FILE_layout.png.")
     ] = False,
@@ -35,9 +38,11 @@ def plot(
     """
     if layout and (log or linear):
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
+    if components and (log or linear or layout):
+        raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales.")
     from mitransient_lidar.analysis.waveforms.records import open_waveforms
     from mitransient_lidar.plots.layout import axis_points, plot_layout
-    from mitransient_lidar.plots.waveforms import plot_waveforms
+    from mitransient_lidar.plots.waveforms import plot_components, plot_waveforms
 
     dataset = open_waveforms(file)
     if shot is not None:
@@ -46,6 +51,11 @@ def plot(
         target = output or file.with_name(f"{file.stem}_layout.png")
         plot_layout(dataset, target)
         typer.echo("\n".join([str(target), *axis_points(dataset)]))
+        return
+    if components:
+        target = output or file.with_name(f"{file.stem}_components.png")
+        plot_components(dataset, target)
+        typer.echo(target)
         return
     target = output or file.with_suffix(".png")
     plot_waveforms(dataset, target, "both" if log == linear else "log" if log else "linear")

@@ -20,6 +20,8 @@ Scale = Literal["both", "linear", "log"]
 
 _DECADES = 7  # at most, on a logarithmic axis
 
+_ORIGIN_COLOURS = {"surface": "#8fa3ad", "water": "#3f8fc9", "bottom": "#a8743a", "target": "#d81e1e"}
+
 
 def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, scale: Scale = "both") -> Figure:
     """Draw the waveforms or recorded signals of a result; of an imager the total of each pixel and the summed waveform.
@@ -62,6 +64,51 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     axes[-1].set_xlabel(drawing.TIME_LABEL)
     _add_depth_axis(axes[0], dataset)
     figure.suptitle(_title(dataset), fontsize="large")
+    return drawing.save(figure, path)
+
+
+def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the waveform of all pixels by the origin of its light: stacked areas, and curves on a logarithmic axis.
+
+    Of a series of shots, it is their mean.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A result of `rendering.render.render` with components.
+    path : path, optional
+        File to write.
+
+    Raises
+    ------
+    UserError
+        If the light of the result was not separated.
+    """
+    name = "waveform_by_origin"
+    if name not in dataset:
+        raise UserError(f"the dataset has no variable {name}: render it with components")
+    parts = dataset[name].mean({"shot"} & set(dataset[name].dims)).transpose("origin", ..., "time")
+    power = parts.sum([dim for dim in parts.dims if dim not in ("origin", "time")]).values
+    time, limits = dataset["time"].values, drawing.time_limits(dataset)
+    names = [str(one) for one in dataset["origin"].values]
+    colours = [_ORIGIN_COLOURS.get(one, f"C{number % 10}") for number, one in enumerate(names)]
+    top = float(np.nanmax(power.sum(axis=0), initial=0.0)) or 1.0
+    factor, prefix = drawing.si_prefix(top)
+    figure = drawing.new_figure(path, 8.0, 6.0)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.stackplot(time, power / factor, colors=colours, labels=names, alpha=0.85, linewidth=0)
+    upper.legend(frameon=False)
+    for values, colour in zip(power / factor, colours, strict=True):
+        lower.plot(time, np.where(values > 0, values, np.nan), color=colour, linewidth=1.3)
+    lower.set_yscale("log")
+    lower.set_ylim(1e-5 * top / factor, 2 * top / factor)
+    lower.set_xlabel(drawing.TIME_LABEL)
+    for ax in (upper, lower):
+        ax.set_xlim(limits)
+        ax.set_ylabel(f"received power ({prefix}W)")
+        drawing.add_grid(ax, hide=("right",))
+    _add_depth_axis(upper, dataset)
+    figure.suptitle(f"{_title(dataset)}  ·  by origin", fontsize="large")
     return drawing.save(figure, path)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -111,11 +111,15 @@ class PassAccumulator(ABC):
 class WaveformAccumulator(PassAccumulator):
     """Statistics of energy and power in every bin, and of the gates cut from them."""
 
-    def __init__(self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None) -> None:
+    def __init__(
+        self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None, origins: Sequence[str] = ()
+    ) -> None:
         super().__init__(scene, window, train)
         response = scene.receiver.optics.response_time_ns
         self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
         self._energy, self._power, self._inflation = PassStatistics(), PassStatistics(), ErrorInflation()
+        self._origins = list(origins)
+        self._parts = PassStatistics(), PassStatistics()
         self._weights = None if train is None else _weights(scene, train)
 
     @property
@@ -130,7 +134,13 @@ class WaveformAccumulator(PassAccumulator):
 
     def add(self, histogram: TransientHistogram) -> None:
         """Add the histogram of a pass."""
-        energy = histogram.energy().reshape(self.scene.receiver.pixels.count, -1)
+        energy = histogram.energy()
+        if self._origins:
+            parts = energy.reshape(self.scene.receiver.pixels.count, len(self._origins), -1)
+            self._parts[0].add(parts)
+            self._parts[1].add(waveform(parts, self.scene.axis.bin_width_ns, self._kernel))
+            energy = parts.sum(axis=1)
+        energy = energy.reshape(self.scene.receiver.pixels.count, -1)
         power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
         self._energy.add(energy)
         self._power.add(power)
@@ -148,10 +158,14 @@ class WaveformAccumulator(PassAccumulator):
         """Return the labelled result; gates are two more variables."""
         axis, pixels = self.scene.axis, self.scene.receiver.pixels
         bins, inflation = self._inflation.over(self._power.mean, self._power.stderr)
+        means = self._energy.mean, self._power.mean
+        if self._origins:
+            # The whole is the sum of its parts to the bit.
+            means = tuple(part.mean.sum(axis=1) for part in self._parts)
         built = results.build(
-            self._energy.mean,
+            means[0],
             self._energy.stderr,
-            self._power.mean,
+            means[1],
             self._power.stderr,
             time=axis,
             pixel_names=pixels.names,
@@ -159,6 +173,9 @@ class WaveformAccumulator(PassAccumulator):
             grid=pixels.grid,
             attributes={**attributes, "error_inflation_bins": bins, "error_inflation": inflation},
         )
+        if self._origins:
+            arrays = (values for part in self._parts for values in (part.mean, part.stderr))
+            built = results.add_components(built, self._origins, *arrays)
         if self.train is None:
             return built
         stack = self._gate_stack(built.coords, dict(built.attrs))
@@ -205,11 +222,16 @@ class GateAccumulator(PassAccumulator):
 
 
 def choose_accumulator(
-    scene: LidarScene, window: ErrorWindow, surface_time_ns: float | None, max_memory: float
+    scene: LidarScene,
+    window: ErrorWindow,
+    surface_time_ns: float | None,
+    max_memory: float,
+    origins: Sequence[str] = (),
 ) -> PassAccumulator:
     """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
-    Depths of gates are relative to the mean time of the surface echo [ns], None without one.
+    Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
+    `origins` if there are any.
 
     Raises
     ------
@@ -219,13 +241,16 @@ def choose_accumulator(
     from mitransient_lidar.transport.histogram import TransientHistogram
 
     pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
-    bins, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
+    bins, limit = pixels * scene.axis.bin_count * (1 + len(origins)), 1e9 * max_memory
     train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + gates
     if everything <= limit:
-        return WaveformAccumulator(scene, window, train)
+        return WaveformAccumulator(scene, window, train, origins)
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
+    if origins:
+        size = size.replace(" takes", f" x {len(origins)} components takes")
+        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer bins or pixels")
     if train is None:
         raise UserError(
             f"{size}: more than max_memory = {max_memory:g} GB allows; "

@@ -99,6 +99,7 @@ def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) ->
         ends: dict[str, Any] = {"passes": [*passes, *[passes[-1]] * frames][:frames]}
     else:
         own["max_memory"] = attributes["max_memory_gb"]
+        own["components"] = bool(attributes.get("components", 0))
         ends = {"passes": attributes["passes"], "pass_share": attributes["pass_share"]}
     chosen = {**own, **({} if any(name in given for name in _ENDS) else ends), **given}
     return render_passive(record, **chosen) if kind == "passive" else render(record, **chosen)

@@ -51,6 +51,7 @@ def render(
     seed: int = 0,
     max_memory: float | None = None,
     pass_share: float | None = None,
+    components: bool | None = None,
     variant: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> xarray.Dataset:
@@ -87,6 +88,10 @@ def render(
         only the gates are kept, with a warning.
     pass_share
         Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, or less where `max_time` needs it.
+    components
+        Whether to separate the light by its origin, by default not: ``surface``, ``water``, and the id of each solid,
+        such as ``bottom``. The origin is the last solid that the light has met, else the water if that has scattered
+        it, else the surface.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
@@ -97,7 +102,9 @@ def render(
     xarray.Dataset
         ``impulse_response`` [J per bin], ``waveform`` [W] (after the pulse and the receiver's response) and their
         standard errors, over (pixel, time) or (row, column, time); see `results.dataset`. With gates in the film,
-        ``gate_energy`` [J] in addition or instead; see `results.gate_stack`. After Ctrl-C it includes the completed
+        ``gate_energy`` [J] in addition or instead; see `results.gate_stack`. With `components`, the parts
+        ``impulse_response_by_origin`` and ``waveform_by_origin``, with standard errors, over ``origin`` and the same
+        dimensions, whose sums over ``origin`` are the whole. After Ctrl-C it includes the completed
         passes, and the attribute ``interrupted`` is 1.
 
     Notes
@@ -119,6 +126,8 @@ def render(
     session = open_scene(scene, params, variant, instrument)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
+    if components:
+        renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
     session.tell_record()
     from mitransient_lidar.rendering.describe import describe_lidar
@@ -132,7 +141,8 @@ def render(
     # Depths are relative to the mean arrival of the surface echo over all pixels.
     arrivals = probe.surface_ns[:, 1]
     surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
-    accumulator = choose_accumulator(lidar, window, surface.get("surface_time_ns"), max_memory)
+    origins = renderer.classes.names if components else []
+    accumulator = choose_accumulator(lidar, window, surface.get("surface_time_ns"), max_memory, origins)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
@@ -172,6 +182,7 @@ def render(
         **pass_attributes(log, seed),
         pass_share=share,
         max_memory_gb=max_memory,
+        components=int(bool(components)),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

@@ -1,5 +1,14 @@
 """Datasets of results, and their files."""
 
-from mitransient_lidar.results.dataset import build, open, pixel_coordinates, provenance, record_dims, save, time_axis
+from mitransient_lidar.results.dataset import (
+    add_components,
+    build,
+    open,
+    pixel_coordinates,
+    provenance,
+    record_dims,
+    save,
+    time_axis,
+)
 
-__all__ = ["build", "open", "pixel_coordinates", "provenance", "record_dims", "save", "time_axis"]
+__all__ = ["add_components", "build", "open", "pixel_coordinates", "provenance", "record_dims", "save", "time_axis"]

@@ -5,9 +5,11 @@ standard errors ``impulse_response_stderr`` and ``waveform_stderr``, over the di
 time) for an imager. The coordinates are ``time`` [ns] at the centres of the bins, ``pixel`` (names), and the centres of
 the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes,
 among them the scene and all parameters of its plugins (`loading.scene_record`), from which it can be rendered again. A
-series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates.
+series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
+by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions.
 
-EXR files round the values to 32 bits and store everything else exactly; NetCDF files store everything exactly.
+EXR files round the values to 32 bits and store everything else exactly, without the light by origin; NetCDF files store
+everything exactly.
 """
 
 from __future__ import annotations
@@ -121,6 +123,44 @@ def build(
         coords,
         provenance({**bins, **attributes}),
     )
+
+
+def add_components(
+    dataset: xr.Dataset,
+    origins: Sequence[str],
+    impulse_response: npt.ArrayLike,
+    impulse_response_stderr: npt.ArrayLike,
+    waveform: npt.ArrayLike,
+    waveform_stderr: npt.ArrayLike,
+) -> xr.Dataset:
+    """Return a result of `build` with its light by origin.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result.
+    origins : sequence of str
+        Unique names of the origins.
+    impulse_response, impulse_response_stderr, waveform, waveform_stderr : array-like of shape (pixel, origin, time)
+        As for `build`, of each origin.
+    """
+    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
+    dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
+    data = {}
+    for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
+        values = np.moveaxis(np.asarray(array, dtype=np.float64), 1, 0).reshape(len(origins), *shape)
+        described = {**about, "long_name": f"{about['long_name']}, by origin"}
+        if "ancillary_variables" in described:
+            described["ancillary_variables"] = by_origin(described["ancillary_variables"])
+        data[by_origin(name)] = (("origin", *dims), values, described)
+    names = ("origin", np.array(origins, dtype=str), {"long_name": "where the light comes from"})
+    return dataset.assign(data).assign_coords(origin=names)
+
+
+def by_origin(name: str) -> str:
+    """Return the name of a variable of a result for light by origin."""
+    stem = name.removesuffix("_stderr")
+    return f"{stem}_by_origin{name[len(stem) :]}"
 
 
 def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
@@ -241,7 +281,8 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         if file_format == "exr":
             _write_exr(dataset, path, temporary)
         else:
-            netcdf.write_netcdf(dataset, temporary, _VARIABLES)
+            large = [name for name in (*_VARIABLES, *map(by_origin, _VARIABLES)) if name in dataset]
+            netcdf.write_netcdf(dataset, temporary, large)
 
 
 def open(path: str | os.PathLike[str]) -> xr.Dataset:

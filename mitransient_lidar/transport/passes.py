@@ -40,12 +40,17 @@ class PassRecord:
         pixel: mi.UInt32,
         order: mi.UInt32,
         reversals: mi.UInt32,
+        solid: mi.UInt32,
         length: mi.Float,
         energy: mi.Float,
         active: mi.Bool,
     ) -> None:
-        """Add the energy [J] of paths by relative optical length [m], order of scattering and number of reversals."""
-        self.histogram.add(self.classes.index(pixel, order, reversals), length, energy, active)
+        """Add the energy [J] of paths by relative optical length [m] and by what their class depends on.
+
+        That is the order of scattering, the number of reversals, and the number of the last solid that the light has
+        met, from 1 on, or 0 (`PathClasses`).
+        """
+        self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active)
 
     def lose(self, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy [J] that is lost because the surface mesh ends."""
@@ -79,6 +84,12 @@ class PassRenderer(ABC):
         scaled = copy.copy(self)
         scaled.paths = max(round(share * self.paths), 1)
         return scaled
+
+    def by_origin(self) -> PassRenderer:
+        """Return a renderer that separates light by its origin; raise UserError for too many solids."""
+        separate = copy.copy(self)
+        separate.classes = PathClasses.by_origin(self.scene.solids)
+        return separate
 
     def render_pass(self, seed: int, *, paths: int | None = None, gates: GateWeights | None = None) -> PassRecord:
         """Render one pass.

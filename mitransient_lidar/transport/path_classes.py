@@ -1,4 +1,4 @@
-"""Classes of received light: order of scattering, and one or several vertical reversals."""
+"""Classes of received light: by order of scattering and vertical reversals, or by origin."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+
+from mitransient_lidar.core.errors import UserError
 
 #: Bits of a label for the pixel, and for the number of scattering events; the others are for reversals.
 _PIXEL_BITS, _ORDER_BITS = 20, 6
@@ -15,41 +17,79 @@ _MOST = (1 << _ORDER_BITS) - 1
 #: Largest number of orders that can be separated.
 MOST_ORDERS = _MOST - 1
 
+#: Origins without a solid: light that has met the sea surface alone, and light that the water has scattered.
+ORIGINS = ("surface", "water")
+
+#: Largest number of solids whose light can be separated: each takes as much memory as all light.
+_MOST_SOLIDS = 30
+
 
 @dataclass(frozen=True)
 class PathClasses:
     """Classes into which the light of each pixel is separated.
 
-    Orders of scattering below `orders`, and all higher ones together; with `orders` = 0 each pixel is one class.
+    Either orders of scattering below `orders`, and all higher ones together; or the origin of the light, that is the
+    last of the `solids` that it has met, else the water if that has scattered it, else the surface. With `orders` = 0
+    and without `solids` each pixel is one class.
     """
 
     orders: int = 0
+    solids: tuple[mi.Shape, ...] | None = None
+
+    @classmethod
+    def by_origin(cls, solids: list[mi.Shape]) -> PathClasses:
+        """Return the classes of light by origin; raise UserError for too many solids."""
+        if len(solids) > _MOST_SOLIDS:
+            raise UserError(f"components: the scene has {len(solids)} solids; allowed are at most {_MOST_SOLIDS}")
+        return cls(solids=tuple(solids))
+
+    @property
+    def by_order(self) -> bool:
+        """Whether there are classes by order of scattering."""
+        return self.orders > 0
 
     @property
     def separate(self) -> bool:
         """Whether there are several classes."""
-        return self.orders > 0
+        return self.by_order or self.solids is not None
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the origins."""
+        return [*ORIGINS, *(str(solid.id()) for solid in self.solids or ())]
 
     @property
     def count(self) -> int:
-        """Number of classes of a pixel: orders, for one reversal and then for several."""
-        return 2 * (self.orders + 1) if self.separate else 1
+        """Number of classes of a pixel: origins; or orders, for one reversal and then for several."""
+        if self.by_order:
+            return 2 * (self.orders + 1)
+        return 1 if self.solids is None else len(ORIGINS) + len(self.solids)
 
     def pack(self, label: mi.UInt32, scatterings: mi.UInt32, reversals: mi.UInt32) -> mi.UInt32:
         """Return a label packed with numbers of scattering events and reversals."""
-        if not self.separate:
+        if not self.by_order:
             return label
         return label | _packed(scatterings, _PIXEL_BITS) | _packed(reversals, _PIXEL_BITS + _ORDER_BITS)
 
     def unpack(self, label: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return a label without the numbers of scattering events and reversals, and these (0 without classes)."""
-        if not self.separate:
+        """Return a label without the numbers of scattering events and reversals, and these (0 without orders)."""
+        if not self.by_order:
             return label, mi.UInt32(0), mi.UInt32(0)
         return (label & ((1 << _PIXEL_BITS) - 1), (label >> _PIXEL_BITS) & _MOST, label >> (_PIXEL_BITS + _ORDER_BITS))
 
-    def index(self, pixel: mi.UInt32, order: mi.UInt32, reversals: mi.UInt32) -> mi.UInt32:
-        """Return the index of a pixel's class."""
-        if not self.separate:
+    def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
+        """Return the numbers of solids among those that are separated, from 1 on; 0 for other shapes."""
+        number = mi.UInt32(0)
+        for index, solid in enumerate(self.solids or (), 1):
+            number = dr.select(shape == mi.ShapePtr(solid), mi.UInt32(index), number)
+        return number
+
+    def index(self, pixel: mi.UInt32, order: mi.UInt32, reversals: mi.UInt32, solid: mi.UInt32) -> mi.UInt32:
+        """Return the index of a pixel's class; `solid` is the number of the last solid that the light has met."""
+        if self.solids is not None:
+            scattered = dr.select(order > 0, mi.UInt32(1), 0)
+            return pixel * self.count + dr.select(solid > 0, solid + (len(ORIGINS) - 1), scattered)
+        if not self.by_order:
             return pixel
         several = dr.select(reversals > 1, mi.UInt32(self.orders + 1), 0)
         return pixel * self.count + several + dr.minimum(order, self.orders)

@@ -174,17 +174,26 @@ class ConnectedPath(Path):
         receiver: the last vertex could not be connected.
     reflected_by_sea
         Whether the next segment was reflected by the dry side of the sea surface.
+    solid
+        Number of the first solid met, as `PathClasses.solid`.
     """
 
     emitter_ratio: mi.Float
     specular: mi.Bool
     reflected_by_sea: mi.Bool
+    solid: mi.UInt32
 
     @classmethod
     def start(cls, scene: WaterScene, angles: mi.Point2f, active: mi.Bool) -> ConnectedPath:
         """Return paths that start at the receiver at tangent-plane angles."""
         state = Path.initial(scene, scene.receiver.pose, angles, mi.Float(1), active)
-        return cls(**state, emitter_ratio=mi.Float(0), specular=mi.Bool(True), reflected_by_sea=mi.Bool(False))
+        return cls(
+            **state,
+            emitter_ratio=mi.Float(0),
+            specular=mi.Bool(True),
+            reflected_by_sea=mi.Bool(False),
+            solid=mi.UInt32(0),
+        )
 
 
 @dataclass

@@ -113,6 +113,10 @@ class PathLight:
         `share` is the received energy per radiance above the surface at `crossing`.
         """
 
+    def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
+        """Return the numbers of solids as `PathClasses.solid`; 0 where the record has no such classes."""
+        return mi.UInt32(0)
+
     def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
         """Record light of emitters that paths meet when they leave the scene; there is none by default."""
 
@@ -144,12 +148,16 @@ class LaserLight(PathLight):
         """Connect scattering events to a laser under water."""
         return connect_event_to_laser(self.scene, point, active)
 
+    def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
+        """Return the numbers of solids among the classes of the record."""
+        return self.record.classes.solid(shape)
+
     def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy to the histogram."""
         # The connection to a laser above goes up: from a vertex that was reached downwards it is one more reversal.
         upward = opaque(self.scene.transmitter.pose.origin[2]) - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
-        self.record.receive(self.pixel, path.scatterings, reversals, length, energy, active)
+        self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add energy to the losses."""
@@ -216,6 +224,8 @@ class PathTracer:
         if self.scene.water is not None and self._absorption is None:
             path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
         emitter = self.light.sampler.direction_from(path.point)
+        met_first = vertex.on_solid & path.before_first_solid
+        path.solid = dr.select(met_first, self.light.solid(vertex.si.shape), path.solid)
         if self.light.submerged:
             self._connect_straight(path, vertex, event, emitter, first)
         else:
@@ -400,6 +410,7 @@ class PathTracer:
         ratio = dr.select(submerged & ~specular & (pdf > 0), sampler_pdf / pdf, 0)
         path.emitter_ratio = dr.select(turned, ratio, path.emitter_ratio)
         self._step.redirect(path, vertex, direction, factor, bs, passes)
+        path.solid = dr.select(path.before_first_solid, mi.UInt32(0), path.solid)
         path.specular = dr.select(turned, specular, path.specular)
         reflected = vertex.at_sea & ~vertex.in_water & ~path.in_water
         path.reflected_by_sea = dr.select(turned, reflected, path.reflected_by_sea)

@@ -103,7 +103,8 @@ class WaterConnections:
         ray.maxt = distance
         clear = self.scene.is_clear(point.point.z) & self.scene.is_clear(other.point.z)
         active &= ~self.scene.ray_test(ray, active & ~clear)
-        self._receive(point, other, direction, 2, point.length + other.length, distance, energy, active)
+        length = point.length + other.length
+        self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active)
 
     def to_solids(self, count: int, light: PhotonBuffer, patches: SolidPatches, seed: int, stream: int) -> None:
         """Connect some of `count` points of the receiver's paths with some photons on solids."""
@@ -124,7 +125,8 @@ class WaterConnections:
         scale = self.rates.on_solids * (float(light.photons) * _POINTS_PER_CONNECTION)
         energy = scale * point.weight * photon.weight * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
-        self._receive(point, photon, direction, 1, point.length + photon.length, distance, energy, active)
+        solid, length = self.record.classes.solid(si.shape), point.length + photon.length
+        self._receive(point, photon, solid, direction, 1, length, distance, energy, active)
 
     def _segment(self, point: SegmentPoints, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Return direction, length [m] and absorption of segments, and their length^2 / transmittance of scattering."""
@@ -150,6 +152,7 @@ class WaterConnections:
         self,
         point: SegmentPoints,
         light: SegmentPoints | Photon,
+        solid: mi.UInt32,
         direction: mi.Vector3f,
         events: int,
         length: mi.Float,
@@ -158,6 +161,6 @@ class WaterConnections:
         active: mi.Bool,
     ) -> None:
         """Add the energy of connected paths to the record."""
-        subpath = SensorSubpath(*self.record.classes.unpack(point.label), point.direction, point.weight)
+        subpath = SensorSubpath(*self.record.classes.unpack(point.label), solid, point.direction, point.weight)
         group: Any = self._water.index_layers.group(mi.UInt32(0))
         subpath.add(self.record, light, events, length + distance * group, energy, active, [direction])

@@ -32,7 +32,7 @@ def store_points(
     # From the point itself: the number of points of other paths does not count.
     key = (dr.reinterpret_array(mi.UInt32, value) for value in (points.point.x, points.length))
     u = mi.sample_tea_float32(*key)
-    photons = PhotonMap(cells.grid.buckets, bucket, u, PHOTONS_OF_CELL, classes.separate)
+    photons = PhotonMap(cells.grid.buckets, bucket, u, PHOTONS_OF_CELL, classes.by_order)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     _, tag, _ = cells.locate(points.point)
@@ -75,7 +75,7 @@ def merge_in_water(
         scatterers.append((water.plume_phase, water.plume.scattering_at(points.point)))
     absorption = water.absorption_flight.attenuation(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
-    subpath = SensorSubpath(*record.classes.unpack(points.label), points.direction, points.weight)
+    subpath = SensorSubpath(*record.classes.unpack(points.label), mi.UInt32(0), points.direction, points.weight)
     first, end = photons.find(bucket, mi.Bool(True))
     typical = cells.typical_volume(points.point)
     weight = points.weight / volume * typical
@@ -118,7 +118,8 @@ def merge_on_solids(
             return
         patch, random = patches.locate(si), mi.PCG32(rng)
         first, end = photons.find(patch.bucket, active)
-        subpath = SensorSubpath(pixel, path.scatterings, path.reversals, path.direction, path.weight)
+        solid = record.classes.solid(si.shape)
+        subpath = SensorSubpath(pixel, path.scatterings, path.reversals, solid, path.direction, path.weight)
         weight = path.weight * patches.inverse_share(patch, si.shape, random, active & (first < end)) / patch.area
         typical = patches.typical_area(si)
         connection = connections * edge / dr.abs(dr.dot(si.n, path.direction))
@@ -144,11 +145,12 @@ def merge_on_solids(
 
 @dataclass(frozen=True)
 class SensorSubpath:
-    """The receiver's part of merged paths."""
+    """The receiver's part of merged paths, and the number of the solid on which it ends (0 for none)."""
 
     pixel: mi.UInt32
     scatterings: mi.UInt32
     reversals: mi.UInt32
+    solid: mi.UInt32
     direction: mi.Vector3f
     weight: mi.Float
 
@@ -168,14 +170,14 @@ class SensorSubpath:
         lies outside the surface mesh count as lost.
         """
         outside = (self.weight < 0) | (light.weight < 0)
-        order, reversals = self.scatterings, self.reversals
-        if record.classes.separate:
+        order, reversals = self.scatterings + events, self.reversals
+        if record.classes.by_order:
             _, before, reversed_before = record.classes.unpack(light.label)
             # Light continues against the directions of the receiver's part.
             course = [self.direction.z, *(direction.z for direction in between), -light.direction.z]
             for here, following in pairwise(course):
                 reversals = reversals + dr.select(here * following < 0, mi.UInt32(1), 0)
             reversals = reversals + reversed_before
-            order = order + before + events
-        record.receive(self.pixel, order, reversals, length, dr.abs(energy), active & ~outside)
+            order = order + before
+        record.receive(self.pixel, order, reversals, self.solid, length, dr.abs(energy), active & ~outside)
         record.lose(dr.abs(energy), active & outside)

@@ -287,7 +287,8 @@ class MergingRenderer(PassRenderer):
             path.rays += dr.select(active, mi.UInt32(1), 0)
             energy = path.throughput * radiance
             # No scattering event, and one reversal.
-            record.receive(start.pixel, mi.UInt32(0), mi.UInt32(1), path.length + length, energy, radiance > 0)
+            order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(si.shape)
+            record.receive(start.pixel, order, reversals, solid, path.length + length, energy, radiance > 0)
 
         of_merges = pass_streams(seed, _MERGE_STREAM, count)
         merge = merge_on_solids(patches, record, light.on_patches, start.pixel, rates.on_solids, of_merges)

@@ -1,0 +1,146 @@
+"""Light by origin: parts and whole, and each part against a closed form or a scene without the others."""
+
+import numpy as np
+import pytest
+from oracles.beam_average import echo_energies
+from significance import largest_error, largest_z
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase import henyey_greenstein
+from mitransient_lidar.plots.waveforms import plot_components
+from mitransient_lidar.rendering.again import render_again
+from mitransient_lidar.results import dataset as results
+from mitransient_lidar.transport.path_classes import PathClasses
+
+INTEGRATORS = ["lidar_merging", "lidar_volpath"]
+ORIGINS = ["surface", "water", "target", "bottom"]
+#: Few paths, for what holds to the bit.
+FEW = {"type": "lidar_merging", "paths_per_pass": 2**12, "photons_per_pass": 2**12}
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return mitransient_lidar.render("fig13_2x2", passes=2, seed=5, integrator=FEW, components=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["impulse_response", "waveform"])
+def test_parts_sum_to_the_whole_to_the_bit(parts, name):
+    assert parts["origin"].values.tolist() == ORIGINS
+    assert parts[f"{name}_by_origin"].dims == ("origin", "pixel", "time")
+    np.testing.assert_array_equal(parts[f"{name}_by_origin"].sum("origin"), parts[name])
+    assert (parts[f"{name}_by_origin_stderr"].max(("pixel", "time")) > 0).all()
+
+
+@pytest.mark.slow
+def test_whole_is_that_without_components(parts):
+    whole = mitransient_lidar.render("fig13_2x2", passes=2, seed=5, integrator=FEW)
+    for name in ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr"):
+        np.testing.assert_allclose(parts[name], whole[name], rtol=1e-12, atol=1e-12 * float(whole[name].max()))
+
+
+@pytest.mark.slow
+def test_parts_survive_a_netcdf_file_and_a_second_render(parts, tmp_path):
+    results.save(parts, tmp_path / "parts.nc")
+    np.testing.assert_array_equal(
+        results.open(tmp_path / "parts.nc")["waveform_by_origin"], parts["waveform_by_origin"]
+    )
+    again = render_again(tmp_path / "parts.nc")
+    np.testing.assert_array_equal(again["waveform_by_origin_stderr"], parts["waveform_by_origin_stderr"])
+
+
+@pytest.mark.slow
+def test_parts_are_drawn(parts, tmp_path):
+    figure = plot_components(parts, tmp_path / "parts.png")
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ORIGINS
+    with pytest.raises(UserError, match="no variable waveform_by_origin: render it with components"):
+        plot_components(parts.drop_dims("origin"))
+
+
+def test_memory_of_the_parts_is_limited():
+    with pytest.raises(
+        UserError, match=r"4 pixels x \d+ bins x 4 components takes .* more than max_memory = 0.0001 GB"
+    ):
+        mitransient_lidar.render("fig13_2x2", passes=2, components=True, max_memory=1e-4)
+
+
+def test_too_many_solids_are_refused():
+    with pytest.raises(UserError, match="the scene has 31 solids; allowed are at most 30"):
+        PathClasses.by_origin([None] * 31)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_each_part_has_its_closed_form(lidar_scene, z_score, integrator):
+    """Ripples seen from above, water that scatters so little that no light is scattered twice, and a grey bottom."""
+    scattering, variance, pose = 1e-4, 1e-3, {"off_nadir_deg": 0.0}
+    water = {"attenuation": 0.1, "scattering": scattering, "backscattering": 2e-6, "phase_function": "hg"}
+    scene = lidar_scene(
+        integrator={"type": integrator, "paths_per_pass": 2**16},
+        tx=pose,
+        rx={"layout": "1x1", **pose},
+        film={"time_start_ns": 1310.0, "bin_count": 170},
+        sea={"slope_variance": str(variance)},
+        water={**water, "phase_g": 0.6},
+    )
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0]).by_origin()
+    count = 16
+    passes = [renderer.render_pass(seed).histogram.energy().sum(axis=-1) for seed in range(count)]
+    column = WaterColumn.from_text(0, 0.1, scattering, 0)
+    backward = float(henyey_greenstein(np.pi, 0.6))
+    lidar = LidarSystem(200.0, 0.0, 5e-3 * 0.81 * 0.9, 0.025, 1.34, 1.34)
+    half = 15e-3
+    echo = echo_energies(
+        lidar, 5e-3, column, backward, 8.0, 0.1, (variance / 2, variance / 2), lambda x, y: x**2 + y**2 <= half**2
+    )
+    z, error = z_score(np.array(passes), np.array([echo.surface, echo.column, echo.bottom]))
+    # The path tracer scatters one path in a thousand.
+    limits = np.array([0.002, 0.15 if integrator == "lidar_volpath" else 0.004, 0.004])
+    assert np.all(error < limits), error
+    # The closed form neglects that ripples bend light.
+    assert np.all(np.abs(z) * error < largest_z(count, 3) * error + 1e-3), (z, error)
+
+
+@pytest.mark.slow
+def test_integrators_agree_by_origin():
+    found = [
+        mitransient_lidar.render("fig13_2x2", passes=12, seed=seed, integrator=integrator, components=True)
+        for seed, integrator in enumerate(INTEGRATORS)
+    ]
+    # Bins of 10 ns, summed over the pixels; errors of the pixels and bins of a pass add up at most.
+    blocks = [one.sum("pixel").isel(time=slice(0, 200)).coarsen(time=10).sum() for one in found]
+    values = [block["impulse_response_by_origin"].values for block in blocks]
+    errors = [block["impulse_response_by_origin_stderr"].values for block in blocks]
+    known = np.all([error < 0.2 * value for value, error in zip(values, errors, strict=True)], axis=0)
+    assert np.all(known.sum(axis=1) >= [2, 8, 1, 2])
+    # Merging's cells blur the first metre of water by 0.5 %.
+    z = np.maximum(np.abs(values[0] - values[1]) - 5e-3 * values[1], 0)[known] / np.hypot(*errors)[known]
+    assert np.all(z < largest_z(12, z.size)), z
+
+
+@pytest.mark.slow
+def test_part_of_a_target_is_what_its_reflectance_adds():
+    """Before light from it can meet the bottom, a grey target differs from a black one by its part."""
+    params = {"time_start_ns": 1400, "bin_count": 120, "layout": "1x1"}
+    grey, black = (
+        mitransient_lidar.render(
+            "fig13_2x2", params={**params, "target_reflectance": rho}, passes=12, seed=seed, components=True
+        )
+        for rho, seed in ((0.3, 3), (0.0, 4))
+    )
+    assert float(black["impulse_response_by_origin"].sel(origin="target").sum()) == 0
+    gate = slice(1478, 1502)
+
+    def gated(one, name):
+        part = one[name].sel(time=gate).sum(("pixel", "time"))
+        inflated = one[f"{name}_stderr"].sel(time=gate).sum(("pixel", "time"))
+        return float(part), float(inflated)
+
+    (whole, whole_error), (dark, dark_error) = (gated(one, "impulse_response") for one in (grey, black))
+    own = grey["impulse_response_by_origin"].sel(origin="target", time=gate).sum()
+    error = np.hypot(whole_error, dark_error)
+    assert error < largest_error(12, 0.042) * own
+    assert abs(whole - dark - own) < largest_z(12) * error
