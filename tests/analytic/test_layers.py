@@ -240,8 +240,8 @@ def test_absorption_changes_the_bins_behind_it_and_no_others(lidar_scene, passes
     way = 1e-9 * C0 / INDEX * (time - surface)
     through_upper = 2 * 3.0 / np.cos(snell(ANGLE, INDEX))
 
-    # A cell of water, 0.15 m thick, mixes light of both sides of the edge: 1.4 ns.
-    early, late = (time > surface + 2) & (time < STEP_NS - 2), time > STEP_NS + 2
+    # A cell of water, 0.3 m thick, mixes light of both sides of the edge: 2.8 ns.
+    early, late = (time > surface + 2) & (time < STEP_NS - 3), time > STEP_NS + 3
     assert np.all(before[early | late] > 0)
     np.testing.assert_array_equal(below[early], before[early])
     np.testing.assert_array_equal(moved[early], above[early])

@@ -21,17 +21,14 @@ from mitransient_lidar.transport.scene import LidarScene
 
 
 def store_points(
-    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses
+    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses, seed: int
 ) -> PhotonMap | None:
     """Store the `count` points of light paths by their cells; return None if there are none."""
     if count == 0:
         return None
     index = dr.arange(mi.UInt32, count)
-    points = segments.points(index)
-    bucket, _, _ = cells.locate(points.point)
-    # From the point itself: the number of points of other paths does not count.
-    key = (dr.reinterpret_array(mi.UInt32, value) for value in (points.point.x, points.length))
-    u = mi.sample_tea_float32(*key)
+    bucket, _, _ = cells.locate(segments.points(index).point)
+    u = segments.random(index, seed)
     photons = PhotonMap(cells.grid.buckets, bucket, u, PHOTONS_OF_CELL, classes.by_order)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)

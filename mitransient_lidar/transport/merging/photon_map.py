@@ -138,6 +138,7 @@ class PhotonBuffer:
         self._classes = classes
         self._stored = dr.zeros(mi.UInt32, 1)
         self._patch = dr.empty(mi.UInt32, 2 * capacity)
+        self._lane = dr.empty(mi.UInt32, capacity)
         self._label = dr.empty(mi.UInt32, capacity if classes.by_order else 1)
         self._record = dr.empty(mi.Float, 4 * capacity)
         self._weight = dr.empty(mi.Float, 2 * capacity)
@@ -151,6 +152,7 @@ class PhotonBuffer:
         keep = active & (slot < self.capacity)
         where = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
+        dr.scatter(self._lane, path.lane, slot, keep)
         dr.scatter(self._record, where, slot, keep)
         dr.scatter(self._weight, mi.Vector2f(path.weight, dr.select(connectable, mi.Float(1), 0)), slot, keep)
         dr.scatter(self._connectable, where, path.lane, connectable)
@@ -162,7 +164,7 @@ class PhotonBuffer:
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, or None, and their number, stored or not."""
-        dr.eval(self._stored, self._patch, self._record, self._weight, self._label)
+        dr.eval(self._stored, self._patch, self._lane, self._record, self._weight, self._label)
         dr.eval(self._connectable, self._place, self._connectable_label)
         wanted = int(self._stored[0])
         if wanted == 0:
@@ -170,7 +172,9 @@ class PhotonBuffer:
         index = dr.arange(mi.UInt32, min(wanted, self.capacity))
         bucket, tag = dr.gather(mi.Point2u, self._patch, index)
         x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
-        u = mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, x), dr.reinterpret_array(mi.UInt32, length))
+        # The hit itself gives its random number, so that those of other paths do not change it.
+        key = dr.reinterpret_array(mi.UInt32, x) ^ dr.reinterpret_array(mi.UInt32, length)
+        u = mi.sample_tea_float32(dr.gather(mi.UInt32, self._lane, index), key)
         photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.by_order)
         label = dr.gather(mi.UInt32, self._label, index) if self._classes.by_order else mi.UInt32(0)
         weight, first = dr.gather(mi.Vector2f, self._weight, index)

@@ -40,8 +40,9 @@ _POINTS_PER_PATH, _POINTS_PER_IMAGE_PATH = 14, 10
 _PATHS, _PATHS_PER_PIXEL, _MOST_PATHS = 2**15, 16, 2**21
 _PHOTONS, _PHOTONS_FOR_IMAGES = 2**15, 2**16
 
-#: Width of the cells at the surface, over the beam's standard deviation there and over the side of the sea's facets.
-_CELL_PER_FOOTPRINT, _CELL_PER_FACET = 0.025, 0.05
+#: Width of the cells at the surface, over the beam's standard deviation there, over the side of the sea's facets, and
+#: over the diameter of the field of view: of larger cells, few would hold the light that is seen.
+_CELL_PER_FOOTPRINT, _CELL_PER_FACET, _CELL_PER_VIEW = 0.025, 0.05, 0.02
 
 #: Width of the cells of a lidar under water, from which that of patches follows, over the beam's standard deviation.
 _CELL_PER_BEAM = 0.05
@@ -147,7 +148,10 @@ class MergingLayout:
         rings = BeamRings(pose, footprint, scene.refractive_index)
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
-        width = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
+        receiver = scene.receiver.pose
+        view = scene.receiver.pixels.field_of_view * float(np.linalg.norm(receiver.ground_point() - receiver.origin))
+        widths = _CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet, _CELL_PER_VIEW * view
+        width = options.cell_size or min(widths)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
         grid = WaterGrid(rings, SurfaceHeights(scene, region), width / core, growth, thickness, reach)
@@ -260,7 +264,7 @@ class MergingRenderer(PassRenderer):
             layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * wanted / count)
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
-        in_cells = store_points(segments, points, cells, self.classes)
+        in_cells = store_points(segments, points, cells, self.classes, seed)
         return _StoredLight(in_cells, segments, points, on_patches, hits)
 
     def _trace_sensor(

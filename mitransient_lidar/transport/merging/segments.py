@@ -12,6 +12,9 @@ from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 
+#: Numbers that tell the points of a path apart; those of paths with more points may be those of other paths.
+_KEYS_PER_PATH = 1021
+
 
 @dataclass(frozen=True)
 class SegmentPoints:
@@ -99,6 +102,13 @@ class SegmentBuffer:
         self._first = dr.prefix_reduce(dr.ReduceOp.Max, begins, exclusive=False)
         dr.eval(self._first, self._slot)
         return count, wanted
+
+    def random(self, index: mi.UInt32, seed: int) -> mi.Float:
+        """Return uniform random numbers of points by number, which points of other paths do not change."""
+        first = dr.gather(mi.UInt32, self._first, index)
+        lane, before = dr.gather(mi.Point2u, self._place, dr.gather(mi.UInt32, self._slot, first))
+        key = lane * _KEYS_PER_PATH + before + index - first
+        return mi.sample_tea_float32(key, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
 
     def points(self, index: mi.UInt32) -> SegmentPoints:
         """Return points by number."""
