@@ -35,12 +35,12 @@ def small(scene="table1", **options):
 @pytest.mark.slow
 @pytest.mark.parametrize(("divergence", "view", "paths"), [(10.0, 30.0, 2**12), (1.0, 10.0, 2**13)])
 def test_intervals_cover_the_long_run_mean(lidar_scene, divergence, view, paths):
-    """Intervals of eight passes (Student's t, 95 %) hold the mean of 60 seeds in 95 % of the bins and gates.
+    """Intervals of eight passes (Student's t, 95 %) hold the mean of 40 seeds in 95 % of the bins and gates.
 
     Judged are those with errors below 10 %. With larger ones, light of few paths makes the distribution of a pass skew:
     94 % of the bins with errors of 10 to 20 %, 91 to 93 % with 20 to 40 %, 50 to 70 % beyond.
     """
-    seeds, passes = 60, 8
+    seeds, passes = 40, 8
     scene = lidar_scene(
         integrator={"type": "lidar_merging", "paths_per_pass": paths, "photons_per_pass": paths},
         tx={"divergence_mrad": divergence},
