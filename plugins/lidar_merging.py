@@ -26,7 +26,8 @@ class LidarMerging(LidarIntegrator):
     photons_per_pass  integer  Paths from the laser in one pass, 1024 to 2^28. Default: 32768, or 65536 from 4096 pixels
                                on
     cell_size         float    Horizontal width of the cells on the beam's axis at the surface [m], at most 1e4; 0: from
-                               footprint and facets of the sea. Smaller cells have less bias and more noise. Default: 0
+                               footprint, facets of the sea and field of view. Smaller cells have less bias and more
+                               noise. Default: 0
     point_spacing     float    Distance between points along a path [m]; 0: a fourteenth of the distance to the bottom
                                or to the depth that the record allows, a tenth from 4096 pixels on. Default: 0
     ================  =======  =========================================================================================
@@ -42,7 +43,8 @@ class LidarMerging(LidarIntegrator):
     Cells are sectors of rings about the refracted beam, in layers below the surface. With the distance *r* from the
     axis and a core radius *q* of two standard deviations of the beam and 0.05 m for each metre of depth, rings have
     equal widths in arsinh(*r*/*q*): cells are small where the light is concentrated, and grow with the distance from a
-    narrow beam. Patches of solids that look up or down are such sectors, too.
+    narrow beam. They are half as thick as the distance of the points, at most 0.3 attenuation lengths. Patches of
+    solids that look up or down are such sectors, too.
 
     Some points of the receiver's paths are connected, over any distance, with a random point of a light path, or with
     light on a solid, by a segment in the water. Light that is scattered into a narrow beam, or out of it, far from the
