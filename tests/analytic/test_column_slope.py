@@ -39,6 +39,7 @@ def test_narrow_view_of_a_narrow_beam_falls_with_c():
     found = fov_sweep("table1", [2], {**VERTICAL, **water, "divergence_mrad": 1}, passes=24, seed=2)
     k, error = (float(found[name][0]) for name in ("effective_attenuation", "effective_attenuation_stderr"))
     assert error < 0.001
+    # Light scattered forward that stays in the spot: 60 passes give 0.2997 with an error of 0.0001.
     assert abs(k - 0.3) < 3 * error + 5e-4
     assert found["scaled_radius"][0] == pytest.approx(0.06)
 

@@ -342,7 +342,7 @@ def test_invalid_option_is_exit_code_2_without_files(tmp_path):
 
 @pytest.mark.slow
 def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
-    """Wind 6 m/s has waves of half a metre; a pile of 0.6 m across stands in the beam."""
+    """Waves at 6 m/s have half a metre, and this sea a trough in view; a pile of 0.6 m across stands in the beam."""
     with pytest.raises(UserError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
         small(params={"wind_speed": 6, "bottom_depth": 0.1, "surface_seed": 2})
     pile = {"type": "cylinder", "p0": [0, 0, -2.0], "p1": [0, 0, 1.0], "radius": 0.3, "bsdf": {"type": "diffuse"}}
