@@ -420,6 +420,23 @@ def test_crowded_passes_make_room_and_lose_nothing(lidar_scene, passes):
     dr.sync_thread()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+def test_passes_share_their_kernels(lidar_scene, integrator):
+    """A number that differs between passes and is part of a kernel would compile it again in every pass."""
+    scene = lidar_scene(integrator={"type": integrator, "paths_per_pass": 2**12}, water={"scattering": 0.2})
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    renderer.render_pass(0)
+    found = []
+    for seed in (1, 2):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            renderer.render_pass(seed)
+            found.append([kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT])
+    assert found[0] == found[1]
+    assert len(found[0]) > 0
+
+
 @pytest.fixture
 def two_levels(tmp_path):
     """Mesh of a wide bottom at 8 m and, 3 m above it, a plate of 4 m."""

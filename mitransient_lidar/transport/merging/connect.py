@@ -82,8 +82,10 @@ class WaterConnections:
         lanes = -(-count // _POINTS_PER_CONNECTION)
         rng = pass_streams(seed, stream, lanes)
         index = dr.arange(mi.UInt32, lanes) * _POINTS_PER_CONNECTION + rng.next_uint32() % _POINTS_PER_CONNECTION
-        partner = mi.UInt32((mi.UInt64(rng.next_uint32()) * partners) >> 32)
-        return self._points.points(dr.minimum(index, count - 1)), partner, index < count
+        # Opaque, as these numbers differ between passes, which share a kernel.
+        found, others = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt64, partners)
+        partner = mi.UInt32((mi.UInt64(rng.next_uint32()) * others) >> 32)
+        return self._points.points(dr.minimum(index, found - 1)), partner, index < found
 
     def to_light(self, count: int, light: SegmentBuffer, partners: int, seed: int, stream: int) -> None:
         """Connect some of `count` points of the receiver's paths with some of `partners` points of light paths."""
@@ -96,7 +98,7 @@ class WaterConnections:
         total += x * (rates.volume(point.point) + rates.in_water * point.edge)
         total += y * (rates.volume(other.point) + rates.in_water * other.edge)
         total += rates.in_water * x * y * pending
-        scale = rates.in_water * (float(partners) * _POINTS_PER_CONNECTION)
+        scale = rates.in_water * opaque(float(partners) * _POINTS_PER_CONNECTION)
         energy = scale * point.weight * other.weight * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
         ray = mi.Ray3f(point.point, direction)
@@ -122,7 +124,7 @@ class WaterConnections:
         x = self._inverse(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
-        scale = self.rates.on_solids * (float(light.photons) * _POINTS_PER_CONNECTION)
+        scale = self.rates.on_solids * opaque(float(light.photons) * _POINTS_PER_CONNECTION)
         energy = scale * point.weight * photon.weight * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length
