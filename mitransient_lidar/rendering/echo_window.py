@@ -83,7 +83,7 @@ def probe_echoes(scene: LidarScene, sampler: SensorSampler) -> EchoProbe:
 
     # Refract at the facet.
     down = -dr.normalize(refract(-start.direction, first.n, 1 / scene.refractive_index))
-    below = scene.ray_intersect(first.spawn_ray(down), at_sea)
+    below = scene.ray_intersect(scene.spawn_ray(first, down), at_sea)
     solid = at_sea & below.is_valid() & ~scene.is_surface(below.shape)
     water = 2 * below.t * scene.group_index
     if scene.submerged:

@@ -229,7 +229,7 @@ def _check_reflection(scene: LidarScene, view: _Rays) -> None:
     first = scene.ray_intersect(ray)
     at_sea = first.is_valid() & scene.is_surface(first.shape)
     down = -dr.normalize(refract(-ray.d, first.n, 1 / scene.refractive_index))
-    below = scene.ray_intersect(first.spawn_ray(down), at_sea)
+    below = scene.ray_intersect(scene.spawn_ray(first, down), at_sea)
     found: list[mi.Shape] = []
     random = unit_points(len(view.directions))
     for hit, active in ((first, first.is_valid() & ~at_sea), (below, at_sea & below.is_valid())):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
@@ -63,7 +65,10 @@ class PassRecord:
 
 
 class PassRenderer(ABC):
-    """Renders independent passes of one prepared scene, by default with `paths` paths from the receiver each."""
+    """Renders independent passes of one prepared scene, by default with `paths` paths from the receiver each.
+
+    A pass may hold several shots, which have these paths each, and pixels of their own.
+    """
 
     def __init__(self, scene: LidarScene, classes: PathClasses, paths: int) -> None:
         self.scene, self.classes, self.paths = scene, classes, paths
@@ -91,27 +96,37 @@ class PassRenderer(ABC):
         separate.classes = PathClasses.by_origin(self.scene.solids)
         return separate
 
-    def render_pass(self, seed: int, *, paths: int | None = None, gates: GateWeights | None = None) -> PassRecord:
-        """Render one pass.
+    def of_shots(self, scene: LidarScene, shots: int, copies: int) -> PassRenderer:
+        """Return a renderer of a number of shots that meet a scene in parts, each `copies` of them at one place."""
+        moved = copy.copy(self)
+        moved.scene = scene
+        return moved
+
+    def render_pass(
+        self, seed: int | Sequence[int], *, paths: int | None = None, gates: GateWeights | None = None
+    ) -> PassRecord:
+        """Render one pass, of one shot or, with several seeds, of several.
 
         Passes of different seeds are independent. Energy is summed over `gates` instead of time bins if they are given.
+        The pixels of several shots are one row, shot after shot.
 
         Raises
         ------
         UserError
             When the histogram would be too large.
         """
-        pixels = self.scene.receiver.pixels
-        shape = (pixels.count * self.classes.count,) if self.classes.separate else pixels.grid or (pixels.count,)
+        pixels, shots = self.scene.receiver.pixels, Shots(seed if isinstance(seed, Sequence) else [seed])
+        flat = (shots.count * pixels.count * self.classes.count,)
+        shape = flat if self.classes.separate or shots.count > 1 else pixels.grid or flat
         scene = self.scene
         emitted = scene.transmitter.energy
         histogram = TransientHistogram(scene.axis, shape, emitted, gates, scene.reference_length)
         record = PassRecord(histogram, self.classes)
         with dr.suspend_grad():
-            self.trace(record, seed, self.paths if paths is None else paths)
+            self.trace(record, shots, self.paths if paths is None else paths)
         record.evaluate()
         return record
 
     @abstractmethod
-    def trace(self, record: PassRecord, seed: int, paths: int) -> None:
-        """Trace the paths of one pass into a record."""
+    def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
+        """Trace the paths of one pass into a record, a number of them for each shot."""

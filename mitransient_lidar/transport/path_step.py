@@ -142,7 +142,7 @@ class PathStep:
         path.active &= path.throughput > 0
         path.before_first_solid &= ~(vertex.on_solid & ~passes)
         path.in_water = dr.select(vertex.at_sea, bs.wo.z < 0, path.in_water)
-        path.point = dr.select(vertex.on_surface, vertex.si.spawn_ray(direction).o, path.point)
+        path.point = dr.select(vertex.on_surface, self.scene.spawn_ray(vertex.si, direction).o, path.point)
         before = mi.Float(path.direction.z)
         turned = path.active & (vertex.on_surface | vertex.scattered)
         path.direction = dr.select(turned, direction, path.direction)

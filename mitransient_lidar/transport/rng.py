@@ -1,21 +1,84 @@
-"""Random numbers of a pass: independent streams for each path, and random shifts."""
+"""Random numbers of a pass: independent streams for each path of each shot, and random shifts."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.opaque import aligned
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Lanes of a kernel that belong to the shots of a pass.
+
+    Attributes
+    ----------
+    shots
+        Number of shots.
+    shot, number
+        Number of the shot of each lane, and of its path within the shot.
+    """
+
+    shots: int
+    shot: mi.UInt32
+    number: mi.UInt32
+
+    @classmethod
+    def of_paths(cls, lane: mi.UInt32, shots: int, per_shot: int) -> Lanes:
+        """Return lanes from the numbers of paths, of which each shot has `per_shot`, one shot after the other."""
+        if shots == 1:
+            return cls(1, mi.UInt32(0), lane)
+        paths = dr.opaque(mi.UInt32, per_shot)
+        shot = lane // paths
+        return cls(shots, shot, lane - shot * paths)
+
+    def pick(self, values: Any) -> Any:
+        """Return the value of the lane's shot, of arrays with one entry a shot."""
+        return values if self.shots == 1 else dr.gather(type(values), values, self.shot)
+
+
+class Shots:
+    """Shots of a pass, with a seed each: random numbers of a shot do not depend on the other shots."""
+
+    def __init__(self, seeds: Sequence[int]) -> None:
+        self.count = len(seeds)
+        self._seeds = [int(seed) for seed in seeds]
+
+    def paths(self, per_shot: int) -> Lanes:
+        """Return the lanes of `per_shot` paths of each shot."""
+        return Lanes.of_paths(dr.arange(mi.UInt32, self.count * per_shot), self.count, per_shot)
+
+    def streams(self, purpose: int, lanes: Lanes) -> mi.PCG32:
+        """Return independent random number generators, of stage number `purpose` of a pass."""
+        words = [np.random.SeedSequence([seed, purpose]).generate_state(2, np.uint64) for seed in self._seeds]
+        # Arrays, so that all seeds share a kernel.
+        state, stream = (lanes.pick(aligned(mi.UInt64, word)) for word in np.array(words).T)
+        # Neighbouring streams of PCG32 are correlated unless their states are scrambled (TEA, Zafar et al. 2010).
+        high, low = mi.sample_tea_32(lanes.number, mi.UInt32(stream))
+        scrambled = state ^ ((mi.UInt64(high) << 32) | mi.UInt64(low))
+        return mi.PCG32(initstate=scrambled, initseq=stream + mi.UInt64(lanes.number))
+
+    def uniform(self, purpose: int, count: int) -> list[mi.Float]:
+        """Return `count` arrays of uniform random numbers, one number a shot."""
+        drawn = [np.random.default_rng([seed, purpose]).random(count, np.float32) for seed in self._seeds]
+        return [aligned(mi.Float, column) for column in np.array(drawn).T]
+
+    def keys(self, lanes: Lanes) -> mi.UInt32:
+        """Return 32 bits of the seeds."""
+        bits = np.array([seed & 0xFFFFFFFF for seed in self._seeds], np.uint32)
+        return lanes.pick(aligned(mi.UInt32, bits))
+
 
 def pass_streams(seed: int, purpose: int, count: int) -> mi.PCG32:
     """Return independent random number generators for `count` paths, of stage number `purpose` of a pass."""
-    words = np.random.SeedSequence([seed, purpose]).generate_state(2, np.uint64)
-    # Opaque, so that all seeds share a kernel.
-    state, stream = (dr.opaque(mi.UInt64, int(word)) for word in words)
-    index = dr.arange(mi.UInt32, count)
-    # Neighbouring streams of PCG32 are correlated unless their states are scrambled (TEA, Zafar et al. 2010).
-    high, low = mi.sample_tea_32(index, mi.UInt32(stream))
-    return mi.PCG32(initstate=state ^ ((mi.UInt64(high) << 32) | mi.UInt64(low)), initseq=stream + mi.UInt64(index))
+    shots = Shots([seed])
+    return shots.streams(purpose, shots.paths(count))
 
 
 def stratified_point(index: mi.UInt32, count: int, rng: mi.PCG32) -> mi.Point2f:
@@ -32,11 +95,11 @@ def stratified_point(index: mi.UInt32, count: int, rng: mi.PCG32) -> mi.Point2f:
     return mi.Point2f(mi.Float(x), mi.Float(y)) * 2**-24
 
 
-def unit_points(count: int) -> mi.Point2f:
-    """Return the points of a rank-1 lattice in the unit square."""
-    index = dr.arange(mi.Float, count)
-    y = index * 0.6180339887
-    return mi.Point2f((index + 0.5) / count, y - dr.floor(y))
+def unit_points(count: int, index: mi.UInt32 | None = None) -> mi.Point2f:
+    """Return the points of a rank-1 lattice of `count` in the unit square, by number or all."""
+    number = dr.arange(mi.Float, count) if index is None else mi.Float(index)
+    y = number * 0.6180339887
+    return mi.Point2f((number + 0.5) / count, y - dr.floor(y))
 
 
 def _even_bits(number: mi.UInt32) -> mi.UInt32:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +17,7 @@ from mitransient_lidar.physics.sea.resolution import Instrument
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.pose import Pose, RelativePose
+from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.sensor.records import fitted_record, submerged_record
 
@@ -29,8 +30,26 @@ _SMALLEST_RISE = 0.1
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
 
+#: Largest rounding error of intersections over their coordinates.
+_ROUNDING = 2.0**-21
+
 #: Length over which slopes change, over the shortest wavelength.
 _FACET_PER_WAVE = 0.25
+
+
+SceneT = TypeVar("SceneT", bound="WaterScene")
+
+
+@dataclass(frozen=True)
+class ScenePart:
+    """Shapes that shots meet at a place of their own: points of the lidar's frame are displaced [m] to them."""
+
+    shapes: mi.Scene
+    displacement: mi.Vector3f
+
+    def of(self, lanes: Lanes) -> ScenePart:
+        """Return the part with the displacement of each lane."""
+        return ScenePart(self.shapes, lanes.pick(self.displacement))
 
 
 @dataclass(frozen=True)
@@ -49,6 +68,8 @@ class WaterScene:
         Shapes that bound the water, with it as interior medium.
     slope_variance
         Total slope variance of the sea, for the sampling of surface connections.
+    parts
+        Parts of the scene at places that differ between shots, in place of `mitsuba_scene`; none for a single shot.
     """
 
     mitsuba_scene: mi.Scene
@@ -56,6 +77,11 @@ class WaterScene:
     water: Any
     surfaces: list[mi.Shape]
     slope_variance: float
+    parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
+
+    def of(self: SceneT, lanes: Lanes) -> SceneT:
+        """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
+        return replace(self, parts=tuple(part.of(lanes) for part in self.parts)) if self.parts else self
 
     @property
     def solids(self) -> list[mi.Shape]:
@@ -135,11 +161,42 @@ class WaterScene:
 
     def ray_intersect(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
         """Return the first intersections of rays."""
-        return self.mitsuba_scene.ray_intersect(ray, active)
+        if not self.parts:
+            return self.mitsuba_scene.ray_intersect(ray, active)
+        nearest, shift = dr.zeros(mi.PreliminaryIntersection3f), mi.Vector3f(0)
+        nearest.t = dr.inf
+        for part in self.parts:
+            found = part.shapes.ray_intersect_preliminary(_moved(ray, part.displacement), active=active)
+            is_nearer = found.t < nearest.t
+            nearest = dr.select(is_nearer, found, nearest)
+            shift = dr.select(is_nearer, part.displacement, shift)
+        si = nearest.compute_surface_interaction(_moved(ray, shift), active=active)
+        si.p -= shift
+        return si
 
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
         """Return whether rays are blocked."""
-        return self.mitsuba_scene.ray_test(ray, active)
+        if not self.parts:
+            return self.mitsuba_scene.ray_test(ray, active)
+        blocked = mi.Bool(False)
+        for part in self.parts:
+            blocked |= part.shapes.ray_test(_moved(ray, part.displacement), active & ~blocked)
+        return blocked
+
+    def spawn_ray(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
+        """Return rays that leave surfaces, from points beside them so that they do not meet these again.
+
+        Mitsuba's own offset grows with the distance from the origin of the world: 250 m away it is 2 cm, and 0.2 ns of
+        the way to a bottom and back are lost. This one grows with that from the reference point of the scene, and with
+        the rounding of coordinates.
+        """
+        reference = self.receiver.pose.nearby_point()
+        farthest = opaque(float(np.abs(reference).max()))
+        for part in self.parts:
+            farthest = dr.maximum(farthest, dr.max(dr.abs(part.displacement)))
+        size = dr.max(dr.abs(si.p - opaque_point(reference)))
+        offset = dr.fma(farthest, _ROUNDING, (1 + size) * mi.math.RayEpsilon)
+        return mi.Ray3f(dr.fma(dr.mulsign(offset, dr.dot(si.n, direction)), si.n, si.p), direction)
 
     def outside_surface(self, z: mi.Float, in_water: mi.Bool) -> mi.Bool:
         """Return whether a height [m] can be reached outside the surface mesh only: wet above it, or dry below it."""
@@ -220,6 +277,13 @@ class LidarScene(WaterScene):
             fit = submerged_record if submerged else fitted_record
             film.fit(*fit(own, transmitters[0], film))
         return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
+
+
+def _moved(ray: mi.Ray3f, displacement: mi.Vector3f) -> mi.Ray3f:
+    """Return displaced rays."""
+    ray = mi.Ray3f(ray)
+    ray.o += displacement
+    return ray
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:

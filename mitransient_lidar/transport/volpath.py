@@ -27,7 +27,7 @@ from mitransient_lidar.transport.refracted_connection import (
     connect_laser,
     trace_to_top_layer,
 )
-from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
@@ -253,7 +253,7 @@ class PathTracer:
         up, density = light.sampler.sample_in_layer(emitter, u, path.index_layer)
         sampled = submerged & (density > 0) if self.options.connection != "phase" else mi.Bool(False)
         value, pdf = self._evaluate(emitter, vertex, event, sampled, up)
-        ray = dr.select(vertex.scattered, mi.Ray3f(path.point, up), si.spawn_ray(up))
+        ray = dr.select(vertex.scattered, mi.Ray3f(path.point, up), scene.spawn_ray(si, up))
         top = trace_to_top_layer(scene, ray, path.index_layer, sampled)
         above = scene.ray_intersect(top.ray, sampled)
         arrives = sampled & (top.factor > 0)
@@ -433,11 +433,12 @@ def _is_rough(si: mi.SurfaceInteraction3f) -> mi.Bool:
 
 
 def trace_connected(
-    scene: LidarScene, sampler: SensorSampler, options: VolpathOptions, record: PassRecord, seed: int, paths: int
+    scene: LidarScene, sampler: SensorSampler, options: VolpathOptions, record: PassRecord, shots: Shots, paths: int
 ) -> None:
-    """Trace paths from the receiver and connect them to the laser, into a record."""
-    rng = pass_streams(seed, _STREAM, paths)
-    start = sampler.sample(dr.arange(mi.UInt32, paths), paths, rng)
+    """Trace a number of paths from the receiver for each shot and connect them to the laser, into a record."""
+    lanes = shots.paths(paths)
+    scene, rng = scene.of(lanes), shots.streams(_STREAM, lanes)
+    start = sampler.sample_shots(lanes, paths, rng)
     path = ConnectedPath.start(scene, start.angles, start.weight > 0)
     light = LaserLight(scene, record, start.pixel, start.weight)
     record.rays += PathTracer(scene, options, light).trace(path, rng)
@@ -450,6 +451,6 @@ class VolpathRenderer(PassRenderer):
         super().__init__(scene, classes, paths)
         self.options = options
 
-    def trace(self, record: PassRecord, seed: int, paths: int) -> None:
+    def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
         """Trace paths and connect them to the laser."""
-        trace_connected(self.scene, self.sampler, self.options, record, seed, paths)
+        trace_connected(self.scene, self.sampler, self.options, record, shots, paths)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -13,12 +14,12 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
-#: Cells on each side of the table of surface heights.
-_HEIGHT_CELLS = 512
+#: Cells on each side of the table of surface heights, of a single shot and of each of several.
+_HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
 
 #: Number of rays that find the region and the solids below it.
 PROBE_RAYS = 4096
@@ -26,8 +27,8 @@ PROBE_RAYS = 4096
 #: Share of rays that may fall outside the region on either side, and margin over its size.
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 
-#: Logarithm to base 2 of the number of buckets.
-_BUCKET_BITS = 20
+#: Logarithm to base 2 of the largest number of buckets of a shot.
+MOST_BUCKET_BITS = 20
 
 #: Largest growth of the width of cells with depth.
 _MOST_GROWTH = 4.0
@@ -66,9 +67,9 @@ class Region:
         """Sides along x and y [m]."""
         return self.high[0] - self.low[0], self.high[1] - self.low[1]
 
-    def probe_points(self) -> tuple[mi.Float, mi.Float]:
-        """Return evenly distributed points (x, y) of the region [m]."""
-        x, y = unit_points(PROBE_RAYS)
+    def probe_points(self, index: mi.UInt32 | None = None) -> tuple[mi.Float, mi.Float]:
+        """Return points (x, y) of the region [m] by number, by default all of 4096, evenly distributed."""
+        x, y = unit_points(PROBE_RAYS, index)
         return dr.lerp(opaque(self.low[0]), opaque(self.high[0]), x), dr.lerp(
             opaque(self.low[1]), opaque(self.high[1]), y
         )
@@ -103,13 +104,17 @@ def _at_sea_level(pose: Pose, directions: np.ndarray) -> np.ndarray:
 
 
 class SurfaceHeights:
-    """Height of the sea surface over a region, as a table."""
+    """Height of the sea surface over a region, as a table for each place of shots, of which there are `copies`."""
 
-    def __init__(self, scene: LidarScene, region: Region) -> None:
-        n = _HEIGHT_CELLS
+    def __init__(self, scene: LidarScene, region: Region, shots: int = 1, copies: int = 1) -> None:
+        n = self._cells = _HEIGHT_CELLS if shots == 1 else _HEIGHT_CELLS_OF_SHOTS
+        self._copies, places = dr.opaque(mi.UInt32, copies), shots // copies
         self._low = [opaque(low) for low in region.low]
         self._per_metre = [opaque(n / size) for size in region.size]
-        index = dr.arange(mi.UInt32, n * n)
+        lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * n * n), places, n * n)
+        index = lanes.number
+        scene = scene.of(Lanes(shots, lanes.shot * self._copies, index))
+        self._start = mi.UInt32(0)
         x = (mi.Float(index % n) + 0.5) / self._per_metre[0] + self._low[0]
         y = (mi.Float(index // n) + 0.5) / self._per_metre[1] + self._low[1]
         top = opaque(max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0)
@@ -124,17 +129,26 @@ class SurfaceHeights:
 
         state = (
             mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1)),
-            dr.zeros(mi.Float, n * n),
-            dr.full(mi.Bool, True, n * n),
+            dr.zeros(mi.Float, places * n * n),
+            dr.full(mi.Bool, True, places * n * n),
         )
         _, self._height, _ = dr.while_loop(state, lambda ray, height, active: active, look_down, label="heights")
         dr.eval(self._height)
 
+    def of(self, lanes: Lanes) -> SurfaceHeights:
+        """Return the heights of each lane's shot."""
+        if lanes.shots == 1:
+            return self
+        heights = copy.copy(self)
+        heights._start = (lanes.shot // self._copies) * (self._cells * self._cells)
+        return heights
+
     def at(self, x: mi.Float, y: mi.Float) -> mi.Float:
         """Return the height at (x, y) [m]; outside the region, that of its nearest point."""
-        i = dr.clip(mi.Int32((x - self._low[0]) * self._per_metre[0]), 0, _HEIGHT_CELLS - 1)
-        j = dr.clip(mi.Int32((y - self._low[1]) * self._per_metre[1]), 0, _HEIGHT_CELLS - 1)
-        return dr.gather(mi.Float, self._height, mi.UInt32(j * _HEIGHT_CELLS + i))
+        n = self._cells
+        i = dr.clip(mi.Int32((x - self._low[0]) * self._per_metre[0]), 0, n - 1)
+        j = dr.clip(mi.Int32((y - self._low[1]) * self._per_metre[1]), 0, n - 1)
+        return dr.gather(mi.Float, self._height, self._start + mi.UInt32(j * n + i))
 
 
 class WaterGrid:
@@ -153,6 +167,8 @@ class WaterGrid:
         Thickness of a cell [m].
     depth
         Depth within which different layers have different buckets [m].
+    bits
+        Logarithm to base 2 of the number of buckets of a shot.
     """
 
     def __init__(
@@ -163,51 +179,71 @@ class WaterGrid:
         growth: float,
         thickness: float,
         depth: float,
+        bits: int = MOST_BUCKET_BITS,
     ) -> None:
-        self.heights, self.rings = heights, rings
+        self.heights, self.rings, self.bits = heights, rings, bits
         self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)
         self.bits_z = int(np.clip(math.ceil(math.log2(depth / thickness + 1)), 2, 8))
-        self.bits_ring = (_BUCKET_BITS - self.bits_z) // 2
-        self.bits_sector = _BUCKET_BITS - self.bits_z - self.bits_ring
+
+    def of_shots(self, heights: SurfaceHeights, wider: float, bits: int) -> WaterGrid:
+        """Return the grid of shots with heights of their own, cells wider by a factor, and buckets for each shot."""
+        grid = copy.copy(self)
+        grid.heights, grid.width, grid.bits = heights, self.width * opaque(wider), bits
+        return grid
+
+    @property
+    def bits_ring(self) -> int:
+        """Bits of the number of the ring in that of the bucket."""
+        return (self.bits - self.bits_z) // 2
+
+    @property
+    def bits_sector(self) -> int:
+        """Bits of the number of the sector in that of the bucket."""
+        return self.bits - self.bits_z - self.bits_ring
 
     def widths(self, depth: mi.Float) -> mi.Float:
         """Return the widths of rings over the core radius at a depth [m]."""
         return self.width * dr.minimum(dr.fma(depth, self.growth, 1), _MOST_GROWTH)
 
-    def volume(self, point: mi.Point3f) -> mi.Float:
-        """Return the approximate volume of the cells at points, a smooth function [m^3]."""
-        depth = dr.maximum(self.heights.at(point.x, point.y) - point.z, 0)
+    def volume(self, point: mi.Point3f, depth: mi.Float) -> mi.Float:
+        """Return the approximate volume of the cells at points at a depth, a smooth function [m^3]."""
         along, across = self.rings.offset(point.x, point.y, depth)
         scale = dr.square(self.rings.core(depth)) + along * along + across * across
         return self.thickness * dr.square(self.widths(depth)) * scale / self.rings.cosine
 
-    @property
-    def buckets(self) -> int:
-        """Number of buckets."""
-        return 1 << _BUCKET_BITS
-
     def cells(self, shift: mi.Point3f) -> WaterCells:
-        """Return the cells of a pass, shifted by three uniform random numbers."""
+        """Return the cells of a pass, shifted by three uniform random numbers of each shot."""
         return WaterCells(self, shift)
 
 
 class WaterCells:
-    """The cells of one pass: a `WaterGrid` shifted by three uniform random numbers."""
+    """The cells of one pass: a `WaterGrid` shifted by three uniform random numbers of each shot."""
 
     def __init__(self, grid: WaterGrid, shift: mi.Point3f) -> None:
-        self.grid = grid
+        self.grid, self.heights = grid, grid.heights
         self._shift = mi.Point2f(shift.x, shift.y)
         # Thickness of the uppermost layer.
         self._top = grid.thickness * (0.5 + shift.z)
+        self._start = mi.UInt32(0)
+
+    def of(self, lanes: Lanes) -> WaterCells:
+        """Return the cells of each lane's shot."""
+        if lanes.shots == 1:
+            return self
+        cells = copy.copy(self)
+        cells.heights = self.heights.of(lanes)
+        cells._shift, cells._top = lanes.pick(self._shift), lanes.pick(self._top)
+        cells._start = lanes.shot << self.grid.bits
+        return cells
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the approximate volume of cells at points, a smooth function, for the weights of merges [m^3]."""
-        return self.grid.volume(point)
+        return self.grid.volume(point, dr.maximum(self.heights.at(point.x, point.y) - point.z, 0))
 
     def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
         grid, rings = self.grid, self.grid.rings
-        depth = grid.heights.at(point.x, point.y) - point.z
+        depth = self.heights.at(point.x, point.y) - point.z
         # The table of heights is approximate: points above it are just below the surface.
         layer = dr.maximum(dr.floor((depth - self._top) * (1 / grid.thickness)) + 1, 0)
         along, across = rings.offset(point.x, point.y, depth)
@@ -220,7 +256,7 @@ class WaterCells:
         )
         tag = low_bits(i >> of_ring, 12) | (low_bits(j >> of_sector, 12) << 12) | (low_bits(k >> z, 8) << 24)
         thickness = dr.select(k == 0, self._top, grid.thickness)
-        return bucket, tag, thickness * rings.area(sector)
+        return self._start + bucket, tag, thickness * rings.area(sector)
 
 
 def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:

@@ -8,21 +8,23 @@ make its path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitransient_lidar.core.validation import IntArray
 from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.merge import SensorSubpath
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import Photon, PhotonBuffer
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentPoints
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.passes import PassRecord
-from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Points of the receiver's paths for each one that is connected.
@@ -69,28 +71,69 @@ class ConnectionRates:
         """Return the rate of merges at scattering events [m^3]."""
         return self.cells.typical_volume(point)
 
+    def of(self, lanes: Lanes) -> ConnectionRates:
+        """Return the rates in the cells of each lane's shot."""
+        return replace(self, cells=self.cells.of(lanes))
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Points of the receiver's paths, and random partners among the light of their shots.
+
+    Attributes
+    ----------
+    lanes
+        Lanes of the pairs, whose numbers are those of pairs.
+    point
+        The points.
+    partner
+        Numbers of the partners.
+    partners
+        Number of possible partners of the shot.
+    exists
+        Whether there are such points and partners.
+    """
+
+    lanes: Lanes
+    point: SegmentPoints
+    partner: mi.UInt32
+    partners: mi.Float
+    exists: mi.Bool
+
 
 class WaterConnections:
-    """Connections of a scene's pass with independent random numbers for each pass."""
+    """Connections of a scene's pass with independent random numbers for each pass and shot."""
 
-    def __init__(self, scene: LidarScene, record: PassRecord, rates: ConnectionRates, points: SegmentBuffer) -> None:
+    def __init__(
+        self, scene: LidarScene, record: PassRecord, rates: ConnectionRates, points: SegmentBuffer, shots: Shots
+    ) -> None:
         self.scene, self.record, self.rates = scene, record, rates
-        self._water, self._points = scene.water, points
+        self._water, self._points, self._shots = scene.water, points, shots
 
-    def _pairs(self, count: int, partners: int, seed: int, stream: int) -> tuple[SegmentPoints, mi.UInt32, mi.Bool]:
-        """Return some of `count` points, numbers of random partners, and which points exist."""
-        lanes = -(-count // _POINTS_PER_CONNECTION)
-        rng = pass_streams(seed, stream, lanes)
-        index = dr.arange(mi.UInt32, lanes) * _POINTS_PER_CONNECTION + rng.next_uint32() % _POINTS_PER_CONNECTION
-        # Opaque, as these numbers differ between passes, which share a kernel.
-        found, others = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt64, partners)
-        partner = mi.UInt32((mi.UInt64(rng.next_uint32()) * others) >> 32)
-        return self._points.points(dr.minimum(index, found - 1)), partner, index < found
+    def _pairs(self, first_partners: IntArray, stream: int) -> _Pairs:
+        """Return some of the points, and random partners; those of each shot begin at the given numbers."""
+        first_points = self._points.first_points.astype(np.int64)
+        most = int(np.diff(first_points).max())
+        shots = self._shots.count
+        lanes = self._shots.paths(-(-most // _POINTS_PER_CONNECTION))
+        rng = self._shots.streams(stream, lanes)
+        # Arrays, as these numbers differ between passes, which share a kernel.
+        start, count, before, others = (
+            lanes.pick(aligned(mi.UInt32, values.astype(np.uint32)))
+            for first in (first_points, first_partners)
+            for values in (first[:shots], np.diff(first))
+        )
+        within = lanes.number * _POINTS_PER_CONNECTION + rng.next_uint32() % _POINTS_PER_CONNECTION
+        partner = before + mi.UInt32((mi.UInt64(rng.next_uint32()) * mi.UInt64(others)) >> 32)
+        exists = (within < count) & (others > 0)
+        point = self._points.points(start + dr.select(exists, within, 0))
+        return _Pairs(lanes, point, dr.select(exists, partner, 0), mi.Float(others), exists)
 
-    def to_light(self, count: int, light: SegmentBuffer, partners: int, seed: int, stream: int) -> None:
-        """Connect some of `count` points of the receiver's paths with some of `partners` points of light paths."""
-        point, partner, exists = self._pairs(count, partners, seed, stream)
-        other, rates = light.points(partner), self.rates
+    def to_light(self, light: SegmentBuffer, stream: int) -> None:
+        """Connect some of the points of the receiver's paths with some points of light paths."""
+        pairs = self._pairs(light.first_points.astype(np.int64), stream)
+        point, exists = pairs.point, pairs.exists
+        other, scene, rates = light.points(pairs.partner), self.scene.of(pairs.lanes), self.rates.of(pairs.lanes)
         direction, distance, transmittance, pending = self._segment(point, other.point)
         x = self._inverse(point.point, point.direction, direction, exists)
         y = self._inverse(other.point, other.direction, -direction, exists)
@@ -98,33 +141,34 @@ class WaterConnections:
         total += x * (rates.volume(point.point) + rates.in_water * point.edge)
         total += y * (rates.volume(other.point) + rates.in_water * other.edge)
         total += rates.in_water * x * y * pending
-        scale = rates.in_water * opaque(float(partners) * _POINTS_PER_CONNECTION)
+        scale = rates.in_water * pairs.partners * _POINTS_PER_CONNECTION
         energy = scale * point.weight * other.weight * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
         ray = mi.Ray3f(point.point, direction)
         ray.maxt = distance
-        clear = self.scene.is_clear(point.point.z) & self.scene.is_clear(other.point.z)
-        active &= ~self.scene.ray_test(ray, active & ~clear)
+        clear = scene.is_clear(point.point.z) & scene.is_clear(other.point.z)
+        active &= ~scene.ray_test(ray, active & ~clear)
         length = point.length + other.length
         self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active)
 
-    def to_solids(self, count: int, light: PhotonBuffer, patches: SolidPatches, seed: int, stream: int) -> None:
-        """Connect some of `count` points of the receiver's paths with some photons on solids."""
-        point, partner, exists = self._pairs(count, light.photons, seed, stream)
-        place, photon = light.connectable(partner)
-        exists &= photon.weight != 0
+    def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
+        """Connect some of the points of the receiver's paths with some photons on solids."""
+        pairs = self._pairs(light.photons * np.arange(self._shots.count + 1), stream)
+        point, patches = pairs.point, patches.of(pairs.lanes)
+        place, photon = light.connectable(pairs.partner)
+        exists = pairs.exists & (photon.weight != 0)
         direction, distance, transmittance, pending = self._segment(point, place)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance
         ray = mi.Ray3f(point.point, direction)
         ray.maxt = distance + tolerance
-        si = self.scene.ray_intersect(ray, exists)
+        si = self.scene.of(pairs.lanes).ray_intersect(ray, exists)
         active = exists & si.is_valid() & (dr.abs(si.t - distance) < tolerance)
         outgoing = si.to_local(-photon.direction)
         bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, active)[0] / dr.abs(dr.dot(si.n, photon.direction))
         x = self._inverse(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
-        scale = self.rates.on_solids * opaque(float(light.photons) * _POINTS_PER_CONNECTION)
+        scale = self.rates.on_solids * pairs.partners * _POINTS_PER_CONNECTION
         energy = scale * point.weight * photon.weight * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length

@@ -17,19 +17,21 @@ from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
+from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 
 
 def store_points(
-    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses, seed: int
+    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses, shots: Shots
 ) -> PhotonMap | None:
     """Store the `count` points of light paths by their cells; return None if there are none."""
     if count == 0:
         return None
     index = dr.arange(mi.UInt32, count)
+    cells = cells.of(segments.lanes(index))
     bucket, _, _ = cells.locate(segments.points(index).point)
-    u = segments.random(index, seed)
-    photons = PhotonMap(cells.grid.buckets, bucket, u, PHOTONS_OF_CELL, classes.by_order)
+    u = segments.random(index, shots)
+    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, classes.by_order)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     _, tag, _ = cells.locate(points.point)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,10 +12,11 @@ import mitsuba as mi
 from mitransient_lidar.transport.merging.cells import ORIGIN, PROBE_RAYS, Region, low_bits
 from mitransient_lidar.transport.merging.rings import BeamRings, Sector
 from mitransient_lidar.transport.opaque import is_one_of, opaque
+from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.scene import LidarScene
 
-#: Logarithm to base 2 of the number of buckets along one side.
-_BUCKET_BITS = 9
+#: Logarithm to base 2 of the largest number of buckets of a shot along one side.
+MOST_SIDE_BITS = 9
 
 #: Height of the levels into which patches of bounded solids are cut, over the width of a patch.
 _LEVEL_WIDTHS = 8
@@ -55,12 +57,13 @@ class Patch:
     faces: mi.Float
 
 
-def solids_of_several_levels(scene: LidarScene, region: Region) -> list[mi.Shape]:
-    """Return solids with parts above each other in the region, found with vertical rays."""
-    x, y = region.probe_points()
+def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) -> list[mi.Shape]:
+    """Return solids with parts above each other in the region of any shot, found with vertical rays."""
+    lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * PROBE_RAYS), shots, PROBE_RAYS)
+    scene, (x, y) = scene.of(lanes), region.probe_points(lanes.number)
     top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
     ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
-    looking = dr.full(mi.Bool, True, PROBE_RAYS)
+    looking = dr.full(mi.Bool, True, shots * PROBE_RAYS)
     met = [mi.UInt32(0) for _ in scene.solids]
     for _ in range(_MOST_LEVELS):
         si = scene.ray_intersect(ray, looking)
@@ -72,7 +75,7 @@ def solids_of_several_levels(scene: LidarScene, region: Region) -> list[mi.Shape
 
 
 class SolidPatches:
-    """Patches of one pass, in projection along the axis nearest to the normal, shifted at random.
+    """Patches of one pass, in projection along the axis nearest to the normal, shifted at random in each shot.
 
     Patches that look up or down are sectors of rings about the beam, others squares.
 
@@ -87,13 +90,12 @@ class SolidPatches:
     width
         Side of a square, and of a sector on the axis at the surface [m].
     shift
-        Two uniform random numbers.
+        Two uniform random numbers of each shot.
     uneven
         Solids that `solids_of_several_levels` found.
+    side_bits
+        Logarithm to base 2 of the number of buckets of a shot along one side.
     """
-
-    #: Number of buckets.
-    buckets = 1 << (2 * _BUCKET_BITS)
 
     def __init__(
         self,
@@ -104,8 +106,10 @@ class SolidPatches:
         width: float,
         shift: mi.Point2f,
         uneven: Sequence[mi.Shape] = (),
+        side_bits: int = MOST_SIDE_BITS,
     ) -> None:
-        self.scene, self._rings = scene, rings
+        self.scene, self._rings, self._side_bits = scene, rings, side_bits
+        self._start = mi.UInt32(0)
         self.width, self._depth = opaque(width), opaque(depth)
         self._core = rings.core(self._depth)
         self._ring_width = self.width / rings.core(mi.Float(0))
@@ -115,6 +119,20 @@ class SolidPatches:
             for solid in scene.solids
             if not region.within(solid.bbox()) or any(solid is other for other in uneven)
         ]
+
+    @property
+    def buckets(self) -> int:
+        """Number of buckets of a shot."""
+        return 1 << (2 * self._side_bits)
+
+    def of(self, lanes: Lanes) -> SolidPatches:
+        """Return the patches of each lane's shot."""
+        if lanes.shots == 1:
+            return self
+        patches = copy.copy(self)
+        patches.scene, patches._shift = self.scene.of(lanes), lanes.pick(self._shift)
+        patches._start = lanes.shot << (2 * self._side_bits)
+        return patches
 
     def locate(self, si: mi.SurfaceInteraction3f) -> Patch:
         """Return the patches of points on solids."""
@@ -133,14 +151,14 @@ class SolidPatches:
         level_patch = axis == 2
         i, j = dr.select(level_patch, sector.ring, i), dr.select(level_patch, sector.number, j)
         projected = dr.select(level_patch, self._rings.area(sector), self.width * self.width)
-        bits = _BUCKET_BITS
+        bits = self._side_bits
         side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
         # Solids with overhangs have several levels over one square.
         level = mi.UInt32(mi.Int32(dr.floor(w / (_LEVEL_WIDTHS * self.width))) + ORIGIN)
         level = dr.select(self._is_bounded(si.shape), level, 0)
         return Patch(
-            bucket=low_bits(i, bits) | (low_bits(j, bits) << bits),
+            bucket=self._start + (low_bits(i, bits) | (low_bits(j, bits) << bits)),
             tag=low_bits(i >> bits, 6)
             | (low_bits(j >> bits, 6) << 6)
             | (low_bits(level, 8) << 12)

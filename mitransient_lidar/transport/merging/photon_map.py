@@ -10,6 +10,7 @@ import mitsuba as mi
 from mitransient_lidar.transport.merging.patches import Patch
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
+from mitransient_lidar.transport.rng import Lanes
 
 #: Number of photons that are kept of full buckets, of cells and of patches: more take time and reduce the variance
 #: little.
@@ -128,13 +129,14 @@ class PhotonMap:
 
 
 class PhotonBuffer:
-    """Light of `photons` paths on solids, in any order; at most `capacity` hits are stored, but all are counted.
+    """Light of `photons` paths of each shot on solids; at most `capacity` hits are stored, but all are counted.
 
     One hit of each path is stored by the number of the path, too, to be connected.
     """
 
-    def __init__(self, capacity: int, photons: int, classes: PathClasses) -> None:
-        self.capacity, self.photons = capacity, photons
+    def __init__(self, capacity: int, photons: int, classes: PathClasses, shots: int) -> None:
+        self.capacity, self.photons, self._shots = capacity, photons, shots
+        photons *= shots
         self._classes = classes
         self._stored = dr.zeros(mi.UInt32, 1)
         self._patch = dr.empty(mi.UInt32, 2 * capacity)
@@ -174,7 +176,8 @@ class PhotonBuffer:
         x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
         # The hit itself gives its random number, so that those of other paths do not change it.
         key = dr.reinterpret_array(mi.UInt32, x) ^ dr.reinterpret_array(mi.UInt32, length)
-        u = mi.sample_tea_float32(dr.gather(mi.UInt32, self._lane, index), key)
+        lanes = Lanes.of_paths(dr.gather(mi.UInt32, self._lane, index), self._shots, self.photons)
+        u = mi.sample_tea_float32(lanes.number, key)
         photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.by_order)
         label = dr.gather(mi.UInt32, self._label, index) if self._classes.by_order else mi.UInt32(0)
         weight, first = dr.gather(mi.Vector2f, self._weight, index)

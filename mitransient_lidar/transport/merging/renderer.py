@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
-from mitransient_lidar.transport.merging.cells import Region, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, Region, SurfaceHeights, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids, store_points
-from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
+from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
@@ -23,7 +24,7 @@ from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.refracted_connection import connect_laser
-from mitransient_lidar.transport.rng import pass_streams
+from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS, SensorSampler
 from mitransient_lidar.transport.volpath import VolpathOptions, trace_connected
@@ -62,6 +63,17 @@ _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
+
+#: Least number of paths of the path tracer in a pass of all shots.
+_COMPLEMENT_PATHS = 1024
+
+#: Bits of the number of buckets of a shot above those of its number of photons: of cells, and of patches along both
+#: sides.
+_BITS_OF_CELLS, _SIDE_BITS_OF_PATCHES = 5, 3
+
+#: Largest width of the cells and patches of shots of few photons, over that of full passes: it halves their noise, and
+#: changes the water's signal by 0.3 % in the published geometry.
+_WIDEST = 2.0
 
 #: Points of a light path that are expected, over those of a straight one, to scale the rate of connections.
 _POINTS_OF_LIGHT = 0.8
@@ -102,6 +114,10 @@ class MergingLayout:
         Width of the patches of solids on the axis at the surface [m].
     light_segments, sensor_segments, hits
         Capacities for segments and hits of solids of each path; they grow when a pass needs more.
+    side_bits
+        Logarithm to base 2 of the number of buckets of patches along one side.
+    widens
+        Whether cells and patches are wider for shots of few photons: their width is automatic.
     """
 
     region: Region
@@ -115,6 +131,26 @@ class MergingLayout:
     light_segments: float
     sensor_segments: float
     hits: float = 2.0
+    side_bits: int = MOST_SIDE_BITS
+    widens: bool = True
+
+    def of_shots(self, scene: LidarScene, shots: int, copies: int, photons: int) -> MergingLayout:
+        """Return the layout of shots that meet a scene in parts, with a number of photons each.
+
+        Each `copies` successive shots are at one place.
+        """
+        bits = math.ceil(math.log2(photons))
+        wider = min((_PHOTONS / photons) ** (1 / 3), _WIDEST) if self.widens else 1.0
+        side_bits = min(MOST_SIDE_BITS, -(-(bits + _SIDE_BITS_OF_PATCHES) // 2))
+        grid = self.grid
+        if isinstance(grid, WaterGrid):
+            heights = SurfaceHeights(scene, self.region, shots, copies)
+            buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, grid.bits_z + 2))
+            grid = grid.of_shots(heights, max(wider, 1.0), buckets)
+        # A copy has capacities of its own.
+        uneven = solids_of_several_levels(scene, self.region, shots)
+        patch_width = self.patch_width * max(wider, 1.0)
+        return replace(self, grid=grid, uneven=uneven, side_bits=side_bits, patch_width=patch_width)
 
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler, options: MergingOptions) -> MergingLayout:
@@ -141,8 +177,10 @@ class MergingLayout:
             grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
             rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0, 0.0)
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
+            patches = _patch_width(scene, width)
             return cls(
-                region, uneven, grid, rings, spacing, reach, depth, _patch_width(scene, width), segments, segments
+                *(region, uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
+                widens=not options.cell_size,
             )
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
         rings = BeamRings(pose, footprint, scene.refractive_index)
@@ -157,7 +195,11 @@ class MergingLayout:
         grid = WaterGrid(rings, SurfaceHeights(scene, region), width / core, growth, thickness, reach)
         sine = np.hypot(*pose.axis[:2]) / scene.refractive_index
         depth = reach * float(np.sqrt(1 - sine**2))
-        return cls(region, uneven, grid, rings, spacing, reach, depth, _patch_width(scene, width), segments, segments)
+        patches = _patch_width(scene, width)
+        return cls(
+            *(region, uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
+            widens=not options.cell_size,
+        )
 
 
 def _patch_width(scene: LidarScene, cell: float) -> float:
@@ -207,48 +249,61 @@ class MergingRenderer(PassRenderer):
         scaled.paths, scaled.photons = (max(round(share * count), 1) for count in (self.paths, self.photons))
         return scaled
 
-    def trace(self, record: PassRecord, seed: int, paths: int) -> None:
+    def of_shots(self, scene: LidarScene, shots: int, copies: int) -> MergingRenderer:
+        """Return a renderer of shots that meet a scene in parts, of which each `copies` are at one place."""
+        moved = copy.copy(self)
+        moved.scene, moved.layout = scene, self.layout.of_shots(scene, shots, copies, self.photons)
+        return moved
+
+    def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
         """Trace the paths of one pass into a record."""
-        while not self._attempt(record, seed, paths):
+        while not self._attempt(record, shots, paths):
             record.clear()
 
-    def _attempt(self, record: PassRecord, seed: int, paths: int) -> bool:
+    def _attempt(self, record: PassRecord, shots: Shots, paths: int) -> bool:
         """Trace one pass; return False, with larger capacities, when a buffer was too small."""
         scene, layout = self.scene, self.layout
-        common = np.random.default_rng([seed, _COMMON_STREAM]).random(5, np.float32)
-        shifts = [dr.opaque(mi.Float, float(shift)) for shift in common]
+        shifts = shots.uniform(_COMMON_STREAM, 5)
         cells = layout.grid.cells(mi.Point3f(shifts[:3]))
         patches = SolidPatches(
-            scene, layout.region, layout.rings, layout.depth, layout.patch_width, mi.Point2f(shifts[3:]), layout.uneven
+            scene,
+            layout.region,
+            layout.rings,
+            layout.depth,
+            layout.patch_width,
+            mi.Point2f(shifts[3:]),
+            layout.uneven,
+            layout.side_bits,
         )
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
         rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)
-        light = self._trace_light(record, seed, cells, patches, rates)
-        if light is None or not self._trace_sensor(record, seed, paths, cells, patches, rates, light):
+        light = self._trace_light(record, shots, cells, patches, rates)
+        if light is None or not self._trace_sensor(record, shots, paths, cells, patches, rates, light):
             return False
         # The path tracer adds the light that merging leaves out.
         if not scene.has_specular_or_dry_solids:
-            paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, 1024)
-        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, seed, paths)
+            paths = max(paths // _PATHS_PER_COMPLEMENT_PATH, _COMPLEMENT_PATHS // shots.count)
+        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)
         return True
 
     def _trace_light(
         self,
         record: PassRecord,
-        seed: int,
+        shots: Shots,
         cells: WaterCells | SphericalCells,
         patches: SolidPatches,
         rates: ConnectionRates,
     ) -> _StoredLight | None:
         """Trace light from the laser; return it, or None when a buffer was too small."""
-        scene, layout, count = self.scene, self.layout, self.photons
-        rng = pass_streams(seed, _LIGHT_STREAM, count)
-        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, count, int(layout.light_segments * count))
-        hits = PhotonBuffer(int(layout.hits * count), count, self.classes)
-        angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
+        layout, lanes, count = self.layout, shots.paths(self.photons), shots.count * self.photons
+        scene, patches, rng = self.scene.of(lanes), patches.of(lanes), shots.streams(_LIGHT_STREAM, lanes)
+        capacity = int(layout.light_segments * count)
+        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, self.photons, capacity, shots.count)
+        hits = PhotonBuffer(int(layout.hits * count), self.photons, self.classes, shots.count)
+        angles, energy = self._beam.sample(lanes.number, self.photons, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.transmitter.pose, angles, energy, offset)
-        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, rates)
+        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, rates.of(lanes))
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
@@ -259,32 +314,36 @@ class MergingRenderer(PassRenderer):
         record.rays = dr.sum(mi.Float64(path.rays))
         dr.schedule(record.rays)
         points, wanted = segments.finalize()
-        on_patches, met = hits.sort(SolidPatches.buckets)
+        on_patches, met = hits.sort(shots.count * patches.buckets)
         if wanted > segments.capacity or met > hits.capacity:
             layout.light_segments = max(layout.light_segments, _CAPACITY_MARGIN * wanted / count)
             layout.hits = max(layout.hits, _CAPACITY_MARGIN * met / count)
             return None
-        in_cells = store_points(segments, points, cells, self.classes, seed)
+        in_cells = store_points(segments, points, cells, self.classes, shots)
         return _StoredLight(in_cells, segments, points, on_patches, hits)
 
     def _trace_sensor(
         self,
         record: PassRecord,
-        seed: int,
-        count: int,
+        shots: Shots,
+        paths: int,
         cells: WaterCells | SphericalCells,
         patches: SolidPatches,
         rates: ConnectionRates,
         light: _StoredLight,
     ) -> bool:
         """Trace paths from the receiver and join them with light; return False when a buffer was too small."""
-        scene, layout = self.scene, self.layout
-        rng = pass_streams(seed, _SENSOR_STREAM, count)
-        start = self.sampler.sample(dr.arange(mi.UInt32, count), count, rng)
-        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, count, int(layout.sensor_segments * count))
+        layout, lanes, count = self.layout, shots.paths(paths), shots.count * paths
+        scene, patches_of_paths = self.scene.of(lanes), patches.of(lanes)
+        rng = shots.streams(_SENSOR_STREAM, lanes)
+        start = self.sampler.sample_shots(lanes, paths, rng)
+        capacity = int(layout.sensor_segments * count)
+        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, paths, capacity, shots.count)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.receiver.pose, start.angles, start.weight, offset)
-        walk = RandomWalk(scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end, rates)
+        walk = RandomWalk(
+            scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end, rates.of(lanes)
+        )
 
         def connect(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
             radiance, length = connect_laser(scene, si, active)
@@ -294,8 +353,8 @@ class MergingRenderer(PassRenderer):
             order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(si.shape)
             record.receive(start.pixel, order, reversals, solid, path.length + length, energy, radiance > 0)
 
-        of_merges = pass_streams(seed, _MERGE_STREAM, count)
-        merge = merge_on_solids(patches, record, light.on_patches, start.pixel, rates.on_solids, of_merges)
+        of_merges = shots.streams(_MERGE_STREAM, lanes)
+        merge = merge_on_solids(patches_of_paths, record, light.on_patches, start.pixel, rates.on_solids, of_merges)
         path = walk.run(path, rng, start.pixel, segments, on_solid=merge, on_first_hit=connect, past_solids=False)
         record.rays += dr.sum(mi.Float64(path.rays))
         dr.schedule(record.rays)
@@ -307,13 +366,14 @@ class MergingRenderer(PassRenderer):
             return True
         if light.in_cells is not None:
             index = dr.arange(mi.UInt32, points)
+            cells = cells.of(segments.lanes(index))
             merge_in_water(scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
         if rates.connected:
-            connections = WaterConnections(scene, record, rates, segments)
+            connections = WaterConnections(self.scene, record, rates, segments, shots)
             if light.points > 0:
-                connections.to_light(points, light.segments, light.points, seed, _CONNECTION_STREAM)
+                connections.to_light(light.segments, _CONNECTION_STREAM)
             if light.on_patches is not None:
-                connections.to_solids(points, light.hits, patches, seed, _SOLID_CONNECTION_STREAM)
+                connections.to_solids(light.hits, patches, _SOLID_CONNECTION_STREAM)
         return True
 
 

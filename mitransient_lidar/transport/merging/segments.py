@@ -7,10 +7,12 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
+from mitransient_lidar.transport.rng import Lanes, Shots
 
 #: Numbers that tell the points of a path apart; those of paths with more points may be those of other paths.
 _KEYS_PER_PATH = 1021
@@ -50,17 +52,22 @@ class SegmentPoints:
 
 
 class SegmentBuffer:
-    """Segments in the water of `paths` paths, with points at equal distances `spacing` [m] along each path.
+    """Segments in the water of `paths` paths of each shot, with points at equal distances `spacing` [m] along them.
 
     At most `capacity` segments are stored, in any order, but all are counted. Points are numbered path by path.
     """
 
-    def __init__(self, water: Any, classes: PathClasses, spacing: float, paths: int, capacity: int) -> None:
+    def __init__(
+        self, water: Any, classes: PathClasses, spacing: float, paths: int, capacity: int, shots: int = 1
+    ) -> None:
         self._water, self._classes = water, classes
+        self._paths, self._shots = paths, shots
+        #: Number of points before those of each shot, and of all.
+        self.first_points = np.zeros(shots + 1, np.uint32)
         self.spacing = opaque(spacing)
         self.capacity = capacity
         self._stored = dr.zeros(mi.UInt32, 1)
-        self._of_path = dr.zeros(mi.UInt32, paths)
+        self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)
         self._label = dr.empty(mi.UInt32, capacity)
         self._start = dr.empty(mi.Float, 4 * capacity)
@@ -89,7 +96,9 @@ class SegmentBuffer:
         """Assign numbers to the points; return their number and that of the segments, stored or not."""
         dr.eval(self._stored, self._of_path, self._place, self._label, self._start, self._direction, self._weight)
         end = dr.cumsum(self._of_path)
-        count, wanted = int(end[dr.width(end) - 1]), int(self._stored[0])
+        last = dr.arange(mi.UInt32, self._shots) * self._paths + (self._paths - 1)
+        self.first_points[1:] = np.array(dr.gather(mi.UInt32, end, last))
+        count, wanted = int(self.first_points[-1]), int(self._stored[0])
         if wanted > self.capacity or count == 0:
             return count, wanted
         slot = dr.arange(mi.UInt32, wanted)
@@ -103,12 +112,18 @@ class SegmentBuffer:
         dr.eval(self._first, self._slot)
         return count, wanted
 
-    def random(self, index: mi.UInt32, seed: int) -> mi.Float:
+    def lanes(self, index: mi.UInt32) -> Lanes:
+        """Return the lanes of points by number: shots, and paths within them."""
+        segment = dr.gather(mi.UInt32, self._slot, dr.gather(mi.UInt32, self._first, index))
+        return Lanes.of_paths(dr.gather(mi.UInt32, self._place, 2 * segment), self._shots, self._paths)
+
+    def random(self, index: mi.UInt32, shots: Shots) -> mi.Float:
         """Return uniform random numbers of points by number, which points of other paths do not change."""
         first = dr.gather(mi.UInt32, self._first, index)
         lane, before = dr.gather(mi.Point2u, self._place, dr.gather(mi.UInt32, self._slot, first))
-        key = lane * _KEYS_PER_PATH + before + index - first
-        return mi.sample_tea_float32(key, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
+        lanes = Lanes.of_paths(lane, self._shots, self._paths)
+        key = lanes.number * _KEYS_PER_PATH + before + index - first
+        return mi.sample_tea_float32(key, shots.keys(lanes))
 
     def points(self, index: mi.UInt32) -> SegmentPoints:
         """Return points by number."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.merging.cells import PROBE_RAYS, Region
 from mitransient_lidar.transport.opaque import opaque, opaque_point
-from mitransient_lidar.transport.rng import pass_streams, unit_points
+from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
@@ -42,8 +44,8 @@ class SphericalGrid:
         Largest thickness of a shell [m].
     """
 
-    #: Number of buckets.
-    buckets = 1 << _BUCKET_BITS
+    #: Logarithm to base 2 of the number of buckets of a shot.
+    bits = _BUCKET_BITS
 
     def __init__(self, scene: LidarScene, thickness: float) -> None:
         pose, spread = scene.transmitter.pose, float(scene.transmitter.angular_spread)
@@ -55,16 +57,25 @@ class SphericalGrid:
         self.even = opaque(thickness / _THICKNESS_PER_RADIUS)
 
     def cells(self, shift: mi.Point3f) -> SphericalCells:
-        """Return the cells of a pass, shifted by three uniform random numbers."""
+        """Return the cells of a pass, shifted by three uniform random numbers of each shot."""
         return SphericalCells(self, shift)
 
 
 class SphericalCells:
-    """The cells of one pass: a `SphericalGrid` shifted by three uniform random numbers."""
+    """The cells of one pass: a `SphericalGrid` shifted by three uniform random numbers of each shot."""
 
     def __init__(self, grid: SphericalGrid, shift: mi.Point3f) -> None:
         self.grid = grid
         self._shift = shift
+        self._start = mi.UInt32(0)
+
+    def of(self, lanes: Lanes) -> SphericalCells:
+        """Return the cells of each lane's shot."""
+        if lanes.shots == 1:
+            return self
+        cells = copy.copy(self)
+        cells._shift, cells._start = lanes.pick(self._shift), lanes.shot << _BUCKET_BITS
+        return cells
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
@@ -93,7 +104,7 @@ class SphericalCells:
         tag = mi.UInt32(mi.Int32(shell) + (1 << 10)) << (_RING_BITS + _SECTOR_BITS)
         tag |= (mi.UInt32(ring) << _SECTOR_BITS) | mi.UInt32(sector)
         # Fibonacci hashing (Knuth 1998, The Art of Computer Programming 3, section 6.4).
-        return (tag * 2654435769) >> (32 - _BUCKET_BITS), tag, volume
+        return self._start + ((tag * 2654435769) >> (32 - _BUCKET_BITS)), tag, volume
 
     def _shell_at(self, radius: mi.Float) -> mi.Float:
         """Return the coordinate of shells at a radius [m]."""

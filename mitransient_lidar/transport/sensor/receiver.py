@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,7 @@ from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.rng import pass_streams, stratified_point, unit_points
+from mitransient_lidar.transport.rng import Lanes, pass_streams, stratified_point, unit_points
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 
@@ -185,6 +185,12 @@ class SensorSampler:
         radius2 = dr.square(angle_x - self.centre[0]) + dr.square(angle_y - self.centre[1])
         density = dr.inv_pi / (self._log_range * (radius2 + self._core * self._core))
         return dr.select(radius2 <= self._edge * self._edge, density, 0)
+
+    def sample_shots(self, lanes: Lanes, count: int, rng: mi.PCG32) -> SensorSample:
+        """Sample directions for `count` paths of each shot, with pixels counted shot after shot."""
+        sample = self.sample(lanes.number, count, rng)
+        pixels = self.receiver.pixels.count
+        return sample if lanes.shots == 1 else replace(sample, pixel=sample.pixel + lanes.shot * pixels)
 
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> SensorSample:
         """Sample directions and pixels for paths number `index` of `count`."""
