@@ -50,7 +50,7 @@ except _UserError as _error:
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["__version__", "open", "render"]
+__all__ = ["__version__", "open", "render", "render_shots"]
 
 
 def render(scene: Any, **options: Any) -> xarray.Dataset:
@@ -69,6 +69,16 @@ def render(scene: Any, **options: Any) -> xarray.Dataset:
     from mitransient_lidar.studies.shot_series import render_shots_again
 
     return render_shots_again(scene, **options)
+
+
+def render_shots(scene: Any, params: Any = None, **options: Any) -> xarray.Dataset:
+    """Render shots at given or random places of one sea, many at a time, with the truth of each place.
+
+    See :func:`mitransient_lidar.studies.shot_series.render_shots`.
+    """
+    from mitransient_lidar.studies.shot_series import render_shots as render_series
+
+    return render_series(scene, params, **options)
 
 
 def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect

@@ -8,7 +8,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.physics.sea.resolution import Instrument, Resolution
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Instrument, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import fill_mesh, recorded
 
@@ -180,6 +181,12 @@ class OceanSurface(mi.Mesh):
         fine = {"cell_size": sea.cell_size, "refined_size": sea.refined_size}
         return values | (fine if np.isfinite(sea.cell_size) else {})
 
+    @property
+    def footprint_size(self) -> float:
+        """Side of the fine patch [m], without an automatic margin for scattered light."""
+        whole = self.sea.refined_size
+        return max(whole - SIZE_MARGIN, 0.5 * whole) if self._values["refined_size"] == "auto" else whole
+
     def _roughness(self) -> tuple[float, float]:
         """Return Beckmann's alpha of the ripples along and across the wind."""
         along, across = (float(np.sqrt(2 * variance)) for variance in self.ripple_variance)
@@ -194,6 +201,35 @@ class OceanSurface(mi.Mesh):
             f"faces={self.face_count()}, "
             f"resolved_variance={sea.resolved_variance}, ripple_variance={sea.ripple_variance}]"
         )
+
+
+class SeaPatches:
+    """Fine patches of an ``ocean_surface`` about several places, side by side in one mesh.
+
+    Attributes
+    ----------
+    shape
+        The mesh, with the ripples of the sea.
+    shapes
+        Scene of this mesh alone.
+    """
+
+    def __init__(self, surface: OceanSurface) -> None:
+        self._surface = surface
+        props = mi.Properties()
+        props["bsdf"], props["face_normals"] = surface.bsdf(), True
+        self.shape = mi.Mesh("sea_patches", 3, 1, props, has_vertex_texcoords=True)
+        self.shapes: mi.Scene | None = None
+
+    def move(self, places: FloatArray) -> FloatArray:
+        """Fill the mesh with the patches about places [m], shape (n, 2); return where each lies, in the same way."""
+        mesh, positions = self._surface.sea.patches(places, self._surface.footprint_size)
+        fill_mesh(self.shape, mesh)
+        if self.shapes is None:
+            self.shapes = mi.load_dict({"type": "scene", "sea": self.shape})
+        else:
+            self.shapes.parameters_changed([])
+        return positions
 
 
 mi.register_shape("ocean_surface", recorded(OceanSurface))

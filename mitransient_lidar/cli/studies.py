@@ -80,7 +80,10 @@ def shots(
     move_target: Annotated[
         bool, typer.Option("--move-target", help="Keep the target's place relative to the aim of each shot.")
     ] = False,
-    passes: Annotated[int | None, typer.Option(help="Passes of each shot, 8 by default.")] = None,
+    target_error: Annotated[
+        float | None, typer.Option(help="Relative standard error of the median bin, instead of full passes.")
+    ] = None,
+    passes: Annotated[int | None, typer.Option(help="Passes of each shot, 8 by default, 4 for a target error.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of random places, 1 by default.")] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = Path("shots.nc"),
     quiet: Quiet = False,
@@ -102,12 +105,13 @@ def shots(
     given: Any = [pair("--at", text) for text in at] if at else None
     if places is not None:
         given = study.read_places(places)
-    where = {"count": count, "places": given, "move_target": move_target or None, "seed": seed}
+    where = {"count": count, "positions": given, "move_target": move_target or None, "seed": seed}
     options = {name: value for name, value in where.items() if value is not None}
     if is_result(scene) and options:
         raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(options)}.")
     options |= {} if passes is None else {"passes": passes}
-    default = {} if is_result(scene) else {"count": 20, "passes": 8}
+    options |= {} if target_error is None else {"target_error": target_error}
+    default = {} if is_result(scene) else {"count": 20}
     render = study.render_shots_again if is_result(scene) else study.render_shots
     with reporting(quiet) as progress:
         series = render(scene, params=parameters(define), progress=progress, **{**default, **options})

@@ -130,19 +130,16 @@ def render(
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
     session.tell_record()
-    from mitransient_lidar.rendering.describe import describe_lidar
-    from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
+    from mitransient_lidar.rendering.echo_window import probe_echoes
     from mitransient_lidar.rendering.pass_size import fit_to_time
     from mitransient_lidar.rendering.scene_checks import check_scene
 
     probe = probe_echoes(lidar, renderer.sampler)
-    window = _error_window(lidar, probe)
+    window = error_window(lidar, probe)
     check_scene(lidar, renderer.sampler, probe)
-    # Depths are relative to the mean arrival of the surface echo over all pixels.
-    arrivals = probe.surface_ns[:, 1]
-    surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
+    described = describe_scene(lidar, probe, window)
     origins = renderer.classes.names if components else []
-    accumulator = choose_accumulator(lidar, window, surface.get("surface_time_ns"), max_memory, origins)
+    accumulator = choose_accumulator(lidar, window, described.get("surface_time_ns"), max_memory, origins)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
@@ -187,19 +184,37 @@ def render(
         error_median=log.error_median,
         error_p95=log.error_p95,
         surface_edge_loss=lost,
-        beam_outside_surface=probe.missed_beam,
-        **describe_lidar(lidar),
-        **surface,
-        **_surface_heights(lidar),
-        window_start_ns=float(window.start_ns.min()),
-        window_end_ns=float(window.end_ns.max()),
+        **described,
     )
-    dataset = accumulator.dataset(attributes)
+    return with_lines_of_sight(accumulator.dataset(attributes), lidar)
+
+
+def with_lines_of_sight(dataset: xarray.Dataset, lidar: LidarScene) -> xarray.Dataset:
+    """Return a result with the pixels' lines of sight as coordinates, unless the scene has no surface."""
+    from mitransient_lidar.rendering.echo_window import lines_of_sight
+
     if not lidar.surfaces:
         return dataset
     pixels = lidar.receiver.pixels
     dims = ("pixel",) if pixels.grid is None else ("row", "column")
     return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
+
+
+def describe_scene(lidar: LidarScene, probe: EchoProbe, window: ErrorWindow) -> dict[str, Any]:
+    """Return the attributes of a result that describe lidar, sea and expected echoes."""
+    from mitransient_lidar.rendering.describe import describe_lidar
+
+    # Depths are relative to the mean arrival of the surface echo over all pixels.
+    arrivals = probe.surface_ns[:, 1]
+    surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
+    return {
+        "beam_outside_surface": probe.missed_beam,
+        **describe_lidar(lidar),
+        **surface,
+        **_surface_heights(lidar),
+        "window_start_ns": float(window.start_ns.min()),
+        "window_end_ns": float(window.end_ns.max()),
+    }
 
 
 def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
@@ -210,7 +225,7 @@ def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
     return {"surface_heights_m": [min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)]}
 
 
-def _error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
+def error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
     """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
     time_ns = lidar.axis.centres_ns
     start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * lidar.transmitter.pulse.fwhm_ns

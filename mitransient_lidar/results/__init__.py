@@ -3,6 +3,7 @@
 from mitransient_lidar.results.dataset import (
     add_components,
     build,
+    build_series,
     open,
     pixel_coordinates,
     provenance,
@@ -11,4 +12,14 @@ from mitransient_lidar.results.dataset import (
     time_axis,
 )
 
-__all__ = ["add_components", "build", "open", "pixel_coordinates", "provenance", "record_dims", "save", "time_axis"]
+__all__ = [
+    "add_components",
+    "build",
+    "build_series",
+    "open",
+    "pixel_coordinates",
+    "provenance",
+    "record_dims",
+    "save",
+    "time_axis",
+]

@@ -125,6 +125,19 @@ def build(
     )
 
 
+def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
+    """Label the arrays of a series of shots, of shape (shot, pixel, time), as a result; see `build`."""
+    values = [np.asarray(array, dtype=np.float64) for array in arrays]
+    # The mean holds what is not finite in any shot.
+    labelled = build(*(array.mean(axis=0) for array in values), **described)
+    data = {
+        name: (("shot", *labelled[name].dims), array.reshape(-1, *labelled[name].shape), labelled[name].attrs)
+        for name, array in zip(_VARIABLES, values, strict=True)
+    }
+    number = ("shot", np.arange(len(values[0])), {"long_name": "number of the shot"})
+    return labelled.assign(data).assign_coords(shot=number)
+
+
 def add_components(
     dataset: xr.Dataset,
     origins: Sequence[str],

@@ -6,29 +6,32 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.text_tables import read_two_columns
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer, positive
 from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
 from mitransient_lidar.loading.scenes import check_params
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
-from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.rendering.render import render
-from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
-from mitransient_lidar.studies.find_shots import SeaMap, Shot
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
+from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
+from mitransient_lidar.studies.find_shots import SeaMap
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+    from mitransient_lidar.rendering.shot_batches import ShotBatches, ShotRecord
+    from mitransient_lidar.transport.passes import PassRenderer
     from mitransient_lidar.transport.scene import LidarScene
 
 _LOG = logging.getLogger(__name__)
@@ -42,14 +45,11 @@ _FARTHEST = 1e4
 _METRES = {"m": 1.0, "cm": 0.01, "km": 1000.0}
 _PLACE = Column("x", ("aim x",), _METRES), Column("y", ("aim y",), _METRES)
 
-#: Attributes that differ between shots, of which the series keeps the sum, the least or the greatest.
-_MERGED: dict[str, Callable[[list[Any]], Any]] = {
-    "elapsed_s": sum,
-    "window_start_ns": min,
-    "window_end_ns": max,
-    "error_p95": max,
-}
-_MERGED |= {"surface_edge_loss": max, "beam_outside_surface": max}
+#: Parameters of the scene that shots replace, and those that they replace to move the target.
+_AIM, _TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
+
+#: Arrays of a series, as of `results.build_series`.
+_ARRAYS = ("energy", "energy_stderr", "power", "power_stderr")
 
 _TRUTH = {
     "aim_x": ("m", "place where the axis meets the mean sea level, x"),
@@ -59,31 +59,6 @@ _TRUTH = {
     "true_surface_height": ("m", "mean height over the beam's footprint above the mean sea level"),
     "true_bottom_depth": ("m", "depth of the bottom below the mean sea level where the refracted axis meets it"),
 }
-
-
-def rendered_shots(
-    scene: Any,
-    params: Mapping[str, Any] | None,
-    places: npt.ArrayLike,
-    *,
-    passes: int,
-    target: tuple[float, float] | None = None,
-    axis: TimeAxis | None = None,
-    progress: ProgressCallback | None = None,
-) -> Iterator[xr.Dataset]:
-    """Yield the result of a shot at each place [m], shape (shots, 2); shot n is rendered with the seed n.
-
-    A `target` keeps this distance [m] from the aim, by the scene's parameters ``target_x`` and ``target_y``. An `axis`
-    replaces automatic time bins, which may differ between the shots.
-    """
-    pairs = np.asarray(places, dtype=np.float64)
-    for number, (x, y) in enumerate(pairs):
-        session = open_scene(scene, _at(params, x, y, target))
-        if axis is not None:
-            session.share_record(axis)
-        yield render(session, passes=passes, seed=number)
-        if progress is not None:
-            progress(Progress(number + 1, len(pairs), "shot"))
 
 
 def read_places(path: str | os.PathLike[str]) -> FloatArray:
@@ -97,119 +72,250 @@ def random_places(sea: SeaMap, count: int, seed: int) -> FloatArray:
     return np.random.default_rng(seed).uniform(sea.x[0], sea.x[-1], (count, 2))
 
 
-def random_shots(
-    scene: Any,
-    params: Mapping[str, Any] | None,
-    sea: SeaMap,
-    *,
-    count: int,
-    passes: int,
-    seed: int,
-    progress: ProgressCallback | None,
-) -> Iterator[tuple[Shot, xr.Dataset]]:
-    """Yield shots at random places of a sea and their results; the parameters are those of `render_shots`."""
-    places = random_places(sea, count, seed)
-    results = rendered_shots(scene, params, places, passes=passes, progress=progress)
-    for (x, y), result in zip(places, results, strict=True):
-        yield Shot("random", x, y, *sea.slope_at(x, y)), result
-
-
 def render_shots(
     scene: Any,
     params: Mapping[str, Any] | None = None,
     *,
     count: int = 200,
-    places: Sequence[tuple[float, float]] | npt.ArrayLike | None = None,
+    positions: Sequence[tuple[float, float]] | npt.ArrayLike | None = None,
     move_target: bool = False,
-    passes: int = 8,
+    passes: int | None = None,
+    target_error: float | None = None,
+    pass_share: float | None = None,
     seed: int = 1,
     axis: TimeAxis | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Render shots at given or random places of one sea.
+    """Render shots at given or random places of one sea, many at a time.
 
     Parameters
     ----------
     scene, params
         An XML scene with the parameters ``aim_x`` and ``aim_y``.
     count
-        Number of random shots, 2 to 100 000; the scene needs an ``ocean_surface`` with waves. Not used with `places`.
-    places
+        Number of random shots, 2 to 100 000; the scene needs an ``ocean_surface`` with waves. Not used with
+        `positions`.
+    positions
         Places (x, y) where the axis meets the mean sea level [m], shape (shots, 2), up to 10 km from the origin.
     move_target
         Whether the target keeps its place relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
     passes
-        Passes of each shot, 2 to 10 000.
+        Passes of each shot, 2 to 10 000; by default 8, and 4 with a `target_error`.
+    target_error
+        Relative standard error of the median bin from the surface echo to the end of the bottom echo, greater than 0.
+        A trial with a few shots chooses the paths of the passes for it, at most those of full passes.
+    pass_share
+        Share of the paths of a full pass in each pass, 1/512 to 1, instead; by default 1. The automatic cells of passes
+        of few paths are up to twice as wide, which changes the water's signal by about 0.3 %.
     seed
-        Seed of random places, at least 0. Shot n is rendered with the seed n.
+        Seed of random places, at least 0. Shot n is rendered with the seed n: the other shots do not change it.
     axis
         Time bins instead of automatic ones, which by default hold the light of all shots.
     progress
-        Called with a `passes.Progress` after every shot.
+        Called with a `passes.Progress` after every batch of shots.
 
     Returns
     -------
     xarray.Dataset
-        A result as of `rendering.render.render` with the dimension ``shot`` first. Coordinates over ``shot``:
-        ``aim_x``, ``aim_y`` [m]; the means over the beam's footprint ``true_slope_along`` (positive for a face towards
-        the lidar), ``true_slope_across`` (positive for a rise to the left) [1] and ``true_surface_height`` [m] above
-        the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a level sea,
-        meets the largest solid of the scene, NaN where it misses. Attributes that differ between shots: the mean of
-        numbers such as ``surface_time_ns``, the sum of ``elapsed_s``, and the limits of the echo window; positions are
-        left out. ``series_parameters``: JSON of the scene's parameters that shots replace. ``slope_deviation``:
-        standard deviations of the two slopes of a sea with waves. After Ctrl-C the dataset holds the completed shots,
-        and the attribute ``interrupted`` is 1.
+        A result as of `rendering.render.render`, without gates, with the dimension ``shot`` first. Coordinates over
+        ``shot``: ``aim_x``, ``aim_y`` [m]; the means over the beam's footprint ``true_slope_along`` (positive for a
+        face towards the lidar), ``true_slope_across`` (positive for a rise to the left) [1] and ``true_surface_height``
+        [m] above the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a
+        level sea, meets the largest solid of the scene, NaN where it misses. Attributes such as ``surface_time_ns`` and
+        the limits of the echo window are those of the first shot; positions are left out. ``series_parameters``: JSON
+        of the scene's parameters that shots replace. ``slope_deviation``: standard deviations of the two slopes of a
+        sea with waves. After Ctrl-C the dataset holds the completed shots, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    passes, seed = integer("passes", passes, 2, 10_000), integer("seed", seed, 0, 2**53)
-    count = integer("count", count, 2, 100_000)
-    given = None if places is None else _checked_places(places)
+    from mitransient_lidar.rendering.shot_batches import relative_errors, share_for_error
+
+    passes = integer("passes", (8 if target_error is None else 4) if passes is None else passes, 2, 10_000)
+    seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
+    if target_error is not None and pass_share is not None:
+        raise UserError(f"target_error = {target_error:g} chooses the paths of a pass: leave out pass_share")
+    wanted = None if target_error is None else positive("target_error", target_error)
+    share = 1.0 if pass_share is None else in_range("pass_share", pass_share, SMALLEST_SHARE, 1.0)
+    given = None if positions is None else _checked_places(positions)
     session = open_scene(scene, params)
     target = _target_offset(session) if move_target else None
     sea = SeaMap.of_scene(session.scene) if given is None or _has_waves(session.scene) else None
-    pairs = given if given is not None or sea is None else random_places(sea, count, seed)
-    assert pairs is not None
-    x, y = pairs[np.argmax(np.hypot(*pairs.T))]
-    open_scene(scene, _at(params, x, y, target))  # before the first render
-    lidar: LidarScene = choose_integrator(session.scene, None).prepare(session.scene, session.sensor).scene
-    axis = axis or _common_record(session, lidar, pairs)
-    truth = _truth(session, lidar, pairs)
+    places = given if given is not None or sea is None else random_places(sea, count, seed)
+    assert places is not None
+    replaced = (*_AIM, *(_TARGET if move_target else ()))
+    own = {name: value for name, value in session.parameters.items() if name in replaced}
+    series = _Series(scene, params, session, target, places, axis)
+    truth = _truth(session, series.lidar, places)
     if missed := np.count_nonzero(np.isnan(truth[-1])):
-        _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(pairs))
-    found: list[xr.Dataset] = []
-    shots = rendered_shots(scene, params, pairs, passes=passes, target=target, axis=axis, progress=progress)
+        _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
+    if wanted is not None:
+        share = share_for_error(wanted, passes, lambda share: series.batches(passes, share), places, series.window)
+    batches = series.batches(passes, share)
+    records: list[ShotRecord] = []
+    errors: list[FloatArray] = []
+    began, done, interrupted = time.perf_counter(), 0, False
     try:
         with DeferredInterrupt() as interruption:
-            for result in shots:
-                if result.attrs["interrupted"]:
-                    raise KeyboardInterrupt
-                found.append(_without_gates(result))
+            for part in batches.parts(len(places)):
+                records.append(batches.render(places[part], range(part.start, part.stop)))
+                errors.append(relative_errors(records[-1], series.window))
+                done = part.stop
+                if progress is not None:
+                    progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], wanted))
                 interruption.check()
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):
             raise
-        if not found:
+        if not records:
             raise KeyboardInterrupt from error
-    series: xr.Dataset = xr.concat(
-        found, "shot", data_vars="all", coords="different", compat="equals", combine_attrs="drop_conflicts"
+        interrupted = True
+    joined = [np.concatenate([getattr(record, name) for record in records]) for name in _ARRAYS]
+    found = np.concatenate(errors)
+    median, p95 = np.quantile(found, [0.5, 0.95], method="higher")
+    lost, received = (sum(values) for values in zip(*((one.lost, one.energy.sum()) for one in records), strict=True))
+    lost = lost / (lost + received) if lost > 0 else 0.0
+    warn_of_edge_loss(lost)
+    attributes = series.attributes(
+        used=batches.used_values,
+        passes=passes,
+        pass_share=share,
+        elapsed_s=time.perf_counter() - began,
+        error_median=float(median),
+        error_p95=float(p95),
+        surface_edge_loss=float(lost),
+        shots=done,
+        interrupted=int(interrupted),
+        moved_target=int(move_target),
+        series_parameters=json.dumps(own),
+        **({} if wanted is None else {"target_error": wanted}),
+        **({"places_seed": seed} if given is None else {}),
     )
-    series = series.assign_coords(shot=("shot", np.arange(len(found)), {"long_name": "number of the shot"}))
-    for (name, (unit, text)), values in zip(_TRUTH.items(), truth, strict=True):
-        series = series.assign_coords({name: ("shot", values[: len(found)], {"units": unit, "long_name": text})})
-    attributes = merged_attributes([one.attrs for one in found])
-    attributes |= {"shots": len(found), "interrupted": int(len(found) < len(pairs)), "moved_target": int(move_target)}
-    own = {name: value for name, value in session.parameters.items() if attributes.get(f"scene.{name}") != value}
-    attributes["series_parameters"] = json.dumps(own)
-    if given is None:
-        attributes["places_seed"] = seed
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
-    return series.assign_attrs(attributes)
+    dataset = series.dataset(joined, attributes)
+    coordinates = {
+        name: ("shot", values[:done], {"units": unit, "long_name": text})
+        for (name, (unit, text)), values in zip(_TRUTH.items(), truth, strict=True)
+    }
+    return dataset.assign_coords(coordinates)
+
+
+class _Series:
+    """The scene of a series of shots, at the place of the first one.
+
+    Attributes
+    ----------
+    lidar
+        Lidar of the first shot, with the time bins of all shots.
+    window
+        Bins whose errors count, in each pixel.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        params: Mapping[str, Any] | None,
+        session: Session,
+        target: tuple[float, float] | None,
+        places: FloatArray,
+        axis: TimeAxis | None,
+    ) -> None:
+        self._scene, self._params, self._target = scene, params, target
+        self._session = open_scene(scene, self._at(*places[0]))
+        self._integrator = choose_integrator(session.scene, None)
+        self._axis = axis or _common_record(session, places)
+        self._renderer = self._prepare(self._session)
+        self.lidar: LidarScene = self._renderer.scene
+        self._place = float(places[0, 0]), float(places[0, 1])
+        self._companions = self._find_companions()
+        from mitransient_lidar.rendering.echo_window import probe_echoes
+        from mitransient_lidar.rendering.render import describe_scene, error_window
+        from mitransient_lidar.rendering.scene_checks import check_scene
+        from mitransient_lidar.rendering.shot_batches import check_size
+
+        check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count)
+        probe = probe_echoes(self.lidar, self._renderer.sampler)
+        self.window = error_window(self.lidar, probe)
+        check_scene(self.lidar, self._renderer.sampler, probe)
+        self._described = describe_scene(self.lidar, probe, self.window)
+
+    def _prepare(self, session: Session) -> PassRenderer:
+        """Return the renderer of a loaded scene, with the time bins of all shots."""
+        if self._axis is not None:
+            session.share_record(self._axis)
+        renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
+        return renderer
+
+    def _at(self, x: float, y: float) -> dict[str, Any]:
+        """Return the parameters of a shot at a place [m]."""
+        target = self._target
+        moved = {} if target is None else {"target_x": x + target[0], "target_y": y + target[1]}
+        return {**(self._params or {}), "aim_x": x, "aim_y": y, **moved}
+
+    def _find_companions(self) -> list[mi.Shape]:
+        """Return the shapes that move with the parameters of the target."""
+        if self._target is None:
+            return []
+        params = self._at(*self._place)
+        other = open_scene(self._scene, {**params, "target_x": params["target_x"] + 1.0}).scene
+        pairs = zip(self._session.scene.shapes(), other.shapes(), strict=True)
+        return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
+
+    def _loaded_at(self, x: float, y: float) -> PassRenderer:
+        """Return the renderer of the scene loaded at a place [m]."""
+        return self._prepare(open_scene(self._scene, self._at(x, y)))
+
+    def batches(self, passes: int, share: float) -> ShotBatches:
+        """Return the shots in batches, for passes with a share of the paths of a full pass."""
+        from mitransient_lidar.rendering.shot_batches import ShotBatches
+
+        return ShotBatches(self._renderer, self._place, passes, share, self._companions, self._loaded_at)
+
+    def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
+        """Return the attributes of the series, with other ones."""
+        found = self._session.attributes(integrator=self._integrator, used=used, **self._described, **others)
+        replaced = (*_AIM, *(() if self._target is None else _TARGET))
+        return {
+            name: value
+            for name, value in found.items()
+            if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
+        }
+
+    def dataset(self, arrays: Sequence[FloatArray], attributes: Mapping[str, Any]) -> xr.Dataset:
+        """Return the labelled result of arrays of shape (shots, pixels, bins)."""
+        from mitransient_lidar.rendering.render import with_lines_of_sight
+
+        pixels = self.lidar.receiver.pixels
+        dataset = results.build_series(
+            *arrays,
+            time=self.lidar.axis,
+            pixel_names=pixels.names,
+            pixel_centres_mrad=1e3 * pixels.centres(),
+            grid=pixels.grid,
+            attributes=attributes,
+        )
+        return with_lines_of_sight(dataset, self.lidar)
+
+
+def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, target: float | None) -> Progress:
+    """Return the progress of a series, with the errors of its last batch."""
+    median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
+    return Progress(
+        done=done,
+        planned=planned,
+        unit="shot",
+        elapsed_s=elapsed,
+        remaining_s=elapsed * (planned - done) / done,
+        error_median=float(median),
+        error_p95=float(p95),
+        target_error=target,
+        target_quantile=0.5,
+        error=None if target is None else float(median),
+    )
 
 
 def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
@@ -239,11 +345,12 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
     given = {name: value for name, value in options.items() if value is not None}
     check_params(given.get("params"))
     # The bins of some shots are those of all of them.
-    same = {} if "params" in given or "places" in given else {"axis": results.time_axis(found)}
+    same = {} if "params" in given or "positions" in given else {"axis": results.time_axis(found)}
     params = {**json_attribute(attributes, "series_parameters"), **given.pop("params", {})}
     own = {
-        "places": np.column_stack([found["aim_x"], found["aim_y"]]),
+        "positions": np.column_stack([found["aim_x"], found["aim_y"]]),
         "passes": int(attributes["passes"]),
+        "pass_share": None if given.get("target_error") else float(attributes["pass_share"]),
         "move_target": bool(attributes["moved_target"]),
     }
     return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
@@ -262,34 +369,13 @@ def describe_shots(series: xr.Dataset) -> list[str]:
     return lines
 
 
-def merged_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the attributes of a series: equal ones, and the merged ones of numbers that differ between shots.
-
-    Seeds, poses and parameters of the scene that differ are left out.
-    """
-    merged: dict[str, Any] = {}
-    for name, first in attributes[-1].items():
-        values = [one.get(name) for one in attributes]
-        if all(value == first for value in values) or name == "history":
-            merged[name] = first
-        elif name in _MERGED:
-            merged[name] = float(_MERGED[name](values))
-        elif name != "seed" and not name.startswith("scene.") and not name.endswith("_pose"):
-            rows = [value if isinstance(value, list) else [value] for value in values]
-            numbers = all(isinstance(item, (int, float)) for row in rows for item in row)
-            if numbers and len({len(row) for row in rows}) == 1:
-                mean = np.array(rows, dtype=np.float64).mean(axis=0).tolist()
-                merged[name] = mean if isinstance(first, list) else mean[0]
-    return merged
-
-
 def _checked_places(places: npt.ArrayLike) -> FloatArray:
     """Return places [m], shape (shots, 2)."""
-    pairs = finite_array("places", places)
+    pairs = finite_array("positions", places)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= 100_000:
-        raise UserError(f"places of shape {pairs.shape} must be 1 to 100000 pairs (x, y)")
+        raise UserError(f"positions of shape {pairs.shape} must be 1 to 100000 pairs (x, y)")
     if np.abs(pairs).max() > _FARTHEST:
-        raise UserError(f"places holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {_FARTHEST:g} m")
+        raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {_FARTHEST:g} m")
     return pairs
 
 
@@ -302,19 +388,6 @@ def _target_offset(session: Session) -> tuple[float, float]:
     return x, y
 
 
-def _at(params: Mapping[str, Any] | None, x: float, y: float, target: tuple[float, float] | None) -> dict[str, Any]:
-    """Return the parameters of a shot at a place [m]."""
-    moved = {} if target is None else {"target_x": x + target[0], "target_y": y + target[1]}
-    return {**(params or {}), "aim_x": x, "aim_y": y, **moved}
-
-
-def _without_gates(result: xr.Dataset) -> xr.Dataset:
-    """Return the waveforms of a result."""
-    if "waveform" not in result:
-        raise UserError("the scene needs too much memory for waveforms: reduce its pixels or bin_count")
-    return result.drop_dims("gate", errors="ignore")
-
-
 def _sea(scene: mi.Scene) -> Any:
     """Return the sea of an ``ocean_surface``, None without one."""
     return next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
@@ -325,11 +398,12 @@ def _has_waves(scene: mi.Scene) -> bool:
     return sea is not None and math.isfinite(sea.cell_size)
 
 
-def _common_record(session: Session, lidar: LidarScene, places: FloatArray) -> TimeAxis | None:
+def _common_record(session: Session, places: FloatArray) -> TimeAxis | None:
     """Return time bins for the light of shots at places [m], None where the film has its own; log them."""
+    from mitransient_lidar.transport.scene import LidarScene
     from mitransient_lidar.transport.sensor.records import fitted_record
 
-    film = session.sensor.film()
+    lidar, film = LidarScene.from_scene(session.scene, session.sensor), session.sensor.film()
     if not film.used_values:
         return None
     aim = np.array([float(session.parameters[name]) for name in ("aim_x", "aim_y")])

@@ -12,10 +12,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.rendering.passes import ProgressCallback
-from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.results.geometry import LidarGeometry
-from mitransient_lidar.studies.find_shots import SeaMap
-from mitransient_lidar.studies.shot_series import random_shots
+from mitransient_lidar.studies.shot_series import render_shots
 
 _PASSES = 8
 
@@ -58,14 +56,16 @@ def shot_statistics(
         If the scene is invalid, has no waves or no bottom, the record lacks an echo, or a number is out of range.
     """
     count, seed = integer("count", count, 2, 100_000), integer("seed", seed, 0, 2**53)
-    sea = SeaMap.of_scene(open_scene(scene, params).scene)
+    series = render_shots(scene, params, count=count, passes=_PASSES, seed=seed, progress=progress)
+    times = _echo_times(series)
     rows: list[dict[str, Any]] = []
-    drawn = random_shots(scene, params, sea, count=count, passes=_PASSES, seed=seed, progress=progress)
-    for shot, result in drawn:
-        row: dict[str, Any] = {"aim_x": shot.x, "aim_y": shot.y, "slope_along": shot.along, "slope_across": shot.across}
-        for name, time in _echo_times(result).items():
+    for number in range(series.sizes["shot"]):
+        shot = series.isel(shot=number)
+        row: dict[str, Any] = {name: float(shot[name]) for name in ("aim_x", "aim_y")}
+        row |= {f"slope_{name}": float(shot[f"true_slope_{name}"]) for name in ("along", "across")}
+        for name, time in times.items():
             gate = time - _HALF_GATE_NS, time + _HALF_GATE_NS
-            row[f"{name}_peak"], row[f"{name}_time"] = highest_points(result, *gate)
+            row[f"{name}_peak"], row[f"{name}_time"] = highest_points(shot, *gate)
         rows.append(row)
     units = {"aim_x": "m", "aim_y": "m", "slope_along": "1", "slope_across": "1"}
     data = {}
@@ -73,8 +73,8 @@ def shot_statistics(
         values = np.array([row[name] for row in rows])
         unit = units.get(name, "W" if "peak" in name else "ns")
         data[name] = (("shot", "pixel")[: values.ndim], values, {"units": unit})
-    pixels = [str(name) for name in result["pixel"].values]
-    return xr.Dataset(data, coords={"pixel": pixels}, attrs={**result.attrs, "places_seed": seed})
+    pixels = [str(name) for name in series["pixel"].values]
+    return xr.Dataset(data, coords={"pixel": pixels}, attrs=series.attrs)
 
 
 def _echo_times(shot: xr.Dataset) -> dict[str, float]:

@@ -26,7 +26,7 @@ _SMALLEST_CELL, _LARGEST_CELL = 0.02, 0.25
 _MANY_CELLS, _MOST_CELLS = 512, 1024
 
 #: Side of the patch: factor on the footprint, and margin [m] for scattered light.
-_SIZE_PER_FOOTPRINT, _SIZE_MARGIN = 1.25, 8.0
+_SIZE_PER_FOOTPRINT, SIZE_MARGIN = 1.25, 8.0
 
 #: Side of the surface: least length [m], and factor on the footprints with the margin.
 _LEAST_SURFACE, _SURFACE_PER_SIZE = 1000.0, 2.0
@@ -125,7 +125,7 @@ class Resolution:
             for name, automatic in zip(("centre_x", "centre_y"), areas[0][:2], strict=True)
             for value in [get(name, "auto")]
         )
-        everything, lit = (_SIZE_PER_FOOTPRINT * area[2] + _SIZE_MARGIN for area in areas)
+        everything, lit = (_SIZE_PER_FOOTPRINT * area[2] + SIZE_MARGIN for area in areas)
         size = size or max(_LEAST_SURFACE, _SURFACE_PER_SIZE * everything)
         waves, lit_waves = (
             min((each.wave for each in some), default=_DEFAULT_WAVE)
@@ -150,7 +150,7 @@ class Resolution:
 def _square(instruments: Sequence[Instrument]) -> tuple[float, float, float]:
     """Return centre (x, y) and side [m] of the square that holds the footprints."""
     if not instruments:
-        return 0.0, 0.0, (_DEFAULT_SIZE - _SIZE_MARGIN) / _SIZE_PER_FOOTPRINT
+        return 0.0, 0.0, (_DEFAULT_SIZE - SIZE_MARGIN) / _SIZE_PER_FOOTPRINT
     low, high = (
         [pick(each.aim[axis] + sign * each.half_side for each in instruments) for axis in (0, 1)]
         for pick, sign in ((min, -1), (max, 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ class SeaMesh:
     texcoords: FloatArray  #: Coordinates along and across the wind [m], axes of the ripples, shape (vertices, 2).
 
 
-def grid_indices(cells: int, extent: int) -> IntArray:
+def grid_indices(cells: int, extent: int, growth: float = _GROWTH) -> IntArray:
     """Return the positions of grid lines in cells of the fine patch, counted from its centre.
 
     Parameters
@@ -31,6 +32,8 @@ def grid_indices(cells: int, extent: int) -> IntArray:
         Cells per side of the fine patch, even.
     extent
         Side of the whole mesh in these cells, at least `cells`.
+    growth
+        Ratio of the lengths of neighbouring cells outside the patch, above 1.
 
     Returns
     -------
@@ -40,11 +43,21 @@ def grid_indices(cells: int, extent: int) -> IntArray:
     inner = np.arange(-(cells // 2), cells // 2 + 1, dtype=np.int64)
     outer, step, end = [], 1.0, cells // 2
     while end < extent / 2:
-        step *= _GROWTH
+        step *= growth
         end = min(end + int(step), -(-extent // 2))
         outer.append(end)
     right = np.array(outer, dtype=np.int64)
     return np.concatenate([-right[::-1], inner, right])
+
+
+def joined(meshes: Sequence[SeaMesh]) -> SeaMesh:
+    """Return one mesh of several."""
+    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.uint32)
+    return SeaMesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)]),
+        np.concatenate([mesh.texcoords for mesh in meshes]),
+    )
 
 
 def triangulate(heights: FloatArray, x: FloatArray, y: FloatArray, wind_direction: float) -> SeaMesh:

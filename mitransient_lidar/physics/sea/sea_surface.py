@@ -20,7 +20,7 @@ from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
 from mitransient_lidar.physics.sea.resolution import Get, Instrument, Resolution, read_length
-from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, triangulate
+from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
 from mitransient_lidar.physics.sea.tabulated_spectrum import TabulatedSpectrum
@@ -43,6 +43,9 @@ _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 
 #: Largest number of cells per side of the fine patch, and smallest number per period for waves to be resolved.
 _MOST_CELLS, _FEWEST_CELLS = 4096, 16
+
+#: Side of each of several patches with the cells around it [m], and growth of these.
+_SIZE_OF_PATCH, _GROWTH_OF_PATCH = 200.0, 2.0
 
 _SPECTRA = ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat")
 
@@ -161,6 +164,41 @@ class SeaSurface:
         first = [round(centre / self.cell_size) for centre in self.centre]
         x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
         return triangulate(self.heights(x, y), x, y, self.wind_direction)
+
+    def patches(self, places: FloatArray, refined_size: float) -> tuple[SeaMesh, FloatArray]:
+        """Return the mesh of fine patches about places, and the position of each place in it.
+
+        The patches lie side by side on a square lattice about the origin, each surrounded by cells that grow out to
+        `_SIZE_OF_PATCH` or the size of the sea.
+
+        Parameters
+        ----------
+        places
+            Places (x, y) on the sea [m], shape (n, 2).
+        refined_size
+            Side of each fine patch [m].
+
+        Returns
+        -------
+        mesh : SeaMesh
+            All patches.
+        positions : ndarray
+            Positions (x, y) of the places in it [m], shape (n, 2).
+        """
+        cells = max(2, 2 * math.ceil(0.5 * refined_size / self.cell_size))
+        size = max(refined_size, min(self.size, max(_SIZE_OF_PATCH, 2 * refined_size)))
+        indices = grid_indices(cells, math.ceil(size / self.cell_size), _GROWTH_OF_PATCH)
+        side = math.ceil(math.sqrt(len(places)))
+        stride = (indices[-1] - indices[0] + 2) * self.cell_size
+        number = np.arange(len(places))
+        positions = stride * (np.stack([number % side, number // side], axis=-1) - 0.5 * (side - 1))
+        meshes = []
+        for place, position in zip(places, positions, strict=True):
+            # On the cells of the sea, as in `mesh`.
+            x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
+            lines = (x - place[0] + position[0], y - place[1] + position[1])
+            meshes.append(triangulate(self.heights(x, y), *lines, self.wind_direction))
+        return joined(meshes), positions
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""

@@ -1,7 +1,7 @@
 """Series of shots: places, truth, attributes, interruption and files, without renders."""
 
+import json
 import math
-import re
 
 import mitsuba as mi
 import numpy as np
@@ -11,8 +11,8 @@ from command_line import assert_refused, run
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.session import Session
+from mitransient_lidar.rendering import shot_batches
+from mitransient_lidar.rendering.session import Session, open_scene
 from mitransient_lidar.studies import shot_series
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
@@ -81,58 +81,37 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
     np.testing.assert_array_equal(np.array(truth[2:5]), 0)
 
 
-def test_attributes_of_a_series():
-    one = {"scene": "a", "passes": 8, "seed": 0, "scene.aim_x": "1", "transmitter_pose": [1.0, 2.0], "scene.aim_y": "2"}
-    one |= {"surface_time_ns": 1420.0, "window_start_ns": 1400.0, "window_end_ns": 1500.0, "elapsed_s": 2.0, "new": "x"}
-    one |= {"error_inflation": [1.0, 2.0], "history": "early"}
-    two = {**one, "seed": 1, "scene.aim_x": "3", "transmitter_pose": [3.0, 2.0], "surface_time_ns": 1422.0, "new": "y"}
-    two |= {"window_start_ns": 1402.0, "window_end_ns": 1503.0, "elapsed_s": 3.0, "error_inflation": [1.0, 4.0]}
-    expected = {"scene": "a", "passes": 8, "scene.aim_y": "2", "surface_time_ns": 1421.0, "window_start_ns": 1400.0}
-    expected |= {"window_end_ns": 1503.0, "elapsed_s": 5.0, "error_inflation": [1.0, 3.0], "history": "late"}
-    assert shot_series.merged_attributes([one, {**two, "history": "late"}]) == expected
-
-
 @pytest.fixture
 def rendered(monkeypatch):
-    """Replace renders by made-up waveforms; return places, options and time bins of all renders."""
+    """Replace renders by made-up waveforms; return places, seeds and time bins of all batches."""
     asked = []
 
-    def render(session, *, passes, seed):
-        params = {name: float(text) for name, text in session.parameters.items() if re.match("(aim|target)_[xy]", name)}
-        asked.append({**params, "passes": passes, "seed": seed, "axis": session.sensor.film().axis})
-        power = np.full((2, 5), 1.0 + seed)
-        attributes = {
-            "scene": session.name,
-            "interrupted": 0,
-            "surface_time_ns": 2.0 + seed,
-            "scene.aim_x": str(params["aim_x"]),
-        }
-        return results.build(
-            power, power, power, power,
-            time=TimeAxis(0.0, 1.0, 5),
-            pixel_names=["near", "far"],
-            pixel_centres_mrad=[(1.0, 0.0), (-1.0, 0.0)],
-            attributes=attributes,
-        )  # fmt: skip
+    def render(batches, places, seeds):
+        lidar = batches.at(places)(1).scene
+        asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
+        power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
+        power *= 1 + np.array(seeds)[:, None, None]
+        return shot_batches.ShotRecord(power, 0.1 * power, power, 0.1 * power, 0.0)
 
-    monkeypatch.setattr(shot_series, "render", render)
+    monkeypatch.setattr(shot_batches.ShotBatches, "render", render)
     return asked
 
 
 def test_shots_at_given_places(rendered, tmp_path):
     done = []
-    series = shot_series.render_shots("fig09_2x2", FLAT, places=PLACES, passes=3, progress=done.append)
-    assert [(one["aim_x"], one["aim_y"], one["passes"], one["seed"]) for one in rendered] == [
-        (x, y, 3, number) for number, (x, y) in enumerate(PLACES)
-    ]
+    series = shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES, passes=3, progress=done.append)
+    # A launch holds one shot of three full passes.
+    assert [one["places"] for one in rendered] == [[list(place)] for place in PLACES]
+    assert [(one["seeds"], one["passes"]) for one in rendered] == [([number], 3) for number in range(3)]
     assert [(one.done, one.planned, one.unit) for one in done] == [(1, 3, "shot"), (2, 3, "shot"), (3, 3, "shot")]
+    assert done[-1].error_median == pytest.approx(0.1)
     assert series["waveform"].dims == ("shot", "pixel", "time")
     assert series["waveform"].values[:, 0, 0].tolist() == [1, 2, 3]
     np.testing.assert_array_equal(np.array([series["aim_x"], series["aim_y"]]).T, PLACES)
     assert all(series[name].dims == ("shot",) and name in series.coords for name in TRUTH)
     np.testing.assert_allclose(series["true_bottom_depth"], 8.0)
-    assert (series.attrs["surface_time_ns"], series.attrs["interrupted"]) == (3.0, 0)
-    assert not {"scene.aim_x", "places_seed", "slope_deviation"} & set(series.attrs)
+    assert (series.attrs["shots"], series.attrs["interrupted"], series.attrs["pass_share"]) == (3, 0, 1.0)
+    assert not {"scene.aim_x", "receiver_pose", "places_seed", "slope_deviation"} & set(series.attrs)
     results.save(series, tmp_path / "shots.nc")
     xr.testing.assert_identical(results.open(tmp_path / "shots.nc"), series)
     with pytest.raises(UserError, match=r"shots\.exr: an EXR file holds a single shot; use a \.nc file"):
@@ -144,18 +123,18 @@ def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
     """The bottom lies 10 m deeper at x = -57 m: 9.4 ns of each metre, and a quarter more for scattered light."""
     scene, slope = "docs/survey_lidar.xml", {**PLANE, "bottom_slope_deg": 10}
     for places in ([(0, 0)], [(0, 0), (-57, 0)]):
-        shot_series.render_shots(scene, slope, places=places)
+        shot_series.render_shots(scene, slope, positions=places)
     flat, deep = rendered[0]["axis"], rendered[1]["axis"]
     assert rendered[2]["axis"] == deep
     assert 85 < deep.end_ns - flat.end_ns < 145
     assert deep.start_ns == pytest.approx(flat.start_ns, abs=5)
-    shot_series.render_shots(scene, slope, places=[(0, 0)], axis=deep)
+    shot_series.render_shots(scene, slope, positions=[(0, 0)], axis=deep)
     assert rendered[3]["axis"] == deep
 
 
 def test_places_beside_the_bottom_are_told(rendered, caplog):
     """The bottom of the scene is a square of 1 km."""
-    series = shot_series.render_shots("fig09_2x2", FLAT, places=[(0, 0), (600, 0)])
+    series = shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0), (600, 0)])
     np.testing.assert_array_equal(series["true_bottom_depth"], [8.0, np.nan])
     assert "the axis of 1 of 2 shots misses the bottom" in caplog.text
 
@@ -172,38 +151,46 @@ def test_random_places_are_those_of_the_seed(rendered):
 
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
-    series = shot_series.render_shots("fig13_2x2", params, places=PLACES, move_target=True)
-    moved = [(one["target_x"] - one["aim_x"], one["target_y"] - one["aim_y"]) for one in rendered]
-    np.testing.assert_allclose(moved, [(0.3, 0.0)] * 3)
-    assert series.attrs["moved_target"] == 1
+    series = shot_series._Series(
+        "fig13_2x2", params, open_scene("fig13_2x2", params), (0.3, 0.0), np.array(PLACES), None
+    )
+    (target,) = series._companions
+    assert target.id() == "target"
+    # In the frame of the first shot, with its aim at x = 1 m.
+    assert 0.5 * (target.bbox().min.x + target.bbox().max.x) == pytest.approx(1.3, abs=1e-5)
+    found = shot_series.render_shots("fig13_2x2", params, positions=PLACES, move_target=True)
+    assert found.attrs["moved_target"] == 1
+    assert set(json.loads(found.attrs["series_parameters"])) == {"aim_x", "aim_y", "target_x", "target_y"}
 
 
 @pytest.mark.parametrize("kept", [0, 2])
 def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
-    whole = shot_series.render
+    whole = shot_batches.ShotBatches.render
 
-    def interrupted(scene, **options):
-        if options["seed"] == kept:
+    def interrupted(batches, places, seeds):
+        if seeds[0] == kept:
             raise KeyboardInterrupt
-        return whole(scene, **options)
+        return whole(batches, places, seeds)
 
-    monkeypatch.setattr(shot_series, "render", interrupted)
+    monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
     if kept == 0:
         with pytest.raises(KeyboardInterrupt):
-            shot_series.render_shots("fig09_2x2", FLAT, places=PLACES)
+            shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES)
         return
-    series = shot_series.render_shots("fig09_2x2", FLAT, places=PLACES)
+    series = shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES)
     assert series.sizes["shot"] == series["aim_x"].size == 2
     assert series.attrs["interrupted"] == 1
 
 
 def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
-    whole = shot_series.render
-    monkeypatch.setattr(
-        shot_series,
-        "render",
-        lambda scene, **options: whole(scene, **options).assign_attrs(interrupted=options["seed"]),
-    )
+    whole = shot_batches.ShotBatches.render
+
+    def interrupted(batches, places, seeds):
+        if seeds[0] == 1:
+            raise KeyboardInterrupt
+        return whole(batches, places, seeds)
+
+    monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
     (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
     arguments = ["-D", "spectrum=flat", "--places", tmp_path / "places.csv", "-o", tmp_path / "new" / "shots.nc"]
     done = run("shots", "fig09_2x2", *arguments)
@@ -216,14 +203,14 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
 @pytest.mark.parametrize(
     ("scene", "options", "message"),
     [
-        ("fig09_2x2", {"places": [(0, 0, 1)]}, r"places of shape \(1, 3\) must be 1 to 100000 pairs"),
-        ("fig09_2x2", {"places": []}, r"places of shape \(0,\) must be 1 to 100000 pairs"),
-        ("fig09_2x2", {"places": [(0, math.nan)]}, "places holds nan"),
-        ("fig09_2x2", {"places": "here"}, "places = 'here' must hold numbers only"),
-        ("fig09_2x2", {"places": [(0, -1e5)]}, "places holds -100000 m; it must lie within 10000 m"),
-        ("fig09_2x2", {"places": PLACES, "passes": 1}, "passes = 1 must lie between 2"),
+        ("fig09_2x2", {"positions": [(0, 0, 1)]}, r"positions of shape \(1, 3\) must be 1 to 100000 pairs"),
+        ("fig09_2x2", {"positions": []}, r"positions of shape \(0,\) must be 1 to 100000 pairs"),
+        ("fig09_2x2", {"positions": [(0, math.nan)]}, "positions holds nan"),
+        ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
+        ("fig09_2x2", {"positions": [(0, -1e5)]}, "positions holds -100000 m; it must lie within 10000 m"),
+        ("fig09_2x2", {"positions": PLACES, "passes": 1}, "passes = 1 must lie between 2"),
         ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
-        ("fig09_2x2", {"places": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
+        ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
     ],
 )
 def test_invalid_input_is_refused_before_rendering(rendered, scene, options, message):

@@ -1,0 +1,221 @@
+"""Shots of one lidar at several places, rendered together in batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pulse import waveform
+from mitransient_lidar.plugins.ocean_surface import SeaPatches
+from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
+from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.scene import ScenePart
+
+if TYPE_CHECKING:
+    from mitransient_lidar.transport.passes import PassRenderer
+
+#: Paths of all shots in a launch, and time bins of all their pixels.
+_PATHS, _BINS = 2**17, 2**24
+
+#: Largest number of shots in a batch: their sea has 120 000 triangles a shot.
+_MOST_SHOTS = 64
+
+#: Largest number of bins of a series, for mean and standard error of energy and power.
+_MOST_BINS = 2**26
+
+#: Number of trials, their shots, the share of the paths of the first, and the exponent of the paths in the error.
+_TRIALS, _TRIAL_SHOTS, _TRIAL_SHARE, _EXPONENT = 2, 8, 2**-5, 0.65
+
+
+@dataclass(frozen=True)
+class ShotRecord:
+    """Means over the passes of shots, and their standard errors, shape (shots, pixels, bins).
+
+    Attributes
+    ----------
+    energy, energy_stderr
+        Received energy [J per bin].
+    power, power_stderr
+        Received power after the pulse and the receiver's response [W].
+    lost
+        Energy lost at the edges of the surface mesh [J], mean over the passes of all shots.
+    """
+
+    energy: FloatArray
+    energy_stderr: FloatArray
+    power: FloatArray
+    power_stderr: FloatArray
+    lost: float
+
+
+class ShotBatches:
+    """The scene of a renderer, displaced to the places of batches of shots.
+
+    The frame of the lidar is that of the scene, and a place is that of the aim. The sea is refined about each place,
+    and the patches lie beside each other in one mesh. Solids are met at the place itself, except those that go with the
+    lidar. Bubbles cannot be displaced: scenes with a plume are loaded again for each shot.
+
+    Parameters
+    ----------
+    renderer
+        Renderer of the shot at the place of the scene.
+    aim
+        Place (x, y) of the scene's own shot [m].
+    passes
+        Passes of each shot.
+    share
+        Share of the paths of a full pass.
+    companions
+        Solids that go with the lidar.
+    loaded_at
+        Returns the renderer of the scene loaded at a place (x, y) [m].
+    """
+
+    def __init__(
+        self,
+        renderer: PassRenderer,
+        aim: tuple[float, float],
+        passes: int,
+        share: float,
+        companions: Sequence[mi.Shape],
+        loaded_at: Callable[[float, float], PassRenderer],
+    ) -> None:
+        lidar = renderer.scene
+        has_plume = lidar.water is not None and lidar.water.plume is not None
+        self._loaded_at = loaded_at if has_plume else None
+        self._renderer, self._aim, self.passes, self.share = renderer.scaled(share), np.array(aim), passes, share
+        response = lidar.receiver.optics.response_time_ns
+        self._kernel = lidar.transmitter.pulse.kernel(lidar.axis.bin_width_ns, response)
+        waves = [shape for shape in lidar.surfaces if np.isfinite(getattr(shape, "cell_size", np.nan))]
+        level = [shape for shape in lidar.surfaces if np.isinf(getattr(shape, "cell_size", np.nan))]
+        going = [*level, *companions]
+        fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
+        self._seas = [SeaPatches(shape) for shape in waves]
+        self._going, self._fixed = _scene_of(going), _scene_of(fixed)
+        paths = max(self._renderer.path_count // 2, 1)
+        bins = lidar.receiver.pixels.count * lidar.axis.bin_count
+        #: Shots in a batch.
+        self.size = 1 if has_plume else int(np.clip(_PATHS // (paths * passes), 1, _MOST_SHOTS))
+        #: Passes of a batch in one launch.
+        most = min(_PATHS // (paths * self.size), _BINS // (bins * self.size))
+        self._together = 1 if has_plume else int(np.clip(most, 1, passes))
+
+    def at(self, places: FloatArray) -> Callable[[int], PassRenderer]:
+        """Return a function that returns the renderer of shots at places [m], shape (shots, 2), each several times."""
+        if (loaded_at := self._loaded_at) is not None:
+            return lambda _: loaded_at(*map(float, places[0])).scaled(self.share)
+        parts = [] if self._going is None else [(self._going, np.zeros_like(places))]
+        for sea in self._seas:
+            positions = sea.move(places)
+            parts.append((sea.shapes, positions - self._aim))
+        parts += [] if self._fixed is None else [(self._fixed, places - self._aim)]
+        lidar = self._renderer.scene
+        surfaces = [*lidar.surfaces, *(sea.shape for sea in self._seas)]
+
+        def several(copies: int) -> PassRenderer:
+            moved = tuple(ScenePart(shapes, _vectors(np.repeat(by, copies, axis=0))) for shapes, by in parts)
+            scene = replace(lidar, parts=moved, surfaces=surfaces)
+            return self._renderer.of_shots(scene, copies * len(places), copies)
+
+        return several
+
+    def render(self, places: FloatArray, seeds: Sequence[int]) -> ShotRecord:
+        """Render the shots of a batch, each with its own seed."""
+        shots, done, copies, lost = len(places), 0, 0, 0.0
+        energy, power = PassStatistics(), PassStatistics()
+        try:
+            several = self.at(places)
+            while done < self.passes:
+                if (here := min(self._together, self.passes - done)) != copies:
+                    renderer, copies = several(here), here
+                numbers = [pass_seed(seed, done + number) for seed in seeds for number in range(here)]
+                record = renderer.render_pass(numbers)
+                lost += float(record.edge_loss[0])
+                axis = renderer.scene.axis
+                found = record.histogram.energy().reshape(shots, here, -1, axis.bin_count)
+                for number in range(here):
+                    energy.add(found[:, number])
+                    power.add(waveform(found[:, number], axis.bin_width_ns, self._kernel))
+                done += here
+        except (RuntimeError, MemoryError) as error:
+            raise_if_out_of_memory(error)
+            raise
+        return ShotRecord(energy.mean, energy.stderr, power.mean, power.stderr, lost / self.passes)
+
+    def parts(self, count: int) -> Iterator[slice]:
+        """Return the shots of each batch of `count`."""
+        for first in range(0, count, self.size):
+            yield slice(first, min(first + self.size, count))
+
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values used for parameters of the integrator that may be automatic."""
+        return self._renderer.used_values
+
+
+def share_for_error(
+    target_error: float,
+    passes: int,
+    batches: Callable[[float], ShotBatches],
+    places: FloatArray,
+    window: ErrorWindow,
+) -> float:
+    """Return the share of the paths of full passes with which shots reach an error, from a trial at some places.
+
+    Parameters
+    ----------
+    target_error
+        Relative standard error of the median bin.
+    passes
+        Passes of each shot.
+    batches
+        Batches of a share of the paths.
+    places
+        Places of the shots [m], shape (shots, 2), the first of which are tried.
+    window
+        Bins that count.
+    """
+    tried, share = places[:: max(len(places) // _TRIAL_SHOTS, 1)][:_TRIAL_SHOTS], _TRIAL_SHARE
+    for _ in range(_TRIALS):
+        trial = batches(share)
+        records = [trial.render(tried[part], range(*part.indices(len(tried)))) for part in trial.parts(len(tried))]
+        error = float(np.median(np.concatenate([relative_errors(record, window) for record in records])))
+        share = float(np.clip(share * (error / target_error) ** (1 / _EXPONENT), SMALLEST_SHARE, 1.0))
+    return share
+
+
+def relative_errors(record: ShotRecord, window: ErrorWindow) -> FloatArray:
+    """Return the relative standard errors of the waveforms in a window, infinite where they are 0."""
+    shots = len(record.power)
+    each = replace(window, start_ns=np.tile(window.start_ns, shots), end_ns=np.tile(window.end_ns, shots))
+    power, stderr = (values.reshape(-1, values.shape[-1]) for values in (record.power, record.power_stderr))
+    return each.relative_errors(power, stderr)
+
+
+def check_size(shots: int, pixels: int, bins: int) -> None:
+    """Refuse series that do not fit the memory."""
+    if shots * pixels * bins > _MOST_BINS:
+        raise UserError(
+            f"{shots} shots of {pixels} pixels x {bins} bins are more than {_MOST_BINS} bins: "
+            "take fewer shots, or reduce the pixels or bin_count"
+        )
+
+
+def _scene_of(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
+    """Return a scene of shapes, None without any."""
+    named = {f"shape{number}": shape for number, shape in enumerate(shapes)}
+    return mi.load_dict({"type": "scene", **named}) if named else None
+
+
+def _vectors(horizontal: FloatArray) -> mi.Vector3f:
+    """Return horizontal vectors, shape (n, 2)."""
+    x, y = (aligned(mi.Float, column.astype(np.float32)) for column in horizontal.T)
+    return mi.Vector3f(x, y, dr.zeros(mi.Float, len(horizontal)))
