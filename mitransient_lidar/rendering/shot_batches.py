@@ -15,7 +15,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
+from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.scene import ScenePart
 
@@ -31,8 +31,9 @@ _MOST_SHOTS = 64
 #: Largest number of bins of a series, for mean and standard error of energy and power.
 _MOST_BINS = 2**26
 
-#: Number of trials, their shots, the share of the paths of the first, and the exponent of the paths in the error.
-_TRIALS, _TRIAL_SHOTS, _TRIAL_SHARE, _EXPONENT = 2, 8, 2**-5, 0.65
+#: Share of the paths of passes that are repeated until an error is reached, their number between two looks at it, and
+#: the most of them.
+SHARE_FOR_ERROR, _PASSES_FOR_ERROR, MOST_PASSES_FOR_ERROR = 2**-5, 4, 400
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class ShotRecord:
         Received power after the pulse and the receiver's response [W].
     lost
         Energy lost at the edges of the surface mesh [J], mean over the passes of all shots.
+    passes
+        Number of passes.
     """
 
     energy: FloatArray
@@ -54,6 +57,7 @@ class ShotRecord:
     power: FloatArray
     power_stderr: FloatArray
     lost: float
+    passes: int
 
 
 class ShotBatches:
@@ -70,9 +74,11 @@ class ShotBatches:
     aim
         Place (x, y) of the scene's own shot [m].
     passes
-        Passes of each shot.
+        Passes of each shot, the most with a `goal`.
     share
         Share of the paths of a full pass.
+    goal
+        Relative standard error of the median bin of a batch that ends its passes, and the bins that count.
     companions
         Solids that go with the lidar.
     loaded_at
@@ -85,6 +91,7 @@ class ShotBatches:
         aim: tuple[float, float],
         passes: int,
         share: float,
+        goal: tuple[float, ErrorWindow] | None,
         companions: Sequence[mi.Shape],
         loaded_at: Callable[[float, float], PassRenderer],
     ) -> None:
@@ -92,6 +99,7 @@ class ShotBatches:
         has_plume = lidar.water is not None and lidar.water.plume is not None
         self._loaded_at = loaded_at if has_plume else None
         self._renderer, self._aim, self.passes, self.share = renderer.scaled(share), np.array(aim), passes, share
+        self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
         response = lidar.receiver.optics.response_time_ns
         self._kernel = lidar.transmitter.pulse.kernel(lidar.axis.bin_width_ns, response)
         waves = [shape for shape in lidar.surfaces if np.isfinite(getattr(shape, "cell_size", np.nan))]
@@ -103,10 +111,10 @@ class ShotBatches:
         paths = max(self._renderer.path_count // 2, 1)
         bins = lidar.receiver.pixels.count * lidar.axis.bin_count
         #: Shots in a batch.
-        self.size = 1 if has_plume else int(np.clip(_PATHS // (paths * passes), 1, _MOST_SHOTS))
+        self.size = 1 if has_plume else int(np.clip(_PATHS // (paths * in_turn), 1, _MOST_SHOTS))
         #: Passes of a batch in one launch.
         most = min(_PATHS // (paths * self.size), _BINS // (bins * self.size))
-        self._together = 1 if has_plume else int(np.clip(most, 1, passes))
+        self._together = 1 if has_plume else int(np.clip(most, 1, in_turn))
 
     def at(self, places: FloatArray) -> Callable[[int], PassRenderer]:
         """Return a function that returns the renderer of shots at places [m], shape (shots, 2), each several times."""
@@ -129,11 +137,11 @@ class ShotBatches:
 
     def render(self, places: FloatArray, seeds: Sequence[int]) -> ShotRecord:
         """Render the shots of a batch, each with its own seed."""
-        shots, done, copies, lost = len(places), 0, 0, 0.0
+        shots, done, copies, lost, reached = len(places), 0, 0, 0.0, False
         energy, power = PassStatistics(), PassStatistics()
         try:
             several = self.at(places)
-            while done < self.passes:
+            while done < self.passes and not reached:
                 if (here := min(self._together, self.passes - done)) != copies:
                     renderer, copies = several(here), here
                 numbers = [pass_seed(seed, done + number) for seed in seeds for number in range(here)]
@@ -145,10 +153,13 @@ class ShotBatches:
                     energy.add(found[:, number])
                     power.add(waveform(found[:, number], axis.bin_width_ns, self._kernel))
                 done += here
+                if self._goal is not None and done >= _PASSES_FOR_ERROR:
+                    target, window = self._goal
+                    reached = float(np.median(relative_errors(power.mean, power.stderr, window))) <= target
         except (RuntimeError, MemoryError) as error:
             raise_if_out_of_memory(error)
             raise
-        return ShotRecord(energy.mean, energy.stderr, power.mean, power.stderr, lost / self.passes)
+        return ShotRecord(energy.mean, energy.stderr, power.mean, power.stderr, lost / done, done)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""
@@ -161,43 +172,14 @@ class ShotBatches:
         return self._renderer.used_values
 
 
-def share_for_error(
-    target_error: float,
-    passes: int,
-    batches: Callable[[float], ShotBatches],
-    places: FloatArray,
-    window: ErrorWindow,
-) -> float:
-    """Return the share of the paths of full passes with which shots reach an error, from a trial at some places.
+def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) -> FloatArray:
+    """Return the relative standard errors of waveforms in a window, infinite where they are 0.
 
-    Parameters
-    ----------
-    target_error
-        Relative standard error of the median bin.
-    passes
-        Passes of each shot.
-    batches
-        Batches of a share of the paths.
-    places
-        Places of the shots [m], shape (shots, 2), the first of which are tried.
-    window
-        Bins that count.
+    Power and standard error have the shape (shots, pixels, bins).
     """
-    tried, share = places[:: max(len(places) // _TRIAL_SHOTS, 1)][:_TRIAL_SHOTS], _TRIAL_SHARE
-    for _ in range(_TRIALS):
-        trial = batches(share)
-        records = [trial.render(tried[part], range(*part.indices(len(tried)))) for part in trial.parts(len(tried))]
-        error = float(np.median(np.concatenate([relative_errors(record, window) for record in records])))
-        share = float(np.clip(share * (error / target_error) ** (1 / _EXPONENT), SMALLEST_SHARE, 1.0))
-    return share
-
-
-def relative_errors(record: ShotRecord, window: ErrorWindow) -> FloatArray:
-    """Return the relative standard errors of the waveforms in a window, infinite where they are 0."""
-    shots = len(record.power)
+    shots = len(power)
     each = replace(window, start_ns=np.tile(window.start_ns, shots), end_ns=np.tile(window.end_ns, shots))
-    power, stderr = (values.reshape(-1, values.shape[-1]) for values in (record.power, record.power_stderr))
-    return each.relative_errors(power, stderr)
+    return each.relative_errors(*(values.reshape(-1, values.shape[-1]) for values in (power, stderr)))
 
 
 def check_size(shots: int, pixels: int, bins: int) -> None:

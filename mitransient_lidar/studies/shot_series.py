@@ -101,15 +101,15 @@ def render_shots(
         Whether the target keeps its place relative to the aim; the scene needs the parameters ``target_x`` and
         ``target_y``.
     passes
-        Passes of each shot, 2 to 10 000; by default 8, and 4 with a `target_error`.
+        Passes of each shot, 2 to 10 000; by default 8. With a `target_error`, the most, by default 400.
     target_error
-        Relative standard error of the median bin from the surface echo to the end of the bottom echo, greater than 0.
-        A trial with a few shots chooses the paths of the passes for it, at most those of full passes.
+        Relative standard error, greater than 0, that ends the passes of a batch of shots when the median of the bins of
+        lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
     pass_share
-        Share of the paths of a full pass in each pass, 1/512 to 1, instead; by default 1. The automatic cells of passes
-        of few paths are up to twice as wide, which changes the water's signal by about 0.3 %.
+        Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and 1/32 with a `target_error`. The
+        automatic cells of passes of few paths are up to twice as wide, which changes the water's signal by about 0.3 %.
     seed
-        Seed of random places, at least 0. Shot n is rendered with the seed n: the other shots do not change it.
+        Seed of random places, at least 0. Shot n is rendered with the seed n.
     axis
         Time bins instead of automatic ones, which by default hold the light of all shots.
     progress
@@ -132,29 +132,28 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    from mitransient_lidar.rendering.shot_batches import relative_errors, share_for_error
+    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, SHARE_FOR_ERROR, relative_errors
 
-    passes = integer("passes", (8 if target_error is None else 4) if passes is None else passes, 2, 10_000)
-    seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
-    if target_error is not None and pass_share is not None:
-        raise UserError(f"target_error = {target_error:g} chooses the paths of a pass: leave out pass_share")
     wanted = None if target_error is None else positive("target_error", target_error)
-    share = 1.0 if pass_share is None else in_range("pass_share", pass_share, SMALLEST_SHARE, 1.0)
+    usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, SHARE_FOR_ERROR)
+    passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
+    share = in_range("pass_share", usual[1] if pass_share is None else pass_share, SMALLEST_SHARE, 1.0)
+    seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
     given = None if positions is None else _checked_places(positions)
-    session = open_scene(scene, params)
-    target = _target_offset(session) if move_target else None
-    sea = SeaMap.of_scene(session.scene) if given is None or _has_waves(session.scene) else None
-    places = given if given is not None or sea is None else random_places(sea, count, seed)
-    assert places is not None
+    session = open_scene(scene, params) if given is None or move_target else None
+    target = _target_offset(session) if session is not None and move_target else None
+    places = given
+    if places is None:
+        assert session is not None
+        places = random_places(SeaMap.of_scene(session.scene), count, seed)
+    series = _Series(scene, params, target, places, axis)
+    sea = SeaMap.of_scene(series.session.scene) if _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
-    own = {name: value for name, value in session.parameters.items() if name in replaced}
-    series = _Series(scene, params, session, target, places, axis)
-    truth = _truth(session, series.lidar, places)
+    own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
+    truth = _truth(series.session, series.lidar, places)
     if missed := np.count_nonzero(np.isnan(truth[-1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
-    if wanted is not None:
-        share = share_for_error(wanted, passes, lambda share: series.batches(passes, share), places, series.window)
-    batches = series.batches(passes, share)
+    batches = series.batches(passes, share, wanted)
     records: list[ShotRecord] = []
     errors: list[FloatArray] = []
     began, done, interrupted = time.perf_counter(), 0, False
@@ -162,7 +161,7 @@ def render_shots(
         with DeferredInterrupt() as interruption:
             for part in batches.parts(len(places)):
                 records.append(batches.render(places[part], range(part.start, part.stop)))
-                errors.append(relative_errors(records[-1], series.window))
+                errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
                 done = part.stop
                 if progress is not None:
                     progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], wanted))
@@ -181,7 +180,7 @@ def render_shots(
     warn_of_edge_loss(lost)
     attributes = series.attributes(
         used=batches.used_values,
-        passes=passes,
+        passes=max(record.passes for record in records),
         pass_share=share,
         elapsed_s=time.perf_counter() - began,
         error_median=float(median),
@@ -209,6 +208,8 @@ class _Series:
 
     Attributes
     ----------
+    session
+        The loaded scene.
     lidar
         Lidar of the first shot, with the time bins of all shots.
     window
@@ -219,24 +220,28 @@ class _Series:
         self,
         scene: Any,
         params: Mapping[str, Any] | None,
-        session: Session,
         target: tuple[float, float] | None,
         places: FloatArray,
         axis: TimeAxis | None,
     ) -> None:
-        self._scene, self._params, self._target = scene, params, target
-        self._session = open_scene(scene, self._at(*places[0]))
-        self._integrator = choose_integrator(session.scene, None)
-        self._axis = axis or _common_record(session, places)
-        self._renderer = self._prepare(self._session)
-        self.lidar: LidarScene = self._renderer.scene
-        self._place = float(places[0, 0]), float(places[0, 1])
-        self._companions = self._find_companions()
         from mitransient_lidar.rendering.echo_window import probe_echoes
         from mitransient_lidar.rendering.render import describe_scene, error_window
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shot_batches import check_size
+        from mitransient_lidar.transport.scene import LidarScene
 
+        self._scene, self._params, self._target = scene, params, target
+        self._place = float(places[0, 0]), float(places[0, 1])
+        self.session = open_scene(scene, self._at(*self._place))
+        self._integrator = choose_integrator(self.session.scene, None)
+        if axis is None:
+            shifts = [(float(x), float(y)) for x, y in places - places[0]]
+            axis = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
+        self._axis = axis
+        self.session.tell_record(axis)
+        self._renderer = self._prepare(self.session)
+        self.lidar: LidarScene = self._renderer.scene
+        self._companions = self._find_companions()
         check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count)
         probe = probe_echoes(self.lidar, self._renderer.sampler)
         self.window = error_window(self.lidar, probe)
@@ -245,8 +250,7 @@ class _Series:
 
     def _prepare(self, session: Session) -> PassRenderer:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
-        if self._axis is not None:
-            session.share_record(self._axis)
+        session.share_record(self._axis)
         renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
         return renderer
 
@@ -262,22 +266,23 @@ class _Series:
             return []
         params = self._at(*self._place)
         other = open_scene(self._scene, {**params, "target_x": params["target_x"] + 1.0}).scene
-        pairs = zip(self._session.scene.shapes(), other.shapes(), strict=True)
+        pairs = zip(self.session.scene.shapes(), other.shapes(), strict=True)
         return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
 
     def _loaded_at(self, x: float, y: float) -> PassRenderer:
         """Return the renderer of the scene loaded at a place [m]."""
         return self._prepare(open_scene(self._scene, self._at(x, y)))
 
-    def batches(self, passes: int, share: float) -> ShotBatches:
-        """Return the shots in batches, for passes with a share of the paths of a full pass."""
+    def batches(self, passes: int, share: float, target_error: float | None) -> ShotBatches:
+        """Return the shots in batches, for passes with a share of the paths of a full pass, or until an error."""
         from mitransient_lidar.rendering.shot_batches import ShotBatches
 
-        return ShotBatches(self._renderer, self._place, passes, share, self._companions, self._loaded_at)
+        goal = None if target_error is None else (target_error, self.window)
+        return ShotBatches(self._renderer, self._place, passes, share, goal, self._companions, self._loaded_at)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
         """Return the attributes of the series, with other ones."""
-        found = self._session.attributes(integrator=self._integrator, used=used, **self._described, **others)
+        found = self.session.attributes(integrator=self._integrator, used=used, **self._described, **others)
         replaced = (*_AIM, *(() if self._target is None else _TARGET))
         return {
             name: value
@@ -349,8 +354,9 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
     params = {**json_attribute(attributes, "series_parameters"), **given.pop("params", {})}
     own = {
         "positions": np.column_stack([found["aim_x"], found["aim_y"]]),
-        "passes": int(attributes["passes"]),
-        "pass_share": None if given.get("target_error") else float(attributes["pass_share"]),
+        "pass_share": float(attributes["pass_share"]),
+        # Batches end with their error, or after their passes.
+        **{name: attributes[name] for name in ["target_error" if "target_error" in attributes else "passes"]},
         "move_target": bool(attributes["moved_target"]),
     }
     return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
@@ -396,22 +402,6 @@ def _sea(scene: mi.Scene) -> Any:
 def _has_waves(scene: mi.Scene) -> bool:
     sea = _sea(scene)
     return sea is not None and math.isfinite(sea.cell_size)
-
-
-def _common_record(session: Session, places: FloatArray) -> TimeAxis | None:
-    """Return time bins for the light of shots at places [m], None where the film has its own; log them."""
-    from mitransient_lidar.transport.scene import LidarScene
-    from mitransient_lidar.transport.sensor.records import fitted_record
-
-    lidar, film = LidarScene.from_scene(session.scene, session.sensor), session.sensor.film()
-    if not film.used_values:
-        return None
-    aim = np.array([float(session.parameters[name]) for name in ("aim_x", "aim_y")])
-    # Also at the scene's own place, where a target that moves with the shots is.
-    shifts = [(0.0, 0.0), *map(tuple, places - aim)]
-    axis, _ = fitted_record(lidar, lidar.transmitter, film, shifts)
-    session.tell_record(axis)
-    return axis
 
 
 def _truth(session: Session, lidar: LidarScene, places: FloatArray) -> tuple[FloatArray, ...]:

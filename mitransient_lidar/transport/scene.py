@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -246,8 +247,17 @@ class LidarScene(WaterScene):
         return sum(self.relative(each.pose).range for each in (self.transmitter, self.receiver))
 
     @classmethod
-    def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor, receiver: Receiver | None = None) -> LidarScene:
+    def from_scene(
+        cls,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        receiver: Receiver | None = None,
+        shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),),
+    ) -> LidarScene:
         """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
+
+        A record of automatic time bins holds the light of all positions of the lidar, above water displaced by `shifts`
+        (x, y) [m].
 
         Raises
         ------
@@ -274,8 +284,8 @@ class LidarScene(WaterScene):
         if film.axis is None:
             # The record is that of the sensor, whatever replaces its receiver.
             own = replace(parts, receiver=find_receiver(sensor))
-            fit = submerged_record if submerged else fitted_record
-            film.fit(*fit(own, transmitters[0], film))
+            found = (own, transmitters[0], film)
+            film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
         return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
 
 

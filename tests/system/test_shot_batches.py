@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import t
 from significance import largest_z
 
 import mitransient_lidar
@@ -33,7 +34,7 @@ def test_batches_give_what_single_shots_do(scene, integrator):
         params |= RECORD
     renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**16}[integrator] / renderer.paths
-    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, [], lambda x, y: None)
+    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
     several = batches.at(PLACES)(passes)
     seeds = [pass_seed(number, each) for number in range(len(PLACES)) for each in range(passes)]
     bins = renderer.scene.axis.bin_count
@@ -116,12 +117,14 @@ def test_shots_through_a_plume_are_those_of_the_scene_at_each_place():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target_error", [0.05, 0.15])
+@pytest.mark.parametrize("target_error", [0.02, 0.15])
 def test_requested_error_is_reached(target_error):
-    """From a trial with eight shots; its errors of four passes and those of the bins scatter."""
+    """In each batch, by as many passes as it takes, at least four."""
     series = mitransient_lidar.render_shots("table1", {"wind_speed": 6}, count=24, target_error=target_error)
-    assert series.attrs["passes"] == 4
-    assert 0.6 * target_error < series.attrs["error_median"] < 1.2 * target_error
+    passes = series.attrs["passes"]
+    assert passes == {0.02: passes, 0.15: 4}[target_error]
+    assert series.attrs["error_median"] < target_error
+    assert passes == 4 or series.attrs["error_median"] > 0.8 * target_error
     # Stated errors, against full passes of the same shots.
     truth = render_shots("table1", {"wind_speed": 6}, positions=np.array([series["aim_x"], series["aim_y"]]).T[:6])
     few, full = series.isel(shot=slice(6)), truth
@@ -129,6 +132,6 @@ def test_requested_error_is_reached(target_error):
     time = full["time"].values
     inside = (time > full.attrs["window_start_ns"]) & (time < full.attrs["window_end_ns"])
     found = z.values[..., inside].ravel()
-    # Student's t with three degrees of freedom: 76 % within 1.44 standard errors; bins of a shot are correlated.
+    # Bins of a shot are correlated.
     share = np.mean(np.abs(found) < 1.44)
-    assert share == pytest.approx(0.754, abs=0.08)
+    assert share == pytest.approx(2 * t.cdf(1.44, passes - 1) - 1, abs=0.08)

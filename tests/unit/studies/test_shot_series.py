@@ -12,7 +12,7 @@ from command_line import assert_refused, run
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import shot_batches
-from mitransient_lidar.rendering.session import Session, open_scene
+from mitransient_lidar.rendering.session import Session
 from mitransient_lidar.studies import shot_series
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
@@ -91,7 +91,7 @@ def rendered(monkeypatch):
         asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
         power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
         power *= 1 + np.array(seeds)[:, None, None]
-        return shot_batches.ShotRecord(power, 0.1 * power, power, 0.1 * power, 0.0)
+        return shot_batches.ShotRecord(power, 0.1 * power, power, 0.1 * power, 0.0, batches.passes)
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", render)
     return asked
@@ -151,9 +151,7 @@ def test_random_places_are_those_of_the_seed(rendered):
 
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
-    series = shot_series._Series(
-        "fig13_2x2", params, open_scene("fig13_2x2", params), (0.3, 0.0), np.array(PLACES), None
-    )
+    series = shot_series._Series("fig13_2x2", params, (0.3, 0.0), np.array(PLACES), None)
     (target,) = series._companions
     assert target.id() == "target"
     # In the frame of the first shot, with its aim at x = 1 m.
