@@ -106,8 +106,9 @@ def render_shots(
         Relative standard error, greater than 0, that ends the passes of a batch of shots when the median of the bins of
         lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
     pass_share
-        Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and 1/32 with a `target_error`. The
-        automatic cells of passes of few paths are up to twice as wide, which changes the water's signal by about 0.3 %.
+        Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and with a `target_error` one that
+        needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
+        signal by about 0.3 %.
     seed
         Seed of random places, at least 0. Shot n is rendered with the seed n.
     axis
@@ -132,10 +133,10 @@ def render_shots(
     UserError
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
-    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, SHARE_FOR_ERROR, relative_errors
+    from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
 
     wanted = None if target_error is None else positive("target_error", target_error)
-    usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, SHARE_FOR_ERROR)
+    usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
     share = in_range("pass_share", usual[1] if pass_share is None else pass_share, SMALLEST_SHARE, 1.0)
     seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
