@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive
-from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.studies.sea_map import KINDS, SeaMap, Shot, footprint, transmitter_of
+from mitransient_lidar.studies.shot_series import render_shots
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -21,98 +20,10 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.transport.pose import Pose
 
-#: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
-KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
-
-#: Longest side of the sea that is searched [m].
-_LARGEST_SEARCH = 512.0
-
 #: Largest number of pixels whose footprints are mapped.
 _MOST_MAPPED_PIXELS = 64
 
-#: Largest difference of the nearest place from the slopes wanted, in standard deviations of the slopes.
-_NEAREST = 1.0
-
 _PASSES = 12
-
-
-@dataclass(frozen=True)
-class Shot:
-    """Intersection of the beam's axis with the mean sea level.
-
-    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m], `along` and `across` the mean slopes over the beam's
-    footprint along the lidar's azimuth, positive for a face towards the lidar, and to its left [1].
-    """
-
-    kind: str
-    x: float
-    y: float
-    along: float
-    across: float
-
-
-@dataclass(frozen=True)
-class SeaMap:
-    """Elevation of a sea [m] on grid lines [m], shape (len(y), len(x)), and its slopes averaged over the footprint.
-
-    Slopes are along the lidar's azimuth and to its left [1], as in `Shot`.
-    """
-
-    x: FloatArray
-    y: FloatArray
-    heights: FloatArray
-    along: FloatArray
-    across: FloatArray
-
-    @classmethod
-    def of_scene(cls, scene: mi.Scene) -> SeaMap:
-        """Return the map of a scene; reject one without waves."""
-        from scipy.ndimage import gaussian_filter
-
-        sea = next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
-        if sea is None or not math.isfinite(sea.cell_size):
-            raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
-        transmitter = _transmitter(scene)
-        transmitter.pose.require_above_sea()
-        # Of a sea of several grids the coarsest.
-        cell = getattr(sea.waves, "cell_size", sea.cell_size)
-        count = min(getattr(sea.waves, "cells", int(sea.size / cell)), int(_LARGEST_SEARCH / cell)) // 2
-        lines = np.arange(-count, count) * cell
-        heights = sea.heights(lines, lines)
-        azimuth, spread_along, spread_across = _footprint(transmitter)
-        # A circle of the same area replaces the elliptical footprint.
-        sigma = math.sqrt(spread_along * spread_across) / cell
-        # The sea of a spectrum is periodic; a height map ends at its edges.
-        smooth = gaussian_filter(heights, sigma, mode="wrap" if sea.spectrum != "height_map" else "nearest")
-        up, right = np.gradient(smooth, cell)
-        cos, sin = math.cos(azimuth), math.sin(azimuth)
-        return cls(lines, lines, heights, cos * right + sin * up, cos * up - sin * right)
-
-    def slope_at(self, x: float, y: float) -> tuple[float, float]:
-        """Return the mean slopes (along, across) [1] over a footprint at a place [m] of the periodic sea."""
-        spacing = self.x[1] - self.x[0]
-        i, j = (round((value - self.x[0]) / spacing) % len(self.x) for value in (x, y))
-        return float(self.along[j, i]), float(self.across[j, i])
-
-    def find(self, kind: str, slope_sigmas: float, count: int, apart: float) -> list[Shot]:
-        """Return the places with the slopes nearest to those of a kind, at least `apart` metres from each other."""
-        spread = np.sqrt([np.mean(self.along**2), np.mean(self.across**2)])
-        wanted = slope_sigmas * np.array(KINDS[kind]) * spread
-        distance = np.hypot((self.along - wanted[0]) / spread[0], (self.across - wanted[1]) / spread[1])
-        if not (nearest := float(np.min(distance, initial=np.inf))) <= _NEAREST:
-            raise UserError(
-                f"slope_sigmas = {slope_sigmas:g}: the sea has no place of the kind {kind} with such a slope; the "
-                f"nearest one differs by {nearest:.1f} standard deviations, and at most {_NEAREST:g} are allowed"
-            )
-        shots: list[Shot] = []
-        for index in np.argsort(distance, axis=None):
-            j, i = np.unravel_index(index, distance.shape)
-            x, y = float(self.x[i]), float(self.y[j])
-            if all(math.hypot(x - shot.x, y - shot.y) >= apart for shot in shots):
-                shots.append(Shot(kind, x, y, float(self.along[j, i]), float(self.across[j, i])))
-            if len(shots) == count:
-                break
-        return shots
 
 
 @dataclass(frozen=True)
@@ -166,7 +77,7 @@ def find_shots(
     slope_sigmas, count = positive("slope_sigmas", slope_sigmas), integer("count", count, 1, 100)
     loaded = open_scene(scene, params).scene
     sea = SeaMap.of_scene(loaded)
-    apart = 4 * _footprint(_transmitter(loaded))[1]
+    apart = 4 * footprint(transmitter_of(loaded))[1]
     return [shot for kind in KINDS for shot in sea.find(kind, slope_sigmas, count, apart)]
 
 
@@ -199,11 +110,11 @@ def render_found_shots(
     session = open_scene(scene, params)
     loaded = session.scene
     sea = SeaMap.of_scene(loaded)
-    results = [
-        render(scene, params={**(params or {}), "aim_x": shot.x, "aim_y": shot.y}, passes=_PASSES)
-        for shot in (shots if waveforms else ())
-    ]
-    azimuth, along, across = _footprint(_transmitter(loaded))
+    results: list[xr.Dataset] = []
+    if waveforms:
+        series = render_shots(scene, params, positions=[(shot.x, shot.y) for shot in shots], passes=_PASSES)
+        results = [series.isel(shot=number) for number in range(len(shots))]
+    azimuth, along, across = footprint(transmitter_of(loaded))
     lines, pixel_map = _pixel_map(loaded)
     count = loaded.sensors()[0].receiver.pixels.count
     return RenderedShots(session.name, tuple(shots), results, sea, azimuth, (along, across), lines, pixel_map, count)
@@ -226,19 +137,3 @@ def _pixel_map(scene: mi.Scene) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     angle_x, angle_y = ((points @ side / depth).astype(np.float32) for side in (pose.far, pose.left))
     index, held = receiver.pixels.pixel_at(mi.Float(angle_x), mi.Float(angle_y), mi.Float(0.5))
     return lines, np.where(np.array(held) > 0, np.array(index).astype(int), -1).reshape(x.shape)
-
-
-def _transmitter(scene: mi.Scene) -> mi.Emitter:
-    transmitter = next((emitter for emitter in scene.emitters() if hasattr(emitter, "pulse_energy")), None)
-    if transmitter is None or not scene.sensors():
-        raise UserError("the scene needs a lidar_transmitter and a multipixel_receiver to find shots for")
-    return transmitter
-
-
-def _footprint(transmitter: mi.Emitter) -> tuple[float, float, float]:
-    """Return the beam's azimuth [rad], and its spread on the mean sea level along and across it [m]."""
-    pose: Pose = transmitter.pose
-    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
-    cosine = max(-float(pose.axis[2]), 1e-3)
-    azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
-    return azimuth, across / cosine, across

@@ -24,7 +24,7 @@ from mitransient_lidar.loading.scenes import check_params
 from mitransient_lidar.rendering.interruption import DeferredInterrupt
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
-from mitransient_lidar.studies.find_shots import SeaMap
+from mitransient_lidar.studies.sea_map import SeaMap
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -1,0 +1,122 @@
+"""Elevation and slopes of a sea over the footprint of the beam, and places of given slopes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitransient_lidar.transport.pose import Pose
+
+#: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
+KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
+
+#: Longest side of the sea that is searched [m].
+_LARGEST_SEARCH = 512.0
+
+#: Largest difference of the nearest place from the slopes wanted, in standard deviations of the slopes.
+_NEAREST = 1.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Intersection of the beam's axis with the mean sea level.
+
+    `x` and `y` are the values of ``aim_x`` and ``aim_y`` [m], `along` and `across` the mean slopes over the beam's
+    footprint along the lidar's azimuth, positive for a face towards the lidar, and to its left [1].
+    """
+
+    kind: str
+    x: float
+    y: float
+    along: float
+    across: float
+
+
+@dataclass(frozen=True)
+class SeaMap:
+    """Elevation of a sea [m] on grid lines [m], shape (len(y), len(x)), and its slopes averaged over the footprint.
+
+    Slopes are along the lidar's azimuth and to its left [1], as in `Shot`.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    heights: FloatArray
+    along: FloatArray
+    across: FloatArray
+
+    @classmethod
+    def of_scene(cls, scene: mi.Scene) -> SeaMap:
+        """Return the map of a scene; reject one without waves."""
+        from scipy.ndimage import gaussian_filter
+
+        sea = next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
+        if sea is None or not math.isfinite(sea.cell_size):
+            raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
+        transmitter = transmitter_of(scene)
+        transmitter.pose.require_above_sea()
+        # Of a sea of several grids the coarsest.
+        cell = getattr(sea.waves, "cell_size", sea.cell_size)
+        count = min(getattr(sea.waves, "cells", int(sea.size / cell)), int(_LARGEST_SEARCH / cell)) // 2
+        lines = np.arange(-count, count) * cell
+        heights = sea.heights(lines, lines)
+        azimuth, spread_along, spread_across = footprint(transmitter)
+        # A circle of the same area replaces the elliptical footprint.
+        sigma = math.sqrt(spread_along * spread_across) / cell
+        # The sea of a spectrum is periodic; a height map ends at its edges.
+        smooth = gaussian_filter(heights, sigma, mode="wrap" if sea.spectrum != "height_map" else "nearest")
+        up, right = np.gradient(smooth, cell)
+        cos, sin = math.cos(azimuth), math.sin(azimuth)
+        return cls(lines, lines, heights, cos * right + sin * up, cos * up - sin * right)
+
+    def slope_at(self, x: float, y: float) -> tuple[float, float]:
+        """Return the mean slopes (along, across) [1] over a footprint at a place [m] of the periodic sea."""
+        spacing = self.x[1] - self.x[0]
+        i, j = (round((value - self.x[0]) / spacing) % len(self.x) for value in (x, y))
+        return float(self.along[j, i]), float(self.across[j, i])
+
+    def find(self, kind: str, slope_sigmas: float, count: int, apart: float) -> list[Shot]:
+        """Return the places with the slopes nearest to those of a kind, at least `apart` metres from each other."""
+        spread = np.sqrt([np.mean(self.along**2), np.mean(self.across**2)])
+        wanted = slope_sigmas * np.array(KINDS[kind]) * spread
+        distance = np.hypot((self.along - wanted[0]) / spread[0], (self.across - wanted[1]) / spread[1])
+        if not (nearest := float(np.min(distance, initial=np.inf))) <= _NEAREST:
+            raise UserError(
+                f"slope_sigmas = {slope_sigmas:g}: the sea has no place of the kind {kind} with such a slope; the "
+                f"nearest one differs by {nearest:.1f} standard deviations, and at most {_NEAREST:g} are allowed"
+            )
+        shots: list[Shot] = []
+        for index in np.argsort(distance, axis=None):
+            j, i = np.unravel_index(index, distance.shape)
+            x, y = float(self.x[i]), float(self.y[j])
+            if all(math.hypot(x - shot.x, y - shot.y) >= apart for shot in shots):
+                shots.append(Shot(kind, x, y, float(self.along[j, i]), float(self.across[j, i])))
+            if len(shots) == count:
+                break
+        return shots
+
+
+def transmitter_of(scene: mi.Scene) -> mi.Emitter:
+    """Return the transmitter of a scene; raise UserError without one, or without a receiver."""
+    transmitter = next((emitter for emitter in scene.emitters() if hasattr(emitter, "pulse_energy")), None)
+    if transmitter is None or not scene.sensors():
+        raise UserError("the scene needs a lidar_transmitter and a multipixel_receiver to find shots for")
+    return transmitter
+
+
+def footprint(transmitter: mi.Emitter) -> tuple[float, float, float]:
+    """Return the beam's azimuth [rad], and its spread on the mean sea level along and across it [m]."""
+    pose: Pose = transmitter.pose
+    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
+    cosine = max(-float(pose.axis[2]), 1e-3)
+    azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
+    return azimuth, across / cosine, across
