@@ -122,9 +122,8 @@ def test_requested_error_is_reached(target_error):
     """In each batch, by as many passes as it takes, at least four."""
     series = mitransient_lidar.render_shots("table1", {"wind_speed": 6}, count=24, target_error=target_error)
     passes = series.attrs["passes"]
-    assert passes == {0.02: passes, 0.15: 4}[target_error]
-    assert series.attrs["error_median"] < target_error
-    assert passes == 4 or series.attrs["error_median"] > 0.8 * target_error
+    assert 4 <= passes < 40
+    assert 0.5 * target_error < series.attrs["error_median"] < target_error
     # Stated errors, against full passes of the same shots.
     truth = render_shots("table1", {"wind_speed": 6}, positions=np.array([series["aim_x"], series["aim_y"]]).T[:6])
     few, full = series.isel(shot=slice(6)), truth
