@@ -99,9 +99,10 @@ def test_target_goes_with_the_shots():
     known = (series["impulse_response_stderr"] < 0.1 * series["impulse_response"]).values
     z = (difference / error).values[known & (difference.values > 0)]
     assert z.max() < largest_z(16, z.size)
-    np.testing.assert_allclose(energy, energy[0], rtol=0.02)
-    # At the other places the target has stayed behind.
-    assert abs(float(without["impulse_response"].isel(shot=1).sum()) / energy[0] - 1) > 0.005
+    # Totals of single shots are known to 0.6 %.
+    np.testing.assert_allclose(energy, energy[0], rtol=0.04)
+    # Left behind at the first place, the target is missing at the others: a sixth of the light.
+    assert float(without["impulse_response"].isel(shot=1).sum()) / energy[0] < 0.9
 
 
 @pytest.mark.slow
@@ -117,20 +118,25 @@ def test_shots_through_a_plume_are_those_of_the_scene_at_each_place():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target_error", [0.02, 0.15])
-def test_requested_error_is_reached(target_error):
-    """In each batch, by as many passes as it takes, at least four."""
-    series = mitransient_lidar.render_shots("table1", {"wind_speed": 6}, count=24, target_error=target_error)
-    passes = series.attrs["passes"]
-    assert 4 <= passes < 40
-    assert 0.5 * target_error < series.attrs["error_median"] < target_error
-    # Stated errors, against full passes of the same shots.
-    truth = render_shots("table1", {"wind_speed": 6}, positions=np.array([series["aim_x"], series["aim_y"]]).T[:6])
-    few, full = series.isel(shot=slice(6)), truth
-    z = (few["waveform"] - full["waveform"]) / np.hypot(few["waveform_stderr"], full["waveform_stderr"])
-    time = full["time"].values
-    inside = (time > full.attrs["window_start_ns"]) & (time < full.attrs["window_end_ns"])
-    found = z.values[..., inside].ravel()
-    # Bins of a shot are correlated.
-    share = np.mean(np.abs(found) < 1.44)
-    assert share == pytest.approx(2 * t.cdf(1.44, passes - 1) - 1, abs=0.08)
+def test_requested_errors_are_reached_and_hold():
+    """Each batch takes as many passes as it needs, at least four; coarse shots scatter about fine ones as stated."""
+    coarse = mitransient_lidar.render_shots("table1", {"wind_speed": 6}, count=24, target_error=0.1)
+    places = np.array([coarse["aim_x"], coarse["aim_y"]]).T
+    # In reverse, so that no shot has the same random numbers again.
+    fine = render_shots("table1", {"wind_speed": 6}, positions=places[::-1], target_error=0.02)
+    for series, target_error in ((coarse, 0.1), (fine, 0.02)):
+        assert 4 <= series.attrs["passes"] < 40
+        assert 0.4 * target_error < series.attrs["error_median"] < target_error
+    fine = fine.isel(shot=slice(None, None, -1))
+    time = fine["time"].values
+    inside = (time > fine.attrs["window_start_ns"]) & (time < fine.attrs["window_end_ns"])
+    assert np.array_equal(time, coarse["time"])
+    error = np.hypot(coarse["waveform_stderr"].values, fine["waveform_stderr"].values)
+    bright = inside & (fine["waveform"].values > 0.05 * fine["waveform"].values.max(axis=2, keepdims=True))
+    within = np.abs(coarse["waveform"].values - fine["waveform"].values) < 1.44 * error
+    # Bins of a shot are correlated: the shots tell how well their share is known.
+    shares = np.sum(within & bright, axis=(1, 2)) / np.sum(bright, axis=(1, 2))
+    expected = 2 * t.cdf(1.44, coarse.attrs["passes"] - 1) - 1
+    known = shares.std(ddof=1) / np.sqrt(len(shares))
+    assert known < 0.03
+    assert abs(shares.mean() - expected) < largest_z(len(shares)) * known
