@@ -13,6 +13,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.results.geometry import LinesOfSight
+from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
@@ -225,7 +226,7 @@ def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
     # Points of the beam, of equal energy. One of several pixels at a point stands for all of them.
     angle_x, angle_y = transmitter.sample_tangent(_lattice(_POINTS))
     time, angles = _by_transmitter(scene, np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
-    pixel, inside = pixels.pixel_at(mi.Float(angles[:, 0]), mi.Float(angles[:, 1]), _choices(_POINTS))
+    pixel, inside = pixels.pixel_at(*(aligned(mi.Float, axis) for axis in angles.T), _choices(_POINTS))
     share = np.where(np.isfinite(time), np.array(inside, dtype=np.float64) / _POINTS, 0.0)
     by_beam = _means(time, angles, np.array(pixel), share, pixels.count)
 
@@ -235,7 +236,7 @@ def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
     pixel, inside = pixels.pixel_at(angle_x, angle_y, _choices(count))
     angles = np.stack([np.array(angle_x), np.array(angle_y)], axis=1).astype(np.float64)
     time, at_laser = _by_receiver(scene, angles, depth)
-    density = np.array(transmitter.tangent_density(*(mi.Float(axis) for axis in at_laser.T)), dtype=np.float64)
+    density = np.array(transmitter.tangent_density(*(aligned(mi.Float, axis) for axis in at_laser.T)), dtype=np.float64)
     weight = np.where((np.array(inside) > 0) & np.isfinite(time), density, 0) * (pixels.area / count)
     by_pixel = _means(time, angles, np.array(pixel), weight, pixels.count)
 
@@ -266,12 +267,12 @@ def _means(time: FloatArray, angles: FloatArray, pixel: NDArray[np.integer], wei
 def _lattice(count: int) -> mi.Point2f:
     """Return the points of a rank-1 lattice in the unit square, computed in 64 bits."""
     index = np.arange(count)
-    return mi.Point2f(mi.Float((index + 0.5) / count), mi.Float((index * 0.6180339887498949) % 1))
+    return mi.Point2f(*(aligned(mi.Float, u) for u in ((index + 0.5) / count, (index * 0.6180339887498949) % 1)))
 
 
 def _choices(count: int) -> mi.Float:
     """Return evenly distributed numbers from 0 to 1, independent of the points of `_lattice`."""
-    return mi.Float((np.arange(count) * 0.4142135623730951) % 1)
+    return aligned(mi.Float, (np.arange(count) * 0.4142135623730951) % 1)
 
 
 def _at_one_place(scene: LidarScene) -> bool:

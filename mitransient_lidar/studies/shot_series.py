@@ -440,6 +440,8 @@ def _bottom_depth(lidar: LidarScene, places: FloatArray) -> FloatArray:
     """Return the depth [m] of the largest solid where the axis of a shot at each place, refracted, meets it."""
     import mitsuba as mi
 
+    from mitransient_lidar.transport.opaque import aligned
+
     solids: list[Any] = lidar.solids
     if not solids:
         return np.full(len(places), np.nan)
@@ -448,7 +450,7 @@ def _bottom_depth(lidar: LidarScene, places: FloatArray) -> FloatArray:
     x, y = (float(part) / lidar.refractive_index for part in axis[:2])
     down = mi.Vector3f(x, y, -math.sqrt(1 - x * x - y * y))
     count = len(places)
-    origin = mi.Point3f(*(mi.Float(column.astype(np.float32)) for column in places.T), mi.Float(np.zeros(count)))
+    origin = mi.Point3f(*(aligned(mi.Float, column) for column in (*places.T, np.zeros(count))))
     met = mi.load_dict({"type": "scene", "bottom": bottom}).ray_intersect(mi.Ray3f(origin, down))
     depth = -np.array(met.p.z, dtype=np.float64)
     # Rays in single precision are known to a tenth of a millimetre.

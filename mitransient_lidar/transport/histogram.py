@@ -12,7 +12,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain, ResponseTable
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import opaque, opaque_index
 
 #: Largest number of sums: more do not fit the memory of a laptop.
 _LARGEST = 2**28
@@ -117,14 +117,20 @@ class TransientHistogram:
         #: Shape of `energy`: pixels, then time bins or gates.
         self.shape = (*shape, self.record_length)
         self._count = pixels * self.record_length
+        sizes = self.record_length, self.record_length - 1, self._count
+        self._length, self._last, self._fine_sums = map(opaque_index, sizes)
         self._start = opaque(axis.start_ns * 1e-9 * C0 - reference_length)
         self._per_metre = opaque(1 / (axis.bin_width_ns * 1e-9 * C0))
         self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
+        self._per_unit = [opaque(1 / unit) for unit in self._units]
+        self._largest_fine = opaque(_COARSEST_FINE * self._units[0])
         self.clear()
 
     def clear(self) -> None:
         """Set all sums to zero."""
-        self._sums = dr.zeros(mi.Int64, 2 * self._count)
+        # Kernels are compiled for the sizes of small arrays to which they add: records of similar length share them.
+        size = 2 * self._count
+        self._sums = dr.zeros(mi.Int64, 1 << (size - 1).bit_length() if size < dr.expand_threshold() else size)
         self._invalid = dr.zeros(mi.UInt32, self._count)
 
     def evaluate(self) -> None:
@@ -137,22 +143,22 @@ class TransientHistogram:
             self.gates.add(path_length, energy, active, lambda k, e, on: self._add(pixel, k, e, on))
             return
         position = (path_length - self._start) * self._per_metre
-        active = active & (position >= 0) & (position < self.axis.bin_count)
-        self._add(pixel, dr.minimum(mi.UInt32(position), self.axis.bin_count - 1), energy, active)
+        active = active & (position >= 0) & (position < mi.Float(self._length))
+        self._add(pixel, dr.minimum(mi.UInt32(position), self._last), energy, active)
 
     def _add(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy to time bin or gate `number` of a pixel."""
-        index = pixel * self.record_length + number
+        index = pixel * self._length + number
         valid = dr.isfinite(energy)
         dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
-        coarse, fine = self._units
-        small = energy < _COARSEST_FINE * coarse
-        units = mi.Int64(dr.round(energy * dr.select(small, mi.Float(1 / fine), mi.Float(1 / coarse))))
-        dr.scatter_add(self._sums, units, index + dr.select(small, mi.UInt32(self._count), 0), active & valid)
+        coarse, fine = self._per_unit
+        small = energy < self._largest_fine
+        units = mi.Int64(dr.round(energy * dr.select(small, fine, coarse)))
+        dr.scatter_add(self._sums, units, index + dr.select(small, self._fine_sums, 0), active & valid)
 
     def energy(self) -> np.ndarray:
         """Return the energy [J] as float64, shape `shape`; NaN where a value was added that is not finite."""
-        coarse, fine = np.array(self._sums).reshape(2, self._count)
+        coarse, fine = np.array(self._sums)[: 2 * self._count].reshape(2, self._count)
         energy = coarse * self._units[0] + fine * self._units[1]
         energy[np.array(self._invalid) > 0] = np.nan
         return np.asarray(energy.reshape(self.shape))

@@ -1,4 +1,4 @@
-"""Scene constants kept opaque, so that kernels need not be recompiled for another shot or sea."""
+"""Scene constants kept opaque, so that kernels need not be recompiled for another shot, sea or water."""
 
 from __future__ import annotations
 
@@ -16,6 +16,11 @@ def opaque(value: float) -> mi.Float:
     return dr.opaque(mi.Float, float(value))
 
 
+def opaque_index(value: int) -> mi.UInt32:
+    """Return a number at least 0 that kernels read from memory."""
+    return dr.opaque(mi.UInt32, value)
+
+
 def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
     """Return a point, of values of shape (3,), that kernels read from memory."""
     return mi.Point3f(*(opaque(value) for value in values))
@@ -27,7 +32,7 @@ def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
     found = mi.Bool(False)
     for shape in shapes:
         wanted = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-        found |= number == dr.opaque(mi.UInt32, int(wanted[0]))
+        found |= number == opaque_index(int(wanted[0]))
     return found
 
 

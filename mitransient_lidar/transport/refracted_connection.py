@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
-from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.opaque import opaque, opaque_point
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.snell import refract
@@ -48,7 +48,7 @@ class RefractedEmitterSampler(ABC):
 
     def __init__(self, scene: WaterScene) -> None:
         self.index = scene.refractive_index
-        self.slope_variance = scene.slope_variance
+        self.slope_variance = opaque(scene.slope_variance)
         self._layers = scene.index_layers
 
     @abstractmethod

@@ -136,7 +136,7 @@ class LaserLight(PathLight):
         self.submerged = scene.submerged
         self.sampler = SubmergedLaserSampler(scene) if scene.submerged else RefractedLaserSampler(scene)
         self._to_laser = scene.relative(scene.transmitter.pose)
-        self._path_end = scene.axis.path_end - scene.reference_length
+        self._path_end = opaque(scene.axis.path_end - scene.reference_length)
 
     def connect(
         self, si: mi.SurfaceInteraction3f, emitter: EmitterDirection, active: mi.Bool

@@ -5,7 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.transport.opaque import opaque
 
 #: Least optical depth left in the last layer of a flight: in clear water even this is never crossed.
 _SMALLEST_OPTICAL_DEPTH = 1e-30
@@ -22,8 +24,8 @@ class LayeredFlight:
     def __init__(self, column: WaterColumn) -> None:
         self.column = column
         self.count = column.count
-        self._attenuation = mi.Float(column.attenuation)
-        self._albedo = mi.Float(column.albedo)
+        self._attenuation = self._table(column.attenuation)
+        self._albedo = self._table(column.albedo)
         self._top = mi.Float(column.layer_tops)
         self._edge = mi.Float(column.edge_optical_depth)
 
@@ -36,16 +38,17 @@ class LayeredFlight:
 
     def attenuation(self, layer: mi.UInt32) -> mi.Float:
         """Return the beam attenuation c [1/m] of a layer."""
-        return self._look_up(self._attenuation, self.column.attenuation, layer)
+        return self._look_up(self._attenuation, layer)
 
     def albedo(self, layer: mi.UInt32) -> mi.Float:
         """Return the single-scattering albedo b/c of a layer."""
-        return self._look_up(self._albedo, self.column.albedo, layer)
+        return self._look_up(self._albedo, layer)
 
-    def _look_up(self, table: mi.Float, values: object, layer: mi.UInt32) -> mi.Float:
-        if self.count == 1:
-            return mi.Float(float(values[0]))  # type: ignore[index]
-        return dr.gather(mi.Float, table, layer)
+    def _table(self, values: FloatArray) -> mi.Float:
+        return opaque(values[0]) if self.count == 1 else mi.Float(values)
+
+    def _look_up(self, table: mi.Float, layer: mi.UInt32) -> mi.Float:
+        return table if self.count == 1 else dr.gather(mi.Float, table, layer)
 
     def distance(self, depth: mi.Float, downward: mi.Float, optical_depth: mi.Float) -> mi.Float:
         """Return the distance at which light has crossed an optical depth [m], infinite if it never does.

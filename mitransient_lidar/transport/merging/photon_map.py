@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.merging.patches import Patch
+from mitransient_lidar.transport.opaque import opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes
@@ -136,6 +137,7 @@ class PhotonBuffer:
 
     def __init__(self, capacity: int, photons: int, classes: PathClasses, shots: int) -> None:
         self.capacity, self.photons, self._shots = capacity, photons, shots
+        self._capacity = opaque_index(capacity)
         photons *= shots
         self._classes = classes
         self._stored = dr.zeros(mi.UInt32, 1)
@@ -151,7 +153,7 @@ class PhotonBuffer:
     def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool, connectable: mi.Bool) -> None:
         """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
-        keep = active & (slot < self.capacity)
+        keep = active & (slot < self._capacity)
         where = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
         dr.scatter(self._lane, path.lane, slot, keep)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
@@ -65,7 +65,7 @@ class SegmentBuffer:
         #: Number of points before those of each shot, and of all.
         self.first_points = np.zeros(shots + 1, np.uint32)
         self.spacing = opaque(spacing)
-        self.capacity = capacity
+        self.capacity, self._capacity = capacity, opaque_index(capacity)
         self._stored = dr.zeros(mi.UInt32, 1)
         self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)
@@ -81,7 +81,7 @@ class SegmentBuffer:
         number = mi.UInt32(dr.maximum(dr.ceil((length - path.offset) * (1 / self.spacing)), 0))
         number = dr.select(active, number, 0)
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
-        keep = (number > 0) & (slot < self.capacity)
+        keep = (number > 0) & (slot < self._capacity)
         dr.scatter(self._place, mi.Point2u(path.lane, path.points), slot, keep)
         dr.scatter(self._label, self._classes.pack(label, path.scatterings, path.reversals), slot, keep)
         dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.offset), slot, keep)
