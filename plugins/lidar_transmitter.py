@@ -13,6 +13,7 @@ from mitransient_lidar.physics.lidar.divergence import WIDTHS, given_divergences
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, recorded
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
@@ -119,7 +120,7 @@ class LidarTransmitter(EmitterWithoutExtent):
         """Return the radiant intensity [J/sr] at a tangent-plane point whose direction has a cosine with the axis."""
         # d(omega) = cos^3 d(angle_x) d(angle_y).
         density = self.tangent_density(angle_x, angle_y) / (cos_axis * cos_axis * cos_axis)
-        return dr.select(cos_axis > 0, self.energy * density, 0)
+        return dr.select(cos_axis > 0, opaque(self.energy) * density, 0)
 
     def tangent_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""

@@ -21,6 +21,11 @@ def opaque_index(value: int) -> mi.UInt32:
     return dr.opaque(mi.UInt32, value)
 
 
+def opaque_vector(values: Sequence[float] | NDArray[np.float64]) -> mi.Vector3f:
+    """Return a vector, of values of shape (3,), that kernels read from memory."""
+    return mi.Vector3f(*(opaque(value) for value in values))
+
+
 def opaque_point(values: Sequence[float] | NDArray[np.float64]) -> mi.Point3f:
     """Return a point, of values of shape (3,), that kernels read from memory."""
     return mi.Point3f(*(opaque(value) for value in values))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.transport.opaque import opaque, opaque_point
+from mitransient_lidar.transport.opaque import opaque, opaque_point, opaque_vector
 
 #: Smallest distance of a pose from the mean sea level [m].
 _NEAREST = 0.1
@@ -102,18 +102,14 @@ class Pose:
 
     def direction(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Vector3f:
         """Return the unit direction of the tangent-plane point (angle_x, angle_y)."""
-        far, left, axis = (mi.Vector3f(v.tolist()) for v in (self.far, self.left, self.axis))
+        far, left, axis = (opaque_vector(v) for v in (self.far, self.left, self.axis))
         return dr.normalize(dr.fma(far, angle_x, dr.fma(left, angle_y, axis)))
 
     def tangent(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return (angle_x, angle_y) of a direction and its cosine with the axis, negative behind the tangent plane."""
-        cos_axis = dr.dot(direction, mi.Vector3f(self.axis.tolist()))
+        x, y, cos_axis = (dr.dot(direction, opaque_vector(v)) for v in (self.far, self.left, self.axis))
         scale = dr.rcp(cos_axis)
-        return (
-            dr.dot(direction, mi.Vector3f(self.far.tolist())) * scale,
-            dr.dot(direction, mi.Vector3f(self.left.tolist())) * scale,
-            cos_axis,
-        )
+        return x * scale, y * scale, cos_axis
 
     @property
     def off_nadir_deg(self) -> float:
@@ -171,10 +167,10 @@ class RelativePose:
         away = reference - pose.origin
         #: Distance to the reference point [m], in double precision.
         self.range = float(np.linalg.norm(away))
-        self._reference, self._away = opaque_point(reference), mi.Vector3f(opaque_point(away))
+        self._reference, self._away = opaque_point(reference), opaque_vector(away)
         self._range = opaque(self.range)
         sides = (pose.far, pose.left, pose.axis)
-        self._sides = [(mi.Vector3f(side.tolist()), opaque(float(side @ away))) for side in sides]
+        self._sides = [(opaque_vector(side), opaque(side @ away)) for side in sides]
 
     def distance(self, point: mi.Point3f) -> mi.Float:
         """Return the relative distances to points [m], negative for those nearer than the reference point."""

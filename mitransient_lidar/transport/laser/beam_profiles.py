@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import positive
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
 from mitransient_lidar.transport.sensor.outlines import Outline, enclosed_area
 
@@ -101,12 +102,13 @@ class GaussianBeam(_Ellipse):
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
         x, y = self._to_circle(angle_x, angle_y)
-        return dr.exp(-(x * x + y * y) / (2 * self.along**2)) / (2 * np.pi * self.along**2 * self._ratio)
+        steepness, peak = 0.5 / self.along**2, 0.5 / (np.pi * self.along**2 * self._ratio)
+        return opaque(peak) * dr.exp(-opaque(steepness) * (x * x + y * y))
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to points by Box and Muller's transform."""
         # 1 - u lies in (0, 1], so that the logarithm is finite.
-        radius = self.along * dr.sqrt(-2 * dr.log(1 - u.x))
+        radius = opaque(self.along) * dr.sqrt(-2 * dr.log(1 - u.x))
         sin, cos = dr.sincos(dr.two_pi * u.y)
         return self._from_circle(radius * cos, radius * sin)
 
@@ -123,12 +125,12 @@ class TopHatBeam(_Ellipse):
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
         x, y = self._to_circle(angle_x, angle_y)
-        inside = x * x + y * y <= self.along**2
-        return dr.select(inside, mi.Float(1 / (np.pi * self.along**2 * self._ratio)), 0)
+        inside = x * x + y * y <= opaque(self.along**2)
+        return dr.select(inside, opaque(1 / (np.pi * self.along**2 * self._ratio)), 0)
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to uniform points of the ellipse."""
-        radius = dr.sqrt(self.along**2 * u.x)
+        radius = opaque(self.along) * dr.sqrt(u.x)
         sin, cos = dr.sincos(dr.two_pi * u.y)
         return self._from_circle(radius * cos, radius * sin)
 

@@ -42,7 +42,7 @@ class BeamSampler:
         transmitter = self.transmitter
         if not self.use_view:
             angle_x, angle_y = transmitter.sample_tangent(stratified_point(index, count, rng))
-            return mi.Point2f(angle_x, angle_y), mi.Float(transmitter.energy / count)
+            return mi.Point2f(angle_x, angle_y), opaque(transmitter.energy / count)
         point = stratified_point(index >> 1, (count + 1) // 2, rng)
         angle_x, angle_y = transmitter.sample_tangent(point)
         vx, vy = self.view.sample(point)
@@ -50,7 +50,7 @@ class BeamSampler:
         angle_x = dr.select(of_view, vx + self.centre[0], angle_x)
         angle_y = dr.select(of_view, vy + self.centre[1], angle_y)
         density = transmitter.tangent_density(angle_x, angle_y)
-        mixture = 0.5 * (density + dr.select(self._inside(angle_x, angle_y), mi.Float(1 / self.view.area), 0))
+        mixture = 0.5 * (density + dr.select(self._inside(angle_x, angle_y), opaque(1 / self.view.area), 0))
         # A sample of the beam's rim may lie outside both by rounding.
         share = dr.select(density > 0, density / mixture, 0)
-        return mi.Point2f(angle_x, angle_y), transmitter.energy / count * share
+        return mi.Point2f(angle_x, angle_y), opaque(transmitter.energy / count) * share

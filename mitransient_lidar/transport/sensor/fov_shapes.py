@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, in_range, positive
+from mitransient_lidar.transport.opaque import opaque
 
 #: Bisection steps that invert a distribution function to float32 accuracy.
 _BISECTION_STEPS = 25
@@ -94,7 +95,7 @@ class Sector(FovShape):
         """Return whether points lie inside."""
         x, y = angle_x - self.centre[0], angle_y - self.centre[1]
         r2 = x * x + y * y
-        inside = (r2 <= self.outer**2) & (r2 >= self.inner**2)
+        inside = (r2 <= opaque(self.outer**2)) & (r2 >= opaque(self.inner**2))
         if self.extent < 2 * np.pi:
             azimuth = dr.atan2(y, x) - self.start
             azimuth -= 2 * np.pi * dr.floor(azimuth * dr.inv_two_pi)
@@ -103,7 +104,7 @@ class Sector(FovShape):
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to uniform points."""
-        r = dr.sqrt(dr.lerp(self.inner**2, self.outer**2, u.x))
+        r = dr.sqrt(dr.lerp(opaque(self.inner**2), opaque(self.outer**2), u.x))
         sin, cos = dr.sincos(self.start + self.extent * u.y)
         return dr.fma(r, cos, self.centre[0]), dr.fma(r, sin, self.centre[1])
 
@@ -145,16 +146,13 @@ class Rectangle(FovShape):
 
     def contains(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Bool:
         """Return whether points lie inside; the lower edges belong to the rectangle, the upper ones do not."""
-        return (
-            (angle_x >= self.angle_x_min)
-            & (angle_x < self.angle_x_max)
-            & (angle_y >= self.angle_y_min)
-            & (angle_y < self.angle_y_max)
-        )
+        x_min, x_max, y_min, y_max = map(opaque, self.bounds())
+        return (angle_x >= x_min) & (angle_x < x_max) & (angle_y >= y_min) & (angle_y < y_max)
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to uniform points."""
-        return dr.lerp(self.angle_x_min, self.angle_x_max, u.x), dr.lerp(self.angle_y_min, self.angle_y_max, u.y)
+        x_min, x_max, y_min, y_max = map(opaque, self.bounds())
+        return dr.lerp(x_min, x_max, u.x), dr.lerp(y_min, y_max, u.y)
 
     def bounds(self) -> tuple[float, float, float, float]:
         """Return (angle_x_min, angle_x_max, angle_y_min, angle_y_max)."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Rectangle, Sector
 from mitransient_lidar.transport.sensor.pixel_lookup import FovLookup
@@ -144,8 +145,8 @@ class LayoutPixels(PixelArray):
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether the field of view contains it (1 or 0)."""
         height, width = self.sides
-        down = (0.5 * height - angle_x) * (self._rows / height)
-        across = (angle_y + 0.5 * width) * (self._columns / width)
+        down = (opaque(0.5 * height) - angle_x) * opaque(self._rows / height)
+        across = (angle_y + opaque(0.5 * width)) * opaque(self._columns / width)
         row = dr.clip(mi.Int32(dr.floor(down)), 0, self._rows - 1)
         column = dr.clip(mi.Int32(dr.floor(across)), 0, self._columns - 1)
         inside = self.field.contains(angle_x, angle_y)

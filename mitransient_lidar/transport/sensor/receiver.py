@@ -208,11 +208,11 @@ class SensorSampler:
             angle_x, angle_y = dr.select(of_footprint, fx, angle_x), dr.select(of_footprint, fy, angle_y)
             px, py = dr.select(of_footprint, fx + dx, px), dr.select(of_footprint, fy + dy, py)
         pixel, pixels_here = self.receiver.pixels.pixel_at(px, py, rng.next_float32())
-        density = pixels_here / self.receiver.pixels.area
+        density = pixels_here * opaque(1 / self.receiver.pixels.area)
         if self.use_footprint:
             density = dr.lerp(self._footprint_density(angle_x, angle_y), density, 0.25 * self._of_view)
         # A point in several pixels is assigned to one of them at random: weight by their number.
-        collection = pixels_here * (self.receiver.optics.collection / count)
+        collection = pixels_here * opaque(self.receiver.optics.collection / count)
         weight = collection * solid_angle_factor(angle_x, angle_y) / density
         weight = dr.select(pixels_here > 0, weight, 0)
         return SensorSample.at(self.receiver.pose, angle_x, angle_y, pixel, weight)
