@@ -12,6 +12,7 @@ from mitransient_lidar.analysis.comparison import pooled_relative_variance
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters, henyey_greenstein
+from mitransient_lidar.rendering.session import choose_integrator, open_scene
 from mitransient_lidar.transport.merging.cells import Region, SurfaceHeights, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.rings import BeamRings
@@ -435,6 +436,32 @@ def test_passes_share_their_kernels(lidar_scene, integrator):
             found.append([kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT])
     assert found[0] == found[1]
     assert len(found[0]) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"attenuation": 0.3, "scattering": 0.21, "bottom_depth": 7.5, "bottom_reflectance": 0.2},
+        {"wind_speed": 4, "surface_seed": 3},
+        {"altitude": 230, "off_nadir_deg": 17, "pulse_energy_mj": 3, "pulse_fwhm_ns": 4},
+        {"divergence_mrad": 8, "field_of_view_mrad": 28, "aperture_area": 0.02},
+    ],
+    ids=lambda parameters: next(iter(parameters)),
+)
+def test_scenes_share_their_kernels(parameters, integrator):
+    """Parameters that are numbers of a kernel would compile it again in every run of a campaign."""
+    found = []
+    for params in ({}, {}, parameters):
+        session = open_scene("table1", {"time_start_ns": 1300, "bin_count": 300, **params})
+        renderer = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            renderer.render_pass(1, paths=2**12)
+            found.append({kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT})
+    assert found[2] <= found[0] | found[1]
+    assert len(found[2]) > 0
 
 
 @pytest.fixture
