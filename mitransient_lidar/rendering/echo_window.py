@@ -226,7 +226,8 @@ def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
     # Points of the beam, of equal energy. One of several pixels at a point stands for all of them.
     angle_x, angle_y = transmitter.sample_tangent(_lattice(_POINTS))
     time, angles = _by_transmitter(scene, np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
-    pixel, inside = pixels.pixel_at(*(aligned(mi.Float, axis) for axis in angles.T), _choices(_POINTS))
+    seen_x, seen_y = (aligned(mi.Float, axis) for axis in angles.T)
+    pixel, inside = pixels.pixel_at(seen_x, seen_y, _choices(_POINTS))
     share = np.where(np.isfinite(time), np.array(inside, dtype=np.float64) / _POINTS, 0.0)
     by_beam = _means(time, angles, np.array(pixel), share, pixels.count)
 

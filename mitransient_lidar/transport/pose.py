@@ -170,7 +170,7 @@ class RelativePose:
         self._reference, self._away = opaque_point(reference), opaque_vector(away)
         self._range = opaque(self.range)
         sides = (pose.far, pose.left, pose.axis)
-        self._sides = [(opaque_vector(side), opaque(side @ away)) for side in sides]
+        self._sides = [(opaque_vector(side), opaque(float(side @ away))) for side in sides]
 
     def distance(self, point: mi.Point3f) -> mi.Float:
         """Return the relative distances to points [m], negative for those nearer than the reference point."""
