@@ -84,6 +84,9 @@ def shots(
         float | None, typer.Option(help="Relative standard error of the median bin, instead of full passes.")
     ] = None,
     passes: Annotated[int | None, typer.Option(help="Passes of each shot, 8 by default, 4 for a target error.")] = None,
+    components: Annotated[
+        bool, typer.Option("--components", help="Also separate the light of surface, water, bottom and targets.")
+    ] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of random places, 1 by default.")] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = Path("shots.nc"),
     quiet: Quiet = False,
@@ -111,6 +114,7 @@ def shots(
         raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(options)}.")
     options |= {} if passes is None else {"passes": passes}
     options |= {} if target_error is None else {"target_error": target_error}
+    options |= {"components": True} if components else {}
     default = {} if is_result(scene) else {"count": 20}
     render = study.render_shots_again if is_result(scene) else study.render_shots
     with reporting(quiet) as progress:

@@ -44,12 +44,16 @@ _SHARE, _ERROR, _EXPONENT = 0.05, 0.05, 0.65
 class ShotRecord:
     """Means over the passes of shots, and their standard errors, shape (shots, pixels, bins).
 
+    Light that is separated by its origin has the shape (shots, pixels, origins, bins) in `parts`.
+
     Attributes
     ----------
     energy, energy_stderr
         Received energy [J per bin].
     power, power_stderr
         Received power after the pulse and the receiver's response [W].
+    parts
+        The same four arrays of light by origin; none unless the renderer separates it.
     lost
         Energy lost at the edges of the surface mesh [J], mean over the passes of all shots.
     passes
@@ -60,6 +64,7 @@ class ShotRecord:
     energy_stderr: FloatArray
     power: FloatArray
     power_stderr: FloatArray
+    parts: tuple[FloatArray, ...]
     lost: float
     passes: int
 
@@ -113,7 +118,8 @@ class ShotBatches:
         self._seas = [SeaPatches(shape) for shape in waves]
         self._going, self._fixed = _scene_of(going), _scene_of(fixed)
         paths = max(self._renderer.path_count // 2, 1)
-        bins = lidar.receiver.pixels.count * lidar.axis.bin_count
+        self._origins = renderer.classes.count
+        bins = lidar.receiver.pixels.count * lidar.axis.bin_count * self._origins
         #: Shots in a batch.
         self.size = 1 if has_plume else int(np.clip(_PATHS // (paths * in_turn), 1, _MOST_SHOTS))
         #: Passes of a batch in one launch.
@@ -142,7 +148,7 @@ class ShotBatches:
     def render(self, places: FloatArray, seeds: Sequence[int]) -> ShotRecord:
         """Render the shots of a batch, each with its own seed."""
         shots, done, copies, lost, needed = len(places), 0, 0, 0.0, self._together
-        energy, power = PassStatistics(), PassStatistics()
+        energy, power, parts = PassStatistics(), PassStatistics(), (PassStatistics(), PassStatistics())
         try:
             several = self.at(places)
             while done < self.passes and needed > 0:
@@ -152,10 +158,13 @@ class ShotBatches:
                 record = renderer.render_pass(numbers)
                 lost += float(record.edge_loss[0])
                 axis = renderer.scene.axis
-                found = record.histogram.energy().reshape(shots, here, -1, axis.bin_count)
+                found = record.histogram.energy().reshape(shots, here, -1, self._origins, axis.bin_count)
                 for number in range(here):
-                    energy.add(found[:, number])
-                    power.add(waveform(found[:, number], axis.bin_width_ns, self._kernel))
+                    by_origin = found[:, number], waveform(found[:, number], axis.bin_width_ns, self._kernel)
+                    for whole, part, values in zip((energy, power), parts, by_origin, strict=True):
+                        whole.add(values.sum(axis=2))
+                        if self._origins > 1:
+                            part.add(values)
                 done += here
                 if self._goal is not None and done >= _PASSES_FOR_ERROR:
                     target, window = self._goal
@@ -164,7 +173,12 @@ class ShotBatches:
         except (RuntimeError, MemoryError) as error:
             raise_if_out_of_memory(error)
             raise
-        return ShotRecord(energy.mean, energy.stderr, power.mean, power.stderr, lost / done, done)
+        means, by_origin = [energy.mean, power.mean], ()
+        if self._origins > 1:
+            # The whole is the sum of its parts to the bit.
+            means = [part.mean.sum(axis=2) for part in parts]
+            by_origin = tuple(values for part in parts for values in (part.mean, part.stderr))
+        return ShotRecord(means[0], energy.stderr, means[1], power.stderr, by_origin, lost / done, done)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""
@@ -203,8 +217,14 @@ def check_size(shots: int, pixels: int, bins: int) -> None:
 
 def _scene_of(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
     """Return a scene of shapes, None without any."""
-    named = {f"shape{number}": shape for number, shape in enumerate(shapes)}
-    return mi.load_dict({"type": "scene", **named}) if named else None
+    if not shapes:
+        return None
+    ids = [shape.id() for shape in shapes]
+    scene = mi.load_dict({"type": "scene", **{f"shape{number}": shape for number, shape in enumerate(shapes)}})
+    # A scene renames its shapes.
+    for shape, own in zip(shapes, ids, strict=True):
+        shape.set_id(own)
+    return scene
 
 
 def _vectors(horizontal: FloatArray) -> mi.Vector3f:

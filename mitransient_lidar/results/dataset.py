@@ -146,7 +146,7 @@ def add_components(
     waveform: npt.ArrayLike,
     waveform_stderr: npt.ArrayLike,
 ) -> xr.Dataset:
-    """Return a result of `build` with its light by origin.
+    """Return a result of `build` or `build_series` with its light by origin.
 
     Parameters
     ----------
@@ -155,13 +155,13 @@ def add_components(
     origins : sequence of str
         Unique names of the origins.
     impulse_response, impulse_response_stderr, waveform, waveform_stderr : array-like of shape (pixel, origin, time)
-        As for `build`, of each origin.
+        As for `build`, of each origin; of a series with the shots first.
     """
     arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
     dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
     data = {}
     for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
-        values = np.moveaxis(np.asarray(array, dtype=np.float64), 1, 0).reshape(len(origins), *shape)
+        values = np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0).reshape(len(origins), *shape)
         described = {**about, "long_name": f"{about['long_name']}, by origin"}
         if "ancillary_variables" in described:
             described["ancillary_variables"] = by_origin(described["ancillary_variables"])

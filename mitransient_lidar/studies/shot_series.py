@@ -84,6 +84,7 @@ def render_shots(
     pass_share: float | None = None,
     seed: int = 1,
     axis: TimeAxis | None = None,
+    components: bool = False,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at given or random places of one sea, many at a time.
@@ -113,6 +114,8 @@ def render_shots(
         Seed of random places, at least 0. Shot n is rendered with the seed n.
     axis
         Time bins instead of automatic ones, which by default hold the light of all shots.
+    components
+        Whether to separate the light by its origin, as for `rendering.render.render`.
     progress
         Called with a `passes.Progress` after every batch of shots.
 
@@ -147,7 +150,7 @@ def render_shots(
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = _Series(scene, params, target, places, axis)
+    series = _Series(scene, params, target, places, axis, components)
     sea = SeaMap.of_scene(series.session.scene) if _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
@@ -174,6 +177,7 @@ def render_shots(
             raise KeyboardInterrupt from error
         interrupted = True
     joined = [np.concatenate([getattr(record, name) for record in records]) for name in _ARRAYS]
+    parts = [np.concatenate(arrays) for arrays in zip(*(record.parts for record in records), strict=True)]
     found = np.concatenate(errors)
     median, p95 = np.quantile(found, [0.5, 0.95], method="higher")
     lost, received = (sum(values) for values in zip(*((one.lost, one.energy.sum()) for one in records), strict=True))
@@ -190,13 +194,14 @@ def render_shots(
         shots=done,
         interrupted=int(interrupted),
         moved_target=int(move_target),
+        components=int(components),
         series_parameters=json.dumps(own),
         **({} if wanted is None else {"target_error": wanted}),
         **({"places_seed": seed} if given is None else {}),
     )
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
-    dataset = series.dataset(joined, attributes)
+    dataset = series.dataset(joined, parts, attributes)
     coordinates = {
         name: ("shot", values[:done], {"units": unit, "long_name": text})
         for (name, (unit, text)), values in zip(_TRUTH.items(), truth, strict=True)
@@ -224,6 +229,7 @@ class _Series:
         target: tuple[float, float] | None,
         places: FloatArray,
         axis: TimeAxis | None,
+        components: bool,
     ) -> None:
         from mitransient_lidar.rendering.echo_window import probe_echoes
         from mitransient_lidar.rendering.render import describe_scene, error_window
@@ -231,7 +237,7 @@ class _Series:
         from mitransient_lidar.rendering.shot_batches import check_size
         from mitransient_lidar.transport.scene import LidarScene
 
-        self._scene, self._params, self._target = scene, params, target
+        self._scene, self._params, self._target, self._components = scene, params, target, components
         self._place = float(places[0, 0]), float(places[0, 1])
         self.session = open_scene(scene, self._at(*self._place))
         self._integrator = choose_integrator(self.session.scene, None)
@@ -243,7 +249,8 @@ class _Series:
         self._renderer = self._prepare(self.session)
         self.lidar: LidarScene = self._renderer.scene
         self._companions = self._find_companions()
-        check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count)
+        parts = 1 + self._renderer.classes.count if components else 1
+        check_size(len(places), parts * self.lidar.receiver.pixels.count, self.lidar.axis.bin_count)
         probe = probe_echoes(self.lidar, self._renderer.sampler)
         self.window = error_window(self.lidar, probe)
         check_scene(self.lidar, self._renderer.sampler, probe)
@@ -253,7 +260,7 @@ class _Series:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
         session.share_record(self._axis)
         renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
-        return renderer
+        return renderer.by_origin() if self._components else renderer
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
         """Return the parameters of a shot at a place [m]."""
@@ -291,8 +298,10 @@ class _Series:
             if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
         }
 
-    def dataset(self, arrays: Sequence[FloatArray], attributes: Mapping[str, Any]) -> xr.Dataset:
-        """Return the labelled result of arrays of shape (shots, pixels, bins)."""
+    def dataset(
+        self, arrays: Sequence[FloatArray], parts: Sequence[FloatArray], attributes: Mapping[str, Any]
+    ) -> xr.Dataset:
+        """Return the labelled result of arrays of shape (shots, pixels, bins), and (shots, pixels, origins, bins)."""
         from mitransient_lidar.rendering.render import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
@@ -304,6 +313,8 @@ class _Series:
             grid=pixels.grid,
             attributes=attributes,
         )
+        if parts:
+            dataset = results.add_components(dataset, self._renderer.classes.names, *parts).transpose("shot", ...)
         return with_lines_of_sight(dataset, self.lidar)
 
 
@@ -359,6 +370,7 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
         # Batches end with their error, or after their passes.
         **{name: attributes[name] for name in ["target_error" if "target_error" in attributes else "passes"]},
         "move_target": bool(attributes["moved_target"]),
+        "components": bool(attributes["components"]),
     }
     return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
 

@@ -140,3 +140,27 @@ def test_requested_errors_are_reached_and_hold():
     known = shares.std(ddof=1) / np.sqrt(len(shares))
     assert known < 0.03
     assert abs(shares.mean() - expected) < largest_z(len(shares)) * known
+
+
+@pytest.mark.slow
+def test_light_of_shots_by_origin():
+    """The sum of the parts is the whole to the bit, and each part that of single shots."""
+    params = {"wind_speed": 6, "layout": "2x2", **RECORD}
+    x, y = PLACES[1]
+    options = {"positions": [(x, y)] * 8, "passes": 8, "pass_share": 0.05, "move_target": True}
+    series = render_shots("fig13_2x2", params, components=True, **options)
+    assert list(series["origin"].values) == ["surface", "water", "target", "bottom"]
+    assert series["waveform_by_origin"].dims == ("shot", "origin", "pixel", "time")
+    for name in ("impulse_response", "waveform"):
+        np.testing.assert_array_equal(series[f"{name}_by_origin"].sum("origin"), series[name])
+    whole = render_shots("fig13_2x2", params, **options)
+    # The same paths, added in another order.
+    np.testing.assert_allclose(series["waveform"], whole["waveform"], rtol=1e-9, atol=1e-30)
+    there = {"aim_x": x, "aim_y": y, "target_x": x, "target_y": y}
+    alone = render("fig13_2x2", params={**params, **there}, passes=16, seed=77, components=True)
+    assert list(alone["origin"].values) == list(series["origin"].values)
+    mean, each = (one["impulse_response_by_origin"].sum(["pixel", "time"]) for one in (alone, series))
+    # 8 shots of 8 passes have a fifth of the paths of 16 full ones.
+    error = each.std("shot", ddof=1) / np.sqrt(8) * np.sqrt(1.2)
+    assert (error / mean).max() < 0.1
+    assert (np.abs(each.mean("shot") - mean) / error).max() < largest_z(8, 4)
