@@ -173,7 +173,8 @@ class ShotBatches:
         except (RuntimeError, MemoryError) as error:
             raise_if_out_of_memory(error)
             raise
-        means, by_origin = [energy.mean, power.mean], ()
+        means = [energy.mean, power.mean]
+        by_origin: tuple[FloatArray, ...] = ()
         if self._origins > 1:
             # The whole is the sum of its parts to the bit.
             means = [part.mean.sum(axis=2) for part in parts]
