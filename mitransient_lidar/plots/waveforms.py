@@ -75,7 +75,7 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
     Parameters
     ----------
     dataset : xarray.Dataset
-        A result of `rendering.render.render` with components.
+        A result of `rendering.render.render`, or a series of shots, with components.
     path : path, optional
         File to write.
 
@@ -108,7 +108,7 @@ def plot_components(dataset: xr.Dataset, path: drawing.FilePath | None = None) -
         ax.set_ylabel(f"received power ({prefix}W)")
         drawing.add_grid(ax, hide=("right",))
     _add_depth_axis(upper, dataset)
-    figure.suptitle(f"{_title(dataset)}  ·  by origin", fontsize="large")
+    figure.suptitle(f"{_title(dataset, 'mean')}  ·  by origin", fontsize="large")
     return drawing.save(figure, path)
 
 
@@ -270,15 +270,15 @@ def _draw_image(ax: Axes, dataset: xr.Dataset) -> None:
     ax.figure.colorbar(image, cax=scale, orientation="horizontal", label=label)
 
 
-def _title(dataset: xr.Dataset) -> str:
-    """Return scene, receiver, shots, and for waveforms their accuracy."""
+def _title(dataset: xr.Dataset, shown: str = "mean and 90 %") -> str:
+    """Return scene, receiver, what is shown of the shots, and for waveforms their accuracy."""
     attributes = dataset.attrs
     error = None if "signal" in dataset else optional_number(attributes, "error_median")
     parts = [drawing.scene_name(attributes) or "received power"]
     if "signal" in dataset:
         parts.append(f"receiver {attributes.get('receiver', 'custom')}")
     if "shot" in dataset.dims:
-        parts.append(f"mean and 90 % of {dataset.sizes['shot']} shots")
+        parts.append(f"{shown} of {dataset.sizes['shot']} shots")
     elif "shot" in dataset.coords:
         parts.append(f"shot {int(dataset['shot'])}")
     if error is not None:

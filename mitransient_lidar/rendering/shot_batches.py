@@ -52,21 +52,21 @@ class ShotRecord:
         Received energy [J per bin].
     power, power_stderr
         Received power after the pulse and the receiver's response [W].
-    parts
-        The same four arrays of light by origin; none unless the renderer separates it.
     lost
         Energy lost at the edges of the surface mesh [J], mean over the passes of all shots.
     passes
         Number of passes.
+    parts
+        The same four arrays of light by origin; none unless the renderer separates it.
     """
 
     energy: FloatArray
     energy_stderr: FloatArray
     power: FloatArray
     power_stderr: FloatArray
-    parts: tuple[FloatArray, ...]
     lost: float
     passes: int
+    parts: tuple[FloatArray, ...] = ()
 
 
 class ShotBatches:
@@ -160,8 +160,8 @@ class ShotBatches:
                 axis = renderer.scene.axis
                 found = record.histogram.energy().reshape(shots, here, -1, self._origins, axis.bin_count)
                 for number in range(here):
-                    by_origin = found[:, number], waveform(found[:, number], axis.bin_width_ns, self._kernel)
-                    for whole, part, values in zip((energy, power), parts, by_origin, strict=True):
+                    both = found[:, number], waveform(found[:, number], axis.bin_width_ns, self._kernel)
+                    for whole, part, values in zip((energy, power), parts, both, strict=True):
                         whole.add(values.sum(axis=2))
                         if self._origins > 1:
                             part.add(values)
@@ -179,7 +179,7 @@ class ShotBatches:
             # The whole is the sum of its parts to the bit.
             means = [part.mean.sum(axis=2) for part in parts]
             by_origin = tuple(values for part in parts for values in (part.mean, part.stderr))
-        return ShotRecord(means[0], energy.stderr, means[1], power.stderr, by_origin, lost / done, done)
+        return ShotRecord(means[0], energy.stderr, means[1], power.stderr, lost / done, done, by_origin)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""

@@ -151,7 +151,7 @@ def test_random_places_are_those_of_the_seed(rendered):
 
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
-    series = shot_series._Series("fig13_2x2", params, (0.3, 0.0), np.array(PLACES), None)
+    series = shot_series._Series("fig13_2x2", params, (0.3, 0.0), np.array(PLACES), None, False)
     (target,) = series._companions
     assert target.id() == "target"
     # In the frame of the first shot, with its aim at x = 1 m.
