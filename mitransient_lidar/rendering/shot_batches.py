@@ -207,11 +207,12 @@ def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) 
     return each.relative_errors(*(values.reshape(-1, values.shape[-1]) for values in (power, stderr)))
 
 
-def check_size(shots: int, pixels: int, bins: int) -> None:
-    """Refuse series that do not fit the memory."""
-    if shots * pixels * bins > _MOST_BINS:
+def check_size(shots: int, pixels: int, bins: int, origins: int = 0) -> None:
+    """Refuse series that do not fit the memory, with light by `origins` beside the whole."""
+    if shots * pixels * bins * (1 + origins) > _MOST_BINS:
+        components = f", and {origins} components of each," if origins else ""
         raise UserError(
-            f"{shots} shots of {pixels} pixels x {bins} bins are more than {_MOST_BINS} bins: "
+            f"{shots} shots of {pixels} pixels x {bins} bins{components} are more than {_MOST_BINS} bins: "
             "take fewer shots, or reduce the pixels or bin_count"
         )
 

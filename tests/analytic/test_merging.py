@@ -445,6 +445,7 @@ def test_passes_share_their_kernels(lidar_scene, integrator):
     [
         {"attenuation": 0.3, "scattering": 0.21, "bottom_depth": 7.5, "bottom_reflectance": 0.2},
         {"wind_speed": 4, "surface_seed": 3},
+        {"time_start_ns": 1310, "bin_count": 270},
         {"altitude": 230, "off_nadir_deg": 17, "pulse_energy_mj": 3, "pulse_fwhm_ns": 4},
         {"divergence_mrad": 8, "field_of_view_mrad": 28, "aperture_area": 0.02},
     ],
