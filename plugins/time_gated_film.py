@@ -99,6 +99,11 @@ class TimeGatedFilm(mi.Film):
         if self.axis is None:
             self.axis, self.end = axis, end if self.bin_count is None else ""
 
+    def share(self, axis: TimeAxis) -> None:
+        """Use the time bins of other records where start or length are automatic."""
+        if self.time_start_ns is None or self.bin_count is None:
+            self.axis, self.end = axis, ""
+
     @property
     def used_values(self) -> dict[str, float]:
         """Values used for the parameters that are automatic, once they are known."""

@@ -33,8 +33,9 @@ DEFAULT_QUANTILE = 0.95
 class Progress:
     """Progress of a render or a study.
 
-    Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place`` or ``render``), elapsed and
-    estimated remaining time [s], median and 95th percentile of the relative standard errors, and the requested error.
+    Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or ``run``), elapsed
+    and estimated remaining time [s], median and 95th percentile of the relative standard errors, the requested error,
+    and the number of completed units that have `failed`.
 
     With a requested error: the quantile of the relative standard errors that must reach it, its value, what the errors
     are those of (``bins``, ``gates`` or ``pixels``), and estimates of the passes and the time [s] still needed, None
@@ -54,6 +55,7 @@ class Progress:
     errors_of: str = "bins"
     needed_passes: int | None = None
     needed_s: float | None = None
+    failed: int = 0
 
 
 ProgressCallback = Callable[[Progress], None]

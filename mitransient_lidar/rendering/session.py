@@ -57,7 +57,7 @@ class Session:
 
     def share_record(self, axis: TimeAxis) -> None:
         """Use the time bins of other renders instead of automatic ones."""
-        self.sensor.film().fit(axis)
+        self.sensor.film().share(axis)
 
     def tell_record(self, axis: TimeAxis | None = None) -> None:
         """Log time bins, by default those of the film, where its start or length are automatic."""

@@ -83,8 +83,11 @@ def render_shots(
     target_error: float | None = None,
     pass_share: float | None = None,
     seed: int = 1,
+    first_seed: int = 0,
     axis: TimeAxis | None = None,
     components: bool = False,
+    instrument: str | None = None,
+    describe_sea: bool = True,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at given or random places of one sea, many at a time.
@@ -111,11 +114,18 @@ def render_shots(
         needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
         signal by about 0.3 %.
     seed
-        Seed of random places, at least 0. Shot n is rendered with the seed n.
+        Seed of random places, at least 0.
+    first_seed
+        Seed of the first shot, 0 to 2^40; shot n is rendered with this seed plus n.
     axis
-        Time bins instead of automatic ones, which by default hold the light of all shots.
+        Time bins instead of automatic ones, which hold the light of all shots; they must hold it, too, up to a
+        twentieth of the record.
     components
         Whether to separate the light by its origin, as for `rendering.render.render`.
+    instrument
+        Name of the instrument whose laser and receiver replace those of the scene.
+    describe_sea
+        Whether to add the attribute ``slope_deviation``, which takes 0.2 s.
     progress
         Called with a `passes.Progress` after every batch of shots.
 
@@ -143,15 +153,16 @@ def render_shots(
     passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
     share = in_range("pass_share", usual[1] if pass_share is None else pass_share, SMALLEST_SHARE, 1.0)
     seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
+    first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
-    session = open_scene(scene, params) if given is None or move_target else None
+    session = open_scene(scene, params, instrument=instrument) if given is None or move_target else None
     target = _target_offset(session) if session is not None and move_target else None
     places = given
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = _Series(scene, params, target, places, axis, components)
-    sea = SeaMap.of_scene(series.session.scene) if _has_waves(series.session.scene) else None
+    series = _Series(scene, params, instrument, target, places, axis, components)
+    sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
     truth = _truth(series.session, series.lidar, places)
@@ -164,7 +175,7 @@ def render_shots(
     try:
         with DeferredInterrupt() as interruption:
             for part in batches.parts(len(places)):
-                records.append(batches.render(places[part], range(part.start, part.stop)))
+                records.append(batches.render(places[part], range(first_seed + part.start, first_seed + part.stop)))
                 errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
                 done = part.stop
                 if progress is not None:
@@ -192,6 +203,7 @@ def render_shots(
         error_p95=float(p95),
         surface_edge_loss=float(lost),
         shots=done,
+        first_seed=first_seed,
         interrupted=int(interrupted),
         moved_target=int(move_target),
         components=int(components),
@@ -226,6 +238,7 @@ class _Series:
         self,
         scene: Any,
         params: Mapping[str, Any] | None,
+        instrument: str | None,
         target: tuple[float, float] | None,
         places: FloatArray,
         axis: TimeAxis | None,
@@ -238,23 +251,26 @@ class _Series:
         from mitransient_lidar.transport.scene import LidarScene
 
         self._scene, self._params, self._target, self._components = scene, params, target, components
-        self._place = float(places[0, 0]), float(places[0, 1])
-        self.session = open_scene(scene, self._at(*self._place))
+        self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
+        self.session = self._open(self._at(*self._place))
         self._integrator = choose_integrator(self.session.scene, None)
-        if axis is None:
-            shifts = [(float(x), float(y)) for x, y in places - places[0]]
-            axis = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
-        self._axis = axis
-        self.session.tell_record(axis)
+        shifts = [(float(x), float(y)) for x, y in places - places[0]]
+        own = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
+        self._axis = own if axis is None else _checked_axis(axis, own)
+        self.session.tell_record(self._axis)
         self._renderer = self._prepare(self.session)
         self.lidar: LidarScene = self._renderer.scene
         self._companions = self._find_companions()
-        parts = 1 + self._renderer.classes.count if components else 1
-        check_size(len(places), parts * self.lidar.receiver.pixels.count, self.lidar.axis.bin_count)
+        origins = self._renderer.classes.count if components else 0
+        check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count, origins)
         probe = probe_echoes(self.lidar, self._renderer.sampler)
         self.window = error_window(self.lidar, probe)
         check_scene(self.lidar, self._renderer.sampler, probe)
         self._described = describe_scene(self.lidar, probe, self.window)
+
+    def _open(self, params: Mapping[str, Any]) -> Session:
+        """Load the scene with parameters."""
+        return open_scene(self._scene, params, instrument=self._instrument)
 
     def _prepare(self, session: Session) -> PassRenderer:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
@@ -273,13 +289,13 @@ class _Series:
         if self._target is None:
             return []
         params = self._at(*self._place)
-        other = open_scene(self._scene, {**params, "target_x": params["target_x"] + 1.0}).scene
+        other = self._open({**params, "target_x": params["target_x"] + 1.0}).scene
         pairs = zip(self.session.scene.shapes(), other.shapes(), strict=True)
         return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
 
     def _loaded_at(self, x: float, y: float) -> PassRenderer:
         """Return the renderer of the scene loaded at a place [m]."""
-        return self._prepare(open_scene(self._scene, self._at(x, y)))
+        return self._prepare(self._open(self._at(x, y)))
 
     def batches(self, passes: int, share: float, target_error: float | None) -> ShotBatches:
         """Return the shots in batches, for passes with a share of the paths of a full pass, or until an error."""
@@ -370,7 +386,8 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
         # Batches end with their error, or after their passes.
         **{name: attributes[name] for name in ["target_error" if "target_error" in attributes else "passes"]},
         "move_target": bool(attributes["moved_target"]),
-        "components": bool(attributes["components"]),
+        "components": bool(attributes.get("components", 0)),
+        "first_seed": int(attributes.get("first_seed", 0)),
     }
     return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
 
@@ -396,6 +413,17 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     if np.abs(pairs).max() > _FARTHEST:
         raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {_FARTHEST:g} m")
     return pairs
+
+
+def _checked_axis(axis: TimeAxis, own: TimeAxis) -> TimeAxis:
+    """Return given time bins; raise `UserError` if they leave out light of the automatic ones."""
+    margin = 0.05 * (own.end_ns - own.start_ns)
+    if own.start_ns < axis.start_ns - margin or own.end_ns > axis.end_ns + margin:
+        raise UserError(
+            f"the record of {axis.start_ns:g} to {axis.end_ns:g} ns leaves out light: it must hold {own.start_ns:g} to "
+            f"{own.end_ns:g} ns"
+        )
+    return axis
 
 
 def _target_offset(session: Session) -> tuple[float, float]:

@@ -1,0 +1,1 @@
+"""Campaigns: many runs of a scene with other parameters, on Dask, into one Zarr store."""

@@ -1,0 +1,301 @@
+"""Runs of a campaign: the shots of one set of parameters, and the arrays that are stored of them."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.campaigns.design import Campaign, Column
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.passes import SMALLEST_SHARE
+from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.studies.shot_series import render_shots
+
+#: Half of the side of the square of the places of a sea [m].
+_REACH = 256.0
+
+#: Relative margin of a shared record on both sides.
+_MARGIN = 0.05
+
+#: Number of the random sea, which each run has of its own unless the campaign gives it.
+_SEA = "surface_seed"
+
+#: Whole numbers for random seas.
+_SEAS = 2**31 - 1
+
+
+class Array(NamedTuple):
+    """Array of a run, or of all: names of its dimensions, values, and attributes."""
+
+    dims: tuple[str, ...]
+    values: npt.NDArray[Any]
+    attributes: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RunRenderer:
+    """Renders the runs of a campaign, each with the same bits wherever and whenever.
+
+    Attributes
+    ----------
+    campaign
+        The campaign.
+    scene
+        Its scene, with its instrument.
+    axis
+        Time bins of all runs; automatic for each run without them.
+    """
+
+    campaign: Campaign
+    scene: SceneRecord
+    axis: TimeAxis | None = None
+
+    @classmethod
+    def of(cls, campaign: Campaign, columns: Mapping[str, Column]) -> RunRenderer:
+        """Return the renderer of a new campaign with the columns of its runs, with a record that holds all of them.
+
+        Raises
+        ------
+        UserError
+            If the scene cannot be loaded, or lacks a parameter that the campaign sets.
+        """
+        session = open_scene(campaign.scene, None, instrument=campaign.instrument)
+        if session.record is None:
+            raise UserError(f"scene = {campaign.scene!r} cannot be recorded: give the name or path of an XML scene")
+        _check_parameters(campaign, columns, session.parameters)
+        renderer = cls(campaign, session.record)
+        return cls(campaign, session.record, renderer._longest_record(columns))
+
+    def inputs(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the parameters of a run that are its own: those of the table, and the random sea."""
+        if _SEA in values or _SEA in self.campaign.fixed or _SEA not in self.scene.parameters:
+            return dict(values)
+        return {**values, _SEA: int(self._random(number).integers(1, _SEAS))}
+
+    def series(self, number: int, values: Mapping[str, Any], **options: Any) -> xr.Dataset:
+        """Return the shots of a run, as of `render_shots`, whose number is that of its row, with its parameters.
+
+        Raises
+        ------
+        UserError
+            If the scene refuses the parameters, or the light does not fit the record.
+        """
+        campaign, known = self.campaign, self.scene.parameters
+        params = {**campaign.fixed, **self.inputs(number, values)}
+        random = self._random(number)
+        random.integers(1, _SEAS)
+        places = random.uniform(-_REACH, _REACH, (campaign.design.shots, 2))
+        for axis, name in enumerate(("aim_x", "aim_y")):
+            if name in params:
+                places[:, axis] = float(params[name])
+        wanted: dict[str, Any] = {
+            "positions": places,
+            "move_target": "target_x" in known and "target_y" in known,
+            "target_error": campaign.target_error,
+            "components": "components" in campaign.keep,
+            "first_seed": int(random.integers(2**40)),
+            "axis": self.axis,
+            "describe_sea": False,
+        }
+        return render_shots(self.scene, params, **{**wanted, **options})
+
+    def record(self, number: int, series: xr.Dataset) -> xr.Dataset | None:
+        """Return the record of the receiver of the shots of a run, None without a receiver."""
+        from mitransient_lidar.analysis.receiver import detect_waveforms
+
+        campaign = self.campaign
+        if campaign.receiver is None:
+            return None
+        noise = int(np.random.SeedSequence([campaign.design.seed, number, 1]).generate_state(1)[0])
+        return detect_waveforms(
+            series,
+            campaign.receiver,
+            seed=noise,
+            background_power=campaign.background_power_w,
+            gain=campaign.gain,  # type: ignore[arg-type]
+            optical_density=campaign.optical_density,  # type: ignore[arg-type]
+        )
+
+    def arrays(self, number: int, values: Mapping[str, Any]) -> dict[str, Array]:
+        """Return what the store holds of a run, without its dimension; raises as `series`."""
+        return self._stored(number, values, self.series(number, values))
+
+    def sample(self, number: int, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return `arrays` of few paths, and the coordinates of their dimensions; raises as `series`."""
+        series = self.series(number, values, target_error=None, passes=2, pass_share=SMALLEST_SHARE)
+        return self._stored(number, values, series), self._coordinates(number, series)
+
+    def _stored(self, number: int, values: Mapping[str, Any], series: xr.Dataset) -> dict[str, Array]:
+        found = dict(self._arrays(number, series))
+        error = "relative standard error of the median bin"
+        found["error_median"] = _number(series.attrs["error_median"], np.float32, error)
+        found["passes"] = _number(series.attrs["passes"], np.int32, "number of passes")
+        if _SEA in (own := self.inputs(number, values)) and _SEA not in values:
+            found[_SEA] = _number(own[_SEA], np.int64, "parameter surface_seed of the scene")
+        if self.campaign.design.shots > 1:
+            return found
+        return {name: _of_one_shot(array) for name, array in found.items()}
+
+    def _arrays(self, number: int, series: xr.Dataset) -> Iterator[tuple[str, Array]]:
+        from mitransient_lidar.analysis.waveforms.echo_table import extract
+
+        keep, recorded = self.campaign.keep, self.record(number, series)
+        names = [name for name, kind in (("waveform", "waveform"), ("waveform_stderr", "stderr")) if kind in keep]
+        if "components" in keep:
+            names += ["waveform_by_origin"] + (["waveform_by_origin_stderr"] if "stderr" in keep else [])
+        for name in names:
+            about = {key: value for key, value in series[name].attrs.items() if key != "ancillary_variables"}
+            yield name, _single(series[name].assign_attrs(about))
+        if recorded is not None:
+            yield "signal", _single(_renamed_time(recorded["signal"], series))
+            yield "gain", _number(recorded.attrs["gain"], np.float64, "factor of the amplifier's transimpedance")
+            yield (
+                "optical_density",
+                _number(recorded.attrs["optical_density"], np.float64, "optical density of the filter"),
+            )
+        if "truth" in keep:
+            for name, values in _truth(series).items():
+                yield name, Array(tuple(map(str, values.dims)), values.values, dict(values.attrs))
+        if "echoes" in keep:
+            echoes = extract(series if recorded is None else recorded)
+            for kind, values in echoes.data_vars.items():
+                array = np.asarray(values, dtype=np.int16 if kind == "flags" else np.float32)
+                yield f"echo_{kind}", Array(tuple(map(str, values.dims)), array, _plain(values.attrs))
+
+    def _coordinates(self, number: int, series: xr.Dataset) -> dict[str, Array]:
+        from mitransient_lidar.analysis.waveforms.echo_table import ECHOES
+
+        recorded = self.record(number, series)
+        names = [name for name in ("pixel", "angle_x", "angle_y", "time", "origin") if name in series.coords]
+        found = {
+            name: Array(tuple(map(str, series[name].dims)), series[name].values, _plain(series[name].attrs))
+            for name in names
+        }
+        if recorded is not None and (time := _renamed_time(recorded["signal"], series)).dims[-1] != "time":
+            found["signal_time"] = Array(("signal_time",), time["signal_time"].values, _plain(series["time"].attrs))
+        if "echoes" in self.campaign.keep:
+            found["echo"] = Array(("echo",), np.array(ECHOES), {"long_name": "kind of echo"})
+        return found
+
+    def _random(self, number: int) -> np.random.Generator:
+        """Return the random numbers of a run: its sea, then its places, then the seed of its shots."""
+        return np.random.default_rng([self.campaign.design.seed, number])
+
+    def _longest_record(self, columns: Mapping[str, Column]) -> TimeAxis | None:
+        """Return time bins that hold the light of all runs, None where the campaign gives them.
+
+        Each end is sought by one parameter after the other: from the first run, its extreme value that makes the record
+        longer is kept.
+        """
+        if all(name in self.campaign.fixed for name in ("time_start_ns", "bin_count")):
+            return None
+        extremes = {name: _extremes(column) for name, column in columns.items()}
+        ends: list[tuple[float, TimeAxis]] = []
+        for sign in (1.0, -1.0):
+            chosen = _values(columns, 0)
+            best: tuple[float, TimeAxis] | None = None
+            for name, tried in extremes.items():
+                for value in tried:
+                    try:
+                        axis = self._own_axis({**chosen, name: value})
+                    except UserError:
+                        # A combination of extremes that the scene refuses; runs of it fail by themselves.
+                        continue
+                    end = axis.end_ns if sign > 0 else -axis.start_ns
+                    if best is None or end > best[0]:
+                        best, chosen = (end, axis), {**chosen, name: value}
+            ends += [] if best is None else [best]
+        if not ends:
+            self._own_axis(_values(columns, 0))
+            raise UserError("the scene refuses the extreme values of all parameters: reduce their ranges")
+        start, end = min(axis.start_ns for _, axis in ends), max(axis.end_ns for _, axis in ends)
+        margin, width = _MARGIN * (end - start), ends[0][1].bin_width_ns
+        return TimeAxis.covering(start - margin, end + margin, width, None, None)
+
+    def _own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
+        """Return the automatic time bins of a run."""
+        from mitransient_lidar.transport.scene import LidarScene
+
+        session = open_scene(self.scene, {**self.campaign.fixed, **values})
+        return LidarScene.from_scene(session.scene, session.sensor).axis
+
+
+def _check_parameters(campaign: Campaign, columns: Mapping[str, Column], known: Collection[str]) -> None:
+    """Raise `UserError` for parameters that the scene does not have, or that may not vary."""
+    for name in itertools.chain(campaign.fixed, columns):
+        if name not in known:
+            close = difflib.get_close_matches(str(name), sorted(known), n=3)
+            hint = f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(known))}"
+            raise UserError(f"parameter {name!r} is not one of scene {campaign.scene}: {hint}")
+    for name in ("time_start_ns", "bin_width_ns", "bin_count"):
+        if name in columns:
+            raise UserError(f"parameter {name!r} must be the same in all runs, which share a record: set it in [fixed]")
+    for name in ("aim_x", "aim_y"):
+        if name not in known:
+            raise UserError(f"scene {campaign.scene} has no parameter {name}, which the places of shots need")
+        if campaign.design.shots > 1 and (name in campaign.fixed or name in columns):
+            raise UserError(f"design.shots = {campaign.design.shots} needs random places: leave out {name}")
+
+
+def _values(columns: Mapping[str, Column], row: int) -> dict[str, Any]:
+    """Return the parameters of a row."""
+    return {name: column[row].item() for name, column in columns.items()}
+
+
+def _extremes(column: Column) -> Sequence[Any]:
+    """Return the values of a parameter that may make a record longer: both ends of numbers, all texts."""
+    values = np.unique(column)
+    return [one.item() for one in (values[[0, -1]] if column.dtype.kind in "if" else values)]
+
+
+def _single(values: xr.DataArray) -> Array:
+    """Return an array in single precision, shots first."""
+    ordered = values.transpose("shot", ...) if "shot" in values.dims else values
+    return Array(tuple(map(str, ordered.dims)), np.asarray(ordered, dtype=np.float32), _plain(ordered.attrs))
+
+
+def _number(value: float, dtype: npt.DTypeLike, text: str) -> Array:
+    """Return a number of each run."""
+    return Array((), np.asarray(value, dtype=dtype), {"units": "1", "long_name": text})
+
+
+def _renamed_time(signal: xr.DataArray, series: xr.Dataset) -> xr.DataArray:
+    """Return a signal over its own time, unless it is sampled as the waveform."""
+    return signal if signal.sizes["time"] == series.sizes["time"] else signal.rename(time="signal_time")
+
+
+def _truth(series: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return what is known of each shot, and of the lines of sight of each pixel."""
+    of_pixels = set(series["angle_x"].dims)
+    return {
+        str(name): values
+        for name, values in series.coords.items()
+        if name not in ("shot", "angle_x", "angle_y", "pixel", "row", "column", "origin", "time")
+        and (values.dims == ("shot",) or set(values.dims) == of_pixels)
+        and values.dtype.kind == "f"
+    }
+
+
+def _of_one_shot(array: Array) -> Array:
+    """Return an array without the dimension of the only shot."""
+    if "shot" not in array.dims:
+        return array
+    place = array.dims.index("shot")
+    return array._replace(dims=array.dims[:place] + array.dims[place + 1 :], values=array.values.take(0, place))
+
+
+def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return attributes that JSON can hold."""
+    return {
+        str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
+        for name, value in attributes.items()
+    }

@@ -1,0 +1,298 @@
+"""Campaigns on Dask: shards as tasks, on processes of this machine or on a cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import itertools
+import logging
+import os
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.campaigns.design import Campaign
+from mitransient_lidar.campaigns.runs import RunRenderer
+from mitransient_lidar.campaigns.shard import render_in_process
+from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_LOG = logging.getLogger(__name__)
+
+#: Shards for each worker that are with the scheduler at a time.
+_AHEAD = 4
+
+#: Runs that are tried until one of them shows the arrays of a store.
+_TRIALS = 8
+
+#: Time between two reports of a shard, and time to wait for a scheduler [s].
+_REPORT_S, _CONNECT_S = 1.0, 15.0
+
+
+def sweep(
+    campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str],
+    store: str | os.PathLike[str],
+    *,
+    workers: int | None = None,
+    scheduler: Client | str | None = None,
+    shard_size: int | None = None,
+    retry_failed: bool = False,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Render the runs of a campaign into a Zarr store, or those that an interrupted one has left.
+
+    Parameters
+    ----------
+    campaign
+        A TOML file, or a dict of its contents; see docs/campaigns.md.
+    store
+        Folder of the store. One that holds the same campaign is completed.
+    workers
+        Processes on this machine, 1 to 1024; by default one for each core.
+    scheduler
+        Address of a Dask scheduler, or a ``distributed.Client``, instead of processes on this machine. Its workers need
+        this package, and the store at the same path.
+    shard_size
+        Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
+        64 to 1024.
+    retry_failed
+        Whether to render runs that have failed, too.
+    progress
+        Called with a `rendering.passes.Progress` about every second.
+
+    Returns
+    -------
+    xarray.Dataset
+        The store, as of `campaigns.store.open_campaign`.
+
+    Raises
+    ------
+    UserError
+        If the campaign is invalid, the store holds another one or cannot be written, the first runs all fail, or the
+        scheduler cannot be reached.
+    KeyboardInterrupt
+        After Ctrl-C; runs that are written stay.
+    """
+    if workers is not None:
+        workers = integer("workers", workers, 1, 1024)
+    if workers is not None and scheduler is not None:
+        raise UserError(
+            f"workers = {workers} are those of this machine, and the scheduler has its own: give one of both"
+        )
+    if not isinstance(campaign, Campaign):
+        campaign = Campaign.of(campaign) if isinstance(campaign, Mapping) else Campaign.read(campaign)
+    return _complete(_prepare(campaign, Path(store), shard_size), workers, scheduler, retry_failed, progress)
+
+
+def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
+    """Render the runs that an interrupted campaign has left in its store; `options` as for `sweep`."""
+    given = {"workers": None, "scheduler": None, "retry_failed": False, "progress": None, **options}
+    return _complete(Store(store), **given)
+
+
+def render_row(store: str | os.PathLike[str], row: int, **options: Any) -> xr.Dataset:
+    """Render one run of a campaign: all shots with everything that `render_shots` returns, the bits of the store.
+
+    Parameters
+    ----------
+    store
+        Folder of the store.
+    row
+        Number of the run.
+    options
+        Options of `render_shots` instead of those of the campaign.
+
+    Raises
+    ------
+    UserError
+        If there is no such run, or it fails.
+    """
+    import drjit as dr
+
+    found = Store(store)
+    row = integer("row", row, 0, found.count - 1)
+    values = {name: column[0].item() for name, column in found.inputs(slice(row, row + 1)).items()}
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        return found.renderer().series(row, values, **options)
+    finally:
+        dr.set_thread_count(threads)
+
+
+def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
+    """Return the store of a campaign, a new one if there is none."""
+    columns = campaign.table()
+    if path.exists():
+        store = Store(path)
+        if not store.is_of(campaign, columns):
+            raise UserError(f"{path} holds another campaign: choose another place, or remove it")
+        return store
+    renderer = RunRenderer.of(campaign, columns)
+    count = len(next(iter(columns.values())))
+    first: UserError | None = None
+    for row in range(min(_TRIALS, count)):
+        values = {name: column[row].item() for name, column in columns.items()}
+        try:
+            arrays, coordinates = renderer.sample(row, values)
+        except UserError as error:
+            first = first or error
+        else:
+            return Store.create(path, renderer, columns, arrays, coordinates, shard_size)
+    raise UserError(f"the first {min(_TRIALS, count)} runs all fail, the first of them so: {first}")
+
+
+def _complete(
+    store: Store,
+    workers: int | None,
+    scheduler: Client | str | None,
+    retry_failed: bool,
+    progress: ProgressCallback | None,
+) -> xr.Dataset:
+    """Render what is missing in a store."""
+    status = store.status()
+    wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
+    shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
+    if shards:
+        with _connected(workers, scheduler) as client:
+            _render(store, shards, client, retry_failed, progress)
+    return open_campaign(store.path)
+
+
+def _render(
+    store: Store, shards: list[int], client: Client, retry_failed: bool, progress: ProgressCallback | None
+) -> None:
+    """Render shards on the workers of a client."""
+    from distributed import KilledWorker, as_completed
+
+    topic = f"campaign-{uuid.uuid4().hex}"
+    tally = _Tally(store, progress)
+    client.subscribe_topic(topic, tally.receive)
+    path, waiting = str(store.path.resolve()), iter(shards)
+    futures = as_completed(loop=client.loop)
+
+    def submit() -> None:
+        # Workers may come and go.
+        wanted = _AHEAD * max(sum(client.nthreads().values()), 1) - futures.count()
+        for shard in itertools.islice(waiting, max(wanted, 0)):
+            key = f"shard-{shard}-{topic}"
+            futures.add(client.submit(_task, path, shard, retry_failed, topic, pure=False, key=key))
+
+    submit()
+    for future in futures:
+        try:
+            tally.finish(*future.result())
+        except KilledWorker as error:
+            raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
+        submit()
+
+
+def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, int, int]:
+    """Render a shard on a worker."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    last = time.monotonic()
+
+    def report(done: int, failed: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > _REPORT_S:
+            last = time.monotonic()
+            worker.log_event(topic, {"shard": shard, "done": done, "failed": failed})
+
+    return shard, *render_in_process(path, shard, retry_failed, report)
+
+
+class _Tally:
+    """Counts of the runs of a campaign, by shard."""
+
+    def __init__(self, store: Store, progress: ProgressCallback | None) -> None:
+        self._store, self._progress = store, progress
+        status = store.status()
+        self._shards = {
+            shard: tuple(int(np.count_nonzero(status[store.runs_of(shard)] == one)) for one in (DONE, FAILED))
+            for shard in store.shards
+        }
+        self._began, self._before = time.perf_counter(), sum(map(sum, self._shards.values()))
+        self._finished: set[int] = set()
+        self._tell()
+
+    def receive(self, event: tuple[float, Mapping[str, int]]) -> None:
+        """Count the runs of a shard that a worker renders."""
+        news = event[1]
+        if news["shard"] not in self._finished:
+            self._shards[news["shard"]] = news["done"], news["failed"]
+            self._tell()
+
+    def finish(self, shard: int, done: int, failed: int) -> None:
+        """Count the runs of a shard that is written."""
+        self._finished.add(shard)
+        self._shards[shard] = done, failed
+        state = self._tell()
+        rate = (state.done - self._before) / max(state.elapsed_s or 0.0, 1e-9)
+        _LOG.info(
+            "shard %d written: %d of %d runs, %d failed, %.3g a second, ends in %.0f s",
+            shard, state.done, state.planned, state.failed, rate, state.remaining_s or 0,
+        )  # fmt: skip
+
+    def _tell(self) -> Progress:
+        done, failed = (sum(counts) for counts in zip(*self._shards.values(), strict=True))
+        elapsed, here = time.perf_counter() - self._began, done + failed - self._before
+        planned = self._store.count
+        remaining = elapsed * (planned - done - failed) / here if here else None
+        state = Progress(
+            done=done + failed, planned=planned, unit="run", elapsed_s=elapsed, remaining_s=remaining, failed=failed
+        )
+        if self._progress is not None:
+            self._progress(state)
+        return state
+
+
+@contextlib.contextmanager
+def _connected(workers: int | None, scheduler: Client | str | None) -> Iterator[Client]:
+    """Yield a client of a scheduler, by default of new processes on this machine."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    if isinstance(scheduler, Client):
+        yield scheduler
+        return
+    # Reports of workers that come and go are not for the user.
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise UserError(
+                f"scheduler = {scheduler!r} cannot be reached: give its address, tcp://HOST:PORT"
+            ) from error
+        with client:
+            yield client
+        return
+    number = workers or os.cpu_count() or 1
+    with (
+        # The processes of the shards hold their memory, not these.
+        dask.config.set({"distributed.worker.memory.terminate": False}),
+        LocalCluster(
+            n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        if _has_dashboard():
+            _LOG.info("dashboard: %s", cluster.dashboard_link)
+        yield client
+
+
+def _has_dashboard() -> bool:
+    """Return whether what Dask's dashboard needs is installed."""
+    return importlib.util.find_spec("bokeh") is not None
