@@ -50,7 +50,7 @@ except _UserError as _error:
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["__version__", "open", "render", "render_shots"]
+__all__ = ["__version__", "open", "render", "render_shots", "sweep"]
 
 
 def render(scene: Any, **options: Any) -> xarray.Dataset:
@@ -81,8 +81,22 @@ def render_shots(scene: Any, params: Any = None, **options: Any) -> xarray.Datas
     return render_series(scene, params, **options)
 
 
+def sweep(campaign: Any, store: str | Path, **options: Any) -> xarray.Dataset:
+    """Render a campaign of many runs into a Zarr store; see :func:`mitransient_lidar.campaigns.sweep.sweep`."""
+    from mitransient_lidar.campaigns.sweep import sweep as render_campaign
+
+    return render_campaign(campaign, store, **options)
+
+
 def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect
-    """Read a result from an EXR stack or a NetCDF file; see :func:`mitransient_lidar.results.dataset.open`."""
+    """Read a result from an EXR stack or a NetCDF file, or the store of a campaign.
+
+    See :func:`mitransient_lidar.results.dataset.open` and :func:`mitransient_lidar.campaigns.store.open_campaign`.
+    """
+    if Path(path).is_dir():
+        from mitransient_lidar.campaigns.store import open_campaign
+
+        return open_campaign(path)
     from mitransient_lidar.results.dataset import open as open_result
 
     return open_result(path)

@@ -262,8 +262,8 @@ class Campaign:
                         raise UserError(f"{name} = {one.text!r} needs {each}, whose values are texts")
                 values = {each: np.asarray(known[each], dtype=np.float64) for each in one.names}
                 found[name] = np.array(np.broadcast_to(one.evaluate(values), (count,)))
-        # In the order of the file, columns of a table first.
-        return {name: found[name] for name in dict.fromkeys([*columns, *self.parameters])}
+        first = columns if self.design.kind == "table" else ()
+        return {name: found[name] for name in dict.fromkeys([*first, *self.parameters])}
 
 
 def _designed(free: Mapping[str, Range | tuple[Any, ...] | Expression], design: Design) -> dict[str, Column]:

@@ -126,11 +126,16 @@ def render_shard(path: str, shard: int, retry: bool, failed: dict[int, str], tel
     written = time.monotonic()
     for place in np.flatnonzero(status == PLANNED):
         number = runs.start + int(place)
+        values = {name: column[place].item() for name, column in inputs.items()}
         tell(begin=number)
+        # The random sea, of runs that fail too.
+        for name, value in renderer.inputs(number, values).items():
+            if name in arrays:
+                arrays[name][place] = value
         try:
             if number in failed:
                 raise UserError(failed[number])
-            found = renderer.arrays(number, {name: column[place].item() for name, column in inputs.items()})
+            found = renderer.arrays(number, values)
             for name, array in found.items():
                 if name not in arrays or array.values.shape != arrays[name].shape[1:]:
                     raise UserError(

@@ -118,7 +118,7 @@ class Store:
     def inputs(self, runs: slice) -> dict[str, Column]:
         """Return the parameters of runs, by name."""
         names: dict[str, str] = self._attributes["inputs"]
-        return {name: np.asarray(self._array(stored)[runs]) for name, stored in names.items()}
+        return {name: self._values(stored, runs) for name, stored in names.items()}
 
     def runs_of(self, shard: int) -> slice:
         """Return the runs of a shard."""
@@ -135,13 +135,13 @@ class Store:
 
     def errors(self, runs: slice = slice(None)) -> npt.NDArray[Any]:
         """Return why runs failed, empty for others."""
-        return np.asarray(self._array("error")[runs])
+        return self._values("error", runs).astype(object)
 
     def read(self, shard: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[Any], dict[str, npt.NDArray[Any]]]:
         """Return status, errors and arrays of a shard."""
         runs = self.runs_of(shard)
         arrays = {name: np.array(self._array(name)[runs]) for name in self._attributes["variables"]}
-        return self.status(runs).copy(), self.errors(runs).astype(object), arrays
+        return self.status(runs).copy(), self.errors(runs), arrays
 
     def write(
         self,
@@ -168,6 +168,11 @@ class Store:
         except OSError as error:
             raise UserError(f"cannot write {self.path}: {error.strerror or error}.") from error
 
+    def _values(self, name: str, runs: slice) -> Column:
+        """Return values of runs; texts have NumPy's fixed length, as in the table of the runs."""
+        values = np.asarray(self._array(name)[runs])
+        return values if values.dtype.kind in "biuf" else np.array([str(one) for one in values], dtype=np.str_)
+
     def _array(self, name: str) -> zarr.Array[Any]:
         found = self._group[name]
         assert isinstance(found, zarr.Array)
@@ -193,17 +198,16 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def describe_campaign(path: str | os.PathLike[str]) -> list[str]:
-    """Return lines on a campaign: its runs, those that failed with their errors, and its variables."""
+    """Return lines on a campaign: the numbers of its runs by status, and the most frequent reasons of failures."""
     store = Store(path)
     status = store.status()
-    counts = [int(np.count_nonzero(status == value)) for value in (DONE, FAILED, PLANNED)]
-    lines = [
-        f"{store.path}: {store.count} runs in {len(store.shards)} shards: "
-        + "{} done, {} failed, {} planned".format(*counts)
-    ]
-    if counts[1]:
+    done, failures, planned = (int(np.count_nonzero(status == value)) for value in (DONE, FAILED, PLANNED))
+    lines = [f"{store.count} runs: {done} done, {failures} failed, {planned} planned"]
+    if failures:
         failed = np.flatnonzero(status == FAILED)
-        reasons, first, number = np.unique(store.errors()[failed].astype(str), return_index=True, return_counts=True)
+        reasons, first, number = np.unique(
+            store.errors()[failed].astype(np.str_), return_index=True, return_counts=True
+        )
         for reason, place, times in sorted(zip(reasons, first, number, strict=True), key=lambda row: -row[2])[:5]:
             lines.append(f"failed {times}, the first run {failed[place]}: {reason}")
     return lines

@@ -9,7 +9,7 @@ import logging
 import os
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,30 +83,24 @@ def sweep(
     KeyboardInterrupt
         After Ctrl-C; runs that are written stay.
     """
-    if workers is not None:
-        workers = integer("workers", workers, 1, 1024)
-    if workers is not None and scheduler is not None:
-        raise UserError(
-            f"workers = {workers} are those of this machine, and the scheduler has its own: give one of both"
-        )
-    if not isinstance(campaign, Campaign):
-        campaign = Campaign.of(campaign) if isinstance(campaign, Mapping) else Campaign.read(campaign)
-    return _complete(_prepare(campaign, Path(store), shard_size), workers, scheduler, retry_failed, progress)
+    return _swept(
+        lambda: _prepare(_campaign(campaign), Path(store), shard_size), workers, scheduler, retry_failed, progress
+    )
 
 
 def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
     """Render the runs that an interrupted campaign has left in its store; `options` as for `sweep`."""
     given = {"workers": None, "scheduler": None, "retry_failed": False, "progress": None, **options}
-    return _complete(Store(store), **given)
+    return _swept(lambda: Store(store), **given)
 
 
-def render_row(store: str | os.PathLike[str], row: int, **options: Any) -> xr.Dataset:
+def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], row: int, **options: Any) -> xr.Dataset:
     """Render one run of a campaign: all shots with everything that `render_shots` returns, the bits of the store.
 
     Parameters
     ----------
-    store
-        Folder of the store.
+    campaign
+        Folder of a store, a TOML file, or a dict of its contents.
     row
         Number of the run.
     options
@@ -117,17 +111,24 @@ def render_row(store: str | os.PathLike[str], row: int, **options: Any) -> xr.Da
     UserError
         If there is no such run, or it fails.
     """
-    import drjit as dr
+    if isinstance(campaign, (str, os.PathLike)) and Path(campaign).is_dir():
+        store = Store(campaign)
+        renderer, row = store.renderer(), integer("row", row, 0, store.count - 1)
+        values = {name: column[0].item() for name, column in store.inputs(slice(row, row + 1)).items()}
+    else:
+        plan = _campaign(campaign)
+        table = plan.table()
+        row = integer("row", row, 0, len(next(iter(table.values()))) - 1)
+        renderer = RunRenderer.of(plan, table)
+        values = {name: column[row].item() for name, column in table.items()}
+    return renderer.series(row, values, **options)
 
-    found = Store(store)
-    row = integer("row", row, 0, found.count - 1)
-    values = {name: column[0].item() for name, column in found.inputs(slice(row, row + 1)).items()}
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        return found.renderer().series(row, values, **options)
-    finally:
-        dr.set_thread_count(threads)
+
+def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> Campaign:
+    """Return a campaign that may be given as a file or a dict."""
+    if isinstance(given, Campaign):
+        return given
+    return Campaign.of(given) if isinstance(given, Mapping) else Campaign.read(given)
 
 
 def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
@@ -152,20 +153,32 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
     raise UserError(f"the first {min(_TRIALS, count)} runs all fail, the first of them so: {first}")
 
 
-def _complete(
-    store: Store,
+def _swept(
+    prepare: Callable[[], Store],
     workers: int | None,
     scheduler: Client | str | None,
     retry_failed: bool,
     progress: ProgressCallback | None,
 ) -> xr.Dataset:
     """Render what is missing in a store."""
-    status = store.status()
-    wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
-    shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
-    if shards:
-        with _connected(workers, scheduler) as client:
-            _render(store, shards, client, retry_failed, progress)
+    if workers is not None and scheduler is not None:
+        raise UserError(f"workers = {workers} are of this machine, and the scheduler has its own: give one of both")
+    number = os.cpu_count() or 1 if workers is None else integer("workers", workers, 1, 1024)
+    with contextlib.ExitStack() as stack:
+        # A scheduler that is away leaves no store.
+        client = None if scheduler is None else stack.enter_context(_connected(scheduler))
+        store = prepare()
+        status = store.status()
+        wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
+        shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
+        if shards:
+            try:
+                client = client or stack.enter_context(_local(min(number, len(shards))))
+                _render(store, shards, client, retry_failed, progress)
+            except KeyboardInterrupt as error:
+                done = int(np.count_nonzero(store.status() != PLANNED))
+                text = f"interrupted after {done} of {store.count} runs, which are kept; the same command goes on."
+                raise KeyboardInterrupt(text) from error
     return open_campaign(store.path)
 
 
@@ -259,40 +272,36 @@ class _Tally:
 
 
 @contextlib.contextmanager
-def _connected(workers: int | None, scheduler: Client | str | None) -> Iterator[Client]:
-    """Yield a client of a scheduler, by default of new processes on this machine."""
-    import dask
-    from distributed import Client, LocalCluster
+def _connected(scheduler: Client | str) -> Iterator[Client]:
+    """Yield a client of a running scheduler."""
+    from distributed import Client
 
     if isinstance(scheduler, Client):
         yield scheduler
         return
-    # Reports of workers that come and go are not for the user.
-    logging.getLogger("distributed").setLevel(logging.ERROR)
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
-            raise UserError(
-                f"scheduler = {scheduler!r} cannot be reached: give its address, tcp://HOST:PORT"
-            ) from error
-        with client:
-            yield client
-        return
-    number = workers or os.cpu_count() or 1
-    with (
-        # The processes of the shards hold their memory, not these.
-        dask.config.set({"distributed.worker.memory.terminate": False}),
-        LocalCluster(
-            n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        if _has_dashboard():
+    _silence()
+    try:
+        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"scheduler = {scheduler!r} cannot be reached: give its address, tcp://HOST:PORT") from error
+    with client:
+        yield client
+
+
+@contextlib.contextmanager
+def _local(workers: int) -> Iterator[Client]:
+    """Yield a client of new processes on this machine."""
+    from distributed import Client, LocalCluster
+
+    _silence()
+    # The processes of the shards hold the memory, not these.
+    options = {"threads_per_worker": 1, "processes": True, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster, set_as_default=False) as client:
+        if importlib.util.find_spec("bokeh") is not None:
             _LOG.info("dashboard: %s", cluster.dashboard_link)
         yield client
 
 
-def _has_dashboard() -> bool:
-    """Return whether what Dask's dashboard needs is installed."""
-    return importlib.util.find_spec("bokeh") is not None
+def _silence() -> None:
+    """Keep Dask from telling of workers and connections that come and go."""
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)

@@ -50,7 +50,7 @@ def find_shots(
     params = parameters(define)
     places = [pair("--at", text) for text in at or []]
     check_figure(output)
-    from mitransient_lidar.plots.find_shots import plot_found_shots
+    from mitransient_lidar.plots.studies.find_shots import plot_found_shots
     from mitransient_lidar.studies import find_shots as study
 
     if places:
@@ -137,7 +137,7 @@ def shot_statistics(
 ) -> None:
     """Correlate the echoes of random shots with the sea's slopes."""
     check_figure(output)
-    from mitransient_lidar.plots.shot_statistics import plot_shot_statistics
+    from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
     from mitransient_lidar.studies import shot_statistics as study
 
     with reporting(quiet) as progress:
@@ -164,7 +164,7 @@ def target_signal(
     """
     params = parameters(define)
     check_figure(output)
-    from mitransient_lidar.plots.target_signal import plot_target_map, plot_target_signal
+    from mitransient_lidar.plots.studies.target_signal import plot_target_map, plot_target_signal
     from mitransient_lidar.studies import target_signal as study
 
     options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed}
@@ -205,7 +205,7 @@ def detect(
     """
     places = numbers("--depths", depths) if depths else []
     check_figure(output)
-    from mitransient_lidar.plots.detection import plot_detection
+    from mitransient_lidar.plots.studies.detection import plot_detection
     from mitransient_lidar.studies import detection as study
 
     with reporting(quiet) as progress:
@@ -244,7 +244,7 @@ def beam_spread(
     """
     wanted = numbers("--depths", depths)
     check_figure(output)
-    from mitransient_lidar.plots.beam_spread import plot_beam_spread
+    from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
     from mitransient_lidar.studies import beam_spread as study
 
     with reporting(quiet) as progress:
@@ -270,7 +270,7 @@ def fov_sweep(
     """Measure the water's attenuation for several fields of view."""
     wanted = numbers("--fov-mrad", fov_mrad)
     check_figure(output)
-    from mitransient_lidar.plots.fov_sweep import plot_fov_sweep
+    from mitransient_lidar.plots.studies.fov_sweep import plot_fov_sweep
     from mitransient_lidar.studies import fov_sweep as study
 
     options: dict[str, Any] = {"min_depth": min_depth, "max_depth": max_depth, "passes": passes, "seed": seed}
@@ -294,7 +294,7 @@ def scattering_orders(
     Each order is also separated by the number of reversals of the vertical direction: one, or several.
     """
     check_figure(output)
-    from mitransient_lidar.plots.scattering_orders import plot_scattering_orders
+    from mitransient_lidar.plots.studies.scattering_orders import plot_scattering_orders
     from mitransient_lidar.studies import scattering_orders as study
 
     options: dict[str, Any] = {"orders": orders, "passes": passes, "seed": seed}

@@ -9,7 +9,7 @@ import xarray as xr
 from command_line import run
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.beam_spread import plot_beam_spread
+from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
 from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
 from mitransient_lidar.transport.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.scene import LidarScene

@@ -132,6 +132,34 @@ def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
     assert rendered[3]["axis"] == deep
 
 
+def test_time_bins_that_leave_out_light_are_refused(rendered):
+    own = shot_series.render_shots("fig09_2x2", {**FLAT, "bottom_depth": 4}, positions=[(0, 0)])
+    with pytest.raises(UserError, match=r"the record of 13\d\d to 1\d\d\d ns leaves out light: it must hold 13\d\d to"):
+        shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0)], axis=results.time_axis(own))
+
+
+def test_seeds_and_instrument_of_a_series(rendered):
+    options = {"positions": PLACES[:2], "passes": 2, "first_seed": 40, "instrument": "teledyne_czmil"}
+    series = shot_series.render_shots("table1", FLAT, **options)
+    again = shot_series.render_shots_again(series)
+    assert [seed for one in rendered for seed in one["seeds"]] == [40, 41, 40, 41]
+    assert series.attrs["instrument"] == again.attrs["instrument"] == "teledyne_czmil"
+
+
+def test_description_of_the_sea_can_be_left_out(rendered):
+    options = {"positions": PLACES[:1], "passes": 2}
+    for describe_sea in (True, False):
+        series = shot_series.render_shots("table1", describe_sea=describe_sea, **options)
+        assert ("slope_deviation" in series.attrs) == describe_sea
+
+
+def test_series_that_does_not_fit_the_memory(rendered):
+    with pytest.raises(
+        UserError, match=r"^30 shots of 4096 pixels x 19\d bins, and 3 components of each, are more than"
+    ):
+        shot_series.render_shots("table1", {"layout": "64x64"}, positions=[(0, 0)] * 30, components=True)
+
+
 def test_places_beside_the_bottom_are_told(rendered, caplog):
     """The bottom of the scene is a square of 1 km."""
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0), (600, 0)])
@@ -151,7 +179,7 @@ def test_random_places_are_those_of_the_seed(rendered):
 
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
-    series = shot_series._Series("fig13_2x2", params, (0.3, 0.0), np.array(PLACES), None, False)
+    series = shot_series._Series("fig13_2x2", params, None, (0.3, 0.0), np.array(PLACES), None, False)
     (target,) = series._companions
     assert target.id() == "target"
     # In the frame of the first shot, with its aim at x = 1 m.

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.plots.target_signal import draw_against_background
+from mitransient_lidar.plots.studies.target_signal import draw_against_background
 
 _COLOURS = {"single": "0.25", "sum": "#e69f00", "brightest": "#56b4e9", "best": "#d55e00"}
 _LABELS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mitransient_lidar.plots.fov_sweep import plot_fov_sweep
+from mitransient_lidar.plots.studies.fov_sweep import plot_fov_sweep
 
 C, KD, A = 0.3, 0.17, 0.15
 

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.colors import to_hex
 from matplotlib.patches import Ellipse
 
-from mitransient_lidar.plots.find_shots import plot_found_shots
+from mitransient_lidar.plots.studies.find_shots import plot_found_shots
 from mitransient_lidar.studies.find_shots import RenderedShots
 from mitransient_lidar.studies.sea_map import SeaMap, Shot
 

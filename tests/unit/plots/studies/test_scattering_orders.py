@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.plots.scattering_orders import plot_scattering_orders
+from mitransient_lidar.plots.studies.scattering_orders import plot_scattering_orders
 
 
 def test_orders_add_up_and_the_last_one_holds_the_rest():

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.plots.shot_statistics import plot_shot_statistics
+from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
 from mitransient_lidar.studies.shot_statistics import depth_bias, slope_correlations
 
 # At 20 degrees in air: cosine 0.966877 in water, and 0.106257 m of depth in a nanosecond.

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_hex
 
-from mitransient_lidar.plots.target_signal import plot_target_map, plot_target_signal
+from mitransient_lidar.plots.studies.target_signal import plot_target_map, plot_target_signal
 
 NAMES = ["red", "green", "blue", "black"]
 TIME = 1400 + np.arange(100.0)

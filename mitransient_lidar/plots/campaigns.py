@@ -1,0 +1,172 @@
+"""Figure of a campaign: a sample of its records, the distributions of its parameters, and its responses."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.plots import drawing
+
+#: Records of the sample, most parameters and pairs of them that are drawn, and runs that the responses are taken from.
+_SAMPLE, _MOST_PARAMETERS, _MOST_PAIRS, _MOST_RUNS = 12, 5, 3, 20_000
+
+#: Cells of a response surface along each side.
+_CELLS = 10
+
+#: Range of the power that is drawn, below the highest.
+_DYNAMIC_RANGE = 1e5
+
+#: Flag of `analysis.waveforms.echo_detection.EchoFlag` for an echo that was not found.
+_NO_ECHO = 1
+
+_DONE = 1
+
+
+def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, seed: int = 0) -> Figure:
+    """Draw a campaign.
+
+    Above: a random sample of records, the first pixel of each. In the middle: the distributions of the parameters.
+    Below, over pairs of parameters: the mean over runs of the share of bottoms that were found, else of the peak power,
+    else of the error.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A campaign as of `campaigns.store.open_campaign`.
+    path : path-like, optional
+        PNG, PDF or SVG file to write.
+    seed : int
+        Seed of the sample.
+
+    Raises
+    ------
+    UserError
+        If no run is done, or the name of the file has another suffix.
+    """
+    figure = drawing.new_figure(path, 11.0, 9.6)
+    done = np.flatnonzero(dataset["status"].values == _DONE)
+    if done.size == 0:
+        raise UserError("the campaign has no run that is done: nothing can be drawn")
+    rng = np.random.default_rng(seed)
+    used = np.sort(rng.choice(done, min(done.size, _MOST_RUNS), replace=False))
+    inputs = _inputs(dataset, used)
+    rows: Any = figure.subfigures(3, 1, height_ratios=[1.2, 0.9, 1.2])
+    _draw_sample(rows[0].subplots(), dataset, np.sort(rng.choice(done, min(done.size, _SAMPLE), replace=False)))
+    _draw_distributions(rows[1], inputs)
+    _draw_responses(rows[2], dataset, used, inputs)
+    total, failed = dataset.sizes["run"], int(np.count_nonzero(dataset["status"].values == _DONE + 1))
+    figure.suptitle(f"{dataset.attrs.get('title', 'campaign')}: {done.size} of {total} done, {failed} failed")
+    return drawing.save(figure, path)
+
+
+def _inputs(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> dict[str, npt.NDArray[Any]]:
+    """Return the parameters of runs, by name, those that vary."""
+    found = {name: dataset[stored].values[runs] for name, stored in dict(dataset.attrs.get("inputs", {})).items()}
+    return {name: column for name, column in found.items() if np.unique(column).size > 1}
+
+
+def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> None:
+    """Draw records of runs."""
+    name = next((name for name in ("signal", "waveform") if name in dataset), None)
+    if name is None:
+        ax.text(0.5, 0.5, "no records are kept", ha="center", va="center")
+        ax.set_axis_off()
+        return
+    records = dataset[name].isel(run=runs)
+    records = records.isel({dim: 0 for dim in records.dims if dim not in ("run", records.dims[-1])}).load()
+    values, time = np.asarray(records, dtype=np.float64), records[records.dims[-1]].values
+    # Records of other heights side by side: each relative to its own peak.
+    peaks = values.max(axis=1, keepdims=True)
+    values = values / np.where(peaks > 0, peaks, 1)
+    if name == "waveform":
+        values = np.maximum(values, 1 / _DYNAMIC_RANGE)
+        ax.set_yscale("log")
+    for run, line, colour in zip(runs, values, drawing.pixel_colours(len(runs) + 11)[::-1], strict=False):
+        ax.plot(time, line, color=colour, linewidth=0.9, label=f"run {run}")
+    ax.set_xlabel(drawing.TIME_LABEL)
+    ax.set_ylabel(f"{name}, relative to its peak")
+    ax.legend(frameon=False, fontsize="x-small", ncols=2)
+    drawing.add_grid(ax)
+
+
+def _draw_distributions(figure: Any, inputs: dict[str, npt.NDArray[Any]]) -> None:
+    """Draw how often each value of a parameter occurs."""
+    shown = dict(itertools.islice(inputs.items(), _MOST_PARAMETERS))
+    if not shown:
+        return
+    for ax, (name, column) in zip(np.atleast_1d(figure.subplots(1, len(shown))), shown.items(), strict=True):
+        values, numbers = np.unique(column, return_counts=True)
+        if values.size <= _CELLS:
+            ax.bar([str(value) for value in values], numbers, color="0.55")
+        else:
+            ax.hist(column, bins=_edges(column), color="0.55")
+            ax.set_xscale("log" if _is_logarithmic(column) else "linear")
+        ax.set_xlabel(name)
+        drawing.add_grid(ax, "y", hide=("top", "right"))
+    figure.axes[0].set_ylabel("runs")
+
+
+def _draw_responses(
+    figure: Any, dataset: xr.Dataset, runs: npt.NDArray[np.intp], inputs: dict[str, npt.NDArray[Any]]
+) -> None:
+    """Draw the mean response over pairs of parameters."""
+    response, label = _response(dataset, runs)
+    axes = {name: column for name, column in inputs.items() if column.dtype.kind in "if"}
+    pairs = list(itertools.islice(itertools.combinations(axes, 2), _MOST_PAIRS))
+    if not pairs:
+        return
+    image = None
+    limits = float(np.nanmin(response)), float(np.nanmax(response))
+    for ax, (x, y) in zip(np.atleast_1d(figure.subplots(1, len(pairs))), pairs, strict=True):
+        edges = [_edges(axes[name]) for name in (x, y)]
+        places = [
+            np.clip(np.digitize(axes[name], edge) - 1, 0, len(edge) - 2)
+            for name, edge in zip((x, y), edges, strict=True)
+        ]
+        shape = tuple(len(edge) - 1 for edge in edges)
+        index, known = np.ravel_multi_index(places, shape), np.isfinite(response)
+        count = np.bincount(index[known], minlength=shape[0] * shape[1])
+        total = np.bincount(index[known], weights=response[known], minlength=shape[0] * shape[1])
+        with np.errstate(invalid="ignore"):
+            mean = (total / count).reshape(shape)
+        image = ax.pcolormesh(edges[0], edges[1], mean.T, vmin=limits[0], vmax=limits[1], cmap="viridis")
+        ax.set(xlabel=x, ylabel=y)
+        ax.set_xscale("log" if _is_logarithmic(axes[x]) else "linear")
+        ax.set_yscale("log" if _is_logarithmic(axes[y]) else "linear")
+    figure.colorbar(image, ax=figure.axes, label=label)
+
+
+def _response(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> tuple[FloatArray, str]:
+    """Return a quantity of each run, and its name."""
+    if "echo_flags" in dataset:
+        flags = dataset["echo_flags"].sel(echo="bottom").isel(run=runs).values.reshape(len(runs), -1)
+        return np.asarray(np.mean((flags & _NO_ECHO) == 0, axis=1)), "share of bottoms found"
+    if "waveform" in dataset:
+        peak = dataset["waveform"].isel(run=runs).max([dim for dim in dataset["waveform"].dims if dim != "run"]).values
+        return np.log10(np.maximum(peak.astype(np.float64), 1e-30)), "peak power (log10 W)"
+    return dataset["error_median"].values[runs].astype(np.float64), "relative error of the median bin"
+
+
+def _is_logarithmic(column: npt.NDArray[Any]) -> bool:
+    """Return whether the values are spread more evenly over their logarithms."""
+    low, high = float(column.min()), float(column.max())
+    return low > 0 and high / low > _CELLS - 1 and float(np.median(column)) < 0.4 * (low + high)
+
+
+def _edges(column: npt.NDArray[Any]) -> FloatArray:
+    """Return the edges of cells: about each of few values, or even ones over the range of many."""
+    values = np.unique(column).astype(np.float64)
+    if values.size <= _CELLS:
+        middle = 0.5 * (values[1:] + values[:-1])
+        return np.concatenate([[1.5 * values[0] - 0.5 * values[1]], middle, [1.5 * values[-1] - 0.5 * values[-2]]])
+    if _is_logarithmic(column):
+        return np.asarray(np.geomspace(values[0], values[-1], _CELLS + 1))
+    return np.linspace(values[0], values[-1], _CELLS + 1)

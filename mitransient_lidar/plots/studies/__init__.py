@@ -1,0 +1,1 @@
+"""Figures of studies, one module for each."""

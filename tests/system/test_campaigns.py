@@ -1,0 +1,327 @@
+"""Campaigns from their files to data sets: labels, failures, interruption, clusters, and single runs."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+
+from mitransient_lidar.campaigns import shard as shards
+from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
+from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
+from mitransient_lidar.core.errors import UserError
+
+#: Runs that take a tenth of a second each.
+QUICK = {
+    "scene": "table1",
+    "target_error": 0.3,
+    "keep": ["waveform", "truth"],
+    "fixed": {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160},
+    "parameters": {"bottom_depth": {"low": 2.0, "high": 9.0}, "bottom_reflectance": "0.02 * bottom_depth"},
+    "design": {"kind": "sobol", "count": 24, "seed": 4},
+}
+
+FULL = {
+    "scene": "fig13_2x2",
+    "target_error": 0.2,
+    "keep": ["waveform", "stderr", "components", "echoes", "truth"],
+    "receiver": "apd",
+    "gain": "auto",
+    "parameters": {"scattering": "0.6 * attenuation"},
+    "design": {"file": "runs.csv", "shots": 2, "seed": 9},
+}
+
+#: The third run is impossible.
+TABLE = """attenuation,target_depth,wind_speed
+0.2,4.5,3
+0.35,5.5,6
+0.3,5,-6
+0.25,3.5,10
+"""
+
+pytestmark = pytest.mark.slow
+
+
+def write_toml(path, campaign):
+    """Write a campaign as TOML, whose values are those of JSON but for tables."""
+
+    def text(value):
+        if isinstance(value, dict):
+            return "{ " + ", ".join(f"{key} = {text(one)}" for key, one in value.items()) + " }"
+        return json.dumps(value)
+
+    sections = {name: value for name, value in campaign.items() if isinstance(value, dict)}
+    lines = [f"{name} = {text(value)}" for name, value in campaign.items() if name not in sections]
+    for name, section in sections.items():
+        lines += [f"[{name}]", *(f"{key} = {text(value)}" for key, value in section.items())]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def files_of(store):
+    """Return the contents of the files of a store by name."""
+    return {path.relative_to(store): path.read_bytes() for path in Path(store).rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """Store of the quick campaign, rendered by two workers in four shards."""
+    path = tmp_path_factory.mktemp("campaign") / "quick.zarr"
+    sweep(QUICK, path, workers=2, shard_size=6)
+    return path
+
+
+def test_everything_that_can_be_kept(tmp_path):
+    (tmp_path / "runs.csv").write_text(TABLE)
+    told = []
+    path = tmp_path / "full.zarr"
+    data = sweep(write_toml(tmp_path / "full.toml", FULL), path, workers=1, progress=told.append).load()
+    assert (told[-1].done, told[-1].planned, told[-1].failed, told[-1].unit) == (4, 4, 1, "run")
+    assert data["status"].values.tolist() == [DONE, DONE, FAILED, DONE]
+    assert data["error"].values.tolist()[:2] == ["", ""]
+    assert data["error"].values[2].startswith("wind_speed = -6")
+    assert np.isnan(data["waveform"].isel(run=2)).all()
+    done = data.isel(run=[0, 1, 3])
+    for name in ("waveform", "waveform_stderr", "waveform_by_origin", "signal", "echo_depth_m", "true_bottom_depth"):
+        assert np.isfinite(done[name].values).any(), name
+    assert done["waveform"].dims == ("run", "shot", "pixel", "time")
+    assert done["origin"].values.tolist() == ["surface", "water", "target", "bottom"]
+    # Inputs as coordinates; the truth follows from them.
+    np.testing.assert_allclose(done["scattering"], 0.6 * np.array([0.2, 0.35, 0.25]))
+    assert set(done["waveform"].coords) >= {
+        "attenuation",
+        "target_depth",
+        "wind_speed",
+        "surface_seed",
+        "pixel",
+        "time",
+    }
+    assert len(np.unique(done["surface_seed"])) == 3
+    np.testing.assert_allclose(done["true_bottom_depth"], 12, atol=1e-3)
+    assert len(np.unique(done["aim_x"])) == 6
+    # The parts add up to the whole, and come from where they should.
+    np.testing.assert_allclose(done["waveform_by_origin"].sum("origin"), done["waveform"], rtol=1e-5, atol=1e-12)
+    first = done["waveform_by_origin"].isel(run=0, shot=0).sum("pixel")
+    peaks = first["time"].values[first.argmax("time").values]
+    assert peaks[0] < peaks[2] < peaks[3]
+    # A run alone, on other random numbers of the process, is the same to the bit.
+    alone = render_row(path, 1)
+    stored = data["waveform"].isel(run=1)
+    np.testing.assert_array_equal(alone["waveform"].values.astype(np.float32), stored.values)
+    assert float(alone.attrs["scene.attenuation"]) == 0.35
+    from_file = render_row(tmp_path / "full.toml", 1)
+    np.testing.assert_array_equal(from_file["waveform"], alone["waveform"])
+    # Analysis commands read it.
+    out = run("sweep", path, "--row", 3, "-o", tmp_path / "run.nc", "-q")
+    assert out.exit_code == 0, out.stderr
+    assert run("waveforms", tmp_path / "run.nc", "--table").exit_code == 0
+    out = run("sweep", path, "--show", "-o", tmp_path / "run.png")
+    assert out.exit_code == 0, out.stderr
+    assert "4 runs: 3 done, 1 failed, 0 planned\nfailed 1, the first run 2: wind_speed = -6" in out.stdout
+    assert (tmp_path / "run.png").stat().st_size > 20_000
+
+
+def test_opening_needs_no_consolidated_metadata(quick):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = xr.open_zarr(quick, consolidated=False).load()
+    assert data["waveform"].dims == ("run", "pixel", "time")
+    np.testing.assert_allclose(data["true_bottom_depth"], data["bottom_depth"], atol=2e-4)
+    np.testing.assert_allclose(data["bottom_reflectance"], 0.02 * data["bottom_depth"])
+    assert (data["error_median"] <= 0.3).all()
+    assert np.isfinite(data["waveform"].values).all()
+
+
+def test_same_bits_whatever_shards_workers_and_order(quick, tmp_path):
+    other = sweep(QUICK, tmp_path / "other.zarr", workers=1, shard_size=17).load()
+    first = open_campaign(quick).load()
+    for name in first.variables:
+        np.testing.assert_array_equal(first[name].values, other[name].values, err_msg=str(name))
+
+
+def test_a_complete_campaign_is_left_as_it_is(quick):
+    before = files_of(quick)
+    resume(quick, workers=1)
+    sweep(QUICK, quick, workers=1)
+    assert files_of(quick) == before
+
+
+def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(quick, tmp_path):
+    path = tmp_path / "killed.zarr"
+    campaign = write_toml(tmp_path / "quick.toml", QUICK)
+    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(campaign), "-o", str(path)]
+    with subprocess.Popen(
+        [*command, "--workers", "2", "--shard-size", "6"], start_new_session=True, stderr=subprocess.PIPE
+    ) as process:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and not (path.exists() and (Store(path).status() == DONE).any()):
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGKILL)
+    status = Store(path).status()
+    assert (status == DONE).any()
+    assert (status == PLANNED).any()
+    # The processes of shards, in sessions of their own, end with their worker.
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline and shard_processes():
+        time.sleep(0.1)
+    assert not shard_processes()
+    finished = [one for one in Store(path).shards if (status[Store(path).runs_of(one)] == DONE).all()]
+    chunks = [path / "waveform" / "c" / str(one) / "0" / "0" for one in finished]
+    written = [chunk.stat().st_mtime_ns for chunk in chunks]
+    out = run("sweep", path, "--workers", 2, "-q")
+    assert out.exit_code == 0, out.stderr
+    assert [chunk.stat().st_mtime_ns for chunk in chunks] == written
+    assert files_of(path) == files_of(quick)
+
+
+def shard_processes():
+    """Return the processes that render a shard below the folder of this test's Python."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (entry / "cmdline").read_bytes().split(b"\0")
+            state = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0]
+        except OSError:
+            continue
+        if b"mitransient_lidar.campaigns.shard" in command and state != "Z":
+            found.append(int(entry.name))
+    return found
+
+
+def test_cluster_that_loses_a_worker(quick, tmp_path):
+    """A scheduler and two workers as on a cluster; one is killed while it renders."""
+    file, path = tmp_path / "scheduler.json", tmp_path / "cluster.zarr"
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1"]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
+    worker += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
+    processes = [subprocess.Popen([*dask, "--no-dashboard", "--scheduler-file", str(file)], **options)]
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        processes += [subprocess.Popen(worker, **options) for _ in range(2)]
+        seen = []
+
+        def watch(state):
+            seen.append(state.done)
+            if state.done >= 6 and processes[1].poll() is None:
+                os.killpg(processes[1].pid, signal.SIGKILL)
+
+        address = json.loads(file.read_text())["address"]
+        data = sweep(QUICK, path, scheduler=address, shard_size=6, progress=watch)
+        assert processes[1].wait(10) == -signal.SIGKILL
+        assert (data["status"] == DONE).all()
+        assert seen[-1] == 24
+        assert files_of(path) == files_of(quick)
+    finally:
+        for process in processes:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def test_interruption_keeps_what_is_written(tmp_path):
+    path, campaign = tmp_path / "out.zarr", write_toml(tmp_path / "quick.toml", QUICK)
+    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(campaign), "-o", str(path)]
+    with subprocess.Popen(
+        [*command, "--workers", "1", "--shard-size", "3"], start_new_session=True, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while process.poll() is None and not (path.exists() and (Store(path).status() == DONE).any()):
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told.splitlines()[-1].startswith("interrupted after ")
+    assert "Traceback" not in told
+    assert 0 < np.count_nonzero(Store(path).status() == DONE) < 24
+
+
+def test_invalid_use_leaves_nothing(quick, tmp_path):
+    def changed(**sections):
+        return {**QUICK, **sections}
+
+    out = tmp_path / "out.zarr"
+    cases = [
+        (changed(fixed={"bottom_dept": 3}), [], "parameter 'bottom_dept' is not one of scene table1: did you mean"),
+        (changed(parameters={"altitude": {"low": 3, "high": 3}}), [], "altitude has the empty range 3 to 3"),
+        (changed(parameters={"bin_width_ns": [1, 2]}), [], "parameter 'bin_width_ns' must be the same in all runs"),
+        (changed(fixed={"bottom_depth": -3, **QUICK["fixed"]}, parameters={"altitude": [100, 200]}), [], "all fail"),
+        (changed(fixed={"aim_x": 3}, design={**QUICK["design"], "shots": 2}), [], "leave out aim_x"),
+        (changed(scene="table9"), [], "table9"),
+        (changed(), ["--scheduler", "tcp://127.0.0.1:9"], "scheduler = 'tcp://127.0.0.1:9' cannot be reached"),
+        (changed(), ["--scheduler", "nonsense://a"], "scheduler = 'nonsense://a' cannot be reached"),
+        (changed(), ["--workers", "0"], "workers = 0 must lie between 1 and 1024"),
+        (changed(), ["--workers", "2", "--row", "1"], "--workers and --row are alternatives"),
+        (changed(), ["--row", "24", "-o", str(tmp_path / "a.nc")], "row = 24 must lie between 0 and 23"),
+    ]
+    for campaign, options, message in cases:
+        given = [] if "-o" in options else ["-o", out]
+        file = write_toml(tmp_path / "campaign.toml", campaign)
+        assert_refused(run("sweep", file, *given, *options, "-q"), message)
+        assert not out.exists()
+    assert_refused(run("sweep", tmp_path / "none.toml", "-o", out), "none.toml")
+    (tmp_path / "text.toml").write_text("scene : table1")
+    assert_refused(run("sweep", tmp_path / "text.toml", "-o", out), "text.toml is not a TOML file")
+    assert_refused(run("sweep", tmp_path, "-q"), "is no store of a campaign")
+    before = files_of(quick)
+    other = write_toml(tmp_path / "other.toml", {**QUICK, "target_error": 0.2})
+    assert_refused(run("sweep", other, "-o", quick, "-q"), "holds another campaign")
+    assert_refused(run("sweep", quick, "-o", out, "-q"), "--output is fixed in the store")
+    assert files_of(quick) == before
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_disk_that_is_full(quick, tmp_path, monkeypatch):
+    """Files of a limited size stand for a full disk: chunks cannot be written, and no status says that they were."""
+    path = tmp_path / "full.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    code = (
+        "import resource, signal, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200));"
+        "from mitransient_lidar.campaigns import shard; shard._main()"
+    )
+    original = subprocess.Popen
+    monkeypatch.setattr(
+        shards.subprocess, "Popen", lambda command, **given: original([sys.executable, "-c", code], **given)
+    )
+    with pytest.raises(UserError, match=r"cannot write .*full\.zarr: File too large"):
+        shards.render_in_process(str(path), 0)
+    assert (Store(path).status() == PLANNED).all()
+
+
+def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatch):
+    path = tmp_path / "dying.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    code = (
+        "import os; from mitransient_lidar.campaigns import runs, shard; arrays = runs.RunRenderer.arrays\n"
+        "def dying(self, number, values): return os.abort() if number == 8 else arrays(self, number, values)\n"
+        "runs.RunRenderer.arrays = dying; shard._main()"
+    )
+    original = subprocess.Popen
+    monkeypatch.setattr(
+        shards.subprocess, "Popen", lambda command, **given: original([sys.executable, "-c", code], **given)
+    )
+    told = []
+    assert shards.render_in_process(str(path), 1, report=lambda *counts: told.append(counts)) == (5, 1)
+    assert told[-1] == (5, 1)
+    store = Store(path)
+    assert store.status(store.runs_of(1)).tolist() == [DONE, DONE, FAILED, DONE, DONE, DONE]
+    assert store.errors()[8] == "the process ended by signal 6"
+    np.testing.assert_array_equal(
+        open_campaign(path)["waveform"].values[[6, 7, 9, 10, 11]],
+        open_campaign(quick)["waveform"].values[[6, 7, 9, 10, 11]],
+    )
+    monkeypatch.undo()
+    assert shards.render_in_process(str(path), 1) == (5, 1)
+    assert shards.render_in_process(str(path), 1, retry=True) == (6, 0)
+    np.testing.assert_array_equal(open_campaign(path)["waveform"].values[8], open_campaign(quick)["waveform"].values[8])

@@ -1,0 +1,218 @@
+import numpy as np
+import pytest
+
+from mitransient_lidar.campaigns.design import Campaign, Range
+from mitransient_lidar.core.errors import UserError
+
+CAMPAIGN = {
+    "scene": "table1",
+    "fixed": {"layout": "2x2", "ratio": 0.8},
+    "parameters": {
+        "bottom_depth": {"low": 2.0, "high": 20.0},
+        "attenuation": {"low": 0.15, "high": 1.5, "scale": "log"},
+        "scattering": "ratio * attenuation",
+        "wind_speed": [3.0, 6.0, 10.0],
+    },
+    "design": {"kind": "sobol", "count": 64, "seed": 1},
+}
+
+TWO = {"scene": "table1", "design": {"kind": "random", "count": 2}}
+
+TOML = """
+scene = "table1"
+target_error = 0.1
+keep = ["truth", "waveform"]
+[parameters]
+bottom_depth = { low = 2.0, high = 20.0 }
+[design]
+kind = "random"
+count = 3
+"""
+
+
+def changed(**sections):
+    """Return the campaign with other keys; None leaves one out."""
+    given = {**CAMPAIGN, **sections}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def test_columns_in_the_order_of_the_file_within_their_ranges():
+    table = Campaign.of(CAMPAIGN).table()
+    assert list(table) == ["bottom_depth", "attenuation", "scattering", "wind_speed"]
+    assert {len(column) for column in table.values()} == {64}
+    assert table["bottom_depth"].min() >= 2
+    assert table["bottom_depth"].max() <= 20
+    np.testing.assert_allclose(table["scattering"], 0.8 * table["attenuation"], rtol=1e-12)
+    # A balanced sequence: 32 of 64 values of a logarithmic range below its geometric mean, and a third of each list.
+    assert np.count_nonzero(table["attenuation"] < np.sqrt(0.15 * 1.5)) == 32
+    assert min(np.unique(table["wind_speed"], return_counts=True)[1]) >= 20
+
+
+@pytest.mark.parametrize("kind", ["sobol", "latin_hypercube", "random"])
+def test_same_seed_same_runs(kind):
+    def table(seed):
+        return Campaign.of(changed(design={"kind": kind, "count": 37, "seed": seed})).table()
+
+    first, again, other = table(1), table(1), table(2)
+    for name in first:
+        np.testing.assert_array_equal(first[name], again[name])
+    assert not np.array_equal(first["bottom_depth"], other["bottom_depth"])
+
+
+def test_latin_hypercube_has_one_run_in_each_part_of_a_range():
+    table = Campaign.of(changed(design={"kind": "latin_hypercube", "count": 36})).table()
+    parts = np.floor((table["bottom_depth"] - 2) / 18 * 36).astype(int)
+    assert sorted(parts) == list(range(36))
+
+
+def test_sobol_fills_the_plane_more_evenly_than_random_numbers():
+    cells = {}
+    for kind in ("sobol", "random"):
+        table = Campaign.of(changed(design={"kind": kind, "count": 256, "seed": 3})).table()
+        depth = (table["bottom_depth"] - 2) / 18
+        share = np.log(table["attenuation"] / 0.15) / np.log(10)
+        cells[kind] = np.histogram2d(depth, share, bins=16, range=[[0, 1], [0, 1]])[0]
+    assert cells["sobol"].max() == cells["sobol"].min() == 1
+    assert cells["random"].max() > 2
+
+
+def test_grid_has_all_combinations():
+    given = changed(
+        parameters={
+            "bottom_depth": {"low": 2, "high": 20, "steps": 3},
+            "attenuation": {"low": 0.1, "high": 1, "scale": "log", "steps": 3},
+            "layout": ["1x1", "2x2"],
+        },
+        fixed=None,
+        design={"kind": "grid"},
+    )
+    table = Campaign.of(given).table()
+    assert len(table["layout"]) == 18
+    assert len(set(zip(*(column.tolist() for column in table.values()), strict=True))) == 18
+    np.testing.assert_allclose(np.unique(table["bottom_depth"]), [2, 11, 20])
+    np.testing.assert_allclose(np.unique(table["attenuation"]), [0.1, 10**-0.5, 1])
+
+
+def test_whole_numbers_stay_whole():
+    given = changed(parameters={"surface_seed": [1, 2, 3]}, fixed=None, design={"kind": "grid"})
+    assert Campaign.of(given).table()["surface_seed"].dtype.kind == "i"
+
+
+def test_table_of_a_file(tmp_path):
+    (tmp_path / "runs.csv").write_text("bottom_depth, petzold\n5, clear\n7.5, coastal\n")
+    given = {"scene": "table1", "parameters": {"altitude": "20 * bottom_depth"}, "design": {"file": "runs.csv"}}
+    table = Campaign.of(given, tmp_path).table()
+    assert table["bottom_depth"].tolist() == [5, 7.5]
+    assert table["petzold"].tolist() == ["clear", "coastal"]
+    assert table["altitude"].tolist() == [100, 150]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bottom_depth\n", "a row for each run"),
+        ("bottom_depth,layout\n5\n", "run 1: it must have 2 values"),
+        ("bottom_depth,bottom_depth\n5,6\n", "name each column once"),
+        ("altitude\n5\n", "is a column of"),
+    ],
+)
+def test_invalid_tables(tmp_path, text, message):
+    (tmp_path / "runs.csv").write_text(text)
+    given = {"scene": "table1", "fixed": {"altitude": 100}, "design": {"kind": "table", "file": "runs.csv"}}
+    with pytest.raises(UserError, match=message):
+        Campaign.of(given, tmp_path).table()
+
+
+def test_file_that_is_missing(tmp_path):
+    with pytest.raises(UserError, match=r"cannot read .*none\.toml"):
+        Campaign.read(tmp_path / "none.toml")
+    with pytest.raises(UserError, match=r"cannot read .*none\.csv"):
+        Campaign.of({"scene": "table1", "design": {"file": "none.csv"}}, tmp_path).table()
+
+
+def test_read(tmp_path):
+    (tmp_path / "campaign.toml").write_text(TOML)
+    campaign = Campaign.read(tmp_path / "campaign.toml")
+    assert campaign.parameters == {"bottom_depth": Range(2, 20)}
+    assert campaign.keep == ("waveform", "truth")
+    assert campaign.target_error == 0.1
+    assert len(campaign.table()["bottom_depth"]) == 3
+    again = Campaign.from_json(campaign.text)
+    np.testing.assert_array_equal(again.table()["bottom_depth"], campaign.table()["bottom_depth"])
+
+
+def test_scene_beside_the_file(tmp_path):
+    (tmp_path / "mine.xml").write_text("<scene version='3.0.0'/>")
+    assert Campaign.of({**TWO, "scene": "mine.xml"}, tmp_path).scene == str(tmp_path / "mine.xml")
+    (tmp_path / "table1").write_text("another file")
+    assert Campaign.of(TWO, tmp_path).scene == "table1"
+
+
+@pytest.mark.parametrize("text", ["scene = ", "\x00", "[design", "scene = 'a'\nscene = 'b'"])
+def test_file_that_is_not_toml(tmp_path, text):
+    (tmp_path / "campaign.toml").write_text(text)
+    with pytest.raises(UserError, match=r"campaign\.toml is not a TOML file: "):
+        Campaign.read(tmp_path / "campaign.toml")
+
+
+def test_file_that_is_not_text(tmp_path):
+    (tmp_path / "campaign.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match="not a text file"):
+        Campaign.read(tmp_path / "campaign.toml")
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"scene": None}, "scene = None must be"),
+        ({"colour": 1}, "'colour' is no key of a campaign"),
+        ({"keep": ["waveform", "light"]}, "keep holds 'light'"),
+        ({"keep": []}, r"keep = \[\] must be a list"),
+        ({"target_error": 0}, "target_error = 0"),
+        ({"receiver": 3}, "receiver = 3 must be a name"),
+        ({"gain": "auto"}, "gain = 'auto' needs a receiver"),
+        ({"fixed": 3}, "fixed = 3 must be a table"),
+        ({"fixed": {"bottom_depth": 3}}, r"'bottom_depth' is in \[fixed\] and in \[parameters\]"),
+        ({"parameters": {"altitude": {"low": 3, "high": 3}}}, "altitude has the empty range 3 to 3"),
+        ({"parameters": {"altitude": {"low": 3, "high": 2}}}, "altitude has the empty range 3 to 2"),
+        ({"parameters": {"altitude": {"low": 3}}}, "altitude = .* must have high"),
+        ({"parameters": {"altitude": {"low": 0, "high": 2, "scale": "log"}}}, r"altitude\.low = 0 must be positive"),
+        ({"parameters": {"altitude": {"low": 0, "high": 2, "scale": "cube"}}}, r"altitude\.scale = 'cube'"),
+        ({"parameters": {"altitude": {"low": 0, "high": 2, "step": 3}}}, "'step' is no key of parameters.altitude"),
+        ({"parameters": {"altitude": {"low": 0, "high": float("inf")}}}, r"altitude\.high = inf"),
+        ({"parameters": {"altitude": 3}}, r"altitude = 3 must be a range .* belongs to \[fixed\]"),
+        ({"parameters": {"altitude": []}}, r"altitude = \[\] must be a range"),
+        ({"parameters": {"altitude": [1, "a"]}}, "altitude = .* must be a range"),
+        ({"parameters": {"altitude": [1, float("nan")]}}, "altitude = nan"),
+        ({"design": {"kind": "square", "count": 3}}, "design.kind = 'square'"),
+        ({"design": {"kind": "sobol"}}, "design.count = None: a design of kind 'sobol' needs a number of runs"),
+        ({"design": {"kind": "grid", "count": 3}}, "design.count = 3"),
+        ({"design": {"kind": "sobol", "count": 0}}, "design.count = 0"),
+        ({"design": {"kind": "sobol", "count": 2, "shots": 0}}, "design.shots = 0"),
+        ({"design": {"kind": "sobol", "count": 2, "file": "a.csv"}}, "design.file = 'a.csv'"),
+        ({"design": {"kind": "table"}}, "design.file = None"),
+        ({"design": {"kind": "sobol", "count": 2, "runs": 3}}, "'runs' is no key of design"),
+    ],
+)
+def test_invalid_campaigns(sections, message):
+    with pytest.raises(UserError, match=message):
+        Campaign.of(changed(**sections))
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"parameters": {}}, "no parameters to vary"),
+        ({"parameters": {"a": "b", "b": "a", "c": [1, 2]}}, "a, b depend on each other in a circle"),
+        ({"parameters": {"a": "z + 1", "c": [1, 2]}}, "needs z, which is neither"),
+        ({"parameters": {"a": "1 / c", "c": [0, 0.0]}}, "not finite"),
+        ({"parameters": {"a": "2 * c", "c": ["x", "y"]}}, "needs c, whose values are texts"),
+        (
+            {"parameters": {"a": {"low": 0, "high": 1}}, "design": {"kind": "grid"}},
+            r"a\.steps is missing: the range of a grid",
+        ),
+    ],
+)
+def test_impossible_designs(sections, message):
+    with pytest.raises(UserError, match=message):
+        Campaign.of(changed(**sections)).table()

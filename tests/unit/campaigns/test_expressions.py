@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from mitransient_lidar.campaigns.expressions import Expression
+from mitransient_lidar.core.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.8 * attenuation", 0.4),
+        ("-attenuation + 2", 1.5),
+        ("(attenuation + depth) / 2 ** 3", 0.5625),
+        ("sqrt(depth) - exp(log(attenuation))", 1.5),
+        ("min(depth, 3) + max(attenuation, 0.75)", 3.75),
+        ("sin(0) + cos(0) + tan(0)", 1.0),
+        ("7", 7.0),
+    ],
+)
+def test_values(text, expected):
+    found = Expression("x", text).evaluate({"attenuation": np.array([0.5]), "depth": np.array([4.0])})
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_names_are_those_of_parameters():
+    assert Expression("x", "max(a, 2 * b) / sqrt(c)").names == {"a", "b", "c"}
+    assert Expression("x", "min + 1").names == {"min"}
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("__import__('os')", "may hold"),
+        ("a.b", "'a.b'"),
+        ("a if b else c", "may hold"),
+        ("[1, 2]", "may hold"),
+        ("a = 2", "no expression"),
+        ("2 *", "no expression"),
+        ("", "no expression"),
+        ("sqrt(1, 2)", "may hold"),
+        ("min(1)", "may hold"),
+        ("'text'", "may hold"),
+        ("True", "may hold"),
+        ("a < b", "may hold"),
+        ("a // b", "may hold"),
+        ("a @ b", "may hold"),
+        ("~a", "may hold"),
+        ("sqrt(x=2)", "may hold"),
+        ("round(2)", "may hold"),
+        ("(" * 300 + "1" + ")" * 300, "no expression"),
+    ],
+)
+def test_anything_else_is_refused(text, part):
+    with pytest.raises(UserError, match=r"^x = ") as error:
+        Expression("x", text)
+    assert part in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["1 / (a - 1)", "log(a - 1)", "10 ** 400", "sqrt(-a)"])
+def test_values_must_be_finite(text):
+    with pytest.raises(UserError, match="not finite"):
+        Expression("x", text).evaluate({"a": np.array([1.0, 2.0])})

@@ -1,0 +1,149 @@
+import errno
+import os
+import warnings
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+
+from mitransient_lidar.campaigns.design import Campaign
+from mitransient_lidar.campaigns.runs import Array, RunRenderer
+from mitransient_lidar.campaigns.store import DONE, FAILED, Store, describe_campaign, open_campaign
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+CAMPAIGN = Campaign.of(
+    {
+        "scene": "table1",
+        "parameters": {"time": {"low": 1, "high": 2}, "layout": ["1x1", "2x2"]},
+        "design": {"kind": "random", "count": 10, "shots": 3},
+    }
+)
+AXIS = TimeAxis(1000.0, 0.5, 4)
+ARRAYS = {
+    "waveform": Array(("shot", "pixel", "time"), np.zeros((3, 2, 4), dtype=np.float32), {"units": "W"}),
+    "echo_flags": Array(("shot", "pixel"), np.zeros((3, 2), dtype=np.int16), {}),
+    "surface_seed": Array((), np.asarray(0), {}),
+}
+COORDINATES = {
+    "pixel": Array(("pixel",), np.array(["red", "blue"]), {}),
+    "time": Array(("time",), AXIS.centres_ns, {"units": "ns"}),
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "campaign.zarr"
+
+
+@pytest.fixture
+def store(path):
+    record = SceneRecord("table1", "<scene/>", True, {"time": "0"}, {})
+    renderer = RunRenderer(CAMPAIGN, record, AXIS)
+    return Store.create(path, renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
+
+
+def filled(store, shard, value):
+    """Return what is written of a shard with equal values."""
+    status, errors, arrays = store.read(shard)
+    return status, errors, {name: np.full_like(array, value) for name, array in arrays.items()}
+
+
+def test_new_store_is_empty_and_complete(store, path):
+    assert list(store.shards) == [0, 1, 2]
+    assert [store.runs_of(shard) for shard in store.shards] == [slice(0, 4), slice(4, 8), slice(8, 10)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = xr.open_zarr(path, consolidated=False).load()
+    assert dict(data.sizes) == {"run": 10, "shot": 3, "pixel": 2, "time": 4}
+    assert np.isnan(data["waveform"]).all()
+    assert not data["status"].any()
+    # A parameter may have the name of another coordinate.
+    np.testing.assert_array_equal(data["time_input"], CAMPAIGN.table()["time"])
+    assert set(data["layout"].values.tolist()) == {"1x1", "2x2"}
+    assert {"time_input", "layout", "surface_seed"} <= set(data.coords)
+    assert data["pixel"].values.tolist() == ["red", "blue"]
+    assert (data.attrs["time_start_ns"], data.attrs["bin_width_ns"]) == (1000, 0.5)
+
+
+def test_renderer_of_a_store_is_that_of_its_campaign(store):
+    renderer = store.renderer()
+    assert (renderer.campaign.text, renderer.axis) == (CAMPAIGN.text, AXIS)
+    assert renderer.scene.parameters == {"time": "0"}
+    assert store.is_of(CAMPAIGN, CAMPAIGN.table())
+    other = Campaign.of({"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}})
+    assert not store.is_of(other, other.table())
+    edited = CAMPAIGN.table()
+    edited["time"] = edited["time"] + 1e-9
+    assert not store.is_of(CAMPAIGN, edited)
+
+
+def test_shards_are_written_and_read(store, path):
+    status, errors, arrays = filled(store, 1, 7)
+    status[:], errors[:] = DONE, ""
+    status[2], errors[2] = FAILED, "attenuation = -1 must not be negative: it is a rate ∞"
+    store.write(1, status, errors, arrays)
+    again = store.read(1)
+    assert again[0].tolist() == [1, 1, 2, 1]
+    assert again[1].tolist() == errors.tolist()
+    data = open_campaign(path).load()
+    assert (data["waveform"].isel(run=slice(4, 8)) == 7).all()
+    assert np.isnan(data["waveform"].isel(run=[0, 3, 8])).all()
+    assert describe_campaign(path) == [
+        "10 runs: 3 done, 1 failed, 6 planned",
+        f"failed 1, the first run 6: {errors[2]}",
+    ]
+
+
+def test_a_finished_shard_is_not_written_again(store, path):
+    status, errors, arrays = filled(store, 0, 7)
+    store.write(0, np.full_like(status, DONE), errors, arrays)
+    store.write(0, status, errors, {name: array + 1 for name, array in arrays.items()})
+    assert (open_campaign(path)["waveform"].isel(run=slice(0, 4)) == 7).all()
+    assert store.status().tolist() == [1, 1, 1, 1, 0, 0, 0, 0, 0, 0]
+
+
+def test_status_is_written_last(store, path, monkeypatch):
+    """A disk that is full while the arrays are written leaves runs that are planned."""
+    status, errors, arrays = filled(store, 0, 7)
+
+    def full(array, runs, values):
+        if array.basename == "echo_flags":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return original(array, runs, values)
+
+    original = zarr.Array.__setitem__
+    monkeypatch.setattr(zarr.Array, "__setitem__", full)
+    with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
+        store.write(0, np.full_like(status, DONE), errors, arrays)
+    assert not Store(path).status().any()
+
+
+def test_failed_creation_leaves_nothing(path, monkeypatch):
+    record = SceneRecord("table1", "<scene/>", True, {}, {})
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(zarr.Group, "create_array", full)
+    with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
+        Store.create(path, RunRenderer(CAMPAIGN, record, AXIS), CAMPAIGN.table(), ARRAYS, COORDINATES)
+    assert not list(path.parent.iterdir())
+
+
+@pytest.mark.parametrize(("count", "size"), [(10, 10), (100, 64), (2048, 128), (10**6, 1024)])
+def test_size_of_shards(tmp_path, count, size):
+    record = SceneRecord("table1", "<scene/>", True, {}, {})
+    columns = {"altitude": np.arange(count)}
+    made = Store.create(tmp_path / "a.zarr", RunRenderer(CAMPAIGN, record, AXIS), columns, ARRAYS, COORDINATES)
+    assert made.shard_size == size
+
+
+def test_other_folders_are_refused(tmp_path):
+    zarr.create_group(str(tmp_path / "group.zarr"), zarr_format=3)
+    for name in ("group.zarr", "none.zarr"):
+        with pytest.raises(UserError, match=rf"{name} is no store of a campaign"):
+            open_campaign(tmp_path / name)
+    assert not (tmp_path / "none.zarr").exists()
