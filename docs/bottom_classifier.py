@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +20,15 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 import mitransient_lidar  # noqa: F401  (it finds LLVM for Dr.Jit)
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
-from mitransient_lidar.analysis.waveforms.echo_table import extract
+from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.store import DONE, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row
-from mitransient_lidar.physics.receiver.presets import RECEIVERS
 
 #: Bins on both sides of a place that the classifier sees, and bins between places.
 REACH, STEP = 24, 2
+
+#: Scale of small signals, about one step of the digitiser [V].
+DIGIT_V = 1e-4
 
 #: Largest error of a depth that counts as found [m].
 TOLERANCE_M = 0.5
@@ -38,6 +41,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("bottom_classifier.png"))
     parser.add_argument("--train", type=int, default=5000, help="number of waveforms to train on")
     given = parser.parse_args()
+    logging.disable(logging.WARNING)
     data = open_campaign(given.store)
     data = data.isel(run=np.flatnonzero(data["status"].values == DONE)).load()
     rng = np.random.default_rng(0)
@@ -46,7 +50,9 @@ def main() -> None:
     train, rest = np.split(order, [given.train // pixels])
     calibrate, test = np.split(rest, [len(rest) // 3])
 
-    with_bottom, without = data["signal"].values, signals_without_bottom(data)
+    with_bottom = data["signal"].values
+    without, shipped_without = without_bottom(given.store, data)
+    shipped_with = found_times(data["echo_flags"].values, data["echo_time_ns"].values)
     time = data["time"].values
     bottom_ns = bottom_times(data)
     # A waveform of each pixel of a training run, half of them without a bottom.
@@ -59,38 +65,49 @@ def main() -> None:
     model = HistGradientBoostingClassifier(max_iter=300, learning_rate=0.08, random_state=0)
     model.fit(features.reshape(-1, features.shape[-1]), labels.ravel())
 
-    template = detect_waveforms(render_row(given.store, 0, target_error=None, passes=2), "apd", gain="auto")
-    shipped = {
-        "with": shipped_detector(template, with_bottom, calibrate, test),
-        "without": shipped_detector(template, without, calibrate, test),
-    }
     learned = {
         "with": classifier(model, with_bottom, time, places, surface_ns),
         "without": classifier(model, without, time, places, surface_ns),
     }
     # The rate of false alarms of the shipped detector, and the level of the classifier that has it.
-    alarms = np.isfinite(shipped["without"][calibrate]).mean()
+    alarms = np.isfinite(shipped_without[calibrate]).mean()
     level = float(np.quantile(learned["without"][0][calibrate], 1 - alarms))
     per_ns = data["depth_per_ns"].values
     found = {
-        "shipped": np.abs(shipped["with"] - bottom_ns) * per_ns < TOLERANCE_M,
+        "shipped": np.abs(shipped_with - bottom_ns) * per_ns < TOLERANCE_M,
         "learned": (learned["with"][0] > level) & (np.abs(learned["with"][1] - bottom_ns) * per_ns < TOLERANCE_M),
     }
     rates = {
-        "shipped": np.isfinite(shipped["without"][test]).mean(),
+        "shipped": np.isfinite(shipped_without[test]).mean(),
         "learned": (learned["without"][0][test] > level).mean(),
     }
     report(data, train, test, found, rates)
     draw(data, test, found, given.output)
 
 
-def signals_without_bottom(data: xr.Dataset) -> np.ndarray:
-    """Return records of the light of surface and water alone, shape (run, pixel, time)."""
+def without_bottom(store: Path, data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return records of the light of surface and water alone, and when the shipped detector finds a bottom there [ns].
+
+    The shapes are (run, pixel, time) and (run, pixel); times without a bottom are NaN.
+    """
+    # Lidar and record of all runs.
+    template = render_row(store, 0, target_error=None, passes=2)
     light = data["waveform_by_origin"].sel(origin=["surface", "water"]).sum("origin").transpose("run", "pixel", "time")
-    width, chain = float(data.attrs["bin_width_ns"]), RECEIVERS["apd"]
-    runs = zip(light.values.astype(np.float64), data["gain"].values, data["run"].values, strict=True)
-    # Seeds that no run of the campaign has.
-    return np.array([chain.with_gain(gain).apply(one, width, 1, 2**40 + int(run))[0][0] for one, gain, run in runs])
+    signals, times = [], []
+    for power, gain, run in zip(light.values.astype(float), data["gain"].values, data["run"].values, strict=True):
+        result = template.assign(waveform=(template["waveform"].dims, power[np.newaxis]))
+        # Seeds that no run of the campaign has.
+        record = detect_waveforms(result, "apd", seed=2**40 + int(run), gain=float(gain))
+        echoes = extract(record).isel(shot=0)
+        signals.append(record["signal"].values[0])
+        times.append(found_times(echoes["flags"].values, echoes["time_ns"].values))
+    return np.array(signals), np.array(times)
+
+
+def found_times(flags: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return the times of bottom echoes [ns], NaN without one, from arrays of shape (..., echo)."""
+    bottom = ECHOES.index("bottom")
+    return np.where(has_echo(flags[..., bottom]), times[..., bottom], np.nan)
 
 
 def bottom_times(data: xr.Dataset) -> np.ndarray:
@@ -105,13 +122,12 @@ def places_of(time: np.ndarray) -> np.ndarray:
 
 
 def windows(signals: np.ndarray, places: np.ndarray, time: np.ndarray, surface_ns: np.ndarray) -> np.ndarray:
-    """Return the features of places of signals: samples about each in units of the noise, and its time after the sea.
+    """Return the features of places of signals: the logarithms about each, and its time after the sea.
 
     The shape is (..., place, feature).
     """
-    quiet = signals[..., :8]
-    noise = np.maximum(quiet.std(axis=-1, keepdims=True), 1e-5)
-    scaled = np.arcsinh((signals - quiet.mean(axis=-1, keepdims=True)) / noise).astype(np.float32)
+    level = signals[..., :8].mean(axis=-1, keepdims=True)
+    scaled = np.arcsinh((signals - level) / DIGIT_V).astype(np.float32)
     around = scaled[..., places[:, None] + np.arange(-REACH, REACH + 1)]
     from_surface = time[places] - surface_ns[..., None]
     return np.concatenate([around, from_surface[..., None].astype(np.float32)], axis=-1)
@@ -132,18 +148,6 @@ def classifier(
         found.append(chances.reshape(features.shape[:-1]))
     joined = np.concatenate(found)
     return joined.max(axis=-1), time[places[joined.argmax(axis=-1)]]
-
-
-def shipped_detector(template: xr.Dataset, signals: np.ndarray, *parts: np.ndarray) -> np.ndarray:
-    """Return the times of the bottoms that `extract` finds [ns], NaN without one, shape (run, pixel)."""
-    times = np.full(signals.shape[:2], np.nan)
-    for run in np.concatenate(parts):
-        record = template.drop_vars(["signal_deviation", "saturated"]).assign(
-            signal=(template["signal"].dims, signals[run : run + 1], template["signal"].attrs)
-        )
-        bottom = extract(record).sel(echo="bottom").isel(shot=0)
-        times[run] = np.where(has_echo(bottom["flags"].values), bottom["time_ns"].values, np.nan)
-    return times
 
 
 def report(

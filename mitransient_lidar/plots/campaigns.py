@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import json
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -21,8 +25,8 @@ _SAMPLE, _MOST_PARAMETERS, _MOST_PAIRS, _MOST_RUNS = 12, 5, 3, 20_000
 #: Cells of a response surface along each side.
 _CELLS = 10
 
-#: Range of the power that is drawn, below the highest.
-_DYNAMIC_RANGE = 1e5
+#: Range that is drawn below the peak, of powers and of noisy signals.
+_DYNAMIC_RANGE = {"waveform": 1e6, "signal": 1e4}
 
 #: Flag of `analysis.waveforms.echo_detection.EchoFlag` for an echo that was not found.
 _NO_ECHO = 1
@@ -34,8 +38,8 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
     """Draw a campaign.
 
     Above: a random sample of records, the first pixel of each. In the middle: the distributions of the parameters.
-    Below, over pairs of parameters: the mean over runs of the share of bottoms that were found, else of the peak power,
-    else of the error.
+    Below, over pairs of parameters: the mean over runs of the share of records with a bottom echo, else of the peak
+    power, else of the error.
 
     Parameters
     ----------
@@ -68,9 +72,14 @@ def plot_campaign(dataset: xr.Dataset, path: drawing.FilePath | None = None, see
 
 
 def _inputs(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> dict[str, npt.NDArray[Any]]:
-    """Return the parameters of runs, by name, those that vary."""
+    """Return the parameters of runs, by name, those that vary and follow from no others."""
+    given = json.loads(dataset.attrs.get("campaign", "{}")).get("parameters", {})
     found = {name: dataset[stored].values[runs] for name, stored in dict(dataset.attrs.get("inputs", {})).items()}
-    return {name: column for name, column in found.items() if np.unique(column).size > 1}
+    return {
+        name: column
+        for name, column in found.items()
+        if np.unique(column).size > 1 and not isinstance(given.get(name), str)
+    }
 
 
 def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> None:
@@ -85,10 +94,8 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     values, time = np.asarray(records, dtype=np.float64), records[records.dims[-1]].values
     # Records of other heights side by side: each relative to its own peak.
     peaks = values.max(axis=1, keepdims=True)
-    values = values / np.where(peaks > 0, peaks, 1)
-    if name == "waveform":
-        values = np.maximum(values, 1 / _DYNAMIC_RANGE)
-        ax.set_yscale("log")
+    values = np.maximum(values / np.where(peaks > 0, peaks, 1), 1 / _DYNAMIC_RANGE[name])
+    ax.set_yscale("log")
     for run, line, colour in zip(runs, values, drawing.pixel_colours(len(runs) + 11)[::-1], strict=False):
         ax.plot(time, line, color=colour, linewidth=0.9, label=f"run {run}")
     ax.set_xlabel(drawing.TIME_LABEL)
@@ -108,7 +115,7 @@ def _draw_distributions(figure: Any, inputs: dict[str, npt.NDArray[Any]]) -> Non
             ax.bar([str(value) for value in values], numbers, color="0.55")
         else:
             ax.hist(column, bins=_edges(column), color="0.55")
-            ax.set_xscale("log" if _is_logarithmic(column) else "linear")
+            _set_scale(ax.set_xscale, ax.xaxis, column)
         ax.set_xlabel(name)
         drawing.add_grid(ax, "y", hide=("top", "right"))
     figure.axes[0].set_ylabel("runs")
@@ -139,8 +146,8 @@ def _draw_responses(
             mean = (total / count).reshape(shape)
         image = ax.pcolormesh(edges[0], edges[1], mean.T, vmin=limits[0], vmax=limits[1], cmap="viridis")
         ax.set(xlabel=x, ylabel=y)
-        ax.set_xscale("log" if _is_logarithmic(axes[x]) else "linear")
-        ax.set_yscale("log" if _is_logarithmic(axes[y]) else "linear")
+        _set_scale(ax.set_xscale, ax.xaxis, axes[x])
+        _set_scale(ax.set_yscale, ax.yaxis, axes[y])
     figure.colorbar(image, ax=figure.axes, label=label)
 
 
@@ -148,11 +155,20 @@ def _response(dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> tuple[FloatArr
     """Return a quantity of each run, and its name."""
     if "echo_flags" in dataset:
         flags = dataset["echo_flags"].sel(echo="bottom").isel(run=runs).values.reshape(len(runs), -1)
-        return np.asarray(np.mean((flags & _NO_ECHO) == 0, axis=1)), "share of bottoms found"
+        return np.asarray(np.mean((flags & _NO_ECHO) == 0, axis=1)), "share of records with a bottom echo"
     if "waveform" in dataset:
         peak = dataset["waveform"].isel(run=runs).max([dim for dim in dataset["waveform"].dims if dim != "run"]).values
         return np.log10(np.maximum(peak.astype(np.float64), 1e-30)), "peak power (log10 W)"
     return dataset["error_median"].values[runs].astype(np.float64), "relative error of the median bin"
+
+
+def _set_scale(scale: Callable[[str], Any], axis: Axis, column: npt.NDArray[Any]) -> None:
+    """Draw an axis of values in their logarithms where they are spread so, with plain numbers."""
+    if _is_logarithmic(column):
+        scale("log")
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def _is_logarithmic(column: npt.NDArray[Any]) -> bool:

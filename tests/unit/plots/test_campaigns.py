@@ -37,7 +37,9 @@ def test_sample_distributions_and_responses(campaign, tmp_path):
     figure = plot_campaign(campaign, tmp_path / "campaign.png")
     assert (tmp_path / "campaign.png").stat().st_size > 10_000
     assert figure.get_suptitle() == "Campaign of 60 runs, scene table1: 59 of 60 done, 1 failed"
-    assert {"attenuation", "bottom_depth", "wind_speed", "petzold", "share of bottoms found"} <= set(texts(figure))
+    assert {"attenuation", "bottom_depth", "wind_speed", "petzold", "share of records with a bottom echo"} <= set(
+        texts(figure)
+    )
     sample = figure.axes[0]
     assert len(sample.lines) == 12
     assert all(line.get_ydata().max() == 1 for line in sample.lines)
