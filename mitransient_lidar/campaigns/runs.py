@@ -68,12 +68,9 @@ class RunRenderer:
         UserError
             If the scene cannot be loaded, or lacks a parameter that the campaign sets.
         """
-        session = open_scene(campaign.scene, None, instrument=campaign.instrument)
-        if session.record is None:
-            raise UserError(f"scene = {campaign.scene!r} cannot be recorded: give the name or path of an XML scene")
-        _check_parameters(campaign, columns, session.parameters)
-        renderer = cls(campaign, session.record)
-        return cls(campaign, session.record, renderer._longest_record(columns))
+        record = record_of(campaign)
+        _check_parameters(campaign, columns, record.parameters)
+        return cls(campaign, record, cls(campaign, record)._longest_record(columns))
 
     def inputs(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters of a run that are its own: those of the table, and the random sea."""
@@ -227,6 +224,13 @@ class RunRenderer:
 
         session = open_scene(self.scene, {**self.campaign.fixed, **values})
         return LidarScene.from_scene(session.scene, session.sensor).axis
+
+
+def record_of(campaign: Campaign) -> SceneRecord:
+    """Return the record of the scene of a campaign, with its instrument; raise `UserError` if it cannot be loaded."""
+    record = open_scene(campaign.scene, None, instrument=campaign.instrument).record
+    assert record is not None
+    return record
 
 
 def _check_parameters(campaign: Campaign, columns: Mapping[str, Column], known: Collection[str]) -> None:

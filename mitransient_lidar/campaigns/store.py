@@ -15,13 +15,14 @@ import xarray as xr
 import zarr
 
 from mitransient_lidar.campaigns.design import Campaign, Column
-from mitransient_lidar.campaigns.runs import Array, RunRenderer
+from mitransient_lidar.campaigns.runs import Array, RunRenderer, record_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import check_encodable
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.again import compare_versions
 
 #: Values of the variable ``status``.
 PLANNED, DONE, FAILED = 0, 1, 2
@@ -100,7 +101,8 @@ class Store:
         return cls(path)
 
     def renderer(self) -> RunRenderer:
-        """Return the renderer of the runs."""
+        """Return the renderer of the runs; warn if the store is of other versions."""
+        compare_versions(self._attributes)
         axis = self._attributes["record"]
         return RunRenderer(
             self.campaign,
@@ -109,11 +111,13 @@ class Store:
         )
 
     def is_of(self, campaign: Campaign, columns: Mapping[str, Column]) -> bool:
-        """Return whether it is the store of a campaign with these columns."""
+        """Return whether it is the store of a campaign with these columns, and of its scene as it is now."""
         if json.loads(self._attributes["campaign"]) != json.loads(campaign.text):
             return False
         own = self.inputs(slice(0, self.count))
-        return own.keys() == columns.keys() and all(np.array_equal(own[name], columns[name]) for name in own)
+        if own.keys() != columns.keys() or not all(np.array_equal(own[name], columns[name]) for name in own):
+            return False
+        return record_of(campaign).attributes() == SceneRecord.from_attributes(self._attributes["scene"]).attributes()
 
     def inputs(self, runs: slice) -> dict[str, Column]:
         """Return the parameters of runs, by name."""

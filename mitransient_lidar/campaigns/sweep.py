@@ -137,7 +137,9 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
     if path.exists():
         store = Store(path)
         if not store.is_of(campaign, columns):
-            raise UserError(f"{path} holds another campaign: choose another place, or remove it")
+            raise UserError(
+                f"{path} holds another campaign, or its scene has changed: choose another place, or remove it"
+            )
         return store
     renderer = RunRenderer.of(campaign, columns)
     count = len(next(iter(columns.values())))
@@ -172,6 +174,8 @@ def _swept(
         wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
         shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
         if shards:
+            # Here for the warning of other versions: the processes of shards tell nothing.
+            store.renderer()
             try:
                 client = client or stack.enter_context(_local(min(number, len(shards))))
                 _render(store, shards, client, retry_failed, progress)
@@ -252,19 +256,24 @@ class _Tally:
         self._finished.add(shard)
         self._shards[shard] = done, failed
         state = self._tell()
-        rate = (state.done - self._before) / max(state.elapsed_s or 0.0, 1e-9)
         _LOG.info(
             "shard %d written: %d of %d runs, %d failed, %.3g a second, ends in %.0f s",
-            shard, state.done, state.planned, state.failed, rate, state.remaining_s or 0,
+            shard, state.done, state.planned, state.failed, state.rate or 0, state.remaining_s or 0,
         )  # fmt: skip
 
     def _tell(self) -> Progress:
         done, failed = (sum(counts) for counts in zip(*self._shards.values(), strict=True))
         elapsed, here = time.perf_counter() - self._began, done + failed - self._before
-        planned = self._store.count
-        remaining = elapsed * (planned - done - failed) / here if here else None
+        planned, rate = self._store.count, here / elapsed
+        remaining = (planned - done - failed) / rate if here else None
         state = Progress(
-            done=done + failed, planned=planned, unit="run", elapsed_s=elapsed, remaining_s=remaining, failed=failed
+            done=done + failed,
+            planned=planned,
+            unit="run",
+            elapsed_s=elapsed,
+            remaining_s=remaining,
+            failed=failed,
+            rate=rate if here else None,
         )
         if self._progress is not None:
             self._progress(state)

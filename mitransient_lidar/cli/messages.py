@@ -99,6 +99,8 @@ def _describe(state: Progress) -> str:
     parts = [f"{state.unit} {state.done}{planned}"]
     if state.failed:
         parts.append(f"{state.failed} failed")
+    if state.rate is not None:
+        parts.append(f"{state.rate:.3g} a second")
     if state.error is not None:
         parts.append(f"{describe_quantile(state.target_quantile, state.errors_of)} within {100 * state.error:.3g} %")
     if state.target_error is not None:

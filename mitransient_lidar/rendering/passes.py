@@ -35,7 +35,7 @@ class Progress:
 
     Numbers of completed and, if known, planned units (``pass``, ``shot``, ``place``, ``render`` or ``run``), elapsed
     and estimated remaining time [s], median and 95th percentile of the relative standard errors, the requested error,
-    and the number of completed units that have `failed`.
+    the number of completed units that have `failed`, and the `rate` of units a second.
 
     With a requested error: the quantile of the relative standard errors that must reach it, its value, what the errors
     are those of (``bins``, ``gates`` or ``pixels``), and estimates of the passes and the time [s] still needed, None
@@ -56,6 +56,7 @@ class Progress:
     needed_passes: int | None = None
     needed_s: float | None = None
     failed: int = 0
+    rate: float | None = None
 
 
 ProgressCallback = Callable[[Progress], None]

@@ -274,7 +274,7 @@ def test_invalid_use_leaves_nothing(quick, tmp_path):
     assert_refused(run("sweep", tmp_path, "-q"), "is no store of a campaign")
     before = files_of(quick)
     other = write_toml(tmp_path / "other.toml", {**QUICK, "target_error": 0.2})
-    assert_refused(run("sweep", other, "-o", quick, "-q"), "holds another campaign")
+    assert_refused(run("sweep", other, "-o", quick, "-q"), "holds another campaign, or its scene has changed")
     assert_refused(run("sweep", quick, "-o", out, "-q"), "--output is fixed in the store")
     assert files_of(quick) == before
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]

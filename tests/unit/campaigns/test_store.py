@@ -1,12 +1,14 @@
 import errno
 import os
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import xarray as xr
 import zarr
 
+from mitransient_lidar.campaigns import store as campaign_store
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import Array, RunRenderer
 from mitransient_lidar.campaigns.store import DONE, FAILED, Store, describe_campaign, open_campaign
@@ -38,10 +40,13 @@ def path(tmp_path):
     return tmp_path / "campaign.zarr"
 
 
+RECORD = SceneRecord("table1", "<scene/>", True, {"time": "0"}, {})
+
+
 @pytest.fixture
-def store(path):
-    record = SceneRecord("table1", "<scene/>", True, {"time": "0"}, {})
-    renderer = RunRenderer(CAMPAIGN, record, AXIS)
+def store(path, monkeypatch):
+    monkeypatch.setattr(campaign_store, "record_of", lambda _: RECORD)
+    renderer = RunRenderer(CAMPAIGN, RECORD, AXIS)
     return Store.create(path, renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
 
 
@@ -68,7 +73,7 @@ def test_new_store_is_empty_and_complete(store, path):
     assert (data.attrs["time_start_ns"], data.attrs["bin_width_ns"]) == (1000, 0.5)
 
 
-def test_renderer_of_a_store_is_that_of_its_campaign(store):
+def test_renderer_of_a_store_is_that_of_its_campaign(store, monkeypatch):
     renderer = store.renderer()
     assert (renderer.campaign.text, renderer.axis) == (CAMPAIGN.text, AXIS)
     assert renderer.scene.parameters == {"time": "0"}
@@ -78,6 +83,15 @@ def test_renderer_of_a_store_is_that_of_its_campaign(store):
     edited = CAMPAIGN.table()
     edited["time"] = edited["time"] + 1e-9
     assert not store.is_of(CAMPAIGN, edited)
+    # The file of the scene has changed since.
+    monkeypatch.setattr(campaign_store, "record_of", lambda _: replace(RECORD, text="<scene></scene>"))
+    assert not store.is_of(CAMPAIGN, CAMPAIGN.table())
+
+
+def test_store_of_other_versions(store, caplog):
+    store._attributes["mitsuba_version"] = "1.0"
+    store.renderer()
+    assert "the result is of mitsuba_version = 1.0" in caplog.text
 
 
 def test_shards_are_written_and_read(store, path):
@@ -122,22 +136,19 @@ def test_status_is_written_last(store, path, monkeypatch):
 
 
 def test_failed_creation_leaves_nothing(path, monkeypatch):
-    record = SceneRecord("table1", "<scene/>", True, {}, {})
-
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(zarr.Group, "create_array", full)
     with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
-        Store.create(path, RunRenderer(CAMPAIGN, record, AXIS), CAMPAIGN.table(), ARRAYS, COORDINATES)
+        Store.create(path, RunRenderer(CAMPAIGN, RECORD, AXIS), CAMPAIGN.table(), ARRAYS, COORDINATES)
     assert not list(path.parent.iterdir())
 
 
 @pytest.mark.parametrize(("count", "size"), [(10, 10), (100, 64), (2048, 128), (10**6, 1024)])
 def test_size_of_shards(tmp_path, count, size):
-    record = SceneRecord("table1", "<scene/>", True, {}, {})
     columns = {"altitude": np.arange(count)}
-    made = Store.create(tmp_path / "a.zarr", RunRenderer(CAMPAIGN, record, AXIS), columns, ARRAYS, COORDINATES)
+    made = Store.create(tmp_path / "a.zarr", RunRenderer(CAMPAIGN, RECORD, AXIS), columns, ARRAYS, COORDINATES)
     assert made.shard_size == size
 
 
