@@ -30,6 +30,9 @@ PLANNED, DONE, FAILED = 0, 1, 2
 #: Fewest and most runs of a shard, and the number of shards that a campaign has if its runs allow.
 _FEWEST, _MOST, _SHARDS = 64, 1024, 16
 
+#: Largest size of a shard in memory [bytes], by default.
+_MOST_BYTES = 2**29
+
 #: Suffix of parameters of the scene that have the name of a variable.
 _INPUT = "_input"
 
@@ -86,7 +89,9 @@ class Store:
         path = Path(path)
         check_encodable(path)
         count = len(next(iter(columns.values())))
-        size = _shard_size(count) if shard_size is None else integer("shard_size", shard_size, 1, 10**6)
+        bytes_of_run = sum(array.values.nbytes for array in arrays.values())
+        size = _shard_size(count, bytes_of_run)
+        size = size if shard_size is None else integer("shard_size", shard_size, 1, 10**6)
         # Beside its place, so that a store is always whole.
         temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
@@ -283,6 +288,7 @@ def _fill(
     )
 
 
-def _shard_size(count: int) -> int:
+def _shard_size(count: int, bytes_of_run: int) -> int:
     """Return the number of runs of a shard."""
-    return int(np.clip(-(-count // _SHARDS), min(_FEWEST, count), _MOST))
+    size = int(np.clip(-(-count // _SHARDS), min(_FEWEST, count), _MOST))
+    return max(min(size, _MOST_BYTES // max(bytes_of_run, 1)), 1)

@@ -51,6 +51,8 @@ def sweep(
 ) -> xr.Dataset:
     """Render the runs of a campaign into a Zarr store, or those that an interrupted one has left.
 
+    Scripts call it below ``if __name__ == "__main__":``, since new processes import the script.
+
     Parameters
     ----------
     campaign
@@ -64,7 +66,7 @@ def sweep(
         this package, and the store at the same path.
     shard_size
         Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
-        64 to 1024.
+        64 to 1024, and fewer where a shard would take more than half a gigabyte.
     retry_failed
         Whether to render runs that have failed, too.
     progress
@@ -205,13 +207,15 @@ def _render(
             key = f"shard-{shard}-{topic}"
             futures.add(client.submit(_task, path, shard, retry_failed, topic, pure=False, key=key))
 
-    submit()
-    for future in futures:
-        try:
-            tally.finish(*future.result())
-        except KilledWorker as error:
-            raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
+    try:
         submit()
+        for future in futures:
+            tally.finish(*future.result())
+            submit()
+    except KilledWorker as error:
+        raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
+    finally:
+        client.unsubscribe_topic(topic)
 
 
 def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, int, int]:
