@@ -1,0 +1,120 @@
+import itertools
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.campaigns.design import Campaign
+from mitransient_lidar.campaigns.runs import RunRenderer, record_of
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+FLAT = {"spectrum": "flat", "surface_size": 60, "layout": "1x1"}
+
+
+def planned(parameters, fixed=FLAT, **design):
+    """Return a campaign of a grid, or of a design, and its columns."""
+    given = {"scene": "table1", "fixed": fixed, "parameters": parameters, "design": design or {"kind": "grid"}}
+    campaign = Campaign.of(given)
+    return campaign, campaign.table()
+
+
+def renderer(parameters, fixed=FLAT, **design):
+    campaign, columns = planned(parameters, fixed, **design)
+    return RunRenderer.of(campaign, columns)
+
+
+def test_record_holds_the_light_of_all_runs():
+    runs = renderer({"altitude": [150, 200, 300], "bottom_depth": [15, 3], "attenuation": [0.2, 1.0]})
+    # Corners of the ranges, of which none was tried in this combination but one.
+    for altitude, depth, attenuation in itertools.product([150, 300], [3, 15], [0.2, 1.0]):
+        own = runs._own_axis({"altitude": altitude, "bottom_depth": depth, "attenuation": attenuation})
+        assert runs.axis.start_ns <= own.start_ns
+        assert runs.axis.end_ns >= own.end_ns
+    longest = runs._own_axis({"altitude": 300, "bottom_depth": 15, "attenuation": 0.2})
+    assert runs.axis.end_ns < longest.end_ns + 0.1 * (longest.end_ns - runs.axis.start_ns)
+
+
+def test_record_of_the_campaign():
+    fixed = {**FLAT, "time_start_ns": 1300, "bin_count": 300}
+    assert renderer({"bottom_depth": [3, 15]}, fixed).axis is None
+
+
+def test_random_seas_are_of_the_run():
+    runs = renderer({"bottom_depth": [3.0, 4.0]})
+    seas = [runs.inputs(number, {"bottom_depth": 3.0})["surface_seed"] for number in range(100)]
+    assert len(set(seas)) == 100
+    assert runs.inputs(7, {"bottom_depth": 5.0}) == {"bottom_depth": 5.0, "surface_seed": seas[7]}
+    given = renderer({"surface_seed": [3, 4]})
+    assert given.inputs(0, {"surface_seed": 3}) == {"surface_seed": 3}
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Replace `render_shots`; return the parameters and options of its calls."""
+    calls = []
+    monkeypatch.setattr(
+        "mitransient_lidar.campaigns.runs.render_shots",
+        lambda scene, params, **options: calls.append((scene, params, options)),
+    )
+    return calls
+
+
+def test_what_is_asked_of_a_run(asked):
+    campaign, _columns = planned({"bottom_depth": [3.0, 4.0]}, kind="random", count=5, shots=40, seed=2)
+    runs = RunRenderer(campaign, record_of(campaign), TimeAxis(1300, 1, 300))
+    for number in (3, 4, 3):
+        runs.series(number, {"bottom_depth": 4.0})
+    (_, params, first), (_, _, other), (_, again, same) = asked
+    assert params == {**FLAT, "bottom_depth": 4.0, "surface_seed": params["surface_seed"]}
+    assert again == params
+    np.testing.assert_array_equal(first["positions"], same["positions"])
+    assert first["first_seed"] == same["first_seed"] != other["first_seed"]
+    assert not np.array_equal(first["positions"], other["positions"])
+    assert first["positions"].shape == (40, 2)
+    assert 100 < np.abs(first["positions"]).max() <= 256
+    assert (first["target_error"], first["components"], first["move_target"]) == (0.05, False, False)
+    assert first["axis"] == TimeAxis(1300, 1, 300)
+
+
+def test_given_places_and_targets(asked):
+    campaign = Campaign.of(
+        {
+            "scene": "fig13_2x2",
+            "keep": ["components"],
+            "fixed": {"aim_x": 3},
+            "parameters": {"aim_y": [1.5, 2.5]},
+            "design": {"kind": "grid"},
+        }
+    )
+    RunRenderer.of(campaign, campaign.table()).series(1, {"aim_y": 2.5})
+    _, _, options = asked[0]
+    assert options["positions"].tolist() == [[3.0, 2.5]]
+    assert options["move_target"]
+    assert options["components"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "fixed", "message"),
+    [
+        (
+            {"bottom_dept": [1, 2]},
+            FLAT,
+            "parameter 'bottom_dept' is not one of scene table1: did you mean bottom_depth",
+        ),
+        (
+            {"altitude": [1, 2]},
+            {"windspeed": 3},
+            "parameter 'windspeed' is not one of scene table1: did you mean wind_",
+        ),
+        ({"bin_count": [100, 200]}, FLAT, "parameter 'bin_count' must be the same in all runs"),
+        ({"bottom_depth": [-3, -4]}, FLAT, "bottom_depth"),
+    ],
+)
+def test_campaigns_that_the_scene_refuses(parameters, fixed, message):
+    with pytest.raises(UserError, match=message):
+        renderer(parameters, fixed)
+
+
+def test_random_places_need_free_aims():
+    with pytest.raises(UserError, match=r"design\.shots = 3 needs random places: leave out aim_x"):
+        renderer({"aim_x": [1.0, 2.0]}, kind="random", count=2, shots=3)
