@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
@@ -110,6 +111,9 @@ def main() -> None:
     """Run the command line."""
     # Commands draw to files only: Matplotlib refuses to be imported with an unknown backend.
     os.environ["MPLBACKEND"] = "agg"
+    if sys.argv[1:2] != ["sweep"]:
+        # xarray imports Dask wherever it is installed, which takes a third of a second. Campaigns alone need it.
+        sys.modules["dask"] = None  # type: ignore[assignment]
     app(prog_name="mitransient-lidar")
 
 

@@ -55,6 +55,15 @@ def test_import_loads_nothing_heavy():
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 
+@pytest.mark.slow
+def test_commands_other_than_sweep_import_no_dask(tmp_path):
+    code = "import sys; from mitransient_lidar.cli.app import main\ntry: main()\nfinally: print(sorted(sys.modules))"
+    command = [sys.executable, "-c", code, "find-shots", "fig09_2x2", "--no-waveforms"]
+    modules = subprocess.check_output(command, text=True, cwd=tmp_path)
+    assert "'xarray'" in modules
+    assert "'dask.base'" not in modules
+
+
 def test_readme_commands_name_what_exists():
     text = (ROOT / "README.md").read_text()
     ci = (ROOT / ".ci" / "run").read_text()
