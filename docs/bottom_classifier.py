@@ -75,17 +75,22 @@ def main() -> None:
     false_chances, _ = classifier(model, without[rest], time, places, surface_ns[rest])
     # The first part of the rest gives the level of each rate of false alarms, the other part the test.
     own, here = slice(0, len(rest) // 3), slice(len(rest) // 3, None)
-    near = np.abs(times - bottom_ns[rest]) * (per_ns := data["depth_per_ns"].values[rest]) < TOLERANCE_M
+    per_ns = data["depth_per_ns"].values[rest]
+    errors_m = {
+        name: np.abs(one - bottom_ns[rest]) * per_ns for name, one in (("shipped", shipped_with[rest]), ("", times))
+    }
+    near = errors_m[""] < TOLERANCE_M
     alarms = {"shipped": np.isfinite(shipped_without[rest])}
-    found = {"shipped": np.abs(shipped_with[rest] - bottom_ns[rest]) * per_ns < TOLERANCE_M}
+    found = {"shipped": errors_m["shipped"] < TOLERANCE_M}
     for name, rate in (("classifier", alarms["shipped"][own].mean()), ("at 1 %", 0.01)):
         level = np.quantile(false_chances[own], 1 - rate)
-        found[name], alarms[name] = (chances > level) & near, false_chances > level
+        found[name], alarms[name], errors_m[name] = (chances > level) & near, false_chances > level, errors_m[""]
     test = data.isel(run=rest[here])
     found = {name: one[here] for name, one in found.items()}
     alarms = {name: one[here] for name, one in alarms.items()}
+    errors_m = {name: errors_m[name][here] for name in found}
     print(f"trained on {has.size} waveforms, tested on {test.sizes['run'] * pixels} with and without a bottom")
-    report(test, found, alarms)
+    report(test, found, alarms, errors_m)
     draw(test, found, given.output)
 
 
@@ -154,14 +159,18 @@ def classifier(
     return joined.max(axis=-1), time[places[joined.argmax(axis=-1)]]
 
 
-def report(data: xr.Dataset, found: dict[str, np.ndarray], alarms: dict[str, np.ndarray]) -> None:
-    """Print the shares of bottoms found by optical depth and depth, and the rates of false alarms."""
+def report(
+    data: xr.Dataset, found: dict[str, np.ndarray], alarms: dict[str, np.ndarray], errors_m: dict[str, np.ndarray]
+) -> None:
+    """Print the shares of bottoms found by optical depth and depth, the rates of false alarms, and errors of depths."""
     lengths, depths = (data["attenuation"] * data["bottom_depth"]).values, data["bottom_depth"].values
     rows = [("all", np.ones(len(depths), dtype=bool))]
     for name, values, edges in (("c z", lengths, (0, 2, 4, 6, 8, 12, 30)), ("z (m)", depths, (2, 3, 4, 20))):
         rows += [(f"{name} {a:g} to {b:g}", (values >= a) & (values < b)) for a, b in itertools.pairwise(edges)]
     print(f"{'':<16}{'waveforms':>10}", *(f"{name:>12}" for name in found), f"{'only shipped':>14}")
     print(f"{'false alarms':<16}{'':>10}", *(f"{one.mean():>12.3f}" for one in alarms.values()))
+    medians = [np.median(errors_m[name][one]) for name, one in found.items()]
+    print(f"{'median error (m)':<16}{'':>10}", *(f"{one:>12.3f}" for one in medians))
     for name, each in rows:
         shares = [one[each].mean() for one in found.values()]
         only = np.count_nonzero(found["shipped"][each] & ~found["classifier"][each])
