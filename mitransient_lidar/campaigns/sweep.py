@@ -210,7 +210,10 @@ def _render(
     try:
         submit()
         for future in futures:
-            tally.finish(*future.result())
+            found = future.result()
+            if isinstance(found, str):
+                raise UserError(found)
+            tally.finish(*found)
             submit()
     except KilledWorker as error:
         raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
@@ -218,8 +221,8 @@ def _render(
         client.unsubscribe_topic(topic)
 
 
-def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, int, int]:
-    """Render a shard on a worker."""
+def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, int, int] | str:
+    """Render a shard on a worker; return the message of a `UserError`, which Dask would log with its traceback."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -231,7 +234,10 @@ def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, i
             last = time.monotonic()
             worker.log_event(topic, {"shard": shard, "done": done, "failed": failed})
 
-    return shard, *render_in_process(path, shard, retry_failed, report)
+    try:
+        return shard, *render_in_process(path, shard, retry_failed, report)
+    except UserError as error:
+        return str(error)
 
 
 class _Tally:
@@ -308,7 +314,13 @@ def _local(workers: int) -> Iterator[Client]:
 
     _silence()
     # The processes of the shards hold the memory, not these.
-    options = {"threads_per_worker": 1, "processes": True, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+    options = {
+        "threads_per_worker": 1,
+        "processes": True,
+        "memory_limit": 0,
+        "dashboard_address": "127.0.0.1:0",
+        "silence_logs": logging.CRITICAL,
+    }
     with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster, set_as_default=False) as client:
         if importlib.util.find_spec("bokeh") is not None:
             _LOG.info("dashboard: %s", cluster.dashboard_link)

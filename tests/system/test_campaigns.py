@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -18,7 +19,6 @@ from command_line import assert_refused, run
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
-from mitransient_lidar.core.errors import UserError
 
 #: Runs that take a tenth of a second each.
 QUICK = {
@@ -280,21 +280,19 @@ def test_invalid_use_leaves_nothing(quick, tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-def test_disk_that_is_full(quick, tmp_path, monkeypatch):
+def test_disk_that_is_full(quick, tmp_path):
     """Files of a limited size stand for a full disk: chunks cannot be written, and no status says that they were."""
     path = tmp_path / "full.zarr"
     shutil.copytree(quick, path)
     shutil.rmtree(path / "status" / "c")
-    code = (
-        "import resource, signal, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200));"
-        "from mitransient_lidar.campaigns import shard; shard._main()"
+    done = subprocess.run(
+        [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--workers", "1", "-q"],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+        capture_output=True,
+        text=True,
     )
-    original = subprocess.Popen
-    monkeypatch.setattr(
-        shards.subprocess, "Popen", lambda command, **given: original([sys.executable, "-c", code], **given)
-    )
-    with pytest.raises(UserError, match=r"cannot write .*full\.zarr: File too large"):
-        shards.render_in_process(str(path), 0)
+    assert done.returncode == 2
+    assert done.stderr == f"cannot write {path}: File too large.\n"
     assert (Store(path).status() == PLANNED).all()
 
 

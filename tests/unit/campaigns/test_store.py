@@ -1,7 +1,9 @@
 import errno
 import os
+import re
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,6 +145,28 @@ def test_failed_creation_leaves_nothing(path, monkeypatch):
     with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
         Store.create(path, RunRenderer(CAMPAIGN, RECORD, AXIS), CAMPAIGN.table(), ARRAYS, COORDINATES)
     assert not list(path.parent.iterdir())
+
+
+def test_lines_of_the_documentation_make_a_batch(tmp_path, monkeypatch):
+    text = (Path(__file__).parents[3] / "docs" / "campaigns.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    arrays = {
+        "signal": Array(("pixel", "time"), np.zeros((2, 4), dtype=np.float32), {}),
+        "true_bottom_depth": Array((), np.zeros(()), {}),
+    }
+    columns = {"altitude": np.arange(10)}
+    store = Store.create(tmp_path / "bottoms.zarr", RunRenderer(CAMPAIGN, RECORD, AXIS), columns, arrays, COORDINATES)
+    status, errors, values = store.read(0)
+    status[:], values["signal"][:], values["true_bottom_depth"][:] = DONE, 1e-4, np.arange(10)
+    status[3] = FAILED
+    store.write(0, status, errors, values)
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(code, names)
+    x, y = names["batch"]
+    # Of nine runs, those with numbers 0 and 5 are held out; each has two pixels.
+    np.testing.assert_allclose(x, np.arcsinh(np.ones((14, 4))), rtol=1e-6)
+    assert y.tolist() == [1, 1, 2, 2, 4, 4, 6, 6, 7, 7, 8, 8, 9, 9]
 
 
 @pytest.mark.parametrize(("count", "size"), [(10, 10), (100, 64), (2048, 128), (10**6, 1024)])
