@@ -6,7 +6,6 @@ import csv
 import json
 import math
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import tomllib
 
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
@@ -27,11 +27,6 @@ from mitransient_lidar.core.validation import (
     positive,
     shown,
 )
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 #: Kinds of designs: every combination; points of a sequence, of a Latin hypercube, or random ones; rows of a file.
 KINDS = ("grid", "sobol", "latin_hypercube", "random", "table")
