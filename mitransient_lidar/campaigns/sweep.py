@@ -192,7 +192,10 @@ def _render(
     store: Store, shards: list[int], client: Client, retry_failed: bool, progress: ProgressCallback | None
 ) -> None:
     """Render shards on the workers of a client."""
+    from concurrent.futures import CancelledError
+
     from distributed import KilledWorker, as_completed
+    from distributed.comm import CommClosedError
 
     topic = f"campaign-{uuid.uuid4().hex}"
     tally = _Tally(store, progress)
@@ -208,6 +211,8 @@ def _render(
             futures.add(client.submit(_task, path, shard, retry_failed, topic, pure=False, key=key))
 
     try:
+        if not client.nthreads():
+            _LOG.warning("the scheduler has no workers: the campaign waits for the first one")
         submit()
         for future in futures:
             found = future.result()
@@ -217,8 +222,11 @@ def _render(
             submit()
     except KilledWorker as error:
         raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
+    except (CancelledError, CommClosedError) as error:
+        raise UserError("the scheduler was lost: what is written is kept, and the same command goes on") from error
     finally:
-        client.unsubscribe_topic(topic)
+        with contextlib.suppress(OSError):
+            client.unsubscribe_topic(topic)
 
 
 def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, int, int] | str:
@@ -329,4 +337,5 @@ def _local(workers: int) -> Iterator[Client]:
 
 def _silence() -> None:
     """Keep Dask from telling of workers and connections that come and go."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -197,36 +197,62 @@ def shard_processes():
     return found
 
 
-def test_cluster_that_loses_a_worker(quick, tmp_path):
-    """A scheduler and two workers as on a cluster; one is killed while it renders."""
-    file, path = tmp_path / "scheduler.json", tmp_path / "cluster.zarr"
-    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1"]
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
-    worker += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
-    processes = [subprocess.Popen([*dask, "--no-dashboard", "--scheduler-file", str(file)], **options)]
-    try:
+SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    """Dask scheduler in a process of its own: this process, and the file with its address."""
+    file = tmp_path / "scheduler.json"
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1"]
+    with subprocess.Popen([*command, "--no-dashboard", "--scheduler-file", str(file)], **SILENT) as process:
         while not file.exists():
             time.sleep(0.1)
-        processes += [subprocess.Popen(worker, **options) for _ in range(2)]
+        yield process, file
+        process.kill()
+
+
+def test_cluster_that_loses_a_worker(quick, tmp_path, scheduler):
+    """A scheduler and two workers as on a cluster; one is killed while it renders."""
+    _, file = scheduler
+    path = tmp_path / "cluster.zarr"
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
+    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
+    workers = [subprocess.Popen(command, **SILENT) for _ in range(2)]
+    try:
         seen = []
 
         def watch(state):
             seen.append(state.done)
-            if state.done >= 6 and processes[1].poll() is None:
-                os.killpg(processes[1].pid, signal.SIGKILL)
+            if state.done >= 6 and workers[0].poll() is None:
+                os.killpg(workers[0].pid, signal.SIGKILL)
 
         address = json.loads(file.read_text())["address"]
         data = sweep(QUICK, path, scheduler=address, shard_size=6, progress=watch)
-        assert processes[1].wait(10) == -signal.SIGKILL
+        assert workers[0].wait(10) == -signal.SIGKILL
         assert (data["status"] == DONE).all()
         assert seen[-1] == 24
         assert files_of(path) == files_of(quick)
     finally:
-        for process in processes:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        for worker in workers:
+            if worker.poll() is None:
+                os.killpg(worker.pid, signal.SIGKILL)
+            worker.wait()
+
+
+def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
+    process, file = scheduler
+    path = tmp_path / "lost.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    address = json.loads(file.read_text())["address"]
+    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--scheduler", address]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as client:
+        assert "the scheduler has no workers: the campaign waits" in client.stderr.readline()
+        process.kill()
+        _, told = client.communicate(timeout=60)
+    assert client.returncode == 2
+    assert told == "the scheduler was lost: what is written is kept, and the same command goes on\n"
 
 
 def test_interruption_keeps_what_is_written(tmp_path):
