@@ -222,7 +222,10 @@ def _render(
             submit()
     except KilledWorker as error:
         raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
-    except (CancelledError, CommClosedError) as error:
+    except (CancelledError, OSError) as error:
+        # A connection that times out is an OSError, and so may be what a worker tells.
+        if client.status == "running" and not isinstance(error, (CancelledError, CommClosedError)):
+            raise
         raise UserError("the scheduler was lost: what is written is kept, and the same command goes on") from error
     finally:
         with contextlib.suppress(OSError):

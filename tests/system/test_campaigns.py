@@ -159,21 +159,25 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(quick, tmp_p
     path = tmp_path / "killed.zarr"
     campaign = write_toml(tmp_path / "quick.toml", QUICK)
     command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(campaign), "-o", str(path)]
+    command += ["--workers", "2", "--shard-size", "6"]
+    mark = {"MARK_OF_TEST": str(tmp_path)}
     with subprocess.Popen(
-        [*command, "--workers", "2", "--shard-size", "6"], start_new_session=True, stderr=subprocess.PIPE
+        command, start_new_session=True, stderr=subprocess.PIPE, env={**os.environ, **mark}
     ) as process:
-        deadline = time.monotonic() + 120
+        deadline, seen = time.monotonic() + 120, set()
         while time.monotonic() < deadline and not (path.exists() and (Store(path).status() == DONE).any()):
             time.sleep(0.05)
+            seen |= set(shard_processes(mark))
+        assert seen
         os.killpg(process.pid, signal.SIGKILL)
     status = Store(path).status()
     assert (status == DONE).any()
     assert (status == PLANNED).any()
     # The processes of shards, in sessions of their own, end with their worker.
     deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and shard_processes():
+    while time.monotonic() < deadline and shard_processes(mark):
         time.sleep(0.1)
-    assert not shard_processes()
+    assert not shard_processes(mark)
     finished = [one for one in Store(path).shards if (status[Store(path).runs_of(one)] == DONE).all()]
     chunks = [path / "waveform" / "c" / str(one) / "0" / "0" for one in finished]
     written = [chunk.stat().st_mtime_ns for chunk in chunks]
@@ -183,16 +187,17 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(quick, tmp_p
     assert files_of(path) == files_of(quick)
 
 
-def shard_processes():
-    """Return the processes that render a shard below the folder of this test's Python."""
-    found = []
+def shard_processes(mark):
+    """Return the processes that render a shard with a variable in their environment."""
+    ((name, value),) = mark.items()
+    variable, found = f"{name}={value}".encode(), []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
-            command = (entry / "cmdline").read_bytes().split(b"\0")
+            command, environment = ((entry / one).read_bytes().split(b"\0") for one in ("cmdline", "environ"))
             state = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0]
         except OSError:
             continue
-        if b"mitransient_lidar.campaigns.shard" in command and state != "Z":
+        if b"mitransient_lidar.campaigns.shard" in command and variable in environment and state != "Z":
             found.append(int(entry.name))
     return found
 
@@ -206,7 +211,7 @@ def scheduler(tmp_path):
     file = tmp_path / "scheduler.json"
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1"]
     with subprocess.Popen([*command, "--no-dashboard", "--scheduler-file", str(file)], **SILENT) as process:
-        while not file.exists():
+        while not (file.exists() and file.read_text().endswith("}")):
             time.sleep(0.1)
         yield process, file
         process.kill()
