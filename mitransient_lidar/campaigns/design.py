@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -120,8 +120,8 @@ class Campaign:
     keep: tuple[str, ...] = ("waveform", "truth")
     instrument: str | None = None
     receiver: str | None = None
-    gain: float | str = 1.0
-    optical_density: float | str = 0.0
+    gain: float | Literal["auto"] = 1.0
+    optical_density: float | Literal["auto"] = 0.0
     background_power_w: float = 0.0
     fixed: Mapping[str, Any] = field(default_factory=dict)
     parameters: Mapping[str, Range | tuple[Any, ...] | Expression] = field(default_factory=dict)

@@ -118,8 +118,8 @@ class RunRenderer:
             campaign.receiver,
             seed=noise,
             background_power=campaign.background_power_w,
-            gain=campaign.gain,  # type: ignore[arg-type]
-            optical_density=campaign.optical_density,  # type: ignore[arg-type]
+            gain=campaign.gain,
+            optical_density=campaign.optical_density,
         )
 
     def arrays(self, number: int, values: Mapping[str, Any]) -> dict[str, Array]:

@@ -19,6 +19,7 @@ from command_line import assert_refused, run
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
+from mitransient_lidar.core.errors import UserError
 
 #: Runs that take a tenth of a second each.
 QUICK = {
@@ -258,6 +259,28 @@ def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
         _, told = client.communicate(timeout=60)
     assert client.returncode == 2
     assert told == "the scheduler was lost: what is written is kept, and the same command goes on\n"
+
+
+def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
+    """Any call may notice first that the scheduler is lost; an error with a scheduler that is there is another one."""
+    from distributed import Client
+
+    path = tmp_path / "lost.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+
+    def times_out():
+        raise OSError("Timed out trying to connect")
+
+    with Client(json.loads(scheduler[1].read_text())["address"], set_as_default=False) as client:
+        monkeypatch.setattr(client, "nthreads", times_out)
+        with pytest.raises(OSError, match="Timed out trying to connect"):
+            resume(path, scheduler=client)
+        monkeypatch.setattr(client, "status", "connecting")
+        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
+            resume(path, scheduler=client)
+        monkeypatch.undo()
+    assert (Store(path).status() == PLANNED).all()
 
 
 def test_interruption_keeps_what_is_written(tmp_path):
