@@ -21,6 +21,7 @@ from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water_phases import KINDS, ScattererPhases, phases_of_layers
+from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.path import Path
 
 #: Attenuation, scattering and backscattering [1/m] unless they are given.
@@ -139,7 +140,7 @@ class LayeredWater(mi.Medium):
         #: Indices of the uppermost layer, where the sea surface is.
         self.refractive_index, self.group_index = (float(values[0]) for values in indices)
         if self.plume is not None:
-            self.plume_phase = bubbles or mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
+            self.plume_phase = bubbles or create_object("fournier_forand", backscatter_ratio=ratio)
             of_layers.append(self.plume_phase)
         #: Phase functions of the layers, and last of the bubbles.
         self.phases = ScattererPhases(of_layers)

@@ -12,6 +12,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Instrument, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import fill_mesh, recorded
+from mitransient_lidar.transport.nested_objects import create_object
 
 
 class OceanSurface(mi.Mesh):
@@ -135,8 +136,8 @@ class OceanSurface(mi.Mesh):
         if self.has_ripples:
             alpha_u, alpha_v = self._roughness()
             indices = {"int_ior": getattr(water, "refractive_index", 1.34), "ext_ior": 1.0}
-            ripples = {"type": "roughdielectric", "distribution": "beckmann", "alpha_u": alpha_u, "alpha_v": alpha_v}
-            props["ripples"] = mi.load_dict(ripples | indices)
+            roughness = {"distribution": "beckmann", "alpha_u": alpha_u, "alpha_v": alpha_v}
+            props["ripples"] = create_object("roughdielectric", **roughness, **indices)
         # Facet normals, not interpolated ones, have the slope variance of the mesh and conserve energy.
         props["face_normals"] = True
         mesh = self.sea.mesh()
@@ -226,7 +227,7 @@ class SeaPatches:
         mesh, positions = self._surface.sea.patches(places, self._surface.footprint_size)
         fill_mesh(self.shape, mesh)
         if self.shapes is None:
-            self.shapes = mi.load_dict({"type": "scene", "sea": self.shape})
+            self.shapes = mi.load_dict({"type": "scene", "sea": self.shape}, parallel=False)
         else:
             self.shapes.parameters_changed([])
         return positions

@@ -16,6 +16,7 @@ from mitransient_lidar.core.validation import FloatArray, finite, in_range, non_
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.sea_mesh import grid_indices, triangulate
 from mitransient_lidar.plugins.bases import fill_mesh, recorded
+from mitransient_lidar.transport.nested_objects import create_object
 
 #: Steepest tilt [deg] and steepest ripples, height over length, so that facets are at most at 45 degrees with either.
 _STEEPEST_TILT, _STEEPEST_RIPPLE = 45.0, 0.3
@@ -278,8 +279,9 @@ class Seabed(mi.Mesh):
     def __init__(self, props: mi.Properties) -> None:
         self.bottom = Bottom(props.get)
         if not any(isinstance(child, mi.BSDF) for _, child in props.objects()):
-            texture = {"type": "mesh_attribute", "name": REFLECTANCE}
-            props["reflection"] = mi.load_dict({"type": "diffuse", "reflectance": texture})
+            props["reflection"] = create_object(
+                "diffuse", reflectance=create_object("mesh_attribute", name=REFLECTANCE)
+            )
         props["face_normals"] = True
         x, y = self.bottom.lines()
         mesh = triangulate(self.bottom.heights(x, y), x, y, 0.0)

@@ -25,6 +25,10 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 if TYPE_CHECKING:
     import mitsuba as mi
 
+#: Options of Mitsuba's loaders. Optimisation would merge a bottom and a target of one material into a shape without a
+#: name; loading in several threads saves no time.
+_LOADING = {"parallel": False, "optimize": False}
+
 _COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
 #: Parameters of scenes that describe the same thing in several ways.
@@ -106,7 +110,7 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     check_dict(given)
     record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
     with as_user_error(), _placeholder_seas():
-        loaded = mi.load_dict({"type": "scene", **given}, optimize=False)
+        loaded = mi.load_dict({"type": "scene", **given}, **_LOADING)
     return LoadedScene(loaded, "scene", {}, record)
 
 
@@ -143,11 +147,10 @@ def _load_xml(
     referred = used if is_file else check_elements(root, parameters)
     values = {key: value for key, value in parameters.items() if key in referred}
     with as_user_error({key: value for key, value in given.items() if key in used}, root), _placeholder_seas():
-        # Optimisation would merge a bottom and a target of one material into a shape without a name.
         if is_file:
-            loaded = mi.load_file(str(source), optimize=False, **values)
+            loaded = mi.load_file(str(source), **_LOADING, **values)
         else:
-            loaded = mi.load_string(root.toxml(), optimize=False, **values)
+            loaded = mi.load_string(root.toxml(), **_LOADING, **values)
     if not isinstance(loaded, mi.Scene):
         raise UserError(f"scene {name} holds a {type(loaded).__name__}: its root element must be <scene>")
     if unused := [key for key in parameters if key not in used]:

@@ -110,7 +110,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
         if not isinstance(wanted, str):
             check_dict(wanted)
         with as_user_error():
-            chosen = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
+            chosen = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted), parallel=False)
     if not hasattr(chosen, "plugin") and isinstance(wanted, str):
         raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
     if not hasattr(chosen, "plugin"):

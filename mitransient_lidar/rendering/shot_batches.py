@@ -222,7 +222,8 @@ def _scene_of(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
     if not shapes:
         return None
     ids = [shape.id() for shape in shapes]
-    scene = mi.load_dict({"type": "scene", **{f"shape{number}": shape for number, shape in enumerate(shapes)}})
+    parts = {f"shape{number}": shape for number, shape in enumerate(shapes)}
+    scene = mi.load_dict({"type": "scene", **parts}, parallel=False)
     # A scene renames its shapes.
     for shape, own in zip(shapes, ids, strict=True):
         shape.set_id(own)

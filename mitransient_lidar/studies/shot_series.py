@@ -491,7 +491,7 @@ def _bottom_depth(lidar: LidarScene, places: FloatArray) -> FloatArray:
     down = mi.Vector3f(x, y, -math.sqrt(1 - x * x - y * y))
     count = len(places)
     origin = mi.Point3f(*(aligned(mi.Float, column) for column in (*places.T, np.zeros(count))))
-    met = mi.load_dict({"type": "scene", "bottom": bottom}).ray_intersect(mi.Ray3f(origin, down))
+    met = mi.load_dict({"type": "scene", "bottom": bottom}, parallel=False).ray_intersect(mi.Ray3f(origin, down))
     depth = -np.array(met.p.z, dtype=np.float64)
     # Rays in single precision are known to a tenth of a millimetre.
     return np.where(np.array(met.is_valid()), np.round(depth, 4), np.nan).astype(np.float64)

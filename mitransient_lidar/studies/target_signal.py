@@ -190,7 +190,7 @@ def _without(scene: mi.Scene, target_id: str) -> mi.Scene:
     parts |= {f"sensor_{i}": sensor for i, sensor in enumerate(scene.sensors())}
     parts |= {f"emitter_{i}": emitter for i, emitter in enumerate(scene.emitters())}
     parts |= {f"shape_{i}": shape for i, shape in enumerate(shapes) if shape is not gone}
-    return mi.load_dict(parts)
+    return mi.load_dict(parts, parallel=False)
 
 
 def _quantities(own: FloatArray, backscatter: FloatArray, shadow: FloatArray) -> dict[str, FloatArray]:

@@ -16,6 +16,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, TabulatedPhase, deflect
+from mitransient_lidar.transport.nested_objects import create_object
 
 #: Phase functions that ``layered_water`` creates.
 KINDS = ("fournier_forand", "petzold", "hg")
@@ -108,9 +109,9 @@ def phases_of_layers(
             )
         particles = [nested[name] for name in wanted]
     elif kind == "petzold":
-        particles = [mi.load_dict({"type": "petzold"})] * count
+        particles = [create_object("petzold")] * count
     elif kind == "hg":
-        particles = [mi.load_dict({"type": "hg", "g": phase_g})] * count
+        particles = [create_object("hg", g=phase_g)] * count
     else:
         return _mixed(*_fournier_forand(column, water_scattering, share), tabulated)
     return _mixed(particles, share, tabulated)
@@ -132,10 +133,7 @@ def _fournier_forand(
     kinds = [(round(float(ratio), 12), float(part)) for ratio, part in zip(ratios, share, strict=True)]
     if len(set(kinds)) > _MOST_FUNCTIONS:
         kinds = [(_rounded(ratio), _rounded(part) if _SMALLEST_SHARE < part < 1 else part) for ratio, part in kinds]
-    made = {
-        ratio: mi.load_dict({"type": "fournier_forand", "backscatter_ratio": ratio})
-        for ratio, _ in dict.fromkeys(kinds)
-    }
+    made = {ratio: create_object("fournier_forand", backscatter_ratio=ratio) for ratio, _ in dict.fromkeys(kinds)}
     return [made[ratio] for ratio, _ in kinds], np.array([part for _, part in kinds])
 
 
