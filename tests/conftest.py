@@ -9,12 +9,40 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import significance
 
 from mitransient_lidar.loading.variants import SUPPORTED_VARIANTS
 
-
 # Campaigns need Python 3.11.
 collect_ignore_glob = [] if sys.version_info >= (3, 11) else ["*/campaigns/*", "system/test_campaigns.py"]
+
+#: Comparisons of each worker of pytest-xdist.
+_comparisons = {}
+
+
+def pytest_addoption(parser):
+    parser.addoption("--seed-shift", type=int, default=0, metavar="N", help="add N to the seeds of all random numbers")
+
+
+def pytest_configure(config):
+    significance.shift_seeds(config.getoption("--seed-shift"))
+
+
+def pytest_testnodedown(node):
+    _comparisons[node.gateway.id] = getattr(node, "workeroutput", {}).get("comparisons", 0)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session):
+    """Fail a run whose comparisons are so many that chance alone would fail it too often."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["comparisons"] = significance.comparisons
+        return
+    count = sum(_comparisons.values()) + significance.comparisons
+    chance = count * significance.FALSE_ALARM
+    print(f"\n{count} comparisons of random numbers: a false alarm in at most {chance:.1e} of all runs")
+    if chance > significance.SUITE_FALSE_ALARM and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -62,7 +90,7 @@ def _build(*, integrator=None, tx=None, rx=None, film=None, sea=None, water=None
             "to_world": mi.ScalarTransform4f().translate([0, 0, -bottom]).scale(500),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "spectrum", "value": rho}},
         }
-    return mi.load_dict(scene)
+    return mi.load_dict(scene, parallel=False)
 
 
 @pytest.fixture

@@ -157,8 +157,10 @@ def within_small_angle(radius, depth, scattering):
     return np.exp(-scattering * depth) + radius * trapezoid(j1(k * radius) * values, k)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("absorption", "scattering"), [(0.05, 0.8), (0.3, 1.5)])
+@pytest.mark.parametrize(
+    ("absorption", "scattering"),
+    [pytest.param(0.05, 0.8, marks=pytest.mark.long), pytest.param(0.3, 1.5, marks=pytest.mark.long)],
+)
 def test_many_weak_scatterings(lidar_scene, narrow, absorption, scattering):
     """Rationale: the theory of McLean, Freeman and Walker assumes what this phase function is.
 

@@ -10,8 +10,6 @@ from mitransient_lidar.analysis import comparison
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
-pytestmark = pytest.mark.slow
-
 ENERGY = 5e-3 * 0.81 * 0.9
 DEPTH = 1.0
 CLEAR = {"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0}
@@ -65,6 +63,7 @@ def cells(angle_x, angle_y):
     return np.where(inside, IMAGE[row.clip(0, 2), column.clip(0, 3)], 0) / IMAGE.sum() / 4e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gaussian", "top_hat", "image"])
 def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, tmp_path):
     """2x2 pixels of a view narrower than the beam's long axis; a mirrored turn would swap left and right pixels."""
@@ -107,6 +106,7 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["ellipse", "image"])
 def test_integrators_agree(kind, lidar_scene, tmp_path):
     shape = {"divergence_mrad": 2.0, "divergence_across_mrad": 15.0}
@@ -129,6 +129,7 @@ def test_integrators_agree(kind, lidar_scene, tmp_path):
     assert outcome.energy_ratio_stderr < 0.01
 
 
+@pytest.mark.slow
 def test_obscured_aperture_receives_its_open_share(lidar_scene, passes):
     """The same seed gives the same paths, so the ratio is exact; it is the area's, not the diameter's or its square."""
     scenes = [lidar_scene(rx={"obscuration": share}, water=CLEAR) for share in (0.0, 0.3)]

@@ -13,7 +13,7 @@ import mitransient_lidar
 from mitransient_lidar.analysis.retrieval.column_slope import effective_attenuation
 from mitransient_lidar.studies.fov_sweep import fov_sweep
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 #: A vertical lidar 200 m above a level sea. Its ripples, the smoothest there are, spread light by millimetres.
 VERTICAL = {"off_nadir_deg": 0, "spectrum": "flat", "slope_variance": 2e-5, "bottom_depth": 30}

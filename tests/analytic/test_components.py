@@ -104,24 +104,7 @@ def test_each_part_has_its_closed_form(lidar_scene, z_score, integrator):
     assert np.all(np.abs(z) * error < largest_z(count, 3) * error + 1e-3), (z, error)
 
 
-@pytest.mark.slow
-def test_integrators_agree_by_origin():
-    found = [
-        mitransient_lidar.render("fig13_2x2", passes=12, seed=seed, integrator=integrator, components=True)
-        for seed, integrator in enumerate(INTEGRATORS)
-    ]
-    # Bins of 10 ns, summed over the pixels; errors of the pixels and bins of a pass add up at most.
-    blocks = [one.sum("pixel").isel(time=slice(0, 200)).coarsen(time=10).sum() for one in found]
-    values = [block["impulse_response_by_origin"].values for block in blocks]
-    errors = [block["impulse_response_by_origin_stderr"].values for block in blocks]
-    known = np.all([error < 0.2 * value for value, error in zip(values, errors, strict=True)], axis=0)
-    assert np.all(known.sum(axis=1) >= [2, 8, 1, 2])
-    # Merging's cells blur the first metre of water by 0.5 %.
-    z = np.maximum(np.abs(values[0] - values[1]) - 5e-3 * values[1], 0)[known] / np.hypot(*errors)[known]
-    assert np.all(z < largest_z(12, z.size)), z
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_part_of_a_target_is_what_its_reflectance_adds():
     """Before light from it can meet the bottom, a grey target differs from a black one by its part."""
     params = {"time_start_ns": 1400, "bin_count": 120, "layout": "1x1"}

@@ -142,9 +142,17 @@ def truth_and_light(dataset, bottom):
     return truth, (lines.beam_share > 0.1 * lines.beam_share.max()) & np.isfinite(truth)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("layout", ["1x1", "2x2", "hex7", "8x8"])
-@pytest.mark.parametrize("depth_from", ["echo", "mean"])
+@pytest.mark.parametrize(
+    ("layout", "depth_from"),
+    [
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("2x2", "echo"),)),
+        *(
+            pytest.param(layout, depth_from, marks=pytest.mark.long)
+            for layout in ("1x1", "2x2", "hex7", "8x8")
+            for depth_from in ("echo", "mean")
+        ),
+    ],
+)
 def test_rendered_waveforms_give_the_depth_of_each_pixel(lidar_scene, layout, depth_from):
     """Over level, falling and rising planes, depths deviate by the errors of noise and method together."""
     z = []
@@ -158,8 +166,9 @@ def test_rendered_waveforms_give_the_depth_of_each_pixel(lidar_scene, layout, de
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.25
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bottom", BOTTOMS)
+@pytest.mark.parametrize(
+    "bottom", [pytest.param(name, marks=pytest.mark.slow if name == "falls" else pytest.mark.long) for name in BOTTOMS]
+)
 def test_rendered_gates_give_the_depth_of_each_pixel(lidar_scene, bottom):
     """Depths of 256 pixels do not fall or rise with the row; on the axis's scale the level bottom falls by 0.8 m."""
     film = {"gate_start_ns": 1452.0, "gate_width_ns": 5.0, "gate_step_ns": 2.0, "gate_count": 30, "bin_width_ns": 0.5}

@@ -38,16 +38,7 @@ def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes, layout
     np.testing.assert_allclose(energies[0], energies[1], rtol=1e-10)
 
 
-@pytest.mark.slow
-def test_pixels_sum_to_the_single_pixel_with_other_seeds(lidar_scene, passes):
-    """A share of the light given to two pixels or none would show."""
-    pixels = lidar_scene(rx={"layout": "2x2"}, sea=WAVY)
-    single = lidar_scene(rx={"layout": "1x1"}, sea=WAVY)
-    first, second = (with_total(echoes(passes(*job))) for job in ((pixels, 32), (single, 32, 1000)))
-    compare(first, second, 0.02)
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
     """Quadrants as sectors of a circle, drawn pixel by pixel, against the layout that cuts the circle."""
     quadrants = {"red": 270.0, "green": 0.0, "blue": 180.0, "black": 90.0}
@@ -82,17 +73,18 @@ def connected(lidar_scene, passes, sea, count, **integrator):
     return passes(scene, count)[:, 0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sea", [ROUGH, WAVY])
+@pytest.mark.parametrize(
+    "sea", [pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long)]
+)
 def test_connections_by_emitter_by_phase_and_mis_have_one_mean(lidar_scene, passes, sea):
     """Each alone is complete; weights that do not sum to one would lose or double what both can find."""
     combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:6])
-    for other, count in (("emitter", 32), ("phase", 64)):
+    for other, count in (("emitter", 24), ("phase", 40)):
         alone = with_total(connected(lidar_scene, passes, sea, count, connection=other)[:, 1:6])
-        compare(combined, alone, 0.045)
+        compare(combined, alone, 0.06)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
     """Against the ordinary path tracer's walk by the phase function alone, which seldom leaves towards the laser."""
@@ -103,8 +95,9 @@ def test_combining_cuts_the_variance_fifty_times(lidar_scene, passes, sea):
     assert walk[:, 5].var(ddof=1) > 50 * combined[:, 5].var(ddof=1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sea", [ROUGH, WAVY])
+@pytest.mark.parametrize(
+    "sea", [pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long)]
+)
 def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
     """A uniform beam seen by a uniform field of view, and the two exchanged, per solid angle of the field of view.
 
@@ -118,11 +111,11 @@ def test_reciprocity_of_beam_and_field_of_view(lidar_scene, passes, sea):
             sea=sea,
             film={"time_start_ns": 1410.0, "bin_width_ns": 20.0, "bin_count": 5},
         )
-        signals.append(with_total(passes(scene, 32)[:, 0] / view**2))
-    compare(*signals, 0.02)
+        signals.append(with_total(passes(scene, 16)[:, 0] / view**2))
+    compare(*signals, 0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
     """One metre apart across the axis, looking at one point, exchanged: equal beams and views see the same signal."""
     energies = []
@@ -145,9 +138,9 @@ def test_reciprocity_of_transmitter_and_receiver(lidar_scene, passes):
 @pytest.mark.slow
 def test_roulette_changes_no_mean(lidar_scene, passes):
     """Without it, and with much of it: survivors that did not carry the share of the dead would lose most light."""
-    reference = echoes(passes(lidar_scene(sea=ROUGH), 24))
+    reference = echoes(passes(lidar_scene(sea=ROUGH), 16))
     # The more light survivors carry, the noisier it is.
-    for threshold, count, error in ((0.0, 12, 0.02), (0.05, 32, 0.045), (0.5, 96, 0.12)):
+    for threshold, count, error in ((0.0, 12, 0.03), (0.05, 32, 0.05)):
         scene = lidar_scene(sea=ROUGH, integrator={"roulette_threshold": threshold})
         compare(reference, echoes(passes(scene, count, 500)), error)
 
@@ -237,7 +230,7 @@ def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
 @pytest.mark.slow
 def test_sample_count_per_pixel_and_default(lidar_scene):
     scene = lidar_scene(integrator={"paths_per_pass": 2**12})
-    few, many = (np.array(mi.render(scene, spp=spp, seed=1)).sum() for spp in (0, 2**14))
-    assert few == pytest.approx(many, rel=0.2)
-    # spp = 1024 for each of four pixels is the pass of 4096 paths.
-    assert np.array(mi.render(scene, spp=1024, seed=1)).sum() == pytest.approx(few, rel=1e-5)
+    # 1024 for each of four pixels are the 4096 paths of a pass; as many again are other paths.
+    default, same, more = (np.array(mi.render(scene, spp=spp, seed=1)).sum() for spp in (0, 1024, 2048))
+    assert same == pytest.approx(default, rel=1e-5)
+    assert abs(more / default - 1) > 1e-3

@@ -149,7 +149,7 @@ def image(lidar_scene, layout, film=None, **integrator):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
     """256 x 256 pixels binned to 2 x 2, and all of them, against receivers of so many pixels with other seeds."""
     sums = {}
@@ -170,7 +170,7 @@ def test_pixels_of_an_image_sum_to_four_and_to_one(lidar_scene, passes):
         assert np.all(error < 0.02 * second.mean(axis=0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_images_do_not_show_the_cells_of_the_sea(lidar_scene, passes):
     """The pattern of light on a bottom at 2 m, in automatic cells, is that in cells of half the size.
 
@@ -219,7 +219,7 @@ def test_paths_go_with_the_pixels(lidar_scene):
         assert (default.paths, default.photons) == (paths, photons)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_contrast_of_the_mine_is_greatest_where_geometry_says():
     """The sphere's energy, and its Weber contrast against the water around it, by gate.
 

@@ -65,9 +65,16 @@ def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator
     return passes(scene, count)[:, 0, 0] * (beam / view) ** 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("albedo", "degrees"), [(0.5, 0.0), (0.5, 40.0), (0.9, 20.0), (0.9, 60.0), (0.99, 0.0), (0.99, 60.0)]
+    ("albedo", "degrees"),
+    [
+        pytest.param(0.5, 0.0, marks=pytest.mark.long),
+        pytest.param(0.5, 40.0, marks=pytest.mark.long),
+        pytest.param(0.9, 20.0, marks=pytest.mark.long),
+        pytest.param(0.9, 60.0, marks=pytest.mark.slow),
+        pytest.param(0.99, 0.0, marks=pytest.mark.long),
+        pytest.param(0.99, 60.0, marks=pytest.mark.long),
+    ],
 )
 def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
     """Light of up to hundreds of scatterings; at albedo 0.99 it is 3 to 6 times the single scattering."""
@@ -82,7 +89,7 @@ def test_reference_returns_h_squared(lidar_scene, passes, z_score, albedo, degre
     assert abs(energy.mean() / expected - 1) < 5e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("albedo", "degrees"), [(0.5, 60.0), (0.9, 60.0), (0.99, 0.0)])
 def test_merging_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees):
     """With cells that are small against the mean free path, over which the light falls.
@@ -105,7 +112,7 @@ def test_merging_returns_h_squared(lidar_scene, passes, z_score, albedo, degrees
     assert abs(energy.mean() / expected - 1) < largest_z(count) * relative + 2e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [0.0, 60.0])
 def test_every_order_of_scattering_returns_its_share(lidar_scene, passes, z_score, degrees):
     """Light scattered once, twice, three and four times, each alone: a share given to another order would show."""

@@ -23,8 +23,6 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.studies.shot_statistics import highest_points
 
-pytestmark = pytest.mark.slow
-
 ANGLE, INDEX = np.radians(20.0), 1.34
 BIN_NS = 0.5
 #: What a tenth of a metre of depth takes, there and back.
@@ -88,6 +86,7 @@ def closed_form_ns(side):
     return steepest_ns(record(3) / record(29), start, STEP_NS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
 def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     """Same seeds, same light: to the bit where layers are equal, as they are joined.
@@ -119,6 +118,7 @@ def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     assert share_of_equal_bins(record("0", scattering=0.701)) < 0.05
 
 
+@pytest.mark.slow
 def test_scenes_of_figure_15_differ_in_layout_only():
     first, second = (catalogue.scene_parameters(catalogue.scene_path(f"fig15_{kind}")) for kind in ("2x2", "1x1"))
     assert {name for name in first if first[name] != second[name]} == {"layout"}
@@ -127,7 +127,11 @@ def test_scenes_of_figure_15_differ_in_layout_only():
 
 @pytest.mark.parametrize(
     ("name", "depth", "group_index", "sea"),
-    [("fig15_1x1", 3.0, 1.34, FLAT), ("fig15_1x1", 3.0, 1.34, {}), ("nepheloid_layer", 6.5, 1.364, {})],
+    [
+        pytest.param("fig15_1x1", 3.0, 1.34, FLAT, marks=pytest.mark.long),
+        pytest.param("fig15_1x1", 3.0, 1.34, {}, marks=pytest.mark.long),
+        pytest.param("nepheloid_layer", 6.5, 1.364, {}, marks=pytest.mark.slow),
+    ],
 )
 def test_step_is_seen_at_its_slanted_depth(name, depth, group_index, sea):
     """A beam of 2 mrad, so narrow that its own spread in time is 0.5 ns; light scattered forward comes later."""
@@ -155,6 +159,7 @@ def of_pixels(energy, pixels):
 SIDES = {"single": ([0, 1, 2, 3], 0), "far": ([0, 1], 1), "near": ([2, 3], -1)}
 
 
+@pytest.mark.long
 def test_step_of_figure_15_is_seen_when_its_beam_says(fig15):
     """Within 0.1 m for the whole beam; earlier in the near pixels than in the far ones by 3.3 ns (2.8 without delays).
 
@@ -186,6 +191,7 @@ def width_ns(ratio, start_ns, step_ns):
     return TEN_TO_NINETY * fitted[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["impulse_response", "waveform"])
 def test_four_pixels_resolve_the_step_better_than_one(fig15, what):
     """Each sees half the arrival times, and smears the step the less; the pulse and delayed light blur all alike.
@@ -217,6 +223,7 @@ def absorbing(upper, lower):
     return {"layer_tops": "0, 3", **dict(zip(("attenuation", "scattering", "backscattering"), texts, strict=True))}
 
 
+@pytest.mark.slow
 def test_absorption_changes_the_bins_behind_it_and_no_others(lidar_scene, passes):
     """A path's absorption is a weight: other absorption, same paths, and exp(-da L) for the way L through it."""
     start, bins = 1410.0, 150
@@ -257,6 +264,7 @@ def test_absorption_changes_the_bins_behind_it_and_no_others(lidar_scene, passes
     assert (moved[again] / before[again]).mean() == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.long
 def test_thin_layer_echoes_from_its_depth():
     """Near pixels have the echo of its middle, 4.2 m deep, before the axis has it, far ones as long after it."""
     shot = mitransient_lidar.render("thin_layer", passes=16)

@@ -16,8 +16,6 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
 from mitransient_lidar.physics.water.phase import henyey_greenstein
 
-pytestmark = pytest.mark.slow
-
 HEIGHT, G = 200.0, 0.9
 HALF_VIEW = 0.05  # tangent of the field of view's half angle: 10 m on the surface
 #: The surface echo, across 1.7 ns, falls into the first gate, which is left out.
@@ -95,14 +93,24 @@ def scatter(rng, direction):
     return turned, phase / ((1 - UPWARD_SHARE) * phase + UPWARD_SHARE * about_vertical)
 
 
-@pytest.fixture(scope="module", params=[(0.3, 0.15, 1.34), (0.8, 0.64, 1.34), (0.8, 0.64, 1.0001)], ids=str)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param((0.3, 0.15, 1.34), marks=pytest.mark.long),
+        pytest.param((0.8, 0.64, 1.34), marks=pytest.mark.slow),
+        pytest.param((0.8, 0.64, 1.0001), marks=pytest.mark.long),
+    ],
+    ids=str,
+)
 def walks(request):
     """Return attenuation, scattering and index, and the energies of independent walks."""
     return request.param, np.array([random_walk(*request.param, 20_000, seed) for seed in range(20)])
 
 
 @pytest.mark.parametrize(
-    ("integrator", "view", "count"), [("lidar_volpath", 0.5e-3, 48), ("lidar_merging", 5e-3, 16)], ids=str
+    ("integrator", "view", "count"),
+    [pytest.param("lidar_volpath", 0.5e-3, 48, marks=pytest.mark.long), ("lidar_merging", 5e-3, 16)],
+    ids=str,
 )
 def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, walks, integrator, view, count):
     (attenuation, scattering, index), references = walks

@@ -115,8 +115,13 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, l
     assert agrees(passes(scene, 12), 1 - lost / 2, 3, bias=lost / 2) < 3e-3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("layers", [{}, {"layer_tops": "0, 2", "refractive_index": "1.33, 1.36"}])
+@pytest.mark.parametrize(
+    "layers",
+    [
+        pytest.param({}, marks=pytest.mark.long),
+        pytest.param({"layer_tops": "0, 2", "refractive_index": "1.33, 1.36"}, marks=pytest.mark.slow),
+    ],
+)
 def test_sampling_does_not_change_the_image(layers):
     """Guided directions, roulette and kinds of connections change only the noise."""
     water = {"attenuation": 0.2, "scattering": 0.12, "backscattering": 0.006}
@@ -243,7 +248,7 @@ def test_deep_water_under_an_even_sky(albedo, hydrolight, monte_carlo):
     agrees(leaving, 0.5 * (hydrolight + monte_carlo), 2, bias=0.015)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("zenith", "azimuth", "view", "coefficients", "spread"),
     [
@@ -295,14 +300,13 @@ def test_deep_natural_water(absorption, particles, molecules, zenith, azimuth, v
     assert agrees(leaving, float(expected), 12, bias=spread) < 0.02
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phase", "albedo", "expected", "spread"),
     [
-        ("rayleigh", 0.9, 4.85e-2, 0.015),
-        ("rayleigh", 0.2, 1.72e-3, 0.044),
-        ("petzold", 0.9, 6.99e-3, 0.063),
-        ("petzold", 0.2, 5.47e-5, 0.060),
+        pytest.param("rayleigh", 0.9, 4.85e-2, 0.015, marks=pytest.mark.slow),
+        pytest.param("rayleigh", 0.2, 1.72e-3, 0.044, marks=pytest.mark.long),
+        pytest.param("petzold", 0.9, 6.99e-3, 0.063, marks=pytest.mark.slow),
+        pytest.param("petzold", 0.2, 5.47e-5, 0.060, marks=pytest.mark.long),
     ],
 )
 def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
@@ -408,7 +412,7 @@ def ray_contrast(depth, amplitude, k, sun, ripple, resolved):
     return light.std() / light.mean()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wind_sea_focuses_the_sun_most_some_metres_down(tmp_path):
     """Contrast of light on plates below a sea at 5 m/s, lit through its waves and seen through still water.
 

@@ -7,8 +7,6 @@ from significance import largest_z
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import fresnel
 
-pytestmark = pytest.mark.slow
-
 HEIGHT, THETA, AREA = 200.0, np.radians(20.0), 0.025
 INDEX, GROUP, THICKNESS = np.array([1.34, 1.6, 1.2]), np.array([1.36, 1.25, 1.2]), np.array([2.0, 3.0, 3.0])
 WATER = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.6, 1.2", "group_index": "1.36, 1.25, 1.2"}
@@ -37,55 +35,37 @@ def bottom_echo(attenuation, reflectance):
     return arrival, sent * reflectance / np.pi * np.cos(phi[-1]) * solid_angle
 
 
-@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
+@pytest.mark.parametrize("integrator", ["lidar_volpath", pytest.param("lidar_merging", marks=pytest.mark.slow)])
 def test_bottom_echo_comes_in_time_and_strength_of_the_refracted_path(lidar_scene, passes, z_score, integrator):
     """With one group index for all the echo would come 5 ns late; without bending it would have a fifth less energy."""
     arrival, expected = bottom_echo(attenuation=0.1, reflectance=0.1)
     narrow = {"divergence_mrad": 0.2}
     scene = lidar_scene(
-        integrator={"type": integrator, "paths_per_pass": 2**16},
+        integrator={"type": integrator, "paths_per_pass": 2**14},
         tx=narrow,
         rx={"field_of_view_mrad": 20.0, "layout": "1x1"},
         film={"bin_width_ns": 0.25, "bin_count": 640},
         sea={"slope_variance": "2e-5"},
         water={**WATER, "attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0},
     )
-    energy = passes(scene, 24)[:, 0]
+    energy = passes(scene, 16)[:, 0]
     late = energy[:, 200:]  # without the surface echo
     time = 1390 + 0.25 * (np.arange(200, 640) + 0.5)
     assert abs(np.average(time, weights=late.mean(axis=0)) - arrival) < 0.1
     z, relative = z_score(late.sum(axis=1), expected)
     # The partial reflections between the index_layers, 1 % a crossing here, are left out by both.
-    assert abs(z) < largest_z(24), (z, late.sum(axis=1).mean() / expected)
-    assert relative < 0.005
+    assert abs(z) < largest_z(16), (z, late.sum(axis=1).mean() / expected)
+    assert relative < 0.015
 
 
-def test_light_beyond_the_critical_angle_is_reflected(lidar_scene, passes, z_score):
-    """Below 1.2 there is 1.0001: light steeper than 56 degrees from the vertical passes, both ways.
-
-    Both integrators bend, but only `lidar_volpath` connects through the index_layers: they would differ where one
-    forgets the square of the index or the density of a bent direction.
-    """
-    water = {"layer_tops": "0, 1", "refractive_index": "1.2, 1.0001", "attenuation": 0.6, "scattering": 0.55}
-    water |= {"phase_function": "hg", "phase_g": 0.3}
-    film = {"bin_width_ns": 4.0, "bin_count": 40}
-    gates = {}
-    for integrator in ("lidar_volpath", "lidar_merging"):
-        scene = lidar_scene(integrator={"type": integrator}, film=film, water=water, bottom=6.0)
-        gates[integrator] = passes(scene, 10).sum(axis=1)[:, 6:36:3]
-    a, b = gates.values()
-    error = np.hypot(*(sample.std(axis=0, ddof=1) / 10**0.5 for sample in (a, b)))
-    z = (a.mean(axis=0) - b.mean(axis=0)) / error
-    assert np.all(np.abs(z) < largest_z(10, z.size)), z
-    assert np.median(error / b.mean(axis=0)) < 0.04
-
-
+@pytest.mark.slow
 def test_strata_of_one_index_are_one(lidar_scene, passes):
     layered = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.34, 1.34"}
     energies = [passes(lidar_scene(water=water), 2) for water in (layered, {"layer_tops": "0, 2, 5"})]
     np.testing.assert_array_equal(*energies)
 
 
+@pytest.mark.slow
 def test_index_changes_within_the_waves_are_refused(lidar_scene, passes):
     water = {"layer_tops": "0, 0.01", "refractive_index": "1.335, 1.34"}
     scene = lidar_scene(sea={"spectrum": "elfouhaily", "wind_speed": 6.0, "size": 60.0}, water=water)
@@ -93,6 +73,7 @@ def test_index_changes_within_the_waves_are_refused(lidar_scene, passes):
         passes(scene, 1)
 
 
+@pytest.mark.slow
 def test_layers_below_the_bottom_are_refused(lidar_scene, passes):
     with pytest.raises(
         (RuntimeError, ValueError), match=r"layer_tops = 9 m is a layer below the bottom: .* less than 8 m"

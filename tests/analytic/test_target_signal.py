@@ -7,15 +7,13 @@ import pytest
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.studies.target_signal import describe_map, describe_target, target_map, target_signal
 
-pytestmark = pytest.mark.slow
-
 NEAR = {"surface_size": 200, "bin_count": 170}
 SMALL = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
 
 
 @pytest.fixture(scope="module")
 def squares():
-    return target_signal("fig13_2x2", NEAR, passes=16)
+    return target_signal("fig13_2x2", NEAR, passes=16, integrator={"type": "lidar_merging", "paths_per_pass": 2**14})
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +21,12 @@ def strips():
     return target_signal("fig14_1x4", NEAR, passes=32)
 
 
-@pytest.fixture(params=["squares", "strips"])
+@pytest.fixture(params=["squares", pytest.param("strips", marks=pytest.mark.long)])
 def published(request):
     return request.getfixturevalue(request.param)
 
 
+@pytest.mark.slow
 def test_common_random_numbers_know_the_target_better_than_the_records(published):
     """Where the target's echo is not, both records are of the same paths, so that their difference is known to be 0."""
     before = published.sel(time=slice(1420, 1470))
@@ -38,18 +37,21 @@ def test_common_random_numbers_know_the_target_better_than_the_records(published
     assert lit < published["waveform_stderr"].sel(time=slice(1480, 1500)).mean()
 
 
+@pytest.mark.slow
 def test_near_pixels_hold_the_published_target(published):
     """FOI-R--2074--SE, figures 13 and 14: blue and black contain the largest part of the target's echo."""
     share = published["echo"] / published["echo"].sum()
     assert share.sel(pixel=["blue", "black"]).sum() > 0.9
 
 
+@pytest.mark.slow
 def test_best_weights_are_no_worse_than_the_sum_or_any_pixel(published):
     snr = published["combined_detectability"].sel(combination="best")
     assert snr >= published["combined_detectability"].sel(combination="sum")
     assert snr >= published["detectability"].max()
 
 
+@pytest.mark.long
 def test_strips_show_the_target_best_in_black(strips):
     """Figure 14: black's echo is within 25 % of blue's, though its field of view and backscatter are smaller."""
     blue, black = (strips.sel(pixel=name) for name in ("blue", "black"))
@@ -63,10 +65,12 @@ def test_strips_show_the_target_best_in_black(strips):
     assert column.sel(pixel=["red", "black"]).max() < 0.5 * column.sel(pixel=["green", "blue"]).min()
 
 
+@pytest.mark.slow
 def test_target_shades_the_bottom_behind_it(published):
     assert float(published["shadow"].sum()) < -5 * float(published["shadow_stderr"].sum())
 
 
+@pytest.mark.long
 def test_map_moves_the_target():
     maps = target_map("fig13_2x2", NEAR, x=(0.0, 2.0), y=(-1.0, 1.0), passes=16, integrator=SMALL)
     far = maps["echo"].sel(pixel=["red", "green"]).sum("pixel") / maps["combined_echo"].sel(combination="sum")
@@ -77,19 +81,21 @@ def test_map_moves_the_target():
     assert len(describe_map(maps)) == 5
 
 
+@pytest.mark.slow
 def test_table_lists_pixels_and_combinations(published):
     lines = describe_target(published)
     assert [line.split()[0] for line in lines[2:]] == ["red", "green", "blue", "black", "sum", "best"]
     assert lines[-2].split()[4] == "100.0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "params", "options", "message"),
     [
         ("fig13_2x2", {}, {"target_id": "mine"}, "target_id = 'mine' must be the id of a shape of the scene: .*bottom"),
         ("fig13_2x2", {}, {"target_id": "surface"}, "target_id = 'surface' must not be the sea surface"),
         ("fig13_2x2", {"target_depth": 13}, {}, "target 'target' lies below the bottom, up to z = -13 m"),
-        ("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light"),
+        pytest.param("fig13_2x2", {"target_reflectance": 0}, {}, "it returns no light", marks=pytest.mark.long),
         ("fig13_2x2", {"layout": "8x8"}, {}, "is an imager"),
     ],
 )
@@ -98,12 +104,14 @@ def test_invalid_input_is_refused(scene, params, options, message):
         target_signal(scene, {**NEAR, **params}, passes=16, integrator=SMALL, **options)
 
 
+@pytest.mark.slow
 def test_target_above_the_sea_is_refused(lidar_scene):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])}
     with pytest.raises(UserError, match="target 'target' lies above the sea, from z = 3 m"):
         target_signal(lidar_scene(extra={"target": plate}), passes=16)
 
 
+@pytest.mark.slow
 def test_map_needs_a_target_that_can_be_moved():
     with pytest.raises(UserError, match="has no parameter target_x"):
         target_map("fig09_2x2", passes=16)

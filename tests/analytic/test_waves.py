@@ -9,8 +9,6 @@ from oracles.two_scale import two_scale_ratio
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 
-pytestmark = pytest.mark.slow
-
 #: So high that one shot takes in a patch of 40 m: the mean over seas needs fewer of them.
 HEIGHT = 2000.0
 SEAS = 10
@@ -45,7 +43,14 @@ def surface_echoes(wind, angle, wave):
 
 
 @pytest.mark.parametrize(
-    ("wind", "angle"), [(3.0, 0.0), (3.0, 10.0), (3.0, 20.0), (6.0, 0.0), (6.0, 20.0), (10.0, 0.0), (10.0, 20.0)]
+    ("wind", "angle"),
+    [
+        pytest.param(6.0, 20.0, marks=pytest.mark.slow),
+        *(
+            pytest.param(wind, angle, marks=pytest.mark.long)
+            for wind, angle in ((3.0, 0.0), (3.0, 10.0), (3.0, 20.0), (6.0, 0.0), (10.0, 0.0), (10.0, 20.0))
+        ),
+    ],
 )
 def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle):
     """Within 5 % of Gaussian slopes but in the tail at light wind, where ripples on facets are 20 % brighter.

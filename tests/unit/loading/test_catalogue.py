@@ -121,3 +121,10 @@ def test_shipped_scenes_are_found_and_described():
         assert catalogue.scene_path(name).is_file()
         assert catalogue.scene_summary(name), name
         catalogue.scene_parameters(name)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_figure_10_zooms_into_the_record_of_figure_11(number):
+    zoom, whole = (catalogue.scene_parameters(catalogue.scene_path(f"fig{figure}_shot{number}")) for figure in (10, 11))
+    assert {name for name in zoom if zoom[name] != whole[name]} <= {"time_start_ns", "bin_width_ns", "bin_count"}
+    assert zoom.keys() == whole.keys()
