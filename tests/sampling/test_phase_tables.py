@@ -5,6 +5,8 @@ from importlib import resources
 import mitsuba as mi
 import numpy as np
 import pytest
+import significance
+from significance import largest_z
 
 from mitransient_lidar.transport.medium import tabulated_phase
 
@@ -96,7 +98,7 @@ def test_petzold_at_every_tabulated_angle():
 def test_petzold_core_holds_five_percent():
     """Below 0.1 degree, where the measurement ends, theta^-1.346 holds 0.05169 of the raw table's integral."""
     count = 2**21
-    rng = mi.PCG32(count, initstate=5)
+    rng = mi.PCG32(count, initstate=5 + significance.seed_shift)
     mei = mi.MediumInteraction3f()
     mei.wi = mi.Vector3f(FRAME_WI.tolist())
     first = rng.next_float32()
@@ -105,7 +107,7 @@ def test_petzold_core_holds_five_percent():
     # Half the distance between the directions is the sine of half the angle.
     share = np.mean(np.linalg.norm(np.array(wo).T + FRAME_WI, axis=1) < 2 * np.sin(np.radians(0.05)))
     expected = 0.05169 / 0.9929
-    assert abs(share - expected) < 4 * np.sqrt(expected / count) + 2e-5
+    assert abs(share - expected) < largest_z(count) * np.sqrt(expected / count) + 2e-5
 
 
 def test_weight_outside_the_forward_lobe_is_the_backward_one():
@@ -131,8 +133,8 @@ def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monk
     assert series._short
     monkeypatch.setattr(tabulated_phase, "_is_short", lambda table: False)
     law = tabulated_phase.TabulatedPhase(series.table)
-    count = 2**20
-    rng = mi.PCG32(count, initstate=3)
+    count = 2**18
+    rng = mi.PCG32(count, initstate=3 + significance.seed_shift)
     u, v = rng.next_float32(), rng.next_float32()
     s, value = (np.array(x, dtype=np.float64) for x in series.sample(u, v))
     s_law, value_law = (np.array(x, dtype=np.float64) for x in law.sample(u, v))
@@ -145,4 +147,4 @@ def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monk
     within = np.abs(np.log(np.maximum(s, 1e-300) / 1e-12)) > 1e-5
     np.testing.assert_allclose(found[within], value[within], rtol=3e-5)
     below = np.mean(s < 1e-12)
-    assert abs(below - series.table.cdf[0]) < 4.5 * np.sqrt(series.table.cdf[0] / count) + 1e-9
+    assert abs(below - series.table.cdf[0]) < largest_z(count) * np.sqrt(series.table.cdf[0] / count) + 10 / count

@@ -5,14 +5,14 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+import significance
+from frequencies import misfit
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
-from scipy.stats import chi2
+from significance import assert_distribution, largest_chi2
 
 from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
-
-pytestmark = pytest.mark.slow
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
@@ -25,12 +25,12 @@ def chi_squared(sample, density):
     return ChiSquareTest(SphericalDomain(), sample, density, 3, sample_count=1_000_000, res=151, ires=8, seed=2)
 
 
-def lobe_p_value(lobe, density, laser, reach=0.25, cells=40, fine=16):
-    """Return the chi-squared p value of samples in a tangent plane about the lobe, 256 density values a cell.
+def lobe_misfit(lobe, density, laser, reach=0.25, cells=40, fine=16):
+    """Return chi-squared of samples in a tangent plane about the lobe, 256 density values a cell, and its freedom.
 
     Mitsuba's own test puts cells in spherical coordinates, too coarse for a lobe of one to three degrees.
     """
-    count = 2**21
+    count = 2**20
     u, v = np.random.default_rng(3).random((2, count), dtype=np.float32)
     sample, pdf = lobe.sample(laser, mi.Point2f(mi.Float(u), mi.Float(v)))
     assert np.all(np.array(pdf) > 0)
@@ -52,20 +52,21 @@ def lobe_p_value(lobe, density, laser, reach=0.25, cells=40, fine=16):
     assert cell.sum() == pytest.approx(1, abs=1e-3)
     expected = count * cell
     used = expected > 50
-    return chi2.sf(np.sum((counts - expected)[used] ** 2 / expected[used]), used.sum())
+    return misfit(counts[used], expected[used])
 
 
-@pytest.mark.parametrize("angle", [0.0, 20.0, 60.0])
-@pytest.mark.parametrize("depth", [0.0, 8.0])
+@pytest.mark.parametrize(("angle", "depth"), [(0.0, 8.0), (20.0, 0.0), (60.0, 8.0)])
 def test_lobe_samples_follow_its_density(angle, depth):
     lobe = lobe_at(angle)
-    assert lobe_p_value(lobe, lobe, lobe.direction_from(mi.Point3f(0.5, -0.2, -depth))) > 1e-3
+    statistic, freedom = lobe_misfit(lobe, lobe, lobe.direction_from(mi.Point3f(0.5, -0.2, -depth)))
+    assert statistic < largest_chi2(freedom)
 
 
 def test_lobe_of_another_variance_is_distinguished():
-    """Negative control: 1 % of slope variance is seen."""
+    """Negative control: 2 % of slope variance is seen."""
     lobe = lobe_at(20.0)
-    assert lobe_p_value(lobe, lobe_at(20.0, 0.0202), lobe.direction_from(mi.Point3f(0, 0, -4))) < 1e-6
+    statistic, freedom = lobe_misfit(lobe, lobe_at(20.0, 0.0204), lobe.direction_from(mi.Point3f(0, 0, -4)))
+    assert statistic > largest_chi2(freedom)
 
 
 @pytest.mark.parametrize("altitude", [5.0, 200.0, 3000.0])
@@ -98,7 +99,7 @@ def interaction(scene, direction):
     return si
 
 
-@pytest.mark.parametrize("wi", [[0.34, 0.1, 0.93], [0.2, -0.15, -0.95]])
+@pytest.mark.parametrize("wi", [[0.34, 0.1, 0.93], pytest.param([0.2, -0.15, -0.95], marks=pytest.mark.slow)])
 def test_ripples_sample_their_density_and_keep_the_energy(wi):
     scene, shape = surface(spectrum="flat", slope_variance="0.03")
     wi = (np.array(wi) / np.linalg.norm(wi)).tolist()
@@ -110,9 +111,9 @@ def test_ripples_sample_their_density_and_keep_the_energy(wi):
     def density(wo):
         return shape.bsdf().pdf(context, si, si.to_local(wo))
 
-    assert chi_squared(sample, density).run()
+    assert_distribution(chi_squared(sample, density))
     # Energy, in importance mode, where nothing but masking is lost: 4e-4 at these angles.
-    rng = mi.PCG32(2**18, initstate=1)
+    rng = mi.PCG32(2**18, initstate=1 + significance.seed_shift)
     context.mode = mi.TransportMode.Importance
     first = rng.next_float32()
     pair = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -135,22 +136,6 @@ def test_ripples_are_rougher_along_the_wind(direction, along_x):
         values.append(np.array(bsdf).ravel()[0])
     ratio = values[0] / values[1] if along_x else values[1] / values[0]
     assert ratio == pytest.approx(np.exp(-0.5 * tilt**2 * (1 / 0.0316 - 1 / 0.0222)), rel=2e-3)
-
-
-def test_mesh_has_the_slopes_that_it_says():
-    """Facet slopes over 24 seas at 6 m/s: their variance is what the ripples are reduced by."""
-    along, across = [], []
-    for seed in range(24):
-        _, shape = surface(wind_speed=6.0, surface_seed=seed, refined_size=64.0, cell_size=0.5, size=64.0, period=64.0)
-        normals = np.array(shape.face_normal(mi.UInt32(np.arange(shape.face_count()))))
-        assert np.all(normals[2] > 0)
-        along.append(np.var(normals[0] / normals[2]))
-        across.append(np.var(normals[1] / normals[2]))
-    for measured, stated in zip((along, across), shape.sea.resolved_variance, strict=True):
-        assert abs(np.mean(measured) - stated) < 4 * np.std(measured, ddof=1) / np.sqrt(24)
-        assert np.std(measured) / np.sqrt(24) < 0.03 * stated
-    # Waves and ripples together are the sea that Cox and Munk measured: 3.16e-3 W up- and 0.003 + 1.92e-3 W crosswind.
-    assert shape.slope_variance == pytest.approx(0.003 + 5.08e-3 * 6.0, rel=1e-6)
 
 
 def test_same_seed_is_the_same_sea_and_a_coarser_one_is_smoother():

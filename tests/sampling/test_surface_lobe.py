@@ -6,13 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import significance
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import norm
+from significance import assert_distribution, largest_z
 
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
-
-pytestmark = pytest.mark.slow
 
 COUNT = 2**20
 
@@ -24,7 +24,7 @@ def lobe_at(angle, slope_variance=0.02, altitude=200.0):
 
 
 def random_points(seed):
-    rng = mi.PCG32(COUNT, initstate=seed)
+    rng = mi.PCG32(COUNT, initstate=seed + significance.seed_shift)
     return mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
@@ -42,7 +42,7 @@ def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
     np.testing.assert_allclose(np.array(laser.in_water).ravel(), water, atol=2e-6)
 
 
-@pytest.mark.parametrize(("angle", "variance"), [(20.0, 0.06), (60.0, 0.06), (80.0, 0.06), (85.0, 0.15)])
+@pytest.mark.parametrize(("angle", "variance"), [pytest.param(60.0, 0.06, marks=pytest.mark.slow), (85.0, 0.15)])
 def test_density_integrates_to_the_lit_share(angle, variance):
     """Facets that turn away from the laser make no direction: what they lack is the share of samples of density 0."""
     lobe = lobe_at(angle, variance)
@@ -51,7 +51,7 @@ def test_density_integrates_to_the_lit_share(angle, variance):
     # Slope of a facet along the azimuth of the laser, of variance s^2 / 2, beyond which it sees the laser's back.
     in_air = np.array(laser.in_air, dtype=np.float64).ravel()
     expected = norm.cdf(in_air[2] / np.hypot(*in_air[:2]), scale=np.sqrt(variance / 2))
-    assert abs(lit.mean() - expected) < 4 * np.sqrt(expected * (1 - expected) / COUNT) + 1e-6
+    assert abs(lit.mean() - expected) < largest_z(COUNT) * np.sqrt(expected * (1 - expected) / COUNT) + 1e-6
     # Midpoint quadrature over the sphere in cos(theta), phi.
     cosine = (np.arange(2000) + 0.5) / 1000 - 1
     phi = (np.arange(2000) + 0.5) / 2000 * 2 * np.pi
@@ -64,7 +64,7 @@ def test_density_integrates_to_the_lit_share(angle, variance):
     assert density.mean() * 4 * np.pi == pytest.approx(expected, abs=2e-3)
 
 
-@pytest.mark.parametrize("angle", [0.0, 20.0, 60.0, 85.0])
+@pytest.mark.parametrize("angle", [20.0, 85.0])
 def test_sampled_directions_are_those_of_snells_law_at_their_facet(angle):
     """n (w x m) = i x m for the facet m that is drawn, and w points up through it."""
     lobe = lobe_at(angle, 0.03)
@@ -80,9 +80,9 @@ def test_sampled_directions_are_those_of_snells_law_at_their_facet(angle):
     # Slopes of these facets have the variance asked for, half along each axis.
     if angle <= 60:
         slopes = normal[:2] / normal[2]
-        error = 4 * 0.015 * np.sqrt(2 / COUNT)
-        np.testing.assert_allclose(np.var(slopes, axis=1), 0.015, atol=error + 1e-5)
-        np.testing.assert_allclose(np.mean(slopes, axis=1), 0, atol=4 * np.sqrt(0.015 / COUNT) + 1e-5)
+        limit = largest_z(COUNT, 4) / np.sqrt(COUNT)
+        np.testing.assert_allclose(np.var(slopes, axis=1), 0.015, atol=limit * 0.015 * np.sqrt(2) + 1e-5)
+        np.testing.assert_allclose(np.mean(slopes, axis=1), 0, atol=limit * np.sqrt(0.015) + 1e-5)
 
 
 def ripples(**parameters):
@@ -105,7 +105,7 @@ def unit(vector):
     return np.asarray(vector) / np.linalg.norm(vector)
 
 
-@pytest.mark.parametrize("wind", [30.0, 90.0, 225.0])
+@pytest.mark.parametrize("wind", [30.0, 225.0])
 @pytest.mark.parametrize("wi", [[0.34, 0.1, 0.93], [0.2, -0.15, -0.95]])
 def test_ripples_turn_with_the_wind(wind, wi):
     """All directions turned with the wind: the same BSDF, in reflection and in refraction."""
@@ -139,5 +139,5 @@ def test_anisotropic_ripples_sample_their_density(wi):
         return bsdf.pdf(context, si, si.to_local(wo))
 
     test = ChiSquareTest(SphericalDomain(), sample, density, 3, sample_count=1_000_000, res=151, ires=8, seed=2)
-    assert test.run()
+    assert_distribution(test)
     assert test.pdf_sum > 0.99  # not the agreement of nothing with nothing

@@ -13,9 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import significance
 import xarray as xr
 from command_line import assert_refused, run
+from few_paths import few_paths
 
+from mitransient_lidar import results
 from mitransient_lidar.campaigns import shard as shards
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
@@ -23,17 +26,15 @@ from mitransient_lidar.core.errors import UserError
 
 #: Runs that take a tenth of a second each.
 QUICK = {
-    "scene": "table1",
     "target_error": 0.3,
     "keep": ["waveform", "truth"],
     "fixed": {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160},
     "parameters": {"bottom_depth": {"low": 2.0, "high": 9.0}, "bottom_reflectance": "0.02 * bottom_depth"},
-    "design": {"kind": "sobol", "count": 24, "seed": 4},
+    "design": {"kind": "sobol", "count": 12, "seed": 4},
 }
 
 FULL = {
-    "scene": "fig13_2x2",
-    "target_error": 0.2,
+    "target_error": 0.6,
     "keep": ["waveform", "stderr", "components", "echoes", "truth"],
     "receiver": "apd",
     "gain": "auto",
@@ -41,15 +42,12 @@ FULL = {
     "design": {"file": "runs.csv", "shots": 2, "seed": 9},
 }
 
-#: The third run is impossible.
+#: The second run is impossible.
 TABLE = """attenuation,target_depth,wind_speed
 0.2,4.5,3
-0.35,5.5,6
 0.3,5,-6
-0.25,3.5,10
+0.35,5.5,6
 """
-
-pytestmark = pytest.mark.slow
 
 
 def write_toml(path, campaign):
@@ -74,30 +72,38 @@ def files_of(store):
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    """Store of the quick campaign, rendered by two workers in four shards."""
+def campaign(tmp_path_factory):
+    """The quick campaign, of a scene with few paths a pass."""
+    return {"scene": str(few_paths("table1", tmp_path_factory.mktemp("scene"))), **QUICK}
+
+
+@pytest.fixture(scope="module")
+def quick(campaign, tmp_path_factory):
+    """Store of the quick campaign, rendered in two shards."""
     path = tmp_path_factory.mktemp("campaign") / "quick.zarr"
-    sweep(QUICK, path, workers=2, shard_size=6)
+    sweep(campaign, path, workers=1, shard_size=6)
     return path
 
 
+@pytest.mark.slow
 def test_everything_that_can_be_kept(tmp_path):
     (tmp_path / "runs.csv").write_text(TABLE)
     told = []
     path = tmp_path / "full.zarr"
-    data = sweep(write_toml(tmp_path / "full.toml", FULL), path, workers=1, progress=told.append).load()
-    assert (told[-1].done, told[-1].planned, told[-1].failed, told[-1].unit) == (4, 4, 1, "run")
-    assert data["status"].values.tolist() == [DONE, DONE, FAILED, DONE]
-    assert data["error"].values.tolist()[:2] == ["", ""]
-    assert data["error"].values[2].startswith("wind_speed = -6")
-    assert np.isnan(data["waveform"].isel(run=2)).all()
-    done = data.isel(run=[0, 1, 3])
+    campaign = write_toml(tmp_path / "full.toml", {"scene": str(few_paths("fig13_2x2", tmp_path)), **FULL})
+    data = sweep(campaign, path, workers=1, progress=told.append).load()
+    assert (told[-1].done, told[-1].planned, told[-1].failed, told[-1].unit) == (3, 3, 1, "run")
+    assert data["status"].values.tolist() == [DONE, FAILED, DONE]
+    assert data["error"].values.tolist()[::2] == ["", ""]
+    assert data["error"].values[1].startswith("wind_speed = -6")
+    assert np.isnan(data["waveform"].isel(run=1)).all()
+    done = data.isel(run=[0, 2])
     for name in ("waveform", "waveform_stderr", "waveform_by_origin", "signal", "echo_depth_m", "true_bottom_depth"):
         assert np.isfinite(done[name].values).any(), name
     assert done["waveform"].dims == ("run", "shot", "pixel", "time")
     assert done["origin"].values.tolist() == ["surface", "water", "target", "bottom"]
     # Inputs as coordinates; the truth follows from them.
-    np.testing.assert_allclose(done["scattering"], 0.6 * np.array([0.2, 0.35, 0.25]))
+    np.testing.assert_allclose(done["scattering"], 0.6 * np.array([0.2, 0.35]))
     assert set(done["waveform"].coords) >= {
         "attenuation",
         "target_depth",
@@ -106,31 +112,32 @@ def test_everything_that_can_be_kept(tmp_path):
         "pixel",
         "time",
     }
-    assert len(np.unique(done["surface_seed"])) == 3
+    assert len(np.unique(done["surface_seed"])) == 2
     np.testing.assert_allclose(done["true_bottom_depth"], 12, atol=1e-3)
-    assert len(np.unique(done["aim_x"])) == 6
+    assert len(np.unique(done["aim_x"])) == 4
     # The parts add up to the whole, and come from where they should.
     np.testing.assert_allclose(done["waveform_by_origin"].sum("origin"), done["waveform"], rtol=1e-5, atol=1e-12)
     first = done["waveform_by_origin"].isel(run=0, shot=0).sum("pixel")
     peaks = first["time"].values[first.argmax("time").values]
     assert peaks[0] < peaks[2] < peaks[3]
-    # A run alone, on other random numbers of the process, is the same to the bit.
-    alone = render_row(path, 1)
-    stored = data["waveform"].isel(run=1)
-    np.testing.assert_array_equal(alone["waveform"].values.astype(np.float32), stored.values)
+    # A run alone, in this process, is the same to the bit, unless the seeds of this process are shifted.
+    alone = render_row(path, 2)
+    if significance.seed_shift == 0:
+        stored = data["waveform"].isel(run=2)
+        np.testing.assert_array_equal(alone["waveform"].values.astype(np.float32), stored.values)
     assert float(alone.attrs["scene.attenuation"]) == 0.35
-    from_file = render_row(tmp_path / "full.toml", 1)
-    np.testing.assert_array_equal(from_file["waveform"], alone["waveform"])
-    # Analysis commands read it.
-    out = run("sweep", path, "--row", 3, "-o", tmp_path / "run.nc", "-q")
+    # Analysis commands read it, also from the campaign's file.
+    out = run("sweep", campaign, "--row", 2, "-o", tmp_path / "run.nc", "-q")
     assert out.exit_code == 0, out.stderr
+    np.testing.assert_array_equal(results.open(tmp_path / "run.nc")["waveform"], alone["waveform"])
     assert run("waveforms", tmp_path / "run.nc", "--table").exit_code == 0
     out = run("sweep", path, "--show", "-o", tmp_path / "run.png")
     assert out.exit_code == 0, out.stderr
-    assert "4 runs: 3 done, 1 failed, 0 planned\nfailed 1, the first run 2: wind_speed = -6" in out.stdout
+    assert "3 runs: 2 done, 1 failed, 0 planned\nfailed 1, the first run 1: wind_speed = -6" in out.stdout
     assert (tmp_path / "run.png").stat().st_size > 20_000
 
 
+@pytest.mark.slow
 def test_opening_needs_no_consolidated_metadata(quick):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -142,25 +149,28 @@ def test_opening_needs_no_consolidated_metadata(quick):
     assert np.isfinite(data["waveform"].values).all()
 
 
-def test_same_bits_whatever_shards_workers_and_order(quick, tmp_path):
-    other = sweep(QUICK, tmp_path / "other.zarr", workers=1, shard_size=17).load()
-    first = open_campaign(quick).load()
+@pytest.mark.long
+def test_same_bits_whatever_shards_workers_and_order(campaign, tmp_path):
+    first = sweep(campaign, tmp_path / "first.zarr", workers=2, shard_size=6).load()
+    other = sweep(campaign, tmp_path / "other.zarr", workers=1, shard_size=17).load()
     for name in first.variables:
         np.testing.assert_array_equal(first[name].values, other[name].values, err_msg=str(name))
 
 
-def test_a_complete_campaign_is_left_as_it_is(quick):
+@pytest.mark.slow
+def test_a_complete_campaign_is_left_as_it_is(campaign, quick):
     before = files_of(quick)
     resume(quick, workers=1)
-    sweep(QUICK, quick, workers=1)
+    sweep(campaign, quick, workers=1)
     assert files_of(quick) == before
 
 
-def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(quick, tmp_path):
+@pytest.mark.long
+def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(campaign, quick, tmp_path):
     path = tmp_path / "killed.zarr"
-    campaign = write_toml(tmp_path / "quick.toml", QUICK)
-    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(campaign), "-o", str(path)]
-    command += ["--workers", "2", "--shard-size", "6"]
+    file = write_toml(tmp_path / "quick.toml", campaign)
+    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(file), "-o", str(path)]
+    command += ["--workers", "1", "--shard-size", "6"]
     mark = {"MARK_OF_TEST": str(tmp_path)}
     with subprocess.Popen(
         command, start_new_session=True, stderr=subprocess.PIPE, env={**os.environ, **mark}
@@ -185,7 +195,8 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(quick, tmp_p
     out = run("sweep", path, "--workers", 2, "-q")
     assert out.exit_code == 0, out.stderr
     assert [chunk.stat().st_mtime_ns for chunk in chunks] == written
-    assert files_of(path) == files_of(quick)
+    if significance.seed_shift == 0:
+        assert files_of(path) == files_of(quick)
 
 
 def shard_processes(mark):
@@ -218,7 +229,8 @@ def scheduler(tmp_path):
         process.kill()
 
 
-def test_cluster_that_loses_a_worker(quick, tmp_path, scheduler):
+@pytest.mark.long
+def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
     """A scheduler and two workers as on a cluster; one is killed while it renders."""
     _, file = scheduler
     path = tmp_path / "cluster.zarr"
@@ -230,15 +242,17 @@ def test_cluster_that_loses_a_worker(quick, tmp_path, scheduler):
 
         def watch(state):
             seen.append(state.done)
-            if state.done >= 6 and workers[0].poll() is None:
+            if state.done >= 2 and workers[0].poll() is None:
                 os.killpg(workers[0].pid, signal.SIGKILL)
 
         address = json.loads(file.read_text())["address"]
-        data = sweep(QUICK, path, scheduler=address, shard_size=6, progress=watch)
+        data = sweep(campaign, path, scheduler=address, shard_size=2, progress=watch)
         assert workers[0].wait(10) == -signal.SIGKILL
         assert (data["status"] == DONE).all()
-        assert seen[-1] == 24
-        assert files_of(path) == files_of(quick)
+        assert seen[-1] == 12
+        alone = sweep(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
+        assert files_of(path) == files_of(tmp_path / "alone.zarr")
+        assert np.array_equal(data["waveform"], alone["waveform"])
     finally:
         for worker in workers:
             if worker.poll() is None:
@@ -246,6 +260,7 @@ def test_cluster_that_loses_a_worker(quick, tmp_path, scheduler):
             worker.wait()
 
 
+@pytest.mark.slow
 def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
     process, file = scheduler
     path = tmp_path / "lost.zarr"
@@ -261,6 +276,7 @@ def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
     assert told == "the scheduler was lost: what is written is kept, and the same command goes on\n"
 
 
+@pytest.mark.slow
 def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
     """Any call may notice first that the scheduler is lost; an error with a scheduler that is there is another one."""
     from distributed import Client
@@ -283,9 +299,10 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
     assert (Store(path).status() == PLANNED).all()
 
 
-def test_interruption_keeps_what_is_written(tmp_path):
-    path, campaign = tmp_path / "out.zarr", write_toml(tmp_path / "quick.toml", QUICK)
-    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(campaign), "-o", str(path)]
+@pytest.mark.long
+def test_interruption_keeps_what_is_written(campaign, tmp_path):
+    path, file = tmp_path / "out.zarr", write_toml(tmp_path / "quick.toml", campaign)
+    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(file), "-o", str(path)]
     with subprocess.Popen(
         [*command, "--workers", "1", "--shard-size", "3"], start_new_session=True, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -296,30 +313,30 @@ def test_interruption_keeps_what_is_written(tmp_path):
     assert process.returncode == 130
     assert told.splitlines()[-1].startswith("interrupted after ")
     assert "Traceback" not in told
-    assert 0 < np.count_nonzero(Store(path).status() == DONE) < 24
+    assert 0 < np.count_nonzero(Store(path).status() == DONE) < 12
 
 
-def test_invalid_use_leaves_nothing(quick, tmp_path):
+@pytest.mark.slow
+def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
     def changed(**sections):
-        return {**QUICK, **sections}
+        return {**campaign, **sections}
 
     out = tmp_path / "out.zarr"
     cases = [
-        (changed(fixed={"bottom_dept": 3}), [], "parameter 'bottom_dept' is not one of scene table1: did you mean"),
+        (changed(fixed={"bottom_dept": 3}), [], "parameter 'bottom_dept' is not one of scene"),
         (changed(parameters={"altitude": {"low": 3, "high": 3}}), [], "altitude has the empty range 3 to 3"),
         (changed(parameters={"bin_width_ns": [1, 2]}), [], "parameter 'bin_width_ns' must be the same in all runs"),
         (changed(fixed={"bottom_depth": -3, **QUICK["fixed"]}, parameters={"altitude": [100, 200]}), [], "all fail"),
         (changed(fixed={"aim_x": 3}, design={**QUICK["design"], "shots": 2}), [], "leave out aim_x"),
         (changed(scene="table9"), [], "table9"),
-        (changed(), ["--scheduler", "tcp://127.0.0.1:9"], "scheduler = 'tcp://127.0.0.1:9' cannot be reached"),
         (changed(), ["--scheduler", "nonsense://a"], "scheduler = 'nonsense://a' cannot be reached"),
         (changed(), ["--workers", "0"], "workers = 0 must lie between 1 and 1024"),
         (changed(), ["--workers", "2", "--row", "1"], "--workers and --row are alternatives"),
-        (changed(), ["--row", "24", "-o", str(tmp_path / "a.nc")], "row = 24 must lie between 0 and 23"),
+        (changed(), ["--row", "12", "-o", str(tmp_path / "a.nc")], "row = 12 must lie between 0 and 11"),
     ]
-    for campaign, options, message in cases:
+    for given_campaign, options, message in cases:
         given = [] if "-o" in options else ["-o", out]
-        file = write_toml(tmp_path / "campaign.toml", campaign)
+        file = write_toml(tmp_path / "campaign.toml", given_campaign)
         assert_refused(run("sweep", file, *given, *options, "-q"), message)
         assert not out.exists()
     assert_refused(run("sweep", tmp_path / "none.toml", "-o", out), "none.toml")
@@ -327,13 +344,23 @@ def test_invalid_use_leaves_nothing(quick, tmp_path):
     assert_refused(run("sweep", tmp_path / "text.toml", "-o", out), "text.toml is not a TOML file")
     assert_refused(run("sweep", tmp_path, "-q"), "is no store of a campaign")
     before = files_of(quick)
-    other = write_toml(tmp_path / "other.toml", {**QUICK, "target_error": 0.2})
+    other = write_toml(tmp_path / "other.toml", {**campaign, "target_error": 0.2})
     assert_refused(run("sweep", other, "-o", quick, "-q"), "holds another campaign, or its scene has changed")
     assert_refused(run("sweep", quick, "-o", out, "-q"), "--output is fixed in the store")
     assert files_of(quick) == before
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.long
+def test_scheduler_that_does_not_answer(campaign, tmp_path):
+    """A quarter of a minute passes until it is given up."""
+    out, file = tmp_path / "out.zarr", write_toml(tmp_path / "campaign.toml", campaign)
+    done = run("sweep", file, "-o", out, "--scheduler", "tcp://127.0.0.1:9", "-q")
+    assert_refused(done, "scheduler = 'tcp://127.0.0.1:9' cannot be reached")
+    assert not out.exists()
+
+
+@pytest.mark.long
 def test_disk_that_is_full(quick, tmp_path):
     """Files of a limited size stand for a full disk: chunks cannot be written, and no status says that they were."""
     path = tmp_path / "full.zarr"
@@ -350,6 +377,7 @@ def test_disk_that_is_full(quick, tmp_path):
     assert (Store(path).status() == PLANNED).all()
 
 
+@pytest.mark.long
 def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatch):
     path = tmp_path / "dying.zarr"
     shutil.copytree(quick, path)

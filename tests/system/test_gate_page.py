@@ -74,6 +74,7 @@ def scene_of(size, gates=40, seed=3):
 
 
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = pytest.mark.slow
 needs_browser = pytest.mark.skipif(
     # Where CI has installed them, skipping would hide a failure.
     (BROWSER is None or DRIVER is None) and os.environ.get("BROWSER_TESTS") != "required",

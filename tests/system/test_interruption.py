@@ -11,6 +11,7 @@ import pytest
 
 import mitransient_lidar
 
+RENDER = ["render", "table1", "--integrator", "lidar_volpath"]
 FILES = ["table1.exr", "table1.nc", "table1.png", "table1_layout.png"]
 
 #: The command line, with a signal when the third pass is added to the first of its statistics.
@@ -65,7 +66,7 @@ def start(script, *arguments, **options):
 
 
 def render(script, folder, *, passes=2, before=(), **options):
-    arguments = [*before, "render", "table1", "--passes", passes, "-o", folder]
+    arguments = [*before, *RENDER, "--passes", passes, "-o", folder]
     process = start(script, *arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
     return process, *process.communicate(timeout=240)
 
@@ -74,7 +75,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_on_the_command_line_keeps_the_passes(tmp_path, number, code):
     process, stdout, stderr = render(INTERRUPTED, tmp_path, passes=100_000, before=[int(number)])
@@ -95,7 +96,7 @@ def test_a_closed_terminal_keeps_the_passes(tmp_path):
         os.setsid()
         os.close(os.open(os.ttyname(follower), os.O_RDWR))
 
-    arguments = [int(signal.SIGHUP), "render", "table1", "--passes", 100_000, "-o", tmp_path]
+    arguments = [int(signal.SIGHUP), *RENDER, "--passes", 100_000, "-o", tmp_path]
     process = start(INTERRUPTED, *arguments, stdin=follower, stdout=follower, stderr=follower, preexec_fn=take_terminal)
     os.close(follower)
     shown = b""
@@ -109,7 +110,7 @@ def test_a_closed_terminal_keeps_the_passes(tmp_path):
     assert attributes["passes"] >= 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_of_a_killed_command_do_not_appear_and_the_next_one_sweeps_them(tmp_path):
     (tmp_path / "table1.exr").write_text("old")
     process, stdout, _ = render(KILLED, tmp_path)
@@ -122,8 +123,8 @@ def test_files_of_a_killed_command_do_not_appear_and_the_next_one_sweeps_them(tm
     assert names(tmp_path) == FILES
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(resource.getrlimit(resource.RLIMIT_FSIZE)[1] != resource.RLIM_INFINITY, reason="files are limited")
+@pytest.mark.long
 @pytest.mark.parametrize(("limit", "file"), [(1000, "table1.exr"), (83_000, "table1.nc"), (120_000, "table1.png")])
 def test_a_full_disk_leaves_the_former_files(tmp_path, limit, file):
     """Limits in bytes, between the sizes of the files: EXR 80 000, NetCDF 86 000, drawing more than 150 000."""

@@ -10,12 +10,11 @@ import mitransient_lidar
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import scenes
 
-pytestmark = pytest.mark.slow
-
 GRAZING = math.radians(5.4)
 IN_WATER = math.asin(math.cos(GRAZING) / 1.34)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("height", [5.0, 30.0])
 def test_target_echoes_at_its_distance_and_no_light_leaks_past_the_sea(height):
     """A level sea tells when: 2 H / sin(5.4 deg) of air and 1 m / cos(48 deg) of water, there and back."""
@@ -36,6 +35,7 @@ def test_target_echoes_at_its_distance_and_no_light_leaks_past_the_sea(height):
     assert float(with_target.waveform.sel(around).sum()) > 3 * float(without.waveform.sel(around).sum())
 
 
+@pytest.mark.slow
 def test_waves_hide_what_geometry_says():
     """Rays from the sea to the mast against the horizon of height profiles in plain NumPy, towards -x."""
     scene, _, _ = scenes.load_scene("fig04_mast", {"wind_speed": 6})

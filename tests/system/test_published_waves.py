@@ -13,7 +13,7 @@ from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.studies import sea_map
 from mitransient_lidar.studies.shot_statistics import highest_points
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 #: Depth that a nanosecond stands for on the depth axis, at 20 degrees and index 1.34.
 METRES_PER_NS = 1e-9 * C0 / (2 * 1.34) * np.sqrt(1 - (np.sin(np.radians(20)) / 1.34) ** 2)

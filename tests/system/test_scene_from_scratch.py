@@ -29,6 +29,7 @@ def test_every_line_of_the_text_is_in_the_scene():
     assert commands == ["render", "waveforms", "render", "shots", "retrieve"]
 
 
+@pytest.mark.slow
 def test_scene_loads_and_renders_without_warnings():
     few = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
     with warnings.catch_warnings():

@@ -5,7 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import xarray as xr
 from command_line import assert_refused, run
+from few_paths import few_paths
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
@@ -13,8 +16,6 @@ from mitransient_lidar.loading import scenes
 from mitransient_lidar.plots.studies.find_shots import plot_found_shots
 from mitransient_lidar.studies import find_shots as shots
 from mitransient_lidar.studies import shot_statistics
-
-pytestmark = pytest.mark.slow
 
 WAVES = {"wind_speed": 6, "bottom_depth": 5, "field_of_view_mrad": 15}
 
@@ -24,6 +25,7 @@ def sea():
     return shots.SeaMap.of_scene(scenes.load_scene("fig09_2x2", WAVES)[0])
 
 
+@pytest.mark.slow
 def test_slopes_are_means_over_the_footprint(sea):
     """Against random points of a Gaussian of the footprint's mean radius, 1.1 m, on the heights themselves."""
     rng = np.random.default_rng(4)
@@ -35,9 +37,10 @@ def test_slopes_are_means_over_the_footprint(sea):
         right = (sea.heights[j, (i + 1) % len(sea.x)] - sea.heights[j, i - 1]) / (2 * spacing)
         up = (sea.heights[(j + 1) % len(sea.y), i] - sea.heights[j - 1, i]) / (2 * spacing)
         for drawn, mean in zip((right, up), sea.slope_at(x, y), strict=True):
-            assert abs(drawn.mean() - mean) < 4 * drawn.std() / 200 + 0.002
+            assert abs(drawn.mean() - mean) < largest_z(drawn.size, 4) * drawn.std() / 200 + 0.002
 
 
+@pytest.mark.slow
 def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
     found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=3)
     assert [shot.kind for shot in found] == [kind for kind in shots.KINDS for _ in range(3)]
@@ -52,6 +55,7 @@ def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
             assert math.hypot(first.x - second.x, first.y - second.y) > 4
 
 
+@pytest.mark.long
 def test_faces_towards_the_lidar_have_the_strongest_surface_echoes():
     """The published effect, as the geometric mean over four places: at single ones it may be the other way round.
 
@@ -66,9 +70,11 @@ def test_faces_towards_the_lidar_have_the_strongest_surface_echoes():
     assert level > 1.3 * away
 
 
-def test_found_shots_are_drawn_on_their_sea():
-    found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5)
-    rendered = shots.render_found_shots("fig09_2x2", found, WAVES)
+@pytest.mark.long
+def test_found_shots_are_drawn_on_their_sea(tmp_path):
+    scene = few_paths("fig09_2x2", tmp_path)
+    found = shots.find_shots(scene, WAVES, slope_sigmas=1.5)
+    rendered = shots.render_found_shots(scene, found, WAVES)
     # Quarters of a circle of 15 mrad full angle on a level sea 212.8 m away: 1.596 m across, and along the azimuth
     # 200 m (tan(20 deg + 7.5 mrad) - tan(20 deg)) on the far side.
     mapped = [np.argwhere(rendered.pixel_map == pixel) for pixel in range(rendered.pixel_count)]
@@ -78,13 +84,14 @@ def test_found_shots_are_drawn_on_their_sea():
     middles = [rendered.pixel_lines[0] + pitch * nodes.mean(axis=0) for nodes in mapped]
     # Far pixels, red and green, lie at +x, and green and black at +y.
     assert [(x > 0, y > 0) for y, x in middles] == [(True, False), (True, True), (False, False), (False, True)]
-    assert (rendered.azimuth, rendered.scene) == (0.0, "fig09_2x2")
+    assert (rendered.azimuth, rendered.scene) == (0.0, "small")
     assert rendered.beam_spread == pytest.approx((1.064 / math.cos(math.radians(20)), 1.064), rel=1e-3)
     panels = [ax for ax in plot_found_shots(rendered).axes if ax.get_ylabel() == "power (mW)"]
     assert [ax.get_title().split()[0] for ax in panels] == list(shots.KINDS)
     np.testing.assert_allclose(panels[0].lines[2].get_ydata(), 1e3 * rendered.results[0].waveform[2])
 
 
+@pytest.mark.slow
 def test_depth_bias_is_that_of_a_ray_through_the_slope():
     """A ray traced with vectors through a tilted plane that meets it at the mean level, down to the bottom."""
     for slope in (-0.12, 0.0, 0.05):
@@ -98,30 +105,31 @@ def test_depth_bias_is_that_of_a_ray_through_the_slope():
     assert shot_statistics.depth_bias(np.array([-0.1]), 5.0, 0.35, 1.34)[0] < -0.03
 
 
+@pytest.mark.long
 def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
     options = [part for name, value in WAVES.items() for part in ("-D", f"{name}={value}")]
     target = tmp_path / "out" / "survey.png"
-    done = run("shot-statistics", "fig09_2x2", *options, "--count", 5, "-q", "-o", target)
+    scene = few_paths("fig09_2x2", tmp_path)
+    done = run("shot-statistics", scene, *options, "--count", 5, "-q", "-o", target)
     assert done.exit_code == 0, done.output
     assert done.stdout.splitlines()[:2] == [str(target), str(target.with_suffix(".nc"))]
     assert "correlation of strength with the slope" in done.stdout
-    import xarray as xr
-
     with xr.open_dataset(target.with_suffix(".nc")) as found:
         assert dict(found.sizes) == {"shot": 5, "pixel": 4}
         place = {**WAVES, "aim_x": float(found.aim_x[2]), "aim_y": float(found.aim_y[2])}
-        again = mitransient_lidar.render("fig09_2x2", params=place, passes=8, seed=2)
+        again = mitransient_lidar.render(scene, params=place, passes=8, seed=2)
         peak = again.waveform.sel(time=slice(1409.9, 1429.9)).max("time")
         known = np.isfinite(found.surface_peak[2].values)
         # A parabola through three bins of 1 ns lies up to a percent above the highest.
         np.testing.assert_allclose(found.surface_peak[2].values[known], peak.values[known], rtol=0.02)
 
 
-def test_invalid_input_is_refused():
+@pytest.mark.slow
+def test_invalid_input_is_refused(tmp_path):
     with pytest.raises(UserError, match="every shot on a flat sea is the same"):
         shots.find_shots("fig09_2x2", {"spectrum": "flat"})
     with pytest.raises(UserError, match="must hold 14"):
-        shot_statistics.shot_statistics("fig09_2x2", {**WAVES, "bin_count": 40}, count=2)
+        shot_statistics.shot_statistics(few_paths("fig09_2x2", tmp_path), {**WAVES, "bin_count": 40}, count=2)
     for arguments, message in (
         (["find-shots", "fig09_2x2", "--at", "3;4"], "--at = '3;4' must hold numbers only"),
         (["find-shots", "fig09_2x2", "--slope-sigmas", "-1"], "slope_sigmas = -1 must be"),
@@ -133,6 +141,7 @@ def test_invalid_input_is_refused():
         assert_refused(run(*arguments), message)
 
 
+@pytest.mark.slow
 def test_shots_command_lists_places():
     done = run("find-shots", "fig09_2x2", "-D", "wind_speed=6", "--at", "1.5,-2", "--at", "3,4")
     assert done.exit_code == 0, done.output

@@ -21,8 +21,6 @@ from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.results.geometry import LidarGeometry
 from mitransient_lidar.studies import shot_series
 
-pytestmark = pytest.mark.slow
-
 TILTS = ((-0.15, 0.0), (-0.075, 0.07), (0.0, 0.0), (0.075, -0.07), (0.15, 0.0))
 
 
@@ -51,6 +49,7 @@ def planes(tmp_path_factory):
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 
 
+@pytest.mark.slow
 def test_slopes_of_planes(planes):
     """Within 0.05: the steep face away leaves little echo, and pixels cut the beam where it is uneven."""
     found = retrieve.surface_slopes(planes)
@@ -60,6 +59,7 @@ def test_slopes_of_planes(planes):
     np.testing.assert_allclose(found["surface_height"], 0, atol=0.05)
 
 
+@pytest.mark.slow
 def test_correction_halves_what_slope_does_to_the_bottom(planes):
     found = retrieve.bottom(planes, retrieve.surface_slopes(planes))
     energy, reflectance = np.log(found["bottom_energy"]), np.log(found["reflectance"])
@@ -82,6 +82,7 @@ def sea(request):
     return shot_series.render_shots("fig09_2x2", params, count=24, passes=2)
 
 
+@pytest.mark.long
 def test_slopes_on_a_sea(sea):
     """Correlation with the truth, and errors as stated.
 
@@ -108,6 +109,7 @@ def test_slopes_on_a_sea(sea):
         assert np.std(slope[0] - truth[0]) < np.std(plane["slope_along"].values - truth[0])
 
 
+@pytest.mark.long
 def test_the_column_takes_out_what_the_sea_does_to_the_bottom(sea):
     """Its energy varies by 10 % in 200 shots, by focusing more than by slope.
 
@@ -122,20 +124,28 @@ def test_the_column_takes_out_what_the_sea_does_to_the_bottom(sea):
     assert float(depth.sel(correction="slope").std()) < 0.7 * float(depth.sel(correction="level").std())
 
 
-WATERS = pytest.mark.parametrize(
-    ("absorption", "scattering", "backscattering"),
-    [(0.0532, 0.124, 0.00196), (0.179, 0.219, 0.00293), (0.0951, 0.432, 0.00944)],
-    ids=["jerlov IB", "petzold coastal", "jerlov 1C"],
+WATERS = {
+    "jerlov IB": (0.0532, 0.124, 0.00196),
+    "petzold coastal": (0.179, 0.219, 0.00293),
+    "jerlov 1C": (0.0951, 0.432, 0.00944),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("jerlov 1C", marks=pytest.mark.slow),
+        pytest.param("jerlov IB", marks=pytest.mark.long),
+        pytest.param("petzold coastal", marks=pytest.mark.long),
+    ],
 )
-
-
-@WATERS
-def test_waters(absorption, scattering, backscattering):
+def test_waters(name):
     """Kd and bb within 25 %: ten waters came within 13 and 10 % with many passes. Of c no more than bounds.
 
     Not an independent check: the constants of the retrieval, 6.4 and 10.6 m and the factor 1.13, were fitted to columns
     of this renderer. An error of the renderer that is the same in all waters would pass. The next test is independent.
     """
+    absorption, scattering, backscattering = WATERS[name]
     params = {"attenuation": absorption + scattering, "scattering": scattering, "backscattering": backscattering}
     params |= {"bottom_depth": 60, "time_start_ns": 1395, "bin_count": 104}
     found = retrieve.water(mitransient_lidar.render("fig09_1x1", params=params, passes=4, seed=4))
@@ -145,8 +155,9 @@ def test_waters(absorption, scattering, backscattering):
     assert found["attenuation_low"] < absorption + scattering < found["attenuation_high"]
 
 
-@WATERS
-def test_waters_in_closed_form(absorption, scattering, backscattering):
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WATERS)
+def test_waters_in_closed_form(name):
     """Columns of the lidar equation, and Kd of an independent Monte Carlo study; nothing is rendered.
 
     In quasi-single scattering (Gordon 1982, doi:10.1364/AO.21.002996) the column in a wide view has the level of single
@@ -155,6 +166,7 @@ def test_waters_in_closed_form(absorption, scattering, backscattering):
     doi:10.4319/lo.1984.29.2.0350, found Kd = sqrt(a^2 + 0.235 a b) for a phase function of Petzold: 7 to 12 % above the
     relation of Lee, Du and Arnone (2005) that the retrieval uses.
     """
+    absorption, scattering, backscattering = WATERS[name]
     angle, index, group = math.radians(20), 1.34, 1.364
     system = LidarSystem(200.0, angle, 5e-3 * 0.81 * 0.9, 0.025, index, group)
     time = TimeAxis(1390.0, 0.5, 160)

@@ -5,8 +5,7 @@ import re
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-
-from mitransient_lidar.loading import catalogue
+from few_paths import few_paths
 
 NEAR = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
 
@@ -14,12 +13,7 @@ NEAR = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=85"]
 @pytest.fixture
 def scene(tmp_path):
     """File of a scene with a target, of few paths a pass."""
-    few = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="8192"/></integrator>'
-    text = catalogue.scene_text("fig13_2x2").replace('<integrator type="lidar_merging"/>', few)
-    assert few in text
-    path = tmp_path / "small.xml"
-    path.write_text(text)
-    return path
+    return few_paths("fig13_2x2", tmp_path)
 
 
 def texts(plot):
@@ -28,9 +22,9 @@ def texts(plot):
 
 
 @pytest.mark.slow
-def test_orders(tmp_path):
+def test_orders(scene, tmp_path):
     plot = tmp_path / "new" / "orders.svg"
-    done = run("scattering-orders", "fig09_2x2", *NEAR, "--orders", 3, "--passes", 2, "-o", plot, "-q")
+    done = run("scattering-orders", scene, *NEAR, "--orders", 3, "--passes", 2, "-o", plot, "-q")
     lines = done.stdout.splitlines()
     assert done.exit_code == 0, done.stderr
     assert lines[:2] == [str(plot), str(plot.with_suffix(".nc"))]
@@ -41,16 +35,7 @@ def test_orders(tmp_path):
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
 
 
-@pytest.mark.slow
-def test_target(scene, tmp_path):
-    plot = tmp_path / "target.svg"
-    done = run("target-signal", scene, *NEAR, "--passes", 16, "-o", plot, "-q")
-    assert done.exit_code == 0, done.stderr
-    assert done.stdout.splitlines()[:2] == [str(plot), str(plot.with_suffix(".nc"))]
-    assert texts(plot) >= {"red", "green", "blue", "black", "without the target", "signal of the target (µW)"}
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_target_on_a_grid(scene, tmp_path):
     plot = tmp_path / "map.svg"
     done = run("target-signal", scene, *NEAR, "--passes", 16, "--grid", 2, "--max-offset", 1, "-o", plot, "-q")

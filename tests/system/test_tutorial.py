@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
 
 # Lines that begin with % are for Jupyter only. Warnings are errors once the first cell has imported everything.
@@ -81,12 +79,14 @@ def rows_after(label, text):
     return [[float(one) for one in part.split()] for part in re.findall(r"\[(.*?)\]", line)]
 
 
+@pytest.mark.long
 def test_outputs_are_those_of_the_cells(cells, printed):
     for number, (cell, text) in enumerate(zip(cells, printed, strict=True), 1):
         assert cell["execution_count"] == number, "save the notebook after one run of all its cells"
         assert shape(stored(cell)) == shape(text), f"code cell {number} prints something else than what is stored"
 
 
+@pytest.mark.slow
 def test_every_cell_shows_something(cells):
     pictures = 0
     for number, cell in enumerate(cells, 1):
@@ -101,23 +101,27 @@ def test_every_cell_shows_something(cells):
     assert pictures == 4
 
 
+@pytest.mark.slow
 def test_file_is_small_and_knows_no_machine():
     text = NOTEBOOK.read_text(encoding="utf-8")
     assert len(text) < 600_000
     assert not re.search(r"/(home|root|tmp|work|Users)/", text)
 
 
+@pytest.mark.slow
 def test_cells_are_short(cells):
     for cell in cells:
         assert len("".join(cell["source"]).splitlines()) <= 20
 
 
+@pytest.mark.long
 def test_the_receiver_saturates_and_then_does_not(printed):
     shares = [number_after("at the limit of the amplifier:", text) for text in printed if "at the limit" in text]
     assert shares[0] > 40
     assert shares[1] == 0
 
 
+@pytest.mark.long
 def test_shots_spread_as_the_text_says(printed):
     """Time as stated, a fifth more at most beside the scatter of a spread of 200 (5 %); depth by half of that."""
     text = next(text for text in printed if "time of the bottom" in text)
@@ -130,6 +134,7 @@ def test_shots_spread_as_the_text_says(printed):
     assert mean == pytest.approx([8.0] * 4, abs=0.15)
 
 
+@pytest.mark.long
 def test_estimates_meet_the_truth(printed):
     """Within what the text promises: errors of the slope, 0.15 m, a tenth, and a few percent."""
     text = next(text for text in printed if "slope along" in text)
@@ -146,6 +151,7 @@ def test_estimates_meet_the_truth(printed):
     assert low < 0.3 < high
 
 
+@pytest.mark.long
 def test_gates_are_as_accurate_as_stored(cells, printed):
     for texts in ([stored(cell) for cell in cells], printed):
         text = next(text for text in texts if text.startswith("gate "))

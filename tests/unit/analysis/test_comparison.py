@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from command_line import run
+from scipy.stats import binom, norm
+from significance import FALSE_ALARM, largest_z
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis import comparison
@@ -30,15 +32,15 @@ def result(seed, passes=6, factor=1.0, relative=0.05, bins=100, **attributes):
 
 @pytest.mark.slow
 def test_false_alarm_rate_of_differences():
-    """Over 400 pairs of few passes: taken for normal, Student's t would exceed the limit in a third of them."""
-    pairs = [comparison.compare(result(2 * seed), result(2 * seed + 1)) for seed in range(400)]
+    """Over 200 pairs of few passes: taken for normal, Student's t would exceed the limit in a third of them."""
+    pairs = [comparison.compare(result(2 * seed), result(2 * seed + 1)) for seed in range(200)]
     assert {pair.bin_count for pair in pairs} == {200}
     alarms = sum(not pair.agrees for pair in pairs)
-    # Binomial with chance 0.01: 4 +- 2; twice that is 6 standard deviations off.
-    assert alarms <= 12
+    assert alarms <= binom.isf(FALSE_ALARM, len(pairs), 0.01)
     rms = np.array([pair.rms for pair in pairs])
     # A bin's error is never taken smaller than its neighbours': a little more than it is.
-    assert 0.85 < rms.mean() < 1.02
+    known = largest_z(len(pairs)) * rms.std(ddof=1) / np.sqrt(len(pairs))
+    assert 0.85 - known < rms.mean() < 1 + known
 
 
 def test_a_difference_in_one_bin_or_in_all_is_found():
@@ -49,7 +51,7 @@ def test_a_difference_in_one_bin_or_in_all_is_found():
     assert np.unravel_index(np.nanargmax(np.abs(outcome.z)), outcome.z.shape) == (1, 30)
     assert outcome.z[1, 30] > 0
     everywhere = comparison.compare(result(1, passes=40), result(2, passes=40, factor=1.05))
-    assert everywhere.energy_ratio == pytest.approx(1.05, abs=4 * everywhere.energy_ratio_stderr)
+    assert abs(everywhere.energy_ratio - 1.05) < largest_z(40) * everywhere.energy_ratio_stderr
     assert everywhere.energy_ratio_stderr < 0.002
     assert not everywhere.agrees
 
@@ -65,8 +67,6 @@ def test_bins_outside_the_window_or_badly_known_do_not_count():
 
 def test_sidak_limit_has_the_significance():
     """Among 200 numbers; Bonferroni's is 0.2 % of z higher, no correction 1.3 lower."""
-    from scipy.stats import norm
-
     limit = comparison.sidak_limit(200)
     assert (1 - 2 * norm.sf(limit)) ** 200 == pytest.approx(0.99, rel=1e-9)
     assert comparison.sidak_limit(1) == pytest.approx(norm.isf(0.005))

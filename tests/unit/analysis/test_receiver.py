@@ -57,9 +57,9 @@ def test_shots_of_pixels():
     assert np.all((mean.argmax(axis=1) >= 16) & (mean.argmax(axis=1) <= 18))
     spread = shots["signal"].std("shot", ddof=1) / shots["signal_deviation"]
     # The standard deviation of n normal numbers has the relative error sqrt(1/(2 n)); 160 comparisons.
-    assert np.max(np.abs(spread.values - 1)) < 6 * np.sqrt(1 / 800)
+    assert np.max(np.abs(spread.values - 1)) < largest_z(400, 160) * np.sqrt(1 / 800)
     z = (shots["signal"].mean("shot") - shots["signal_mean"]) / shots["signal_deviation"] * 20
-    assert np.max(np.abs(z.values)) < 6
+    assert np.max(np.abs(z.values)) < largest_z(400, 160)
     assert not shots["saturated"].any()
     found = (shots["signal_mean"] - shots["signal_mean"][:, 0]) / shots["signal_deviation"]
     np.testing.assert_allclose(shots["snr"], found, atol=0.01)

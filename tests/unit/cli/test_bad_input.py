@@ -41,8 +41,9 @@ LISTS = "layer_tops attenuation scattering backscattering water_scattering refra
 
 TABLE1 = {
     ("inf", "must be finite"): NUMBERS,
-    ("", "is empty: it must have a value"): f"{NUMBERS} {LISTS} bin_count surface_seed layout spectrum phase",
-    ("deep", "must be a number"): NUMBERS,
+    # All numbers are read alike: each of these mistakes for a third of them.
+    ("", "is empty: it must have a value"): f"{' '.join(NUMBERS.split()[::3])} {LISTS} bin_count surface_seed layout",
+    ("deep", "must be a number"): NUMBERS.split()[1::3],
     ("1 2", "must be one number"): "pulse_energy_mj pulse_fwhm_ns wavelength_nm optical_efficiency altitude",
     ("1 2", "must be a number"): "divergence_mrad",
     ("-1", "must lie between"): f"{LASER} {RECEIVER} off_nadir_deg bin_width_ns surface_size",
@@ -50,7 +51,6 @@ TABLE1 = {
     ("0", "must lie between"): "altitude pulse_energy_mj field_of_view_mrad aperture_area bin_width_ns surface_size",
     ("0.3,", "has an empty entry"): LISTS,
     (",", "is empty"): LISTS,
-    ("0.2,,0.4", "has an empty entry"): LISTS,
     ("0.2, x", "must hold numbers only"): LISTS,
     ("nan, 2", "must be finite"): "layer_tops scattering",
     ("-2000", "must lie between -1000 and 1e+06"): "altitude",
@@ -331,10 +331,10 @@ AXES = {
 GATES = ("--start-ns", 1410, "--width-ns", 5, "--step-ns", 5, "--count", 4)
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("plot", "waveforms", "retrieve", "compare")]
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("plot", "waveforms", "retrieve", "compare")]
 
 
-@pytest.mark.parametrize("command", ["gates", *SLOW])
+@pytest.mark.parametrize("command", ["gates", *LONG])
 @pytest.mark.parametrize("axis", AXES)
 def test_results_with_invalid_times(folder, stored, command, axis):
     change, part = AXES[axis]

@@ -8,7 +8,12 @@ from mitransient_lidar.loading import catalogue
 
 #: The reference compiles one kernel, merging three.
 FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
-PARAMETERS = ["-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=95"]
+FLAT = ["-D", "spectrum=flat", "-D", "surface_size=60", "-D", "bin_width_ns=2", "-D", "bin_count=95"]
+#: Only these ask for waves.
+WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
+SEA_COMMANDS = ("find-shots", "shot-statistics")
+#: Those that take more than 2 s.
+MARKS = {"detect": pytest.mark.slow, "target-signal": pytest.mark.slow, "shot-statistics": pytest.mark.slow}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
@@ -16,7 +21,7 @@ SCENE_COMMANDS = {
     "shot-statistics": ["--count", 2],
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
-    "beam-spread": ["--depths", "2,5", "--passes", 4],
+    "beam-spread": ["--depths", "2,5", "--passes", 2],
     "fov-sweep": ["--fov-mrad", "20,35", "--passes", 4],
     "scattering-orders": ["--passes", 2, "--orders", 2],
 }
@@ -51,7 +56,7 @@ def scene(tmp_path_factory):
 def result(scene, tmp_path_factory):
     """A rendered file of the scene."""
     folder = tmp_path_factory.mktemp("result")
-    done = run("render", scene, *PARAMETERS, "--passes", 4, "-o", folder, "-q")
+    done = run("render", scene, *FLAT, "--passes", 2, "-o", folder, "-q")
     assert done.exit_code == 0, done.stderr
     assert sorted(path.suffix for path in folder.iterdir()) == [".exr", ".nc", ".png", ".png"]
     return folder / "small.nc"
@@ -65,12 +70,10 @@ def check(done, tmp_path):
     assert done.stdout
 
 
-@pytest.mark.parametrize(
-    "command", [pytest.param(name, marks=[pytest.mark.slow] * (name == "detect")) for name in SCENE_COMMANDS]
-)
+@pytest.mark.parametrize("command", [pytest.param(name, marks=MARKS.get(name, ())) for name in SCENE_COMMANDS])
 def test_command_of_a_scene(command, scene, tmp_path):
     options = SCENE_COMMANDS[command]
-    done = run(command, scene, *PARAMETERS, *options, "-o", tmp_path / "figure.png")
+    done = run(command, scene, *(WAVES if command in SEA_COMMANDS else FLAT), *options, "-o", tmp_path / "figure.png")
     check(done, tmp_path)
     assert (tmp_path / "figure.png").is_file()
 
@@ -95,11 +98,12 @@ def test_commands_of_a_result_refuse_invalid_options(arguments, message, result)
     assert_refused(run(command, result, *options, *(["-q"] if command == "record" else [])), message)
 
 
+@pytest.mark.slow
 def test_series_of_shots_from_end_to_end(scene, tmp_path):
     """Shots, a record of them, its echoes, slopes, and drawings, each from the file of the one before."""
     shots, echoes, signals = (tmp_path / name for name in ("shots.nc", "echoes.csv", "signals.nc"))
     options = ["--at", "0,0", "--at", "20,-8", "--move-target", "--passes", 2, "-D", "time_start_ns=1370"]
-    done = run("shots", scene, *PARAMETERS, *options, "-o", shots, "-q")
+    done = run("shots", scene, *FLAT, *options, "-o", shots, "-q")
     check(done, tmp_path)
     check(run("record", shots, "--receiver", "apd", "--optical-density", "auto", "-o", signals), tmp_path)
     check(run("waveforms", signals, "--csv", echoes), tmp_path)

@@ -190,7 +190,7 @@ def test_files_contain_everything_that_is_drawn(lidar_scene, tmp_path):
     assert drawn[0] == drawn[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_long_texts_are_left_out(lidar_scene, tmp_path):
     """256 pixels of a circle have outlines that NetCDF could not keep together with other attributes."""
     attributes = described(lidar_scene(rx={"layout": "16x16", "imager": False}))

@@ -161,7 +161,7 @@ def test_imagers_and_records_of_a_series_are_drawn():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pixels", [1, 3, 4, 11, 40])
+@pytest.mark.parametrize("pixels", [1, 40])
 def test_missing_attributes_leave_out_what_needs_them(pixels, tmp_path):
     dataset = make(pixels)
     dataset.attrs = {}
@@ -171,7 +171,7 @@ def test_missing_attributes_leave_out_what_needs_them(pixels, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", [0.0, np.nan, -1.0])
+@pytest.mark.parametrize("level", [np.nan, -1.0])
 def test_signals_without_positive_values_are_drawn(level, tmp_path):
     linear, log = waveforms.plot_waveforms(make(2, scale=level), tmp_path / "a.png").axes[:2]
     # Without a significant value the axes are those of a signal of 1 W.

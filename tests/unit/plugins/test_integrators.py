@@ -20,8 +20,10 @@ def scene_with(lidar_scene, name, depth=8.0):
     return lidar_scene(integrator={"type": name, **INTEGRATORS[name]}, bottom=depth)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("lidar_volpath", marks=pytest.mark.slow), pytest.param("lidar_merging", marks=pytest.mark.long)],
+)
 def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
     """A bottom moved from 8 m to 6 m gives the energies of a scene that was built with it at 6 m, in every bit."""
     scene = scene_with(lidar_scene, name)
@@ -59,8 +61,8 @@ def living():
 def test_refused_and_finished_renders_keep_no_scene():
     """Scenes that stay in memory are part of every later kernel."""
     before = living()
-    options = {"integrator": {"type": "lidar_merging", **INTEGRATORS["lidar_merging"]}, "passes": 2}
-    for params in ({}, {"bin_count": 1}, {"time_start_ns": 100.0}, {"bottom_depth": 0.1}):
+    options = {"integrator": {"type": "lidar_volpath", **FEW}, "passes": 2}
+    for params in ({}, {"bin_count": 1}, {"bottom_depth": 0.1}):
         try:
             mitransient_lidar.render("table1", params=params, **options)
         except UserError:

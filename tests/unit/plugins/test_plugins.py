@@ -262,19 +262,21 @@ def scene(**parts):
             "type": "scene",
             "tx": {"type": "lidar_transmitter"},
             "rx": {"type": "multipixel_receiver", "film": {"type": "time_gated_film"}},
-            "sea": {"type": "ocean_surface", "interior": {"type": "layered_water"}},
+            "sea": {"type": "ocean_surface", "spectrum": "flat", "interior": {"type": "layered_water"}},
             **parts,
         }
     )
 
 
 FILM = {"film": {"type": "time_gated_film"}}
+FLAT = {"type": "ocean_surface", "spectrum": "flat"}
 UNDER_WATER = {
     "tx": {"type": "lidar_transmitter", "altitude": -0.2, "aim_x": 80.0},
     "rx": {"type": "multipixel_receiver", "altitude": -0.2, "aim_x": 80.0, **FILM},
 }
 LAYERED = {
     "type": "ocean_surface",
+    "spectrum": "flat",
     "interior": {
         "type": "layered_water",
         "layer_tops": "0, 5",
@@ -290,9 +292,9 @@ WRONG_SCENES = [
     ({"rx": {"type": "multipixel_receiver"}}, "time_gated_film"),
     ({"tx": {"type": "constant"}}, "exactly one lidar_transmitter"),
     ({"tx2": {"type": "lidar_transmitter"}}, "has 2 of which 2"),
-    ({"sea": {"type": "ocean_surface"}}, "needs a layered_water"),
-    ({"sea": {"type": "ocean_surface", "interior": {"type": "homogeneous"}}}, "must be layered_water"),
-    ({"sea": {"type": "ocean_surface", "exterior": {"type": "layered_water"}}}, "interior medium"),
+    ({"sea": FLAT}, "needs a layered_water"),
+    ({"sea": {**FLAT, "interior": {"type": "homogeneous"}}}, "must be layered_water"),
+    ({"sea": {**FLAT, "exterior": {"type": "layered_water"}}}, "interior medium"),
     ({"more": {"type": "sphere", "interior": {"type": "layered_water", "attenuation": 1.0}}}, "allowed is one"),
     ({"tx": {"type": "lidar_transmitter", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}}, "altitude"),
     ({"tx": {"type": "lidar_transmitter", "altitude": -3.0}}, r"at z = -3 m and 200 m must both be above the mean sea"),
@@ -312,11 +314,11 @@ def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
 
 
 def test_users_bsdf_wins_and_ripples_take_the_waters_index():
-    own = scene(sea={"type": "ocean_surface", "bsdf": {"type": "dielectric"}, "interior": {"type": "layered_water"}})
+    own = scene(sea={**FLAT, "bsdf": {"type": "dielectric"}, "interior": {"type": "layered_water"}})
     (surface,) = (s for s in own.shapes() if hasattr(s, "ripple_variance"))
     assert not surface.has_ripples
     water = {"type": "layered_water", "refractive_index": 1.25}
-    loaded = scene(sea={"type": "ocean_surface", "interior": water})
+    loaded = scene(sea={**FLAT, "interior": water})
     indices = [float(value[0]) if hasattr(value, "__len__") else float(value)
                for key, value in mi.traverse(loaded) if key.endswith(".eta")]  # fmt: skip
     assert indices == [pytest.approx(1.25)]
@@ -342,7 +344,7 @@ def test_other_integrators_see_the_layers():
     np.testing.assert_allclose(null + total, np.array(water.get_majorant(mei)).ravel()[0], rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pixel_alone_is_a_receiver():
     alone = scene(rx={**CIRCLE, "film": {"type": "time_gated_film"}}, integrator={"type": "lidar_volpath"})
     energy = np.array(mi.render(alone, seed=1, spp=2**14))

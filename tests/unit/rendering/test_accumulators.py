@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -25,7 +26,7 @@ def test_errors_of_independent_bins_do_not_grow():
     bins, inflation = inflation_of(lambda rng: rng.normal(10, 1, (5, 50)))
     assert bins == [1, 2, 4, 8, 16, 32]
     # A standard deviation from 400 passes is known to 3.5 %; the median is over 5 blocks or more.
-    np.testing.assert_allclose(inflation, 1, rtol=0.1)
+    np.testing.assert_allclose(inflation, 1, rtol=largest_z(400, 6) / np.sqrt(2 * 400))
 
 
 def test_errors_of_bins_that_go_together_grow_with_their_number():
@@ -37,7 +38,7 @@ def test_errors_that_go_together_over_a_few_bins_grow_that_far():
     """Sums over runs of 4 equal bins: twice the quadrature sum from 4 bins on."""
     _, inflation = inflation_of(lambda rng: np.repeat(rng.normal(10, 1, (5, 32)), 4, axis=1))
     np.testing.assert_allclose(inflation[:3], [1, np.sqrt(2), 2], rtol=1e-9)
-    np.testing.assert_allclose(inflation[3:], 2, rtol=0.1)
+    np.testing.assert_allclose(inflation[3:], 2, rtol=largest_z(400, 6) / np.sqrt(2 * 400))
 
 
 def test_dark_blocks_do_not_count():
@@ -46,7 +47,7 @@ def test_dark_blocks_do_not_count():
         values[:, 4:] = 1e-9 * rng.normal(10, 1)
         return values
 
-    assert inflation_of(draw)[1][1:] == pytest.approx([1, 1, 1], rel=0.1)
+    assert inflation_of(draw)[1][1:] == pytest.approx([1, 1, 1], rel=largest_z(400, 3) / np.sqrt(2 * 400))
 
 
 def test_statistics_of_part_of_the_pixels():

@@ -69,7 +69,8 @@ def test_ratio_statistics():
         ratios.append(statistics.ratio[0])
         errors.append(statistics.stderr[0])
     assert abs(np.mean(ratios) - 3) < largest_z(400) * np.std(ratios) / 20
-    assert np.mean(errors) == pytest.approx(np.std(ratios), rel=0.2)
+    # The spread of 400 ratios has an error of 1/sqrt(800).
+    assert abs(np.mean(errors) / np.std(ratios, ddof=1) - 1) < 0.02 + largest_z(10**6) / np.sqrt(800)
     nothing = passive.RatioStatistics(2)
     for _ in range(2):
         nothing.add(np.array([1.0, 0.0]), np.array([1.0, 0.0]))
@@ -119,15 +120,7 @@ def test_a_still_picture():
     assert {"sun_zenith_deg", "sky_irradiance", "passes", "seed", "integrator", "title"} <= set(picture.attrs)
 
 
-@pytest.mark.slow
-def test_same_seed_same_picture_other_seed_another_one():
-    first, again, other = (render(seed=seed)["radiance"].values for seed in (5, 5, 6))
-    # Sums of 64 bits, in any order.
-    np.testing.assert_allclose(first, again, rtol=1e-10)
-    assert np.all(first != other)
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_standard_errors_and_connections():
     """Both samplings and their combination have one mean, within the stated errors."""
     found = {}
@@ -158,36 +151,31 @@ def test_blur_leaves_the_mean_and_evens_the_edges():
 
 
 @pytest.mark.slow
-def test_frames_move_the_sea():
-    pictures = render(frames=2, frame_step_s=0.5)
+def test_frames_move_the_sea_and_fill_files(tmp_path):
+    pictures = render(frames=2, frame_step_s=0.5, filter_width_nm=1.0)
     assert pictures["radiance"].dims == ("frame", "row", "column")
     assert pictures["time_s"].values.tolist() == [0.0, 0.5]
     assert np.any(pictures["radiance"][0] != pictures["radiance"][1])
+    for suffix in (".nc", ".exr"):
+        save_radiance(pictures, tmp_path / f"a{suffix}")
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as again:
+        np.testing.assert_array_equal(again["radiance"], pictures["radiance"])
+        np.testing.assert_array_equal(again["background_power"], pictures["background_power"])
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert [part.header["name"] for part in file.parts] == ["frame0000", "frame0001"]
+        assert set(file.parts[1].channels) == {"Y", "Y.stderr"}
+        np.testing.assert_array_equal(file.parts[1].channels["Y"].pixels, pictures["radiance"][1].astype(np.float32))
+    save_radiance(pictures.isel(frame=0), tmp_path / "b.exr")
+    with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
+        assert len(file.parts) == 1
+    with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
+        save_radiance(pictures, tmp_path / "a.txt")
     # A flat sea has nothing that moves: frames differ by noise only.
     flat = no_none(scene())
     flat["sea"]["spectrum"] = "flat"
     still = render(flat, frames=2, passes=16)
     z = (still["radiance"][0] - still["radiance"][1]) / np.hypot(*still["radiance_stderr"].values)
     assert np.abs(z).max() < largest_z(16, 16)
-
-
-@pytest.mark.slow
-def test_files(tmp_path):
-    picture = render(filter_width_nm=1.0, frames=2)
-    for suffix in (".nc", ".exr"):
-        save_radiance(picture, tmp_path / f"a{suffix}")
-    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as again:
-        np.testing.assert_array_equal(again["radiance"], picture["radiance"])
-        np.testing.assert_array_equal(again["background_power"], picture["background_power"])
-    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
-        assert [part.header["name"] for part in file.parts] == ["frame0000", "frame0001"]
-        assert set(file.parts[1].channels) == {"Y", "Y.stderr"}
-        np.testing.assert_array_equal(file.parts[1].channels["Y"].pixels, picture["radiance"][1].astype(np.float32))
-    save_radiance(picture.isel(frame=0), tmp_path / "b.exr")
-    with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
-        assert len(file.parts) == 1
-    with pytest.raises(UserError, match=r"must end in \.exr or \.nc"):
-        save_radiance(picture, tmp_path / "a.txt")
 
 
 @pytest.mark.slow
@@ -205,7 +193,7 @@ def test_daylight_does_not_touch_the_laser():
     np.testing.assert_allclose(dark["radiance"], render(scene("2x2"))["radiance"], rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_shipped_scene_by_the_command(tmp_path):
     assert "passive_sea" in catalogue.scene_names()
     small = ["-D", "layout=8x8", "-D", "surface_refined_size=8", "-D", "surface_cell_size=0.5"]

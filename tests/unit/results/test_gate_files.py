@@ -170,7 +170,7 @@ def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
     xr.testing.assert_identical(gate_files.open_stack(tmp_path / "b.nc"), more)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_imager_of_256_squared_and_64_gates(tmp_path):
     stack = make(256, 256, 64)
     gate_files.save_stack(stack, tmp_path / "a.exr")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import run
+from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
@@ -128,7 +129,10 @@ def test_share_in_view(lidar_scene, off_nadir):
         water={"attenuation": 0.1, "scattering": 0.0, "backscattering": 0.0},
     )
     found = beam_spread(scene, [1.0, 7.0], passes=4, photons=2**14)
-    np.testing.assert_allclose(found["in_view"], 1 - np.exp(-0.5 * 1.2**2), atol=0.012)
+    # Photons count as if they were drawn one by one; 0.2 % for the ripples.
+    share = 1 - np.exp(-0.5 * 1.2**2)
+    error = np.sqrt(share * (1 - share) / (4 * 2**14))
+    assert np.abs(found["in_view"] - share).max() < 0.002 + largest_z(10**6, 2) * error
     # Light that is not scattered is neither shifted nor late.
     assert not found["shift_rms"].any()
     assert not found["delay_mean"].any()
@@ -196,7 +200,7 @@ def test_figure(spread, tmp_path, lidar_scene):
         plot_beam_spread(spread, tmp_path / "spread.txt")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_closed_form_is_drawn_for_no_other_water(lidar_scene):
     for water in (
         {"scattering": 0.0, "backscattering": 0.0},
@@ -207,7 +211,7 @@ def test_closed_form_is_drawn_for_no_other_water(lidar_scene):
         assert dashed(plot_beam_spread(beam_spread(lidar_scene(water=water), 5.0, **QUICK))) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_command(tmp_path):
     target = tmp_path / "new" / "spread.png"
     result = run(
@@ -222,14 +226,6 @@ def test_command(tmp_path):
     assert kept.attrs["seed"] == 3
     assert kept.attrs["scene.bottom_depth"] == "6"
     assert f"{100 * kept['in_view'].values[0]:.1f}" in lines[3]
-
-
-@pytest.mark.slow
-def test_quiet_command(tmp_path):
-    result = run("beam-spread", "fig09_1x1", "--depths", "2", "--passes", 2, "-q", "-o", tmp_path / "s.svg")
-    assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines() == [str(tmp_path / "s.svg"), str(tmp_path / "s.nc")]
-    assert result.stderr == ""
 
 
 @pytest.mark.parametrize(

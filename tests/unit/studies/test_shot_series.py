@@ -147,9 +147,9 @@ def test_seeds_and_instrument_of_a_series(rendered):
 
 
 def test_description_of_the_sea_can_be_left_out(rendered):
-    options = {"positions": PLACES[:1], "passes": 2}
+    options = {"params": {"surface_size": 60, "surface_cell_size": 1}, "positions": PLACES[:1], "passes": 2}
     for describe_sea in (True, False):
-        series = shot_series.render_shots("table1", describe_sea=describe_sea, **options)
+        series = shot_series.render_shots("fig09_2x2", describe_sea=describe_sea, **options)
         assert ("slope_deviation" in series.attrs) == describe_sea
 
 
@@ -157,7 +157,7 @@ def test_series_that_does_not_fit_the_memory(rendered):
     with pytest.raises(
         UserError, match=r"^30 shots of 4096 pixels x 19\d bins, and 3 components of each, are more than"
     ):
-        shot_series.render_shots("table1", {"layout": "64x64"}, positions=[(0, 0)] * 30, components=True)
+        shot_series.render_shots("table1", {**FLAT, "layout": "64x64"}, positions=[(0, 0)] * 30, components=True)
 
 
 def test_places_beside_the_bottom_are_told(rendered, caplog):

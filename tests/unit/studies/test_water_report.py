@@ -196,7 +196,7 @@ def test_every_kind_draws_its_function(monkeypatch, kind, value, label, share, a
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["jerlov", "II"], ["petzold", "turbid"], ["pure"], ["profile"]])
+@pytest.mark.parametrize("arguments", [["petzold", "turbid"], ["profile"]])
 def test_plots_are_written_and_their_paths_come_last(station, tmp_path, arguments):
     path = tmp_path / "a.png"
     words = [*arguments, str(station)] if arguments == ["profile"] else arguments

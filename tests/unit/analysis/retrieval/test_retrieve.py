@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from command_line import assert_refused, run
 from scipy.stats import exponnorm, norm, truncnorm
+from significance import largest_z
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve, surface_inputs
@@ -415,10 +416,10 @@ def test_errors_of_the_drawing(tmp_path):
     guess = slopes["slope_along"].values
     one = retrieval.slope_statistics(truth, guess)
     # Equal variances of slope and error: a correlation of 0.71; Fisher's z has the standard error 0.05.
-    assert abs(math.atanh(one["correlation"]) - math.atanh(math.sqrt(0.5))) < 4.5 * 0.05
+    assert abs(math.atanh(one["correlation"]) - math.atanh(math.sqrt(0.5))) < largest_z(400, 3) * 0.05
     assert one["low"] < one["correlation"] < one["high"]
-    assert one["bias_deg"] == pytest.approx(math.degrees(0.01), abs=4.5 * math.degrees(0.05) / 20)
-    assert one["rms_deg"] == pytest.approx(math.degrees(math.hypot(0.05, 0.01)), rel=0.16)
+    assert one["bias_deg"] == pytest.approx(math.degrees(0.01), abs=largest_z(400, 3) * math.degrees(0.05) / 20)
+    assert one["rms_deg"] == pytest.approx(math.degrees(math.hypot(0.05, 0.01)), rel=largest_z(400, 3) / math.sqrt(800))
     (ax,) = retrieval.plot_slopes({"1x4": slopes}).axes
     # Across nothing is known, and nothing is drawn but the diagonal.
     dots, diagonal = ax.lines

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 from mitransient_lidar.analysis.waveforms.deconvolution import deconvolution_offset, deconvolved_echo, richardson_lucy
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
@@ -82,7 +83,7 @@ def test_errors_of_time_and_energy_are_those_of_the_noise_within_a_fifth():
     got = deconvolved_echo(records, sharp, found.surface, TEMPLATE, found.flags[0], TEMPLATE.fwhm_ns)
     truth = np.sqrt(2 * np.pi) * SIGMA * 1e-9
     for value, error in ((got.time_ns - arrivals, got.time_stderr), (got.energy - truth, got.energy_stderr)):
-        assert abs((value / error).std(ddof=1) - 1) < 0.2 + 4.5 / np.sqrt(2 * count)
+        assert abs((value / error).std(ddof=1) - 1) < 0.2 + largest_z(count, 2) / np.sqrt(2 * count)
     assert abs(np.mean(got.time_ns - arrivals)) < 0.01
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import exponnorm, norm
+from significance import largest_z
 
 from mitransient_lidar.analysis.waveforms import echo_estimators
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
@@ -137,8 +138,8 @@ def test_errors_are_those_of_the_noise(method):
     assert np.isfinite(z).all()
     # Standard error of a standard deviation of normal numbers: 1/sqrt(2 n). Samples taken by their height share noise
     # with what they are compared with, which costs up to 5 %.
-    assert abs(z.std(ddof=1) - 1) < 4.5 / np.sqrt(2 * count) + 0.05
-    assert abs(z.mean()) < 4.5 / np.sqrt(count) + 0.1
+    assert abs(z.std(ddof=1) - 1) < largest_z(count, 2) / np.sqrt(2 * count) + 0.05
+    assert abs(z.mean()) < largest_z(count, 2) / np.sqrt(count) + 0.1
 
 
 def test_surface_target_and_bottom_are_found_on_a_column():

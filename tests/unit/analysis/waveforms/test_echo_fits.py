@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import exponnorm
+from significance import largest_z
 
 from mitransient_lidar.analysis.waveforms.column_fits import change_points, column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records
@@ -39,8 +40,8 @@ def assert_true(values, errors, truth, bias=0.0):
     """Values scatter about the truth as their errors say; `bias` is what the model is known to miss."""
     z = (values - truth) / errors
     assert np.isfinite(z).all()
-    assert abs(z.std(ddof=1) - 1) < 4.5 / np.sqrt(2 * z.size)
-    assert abs(values.mean() - truth) < bias + 4.5 * errors.mean() / np.sqrt(z.size)
+    assert abs(z.std(ddof=1) - 1) < largest_z(z.size, 2) / np.sqrt(2 * z.size)
+    assert abs(values.mean() - truth) < bias + largest_z(z.size, 2) * errors.mean() / np.sqrt(z.size)
 
 
 def test_surface_and_column_are_separated():
@@ -126,9 +127,9 @@ def test_column_fit_finds_level_and_decay_also_from_samples_in_the_noise():
     assert_true(found.decay, found.decay_stderr, 0.05)
     assert_true(found.level, found.level_stderr, 1.0)
     # chi2/f has the mean 1 and the variance 2/f.
-    assert abs(found.chi2.mean() - 1) < 4.5 * np.sqrt(2 / (found.bins[0] - 2) / COUNT)
+    assert abs(found.chi2.mean() - 1) < largest_z(COUNT, 2) * np.sqrt(2 / (found.bins[0] - 2) / COUNT)
     correlation = np.corrcoef(found.level, found.decay)[0, 1]
-    assert correlation == pytest.approx(found.correlation.mean(), abs=4.5 / np.sqrt(COUNT))
+    assert correlation == pytest.approx(found.correlation.mean(), abs=largest_z(COUNT, 2) / np.sqrt(COUNT))
 
 
 def test_column_fit_needs_a_column():
@@ -145,7 +146,7 @@ def test_change_points_raise_false_alarms_no_more_often_than_they_say():
     found = change_points(records, 50 * every, 120 * every, model_error=0.0)
     for level in (0.2, 0.05, 0.01):
         alarms = np.mean(found.p_value[:, 0] < level)
-        assert alarms < level + 4.5 * np.sqrt(level / count)
+        assert alarms < level + largest_z(count, 3) * np.sqrt(level / count)
     # The bound is not idle: the places are correlated, which makes it a few times too careful, not a hundred times.
     assert np.mean(found.p_value[:, 0] < 0.2) > 0.02
 

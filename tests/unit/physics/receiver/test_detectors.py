@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 from mitransient_lidar.physics.receiver import dead_time
 from mitransient_lidar.physics.receiver.detectors import (
@@ -13,17 +14,15 @@ from mitransient_lidar.physics.receiver.detectors import (
     photons_per_joule,
 )
 
-# Two-sided 2e-9: below 1e-5 for the few thousand comparisons of the file.
-LIMIT = 6.0
-
 
 def assert_moments(samples, mean, variance):
     """Compare realisations (first axis) with mean and variance by z-scores; the fourth moment is the samples' own."""
     n = len(samples)
     found_mean, found = samples.mean(axis=0), samples.var(axis=0, ddof=1)
     fourth = ((samples - found_mean) ** 4).mean(axis=0)
-    assert np.max(np.abs(found_mean - mean) / np.sqrt(variance / n)) < LIMIT
-    assert np.max(np.abs(found - variance) / np.sqrt((fourth - found**2) / n)) < LIMIT
+    limit = largest_z(n, 2 * np.size(found_mean))
+    assert np.max(np.abs(found_mean - mean) / np.sqrt(variance / n)) < limit
+    assert np.max(np.abs(found - variance) / np.sqrt((fourth - found**2) / n)) < limit
 
 
 def test_photons_of_green_light():
@@ -103,7 +102,7 @@ def test_probability_of_crosstalk():
     one, some = np.count_nonzero(count == 1), np.count_nonzero(count)
     # exp(-0.02) 0.02 0.8 of all shots have one avalanche; those with any: 1 - exp(-0.02).
     share = np.exp(-0.02) * 0.016 / -np.expm1(-0.02)
-    assert abs(one - some * share) / np.sqrt(some * share * (1 - share)) < LIMIT
+    assert abs(one - some * share) / np.sqrt(some * share * (1 - share)) < largest_z(some)
 
 
 def varying_light(bins=90, peak=0.8):
@@ -133,7 +132,7 @@ def test_geiger_detectors_against_realisations(detector):
         z = (products.mean(axis=0) - covariances[lag]) / (products.std(axis=0) / np.sqrt(len(samples)))
         # Pairs of counts that are rare are not normally distributed.
         often = len(samples) * mean[..., :-lag] * mean[..., lag:] > 50
-        assert np.max(np.abs(z[often])) < LIMIT, lag
+        assert np.max(np.abs(z[often])) < largest_z(len(samples), often.sum()), lag
 
 
 @pytest.mark.parametrize("paralyzable", [False, True])
@@ -180,7 +179,7 @@ def test_counts_of_live_shots_give_the_events(dead):
     error = np.sqrt(np.expm1(events) / (shots * live))
     kept = counts > 200
     found = -np.log1p(-counts[kept] / (shots * live[kept]))
-    assert np.max(np.abs(found - events[kept]) / error[kept]) < LIMIT
+    assert np.max(np.abs(found - events[kept]) / error[kept]) < largest_z(shots, kept.sum())
     # Without the correction the histogram is far off.
     assert np.max(np.abs(counts / shots - events)[kept] / error[kept]) > 20
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import norm
+from significance import largest_z
 
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout, filtered
 
@@ -81,8 +82,9 @@ def test_rounding_noise():
     samples, saturated = stage.read(volts)
     assert not saturated.any()
     # The variance of n normal numbers has the relative error sqrt(2/n).
-    assert np.max(np.abs(samples.var(axis=0) / expected.variance - 1)) < 5 * np.sqrt(2 / n)
-    assert np.all(samples.var(axis=0) > sigma**2 * (1 + 5 * np.sqrt(2 / n)))
+    limit = largest_z(n, 4) * np.sqrt(2 / n)
+    assert np.max(np.abs(samples.var(axis=0) / expected.variance - 1)) < limit
+    assert np.all(samples.var(axis=0) > sigma**2 * (1 + limit))
 
 
 @pytest.mark.parametrize("mean", [-1.5, -0.9, 0.2, 0.95, 3.0])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
@@ -11,8 +12,6 @@ from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser,
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 
 SHOTS = 10_000
-# Two-sided 2e-9: below 1e-5 for the few thousand comparisons of the file.
-LIMIT = 6.0
 ELECTRON = 1.602176634e-19
 PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # J
 
@@ -26,8 +25,9 @@ def power(bins=64, scale=1.0):
 
 def assert_expected(record, expected, shots=SHOTS, fewest=-np.inf):
     """Compare shots with mean, variance and saturation, in samples that have `fewest` counts or more."""
+    limit = largest_z(shots, 3 * expected.mean.size)
     error = np.sqrt(np.maximum(expected.saturation * (1 - expected.saturation), 1e-3) / shots)
-    assert np.max(np.abs(record.saturated.mean(axis=0) - expected.saturation) / error) < LIMIT
+    assert np.max(np.abs(record.saturated.mean(axis=0) - expected.saturation) / error) < limit
     # Where all but a few samples are at a limit, those few make the variance.
     often = (expected.mean * shots >= fewest) & ((1 - expected.saturation) * shots > 100)
     samples = record.signal.astype(np.float64)[:, often]
@@ -36,9 +36,9 @@ def assert_expected(record, expected, shots=SHOTS, fewest=-np.inf):
     fourth = ((samples - samples.mean(axis=0)) ** 4).mean(axis=0)
     rounding = 1e-6 * np.max(np.abs(mean))  # of 32 bits
     z = (samples.mean(axis=0) - mean) / np.sqrt(variance / shots + rounding**2)
-    assert np.max(np.abs(z)) < LIMIT
+    assert np.max(np.abs(z)) < limit
     error = np.sqrt((fourth - found**2) / shots + rounding**4)
-    assert np.max(np.abs(found - variance) / error) < LIMIT
+    assert np.max(np.abs(found - variance) / error) < limit
 
 
 DIODE = LinearDetector(0.6)
@@ -83,7 +83,7 @@ def test_stages_alone_and_together(name):
     assert_expected(chain.apply(light, 1.0, SHOTS, 11, 3e-10), chain.expected(light, 1.0, 3e-10), fewest=fewest)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(set(RECEIVERS) - {"pmt_log"}))
 def test_receivers_in_use(name):
     chain = RECEIVERS[name]
@@ -98,8 +98,9 @@ def test_logarithmic_receiver_with_much_light():
     light = power(scale=1e-7) + 3e-7
     record, expected = chain.apply(light, 1.0, 2000, 13), chain.expected(light, 1.0)
     # Tens of photoelectrons are normally distributed to a few per cent of their standard deviation.
-    assert np.max(np.abs(record.signal.mean(axis=0) - expected.mean) / np.sqrt(expected.variance)) < 0.15
-    np.testing.assert_allclose(record.signal.var(axis=0), expected.variance, rtol=0.25)
+    limit = largest_z(2000, 256) / np.sqrt(2000)
+    assert np.max(np.abs(record.signal.mean(axis=0) - expected.mean) / np.sqrt(expected.variance)) < limit + 0.03
+    np.testing.assert_allclose(record.signal.var(axis=0), expected.variance, rtol=np.sqrt(2) * limit + 0.05)
 
 
 def test_signal_and_shot_noise_by_hand():
@@ -122,12 +123,16 @@ def test_signal_and_shot_noise_by_hand():
 
 
 def test_noise_of_neighbouring_samples_is_correlated():
-    chain = ReceiverChain(DIODE, Amplifier(1e4, 5.0, bandwidth_mhz=20.0))
+    amplifier = Amplifier(1e4, 5.0, bandwidth_mhz=20.0)
+    chain = ReceiverChain(DIODE, amplifier)
     samples = chain.apply(np.zeros(40), 1.0, SHOTS, 14).signal.astype(np.float64)
     found = np.mean(samples[:, 20] * samples[:, 25]) / np.mean(samples[:, 20] ** 2)
-    # exp(-t/tau), tau = 1/(2 pi f); a correlation of n pairs has the error (1 - rho^2)/sqrt(n).
-    rho = np.exp(-5 * 2e-3 * np.pi * 20)
-    assert abs(found - rho) < LIMIT * (1 - rho**2) / np.sqrt(SHOTS) + 1e-3
+    # exp(-t/tau), tau = 1/(2 pi f), for samples of a moment; bins of 1 ns and charges in their middle add 7 %.
+    _, weights = amplifier.kernel(1.0)
+    rho = np.sum(weights[5:] * weights[:-5]) / np.sum(weights**2)
+    assert rho == pytest.approx(np.exp(-5 * 2e-3 * np.pi * 20), rel=0.07)
+    # A slope of n pairs of equal variance has the error sqrt((1 - rho^2)/n).
+    assert abs(found - rho) < largest_z(SHOTS) * np.sqrt((1 - rho**2) / SHOTS)
 
 
 def test_quiet_logarithm_divides_the_noise_by_the_signal():
@@ -155,9 +160,9 @@ def test_seeds():
     one, two, three = (chain.apply(light, 1.0, 30, seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.signal, two.signal)
     assert not np.array_equal(one.signal, three.signal)
-    # More shots than one block holds: all differ.
+    # More shots than one block holds: they differ, but for equal codes of the digitiser by chance.
     many = chain.apply(np.full(4096, 1e-7), 1.0, 600, 5).signal
-    assert len(np.unique(many[:, 100:104], axis=0)) == 600
+    assert len(np.unique(many[:, 100:104], axis=0)) > 590
 
 
 def test_shapes_and_background_per_record():

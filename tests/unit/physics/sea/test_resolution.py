@@ -40,7 +40,7 @@ def test_every_lidar_has_cells_within_their_limits(altitude, divergence, field_o
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wind", [0.0, 0.5, 2.0, 6.0, 20.0])
+@pytest.mark.parametrize("wind", [0.0, 0.5, 6.0])
 @pytest.mark.parametrize(("divergence", "altitude"), [(5e-4, 200.0), (1e-3, 200.0), (2e-2, 5.0), (2e-2, 5e5)])
 def test_total_slope_variance_is_that_of_cox_and_munk(wind, divergence, altitude):
     parameters = {"wind_speed": wind}

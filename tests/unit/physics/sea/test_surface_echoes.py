@@ -72,8 +72,10 @@ def footprint_variances(wind, direction, spread):
     return up * cos + cross * sin, up * sin + cross * cos
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("wind", "direction"), [(3.0, 0.0), (10.0, 0.4)])
+@pytest.mark.parametrize(
+    ("wind", "direction"),
+    [pytest.param(10.0, 0.4, marks=pytest.mark.slow), pytest.param(3.0, 0.0, marks=pytest.mark.long)],
+)
 def test_seas_have_the_slopes_and_mean_echo_of_their_spectrum(wind, direction):
     """Eight independent sets of seas: their spread is the standard error."""
     beam = 5e-3

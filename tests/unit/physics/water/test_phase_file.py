@@ -17,7 +17,7 @@ from mitransient_lidar.physics.water.phase_table import PowerLawTable
 def uneven_angles():
     """150 angles [deg] from 0.05 to 180, with gaps of 2 to 10 % of the angle."""
     gaps = np.random.default_rng(11).uniform(0.2, 1, 149)
-    return 0.05 * 3600 ** np.append(0, np.cumsum(gaps) / gaps.sum())
+    return np.minimum(0.05 * 3600 ** np.append(0, np.cumsum(gaps) / gaps.sum()), 180)
 
 
 def write(path, degrees, values, separator=","):

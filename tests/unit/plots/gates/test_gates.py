@@ -207,14 +207,14 @@ def fake_ffmpeg(tmp_path):
     return install
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mp4_passes_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
     with fake_ffmpeg(status=0):
         animate_gates(make(3), tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").stat().st_size == 3 * 840 * 540 * 4  # raw frames
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_failing_or_missing_ffmpeg(tmp_path, fake_ffmpeg):
     with fake_ffmpeg(status=3), pytest.raises(UserError, match=r"a\.mp4: ffmpeg ended with the error 3"):
         animate_gates(make(3), tmp_path / "a.mp4")

@@ -1,0 +1,296 @@
+"""Power of the test suite: plant faults, one at a time, in a copy of the repository, and run the tests there.
+
+Run by hand, in the environment that the package is developed in::
+
+    .venv/bin/python tests/planted_faults.py --check              # whether all faults still apply
+    .venv/bin/python tests/planted_faults.py --control            # the whole measurement, in hours
+    .venv/bin/python tests/planted_faults.py one_bin_late --tier quick
+
+Progress goes to stderr and a Markdown table to stdout. A fault counts as found when a test fails that passes without
+it. Tests that cannot be collected or fail anyway, crashes of pytest and stages that take too long are errors. The
+slow tier runs where the quick one found nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TIERS = {"quick": "not slow and not long", "slow": "slow and not long"}
+
+#: Arguments of pytest that select the tests of each stage: those that find most come first.
+_REST = ("tests", "--ignore=tests/analytic", "--ignore=tests/sampling")
+STAGES = (("tests/analytic",), ("tests/sampling",), _REST)
+
+#: Exit statuses of pytest: tests failed; or it stopped, as pytest-xdist does at the first failure.
+_PASSED, _FAILED, _STOPPED, _INTERNAL_ERROR, _NO_TESTS = 0, 1, 2, 3, 5
+
+#: Prints where the packages that the tests import are.
+_WHERE = (
+    "import mitransient_lidar, mitransient_lidar.scenes as scenes, mitransient_lidar.plugins.ocean_surface as plugin;"
+    "print(mitransient_lidar.__file__, scenes.__file__, plugin.__file__, sep='\\n')"
+)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: a text in a file that is replaced by another one, and the number of its places."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    count: int = 1
+
+    def planted(self, text: str) -> str:
+        """Return the faulty text of the file; end the script where the fault does not apply."""
+        found = text.count(self.old)
+        if found != self.count:
+            sys.exit(f"fault {self.name}: its text occurs {found} times in {self.file}, not {self.count}: {self.old!r}")
+        return text.replace(self.old, self.new)
+
+
+_T, _P = "mitransient_lidar/transport", "mitransient_lidar/physics"
+_M = f"{_T}/merging"
+
+FAULTS = (
+    # Radiance is connected to the laser through the surface without the square of the refractive index.
+    Fault(
+        *("radiance_without_index_squared", f"{_T}/refracted_connection.py"),
+        "si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction)",
+        "si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(direction)",
+    ),
+    # The cosine of the photon stays in the BSDF of merges on solids.
+    Fault("cosine_at_the_bottom", f"{_M}/merge.py", "outgoing, within)[0] / cosine", "outgoing, within)[0]"),
+    Fault("merged_light_2_percent_more", f"{_M}/merge.py", "= points.weight / vol", "= 1.02 * points.weight / vol"),
+    Fault("phase_index_times_water_leg", f"{_T}/volpath.py", "above.t * scene.group", "above.t * scene.refractive"),
+    # All photons enter the water.
+    Fault(
+        *("no_fresnel_at_entry", f"{_T}/random_walk.py"),
+        "sample(step.context, si, pick, u, vertex.on_surface)",
+        "sample(step.context, si, dr.select(vertex.at_sea & step.adjoint, 1, pick), u, vertex.on_surface)",
+    ),
+    Fault("one_bin_late", f"{_T}/histogram.py", "minimum(mi.UInt32(position),", "minimum(mi.UInt32(position) + 1,"),
+    # The last part of a segment that crosses edges has the coefficient of the layer where it starts.
+    Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.attenuation(end)", "downward * here"),
+    # The balance heuristic of beam and view takes the view for 3 % smaller than it is.
+    Fault("share_of_photons_in_view", f"{_T}/laser/beam_sampler.py", "opaque(1 / self.view", "opaque(1.03 / self.view"),
+    Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
+    Fault(
+        *("left_and_right_exchanged", f"{_T}/sensor/pixels.py"),
+        "across = (angle_y + opaque(0.5 * width))",
+        "across = (opaque(0.5 * width) - angle_y)",
+    ),
+    Fault(
+        "efficiency_squared", f"{_T}/sensor/receiver.py", "self.optical_efficiency *", "self.optical_efficiency**2 *"
+    ),
+    Fault("half_of_the_group_delay", f"{_M}/segments.py", "length + along * group", "length + 0.5 * along * group"),
+    Fault("obscuration_squared", f"{_T}/sensor/receiver.py", "(1 - self.obscuration)", "(1 - self.obscuration**2)"),
+    # Probes of the covered share of a patch start too close to it to meet steep surfaces.
+    Fault("short_probe_of_patches", f"{_M}/patches.py", "reach = 2 * self.width", "reach = 1.2 * self.width"),
+    Fault("index_without_square_in_layers", f"{_T}/path_step.py", "& passes, ratio * ratio, 1)", "& passes, ratio, 1)"),
+    Fault(
+        *("no_complement", f"{_M}/renderer.py"),
+        "        trace_connected(scene, self.sampler, VolpathOptions(complement_only=True), record, shots, paths)\n",
+        "",
+    ),
+    Fault("connections_absorb_3_percent_more", f"{_T}/volpath.py", "dr.exp(-crossed)", "dr.exp(-1.03 * crossed)"),
+    # Beckmann's alpha is the square root of twice the slope variance.
+    Fault("ripples_without_root_2", "plugins/ocean_surface.py", "np.sqrt(2 * variance)", "np.sqrt(variance)"),
+    # The ripples have the slope variance along the wind across it.
+    Fault("ripples_across_the_wind", "plugins/ocean_surface.py", "return along, across", "return across, along"),
+    # The weights of the two connections of the reference do not sum to one.
+    Fault(
+        *("balance_without_transmittance", f"{_T}/volpath.py"),
+        "transmittance / (transmittance + path.emitter_ratio)",
+        "1 / (1 + path.emitter_ratio)",
+    ),
+    # Light in a plume scatters at bubbles too often instead of the water, though as often in all.
+    Fault(
+        "too_many_bubbles",
+        "plugins/layered_water.py",
+        "() * (bubbles + flight.attenuation(layer)) <",
+        "() * flight.attenuation(layer) <",
+    ),
+    # Sampled phase functions have other values than evaluated ones.
+    Fault(
+        "sampled_phase_1_percent_more",
+        f"{_T}/medium/tabulated_phase.py",
+        "value * dr.select(even",
+        "1.01 * value * dr.select(even",
+    ),
+    # The response of pulse and receiver is reversed in time, which only an uneven one shows.
+    Fault("reversed_response_of_gates", f"{_P}/lidar/gate_train.py", "(gate, kernel[::-1])", "(gate, kernel)"),
+    # The sky that the sea reflects counts twice.
+    Fault(
+        *("reflected_sky_twice", f"{_T}/daylight/renderer.py"),
+        "dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))",
+        "scene.sky_radiance(path.direction)",
+    ),
+    # Light that survives a reflection by a solid is weakened by its reflectance, too.
+    Fault("roulette_without_compensation", f"{_T}/random_walk.py", "factor / survival, bs", "factor, bs"),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a tier: ``found``, ``not found`` or ``error``, its time [s], and the first failed test or the cause."""
+
+    result: str
+    seconds: float
+    cause: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.result}, {self.seconds:.0f} s"
+
+
+def snapshot(folder: Path) -> Path:
+    """Copy the working tree, with its own git history and a package that holds plugins and scenes as installed."""
+
+    def listed(*options: str) -> set[str]:
+        command = ["git", "-C", str(ROOT), "ls-files", "-z", "--exclude-standard", *options]
+        return set(subprocess.check_output(command, text=True).split("\0")) - {""}
+
+    copy = folder / "pristine"
+    subprocess.run(["git", "clone", "--quiet", "--shared", str(ROOT), str(copy)], check=True)
+    for name in listed("--cached"):
+        if not (ROOT / name).exists():
+            (copy / name).unlink(missing_ok=True)
+    for name in listed("--cached", "--others"):
+        if (ROOT / name).is_file():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, copy / name)
+    for name in ("plugins", "scenes"):
+        (copy / "mitransient_lidar" / name).symlink_to(Path("..", name))
+    with (copy / ".git" / "info" / "exclude").open("a") as excluded:
+        excluded.write("/mitransient_lidar/plugins\n/mitransient_lidar/scenes\n")
+    return copy
+
+
+def run(command: list[str], copy: Path, log: Path, limit: float) -> int | None:
+    """Run Python in a copy, whose package precedes the installed one; return the exit status, None after the limit."""
+    # Finders of editable installs come last in sys.meta_path, so that PYTHONPATH wins, in subprocesses, too.
+    environment = {**os.environ, "PYTHONPATH": str(copy)}
+    with log.open("w") as output:
+        streams = {"stdout": output, "stderr": subprocess.STDOUT}
+        command = [sys.executable, *command]
+        process = subprocess.Popen(command, cwd=copy, env=environment, start_new_session=True, **streams)
+        try:
+            return process.wait(limit)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+def run_tier(copy: Path, pristine: Path, tier: str, processes: int, limit: float) -> Outcome:
+    """Run a tier's stages up to the first failure."""
+    start, ran = time.monotonic(), False
+    log = copy.with_suffix(f".{tier}.log")
+    if run(["-c", _WHERE], copy, log, limit) != 0:
+        return Outcome("error", time.monotonic() - start, "import")
+    places = log.read_text().split()
+    assert all(Path(place).is_relative_to(copy) for place in places), places
+    options = ["-q", "-x", "-p", "no:cacheprovider", "-n", str(processes), "-m", TIERS[tier]]
+    for stage in STAGES:
+        status = run(["-m", "pytest", *options, *stage], copy, log, limit)
+        if status == _INTERNAL_ERROR:
+            # Rarely, pytest-xdist loses a test.
+            status = run(["-m", "pytest", *options, *stage], copy, log, limit)
+        seconds = time.monotonic() - start
+        failed = re.findall(r"^(?:FAILED|ERROR) (\S+::.+?)(?: - .*)?$", log.read_text(errors="replace"), re.MULTILINE)
+        # Files that cannot be collected stop it, too, but no test of them has failed.
+        if status in (_FAILED, _STOPPED) and failed:
+            again = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "", failed[0]]
+            if run(again, pristine, log.with_suffix(".pristine.log"), limit) != _PASSED:
+                return Outcome("error", seconds, f"fails without the fault, too: {failed[0]}")
+            return Outcome("found", seconds, failed[0])
+        if status not in (_PASSED, _NO_TESTS):
+            return Outcome("error", seconds, "time limit" if status is None else f"exit status {status}")
+        ran |= status == _PASSED
+    return Outcome("not found" if ran else "error", time.monotonic() - start, "" if ran else "no tests")
+
+
+def measure(
+    fault: Fault | None, pristine: Path, tiers: list[str], processes: int, limit: float, keep: bool
+) -> dict[str, Outcome]:
+    """Return the outcome of each tier that ran with a fault, or without one."""
+    name = "control" if fault is None else fault.name
+    copy = pristine.with_name(name)
+    shutil.copytree(pristine, copy, symlinks=True)
+    if fault is not None:
+        path = copy / fault.file
+        path.write_text(fault.planted(path.read_text("utf-8")), "utf-8")
+    outcomes: dict[str, Outcome] = {}
+    for tier in tiers:
+        print(f"{name}: {tier} ...", end=" ", file=sys.stderr, flush=True)
+        outcomes[tier] = outcome = run_tier(copy, pristine, tier, processes, limit)
+        print(outcome, outcome.cause, file=sys.stderr, flush=True)
+        if outcome.result != "not found":
+            break
+    if not keep:
+        shutil.rmtree(copy)
+    return outcomes
+
+
+def main() -> None:
+    """Measure, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="faults to plant; default: all")
+    parser.add_argument("--check", action="store_true", help="check that all faults apply, and run no tests")
+    parser.add_argument("--control", action="store_true", help="run the tests without a fault first: they must pass")
+    parser.add_argument("--tier", choices=[*TIERS, "both"], default="both", help="tests to run; default: both")
+    parser.add_argument("--keep", action="store_true", help="keep the copies and the output of pytest")
+    parser.add_argument("-n", "--processes", type=int, default=2, help="processes of pytest; default: 2")
+    parser.add_argument("--limit", type=float, default=3600.0, help="longest time of a stage [s]; default: 3600")
+    given = parser.parse_args()
+    for fault in FAULTS:
+        ast.parse(fault.planted((ROOT / fault.file).read_text("utf-8")), fault.file)
+    unknown = sorted(set(given.names) - {fault.name for fault in FAULTS})
+    if unknown:
+        parser.error(f"no such fault: {', '.join(unknown)}; there are {', '.join(fault.name for fault in FAULTS)}")
+    if given.check:
+        print(f"All {len(FAULTS)} faults apply.")
+        return
+    chosen = [fault for fault in FAULTS if not given.names or fault.name in given.names]
+    tiers = list(TIERS) if given.tier == "both" else [given.tier]
+    folder = Path(tempfile.mkdtemp(prefix="planted_faults_")).resolve()
+    rows, found = [], []
+    try:
+        settings = (snapshot(folder), tiers, given.processes, given.limit, given.keep)
+        if given.control:
+            for tier, outcome in measure(None, *settings).items():
+                if outcome.result != "not found":
+                    sys.exit(f"without a fault the {tier} tier does not pass: {outcome.cause}")
+        for fault in chosen:
+            outcomes = measure(fault, *settings)
+            last = list(outcomes.values())[-1]
+            found += [tier for tier, outcome in outcomes.items() if outcome.result == "found"]
+            cells = [str(outcomes.get(tier, "")) for tier in TIERS]
+            rows.append(" | ".join(["", fault.name, fault.file, *cells, last.cause, ""]).strip())
+    finally:
+        if given.keep:
+            print(f"copies and output: {folder}", file=sys.stderr)
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+        if rows:
+            print("| fault | file | quick | slow | found by |", "|---|---|---|---|---|", *rows, sep="\n")
+            print(f"\n{len(found)} of {len(rows)} found, {found.count('quick')} by the quick tier")
+
+
+if __name__ == "__main__":
+    main()
