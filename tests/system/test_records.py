@@ -171,20 +171,8 @@ def test_a_scene_without_water():
 @pytest.mark.slow
 def test_the_command_states_the_record(tmp_path):
     small = [word for name, value in SMALL.items() for word in ("-D", f"{name}={value}")]
-    done = run(
-        "render",
-        "table1",
-        "-D",
-        "altitude=400",
-        *small,
-        "--integrator",
-        "lidar_volpath",
-        "--passes",
-        2,
-        "--no-plot",
-        "-o",
-        tmp_path,
-    )
+    options = ["--integrator", "lidar_volpath", "--passes", 2, "--no-plot", "-o", tmp_path]
+    done = run("render", "table1", "-D", "altitude=400", *small, *options)
     assert done.exit_code == 0
     line = " ".join(done.stderr.split())
     assert "bins of 4 ns; it ends after the echo of shape 'bottom'" in line

@@ -26,7 +26,7 @@ def test_layers_are_bins(tmp_path):
     assert header["type"] == OpenEXR.scanlineimage
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_more_than_ten_thousand_bins_have_five_digits(tmp_path):
     values = np.arange(10001, dtype=float).reshape(1, 1, -1)
     exr.write(tmp_path / "a.exr", {"bin": {"Y": values}}, {}, {})
