@@ -44,7 +44,7 @@ def planes(tmp_path_factory):
         name = str(folder / f"{along}.npz")
         np.savez(name, heights=along * lines + across * lines[:, np.newaxis], x=lines, y=lines)
         shots.append(
-            mitransient_lidar.render(str(folder / "plane.xml"), params={**params, "map": name}, passes=3, seed=2)
+            mitransient_lidar.render(str(folder / "plane.xml"), params={**params, "map": name}, passes=2, seed=2)
         )
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 

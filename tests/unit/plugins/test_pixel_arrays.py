@@ -94,7 +94,7 @@ def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
     outline = lidar_scene(rx={"a": polygon(corners)}, **MERGING)
     pixels = [scene.sensors()[0].receiver.pixels for scene in (hexagons, outline)]
     assert pixels[0].area == pytest.approx(pixels[1].area, rel=1e-6)
-    assert_same(passes(hexagons, 12).sum(axis=1), passes(outline, 12, 50).sum(axis=1), error=0.03)
+    assert_same(passes(hexagons, 8).sum(axis=1), passes(outline, 8, 50).sum(axis=1), error=0.04)
 
 
 @pytest.mark.long
