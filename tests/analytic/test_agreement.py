@@ -77,13 +77,18 @@ CASES = {
     "turbid, by order": ({"sea": ROUGH, "water": TURBID, "bottom": 4.0}, FROM_200_M, 5, 0.03, 4),
     "solids on sand": ({"sea": ROUGH, "bottom": None, "extra": SOLIDS}, FROM_200_M, 5, 0.02, None),
     "materials": ({"sea": ROUGH, "extra": MATERIALS}, FROM_200_M, 5, 0.03, None),
-    "mirror and sphere in strata": (
+    "mirror and sphere above a bright bottom": (
         {
             "sea": ROUGH,
-            "water": {"layer_tops": "0, 2", "refractive_index": "1.34, 1.25", "group_index": "1.36, 1.3"},
-            "extra": {"mirror": plate(0.4, -1.2, -5.0, 0.8, {"type": "conductor"}), "sphere": SPHERE},
+            "water": {**SMOOTH, "layer_tops": "0, 2", "refractive_index": "1.34, 1.25", "group_index": "1.36, 1.3"},
+            **{"bottom": 4.0, "rho": 0.95},
+            "extra": {
+                # It faces the beam.
+                "mirror": plate(0.4, -0.9, -3.0, 0.5, {"type": "conductor"}, tilt=-15.0),
+                "sphere": {**SPHERE, "center": [0.3, 0.8, -3.0]},
+            },
         },
-        *(FROM_200_M, 5, 0.5, None),
+        *(FROM_200_M, 5, 0.1, None),
     ),
     "plates in the air": ({"sea": ROUGH, "extra": DRY}, FROM_200_M, 5, 0.01, None),
     "patches on a slope": ({"sea": ROUGH, "bottom": None, "extra": {"bottom": PATCHES}}, FROM_200_M, 5, 0.02, None),
@@ -207,9 +212,10 @@ def assert_same_light(merged, reference, error):
 
 
 #: In the quick tier.
-MIXED = "mirror and sphere in strata"
-#: In the long tier, as others have what they test: seabeds, receivers aside, beams in views.
-LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam"}
+MIXED = "mirror and sphere above a bright bottom"
+#: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water.
+LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam", "a diver looks up"}
+LONG |= {"mast, 1 m aside over waves", "from orbit over waves"}
 
 
 def tier_of(name):

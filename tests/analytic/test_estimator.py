@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from significance import largest_z
+from significance import assert_same, largest_z
 
 #: Cells and shortest wave are the same for every beam and view.
 WAVY = {"spectrum": "elfouhaily", "slope_variance": "cox_munk", "cell_size": 0.1, "shortest_wave": 1.0}
@@ -73,9 +73,28 @@ def connected(lidar_scene, passes, sea, count, **integrator):
     return passes(scene, count)[:, 0]
 
 
-@pytest.mark.parametrize(
-    "sea", [pytest.param(ROUGH, marks=pytest.mark.slow), pytest.param(WAVY, marks=pytest.mark.long)]
-)
+def test_connections_of_a_bottom_have_one_mean(lidar_scene, passes):
+    """Through absorbing water and a rough sea, where both connections find the bottom about as often."""
+    sea, water = {"slope_variance": "0.1"}, {"attenuation": 0.4, "scattering": 0.0, "backscattering": 0.0}
+    combined, by_emitter, by_phase = (
+        passes(
+            lidar_scene(
+                integrator={"connection": connection, "paths_per_pass": 2**15},
+                # Without the surface echo.
+                **{"sea": sea, "water": water, "bottom": 4.0, "film": {"time_start_ns": 1440.0}},
+                rx={"layout": "1x1"},
+            ),
+            16,
+            first_seed=100 * number,
+        ).sum(axis=(1, 2))
+        for number, connection in enumerate(("mis", "emitter", "phase"))
+    )
+    assert_same(combined, by_emitter, error=0.007)
+    assert_same(combined, by_phase, error=0.04)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sea", [ROUGH, WAVY])
 def test_connections_by_emitter_by_phase_and_mis_have_one_mean(lidar_scene, passes, sea):
     """Each alone is complete; weights that do not sum to one would lose or double what both can find."""
     combined = with_total(connected(lidar_scene, passes, sea, 24)[:, 1:6])

@@ -67,10 +67,9 @@ def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
         assert words in caplog.text
         assert "waveform" not in result
         assert result.attrs["pulses"] == 10
-        bright = whole["gate_energy"] > 1e-3 * whole["gate_energy"].max()
-        np.testing.assert_allclose(
-            result["gate_energy"].values[bright], whole["gate_energy"].values[bright], rtol=rtol, err_msg=words
-        )
+        energy, expected = result["gate_energy"].values, whole["gate_energy"].values
+        # Half a bin matters most where a few paths arrive at the edge of a gate.
+        np.testing.assert_allclose(energy, expected, rtol=rtol, atol=1e-3 * expected.max(), err_msg=words)
     ten = gated(lidar_scene, integrator)
     np.testing.assert_allclose(10 * render(ten)["gate_energy"], whole["gate_energy"], rtol=1e-6)
 

@@ -152,7 +152,7 @@ def many_fields():
         elif kind % 4 == 1:
             fields.append(Rectangle(x, x + 3 * MRAD, y, y + 5 * MRAD))
         elif kind % 4 == 2:
-            corners = np.sort(rng.uniform(0, 2 * np.pi, 7))
+            corners = (np.arange(7) + rng.uniform(0.1, 0.9, 7)) * 2 * np.pi / 7
             radii = rng.uniform(1, 6, 7) * MRAD
             fields.append(Polygon(np.stack([x + radii * np.cos(corners), y + radii * np.sin(corners)], axis=1)))
         else:

@@ -4,6 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import significance
+from frequencies import assert_counts
 from significance import assert_same, largest_z, mean_and_error
 
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
@@ -56,8 +58,31 @@ def test_flight_inverts_the_optical_depth():
     assert ends.sum() > 100
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
+def test_events_are_shared_by_water_and_bubbles_as_they_attenuate():
+    """Bubbles of 1.5/m: in the attenuation of two layers, 0.5 and 0.9 of 2 and 2.4, and in their scattering."""
+    water = mi.load_dict(
+        {
+            **{"type": "layered_water", "layer_tops": "0, 2", "attenuation": "0.5, 0.9", "scattering": "0.3, 0.6"},
+            **{"backscattering": "0.006, 0.012", "plume_scattering": 1.5, "plume_x": 10.0, "plume_depth": 3.0},
+        }
+    )
+    count = 2**18
+    for flight, upper, lower in ((water.flight, 0.5, 0.9), (water.scattering_flight, 0.3, 0.6)):
+        for depth, number, coefficient in ((1.0, 0, upper), (2.5, 1, lower)):
+            point = dr.full(mi.Point3f, 0, count) + mi.Point3f(0, 0, -depth)
+            rng = mi.PCG32(size=count, initstate=significance.seed_shift + number)
+            drawn = np.array(water.scatterer_at(flight, point, rng))
+            expected = np.zeros(3)
+            expected[[number, 2]] = count * np.array([coefficient, 1.5]) / (coefficient + 1.5)
+            counts = np.bincount(drawn, minlength=3)
+            assert counts[1 - number] == 0
+            assert_counts(counts[[number, 2]], expected[[number, 2]], known=1)
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [pytest.param("lidar_volpath", marks=pytest.mark.long), pytest.param("lidar_merging", marks=pytest.mark.slow)],
+)
 def test_plume_that_fills_the_water_is_water_that_scatters_more(lidar_scene, passes, integrator):
     """Half of the scattering from bubbles: mean energies by gate agree with all of it from the water."""
     hg = {"phase_function": "hg", "phase_g": 0.9, "backscattering": 0.0}

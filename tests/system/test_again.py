@@ -80,6 +80,7 @@ def test_a_result_and_its_files_give_the_same_bits(suffix, table, tmp_path):
     assert values["surface"]["used"]["size"] == 60
 
 
+@pytest.mark.slow
 def test_long_scenes_survive_files(tmp_path):
     """The text of a scene may exceed 64 KiB, the limit of other NetCDF attributes."""
     (tmp_path / "long.xml").write_text(
@@ -94,6 +95,7 @@ def test_long_scenes_survive_files(tmp_path):
     assert_same_bits(first, mitransient_lidar.render(tmp_path / "a.nc"))
 
 
+@pytest.mark.slow
 def test_given_options_win(own):
     first = own
     other = mitransient_lidar.render(first, seed=1, passes=3)
@@ -120,6 +122,7 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
     assert_same_bits(first, mitransient_lidar.render(first))
 
 
+@pytest.mark.slow
 def test_files_of_an_xml_scene_are_found_from_another_folder(tmp_path, monkeypatch):
     """A mesh is named relative to the scene, a profile to the working folder; both are recorded by their paths."""
     home, other = tmp_path / "home", tmp_path / "other"
@@ -179,6 +182,7 @@ def test_damaged_results_are_refused(attributes, message, own):
         mitransient_lidar.render(first)
 
 
+@pytest.mark.slow
 def test_commands(table, tmp_path):
     first = table
     (tmp_path / "a").mkdir()

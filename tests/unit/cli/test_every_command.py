@@ -12,8 +12,8 @@ FLAT = ["-D", "spectrum=flat", "-D", "surface_size=60", "-D", "bin_width_ns=2", 
 #: Only these ask for waves.
 WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots", "shot-statistics")
-#: Those that take more than 2 s.
-MARKS = {"detect": pytest.mark.slow, "target-signal": pytest.mark.slow, "shot-statistics": pytest.mark.slow}
+#: Those that take most time.
+SLOW = {"detect", "target-signal", "shot-statistics", "beam-spread", "fov-sweep", "plot", "passive"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
@@ -39,6 +39,11 @@ OTHER_COMMANDS = {
     "instruments": ["teledyne_czmil"],
     "passive": ["passive_sea", "-D", "layout=4x4", "-D", "surface_cell_size=2", "--passes", 2],
 }
+
+
+def commands(arguments):
+    """Return the commands of a table, some with the mark of the slow tier."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in arguments]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +75,7 @@ def check(done, tmp_path):
     assert done.stdout
 
 
-@pytest.mark.parametrize("command", [pytest.param(name, marks=MARKS.get(name, ())) for name in SCENE_COMMANDS])
+@pytest.mark.parametrize("command", commands(SCENE_COMMANDS))
 def test_command_of_a_scene(command, scene, tmp_path):
     options = SCENE_COMMANDS[command]
     done = run(command, scene, *(WAVES if command in SEA_COMMANDS else FLAT), *options, "-o", tmp_path / "figure.png")
@@ -78,7 +83,7 @@ def test_command_of_a_scene(command, scene, tmp_path):
     assert (tmp_path / "figure.png").is_file()
 
 
-@pytest.mark.parametrize("command", RESULT_COMMANDS)
+@pytest.mark.parametrize("command", commands(RESULT_COMMANDS))
 def test_command_of_a_result(command, result, tmp_path):
     check(run(command, result, *RESULT_COMMANDS[command]), tmp_path)
 
@@ -124,7 +129,7 @@ def test_comparison_of_a_result_with_itself(result):
     assert done.exit_code == 0, done.stderr
 
 
-@pytest.mark.parametrize("command", OTHER_COMMANDS)
+@pytest.mark.parametrize("command", commands(OTHER_COMMANDS))
 def test_command_without_a_result(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     check(run(command, *OTHER_COMMANDS[command]), tmp_path)
@@ -132,7 +137,7 @@ def test_command_without_a_result(command, tmp_path, monkeypatch):
 
 def test_every_command_is_run():
     tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare"}
-    commands = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
+    names = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     groups = {group.name for group in app.registered_groups}
     # The benchmark measures for minutes; its tests replace the renders. tests/system/test_campaigns.py runs campaigns.
-    assert commands | groups == tested | {"bench", "sweep"}
+    assert names | groups == tested | {"bench", "sweep"}

@@ -218,6 +218,7 @@ def test_table_lists_all(result):
     assert f"{100 * float(result['needed_target'][3]):.3g} (" in best
 
 
+@pytest.mark.slow
 def test_command_writes_and_prints(result, tmp_path, monkeypatch):
     asked = {}
     monkeypatch.setattr(detection, "detect", lambda scene, params, **options: asked.update(options) or result)

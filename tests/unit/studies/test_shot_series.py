@@ -119,6 +119,7 @@ def test_shots_at_given_places(rendered, tmp_path):
     assert len(shot_series.describe_shots(series)) == 4
 
 
+@pytest.mark.slow
 def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
     """The bottom lies 10 m deeper at x = -57 m: 9.4 ns of each metre, and a quarter more for scattered light."""
     scene, slope = "docs/survey_lidar.xml", {**PLANE, "bottom_slope_deg": 10}
@@ -138,6 +139,7 @@ def test_time_bins_that_leave_out_light_are_refused(rendered):
         shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0)], axis=results.time_axis(own))
 
 
+@pytest.mark.slow
 def test_seeds_and_instrument_of_a_series(rendered):
     options = {"positions": PLACES[:2], "passes": 2, "first_seed": 40, "instrument": "teledyne_czmil"}
     series = shot_series.render_shots("table1", FLAT, **options)
@@ -167,6 +169,7 @@ def test_places_beside_the_bottom_are_told(rendered, caplog):
     assert "the axis of 1 of 2 shots misses the bottom" in caplog.text
 
 
+@pytest.mark.slow
 def test_random_places_are_those_of_the_seed(rendered):
     waves = {"surface_size": 60, "surface_cell_size": 1}
     series = [shot_series.render_shots("fig09_2x2", waves, count=2, seed=seed) for seed in (1, 1, 2)]
@@ -177,6 +180,7 @@ def test_random_places_are_those_of_the_seed(rendered):
     assert min(series[0].attrs["slope_deviation"]) > 0
 
 
+@pytest.mark.slow
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
     series = shot_series._Series("fig13_2x2", params, None, (0.3, 0.0), np.array(PLACES), None, False)
