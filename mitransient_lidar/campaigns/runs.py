@@ -203,7 +203,7 @@ class RunRenderer:
             for name, tried in extremes.items():
                 for value in tried:
                     try:
-                        axis = self._own_axis({**chosen, name: value})
+                        axis = self.own_axis({**chosen, name: value})
                     except UserError:
                         # A combination of extremes that the scene refuses; runs of it fail by themselves.
                         continue
@@ -212,13 +212,13 @@ class RunRenderer:
                         best, chosen = (end, axis), {**chosen, name: value}
             ends += [] if best is None else [best]
         if not ends:
-            self._own_axis(_values(columns, 0))
+            self.own_axis(_values(columns, 0))
             raise UserError("the scene refuses the extreme values of all parameters: reduce their ranges")
         start, end = min(axis.start_ns for _, axis in ends), max(axis.end_ns for _, axis in ends)
         margin, width = _MARGIN * (end - start), ends[0][1].bin_width_ns
         return TimeAxis.covering(start - margin, end + margin, width, None, None)
 
-    def _own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
+    def own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
         """Return the automatic time bins of a run."""
         from mitransient_lidar.transport.scene import LidarScene
 

@@ -60,14 +60,14 @@ class Store:
         self.path = Path(path)
         try:
             self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
-            self._attributes: dict[str, Any] = dict(self._group.attrs)
-            self.campaign = Campaign.from_json(self._attributes["campaign"])
+            self.attributes: dict[str, Any] = dict(self._group.attrs)
+            self.campaign = Campaign.from_json(self.attributes["campaign"])
         except (OSError, KeyError, ValueError, TypeError) as error:
             if isinstance(error, UserError):
                 raise
             raise UserError(f"{path} is no store of a campaign.") from error
         #: Number of runs, and of runs of a shard.
-        self.count, self.shard_size = int(self._attributes["runs"]), int(self._attributes["shard_size"])
+        self.count, self.shard_size = int(self.attributes["runs"]), int(self.attributes["shard_size"])
 
     @classmethod
     def create(
@@ -107,26 +107,26 @@ class Store:
 
     def renderer(self) -> RunRenderer:
         """Return the renderer of the runs; warn if the store is of other versions."""
-        compare_versions(self._attributes)
-        axis = self._attributes["record"]
+        compare_versions(self.attributes)
+        axis = self.attributes["record"]
         return RunRenderer(
             self.campaign,
-            SceneRecord.from_attributes(self._attributes["scene"]),
+            SceneRecord.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
         )
 
     def is_of(self, campaign: Campaign, columns: Mapping[str, Column]) -> bool:
         """Return whether it is the store of a campaign with these columns, and of its scene as it is now."""
-        if json.loads(self._attributes["campaign"]) != json.loads(campaign.text):
+        if json.loads(self.attributes["campaign"]) != json.loads(campaign.text):
             return False
         own = self.inputs(slice(0, self.count))
         if own.keys() != columns.keys() or not all(np.array_equal(own[name], columns[name]) for name in own):
             return False
-        return record_of(campaign).attributes() == SceneRecord.from_attributes(self._attributes["scene"]).attributes()
+        return record_of(campaign).attributes() == SceneRecord.from_attributes(self.attributes["scene"]).attributes()
 
     def inputs(self, runs: slice) -> dict[str, Column]:
         """Return the parameters of runs, by name."""
-        names: dict[str, str] = self._attributes["inputs"]
+        names: dict[str, str] = self.attributes["inputs"]
         return {name: self._values(stored, runs) for name, stored in names.items()}
 
     def runs_of(self, shard: int) -> slice:
@@ -149,7 +149,7 @@ class Store:
     def read(self, shard: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[Any], dict[str, npt.NDArray[Any]]]:
         """Return status, errors and arrays of a shard."""
         runs = self.runs_of(shard)
-        arrays = {name: np.array(self._array(name)[runs]) for name in self._attributes["variables"]}
+        arrays = {name: np.array(self._array(name)[runs]) for name in self.attributes["variables"]}
         return self.status(runs).copy(), self.errors(runs), arrays
 
     def write(

@@ -84,14 +84,14 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
             def show(state: Progress) -> None:
                 expected = state.planned or (None if state.needed_passes is None else state.done + state.needed_passes)
-                bar.update(task, description=_describe(state), completed=state.done, total=expected)
+                bar.update(task, description=progress_line(state), completed=state.done, total=expected)
 
             yield show
     finally:
         logger.removeHandler(handler)
 
 
-def _describe(state: Progress) -> str:
+def progress_line(state: Progress) -> str:
     """Describe the progress in one line."""
     from mitransient_lidar.rendering.passes import describe_quantile
 

@@ -154,7 +154,7 @@ def _sweep(folder: Path) -> None:
     # Moves first: they need the temporary files.
     for name in sorted(names, key=lambda name: not name.endswith(_MOVES)):
         match = _TEMPORARY.fullmatch(name)
-        if match is None or match["host"] != _host() or _is_running(int(match["process"])):
+        if match is None or match["host"] != host_name() or _is_running(int(match["process"])):
             continue
         if match["suffix"] == _MOVES:
             # A list that was not written in full precedes all moves.
@@ -167,10 +167,10 @@ def _sweep(folder: Path) -> None:
 
 def _temporary(path: Path) -> Path:
     """Return the name of a temporary file beside a file, of the same type."""
-    return path.with_name(f"{_PREFIX}{_host()}.{os.getpid()}.{uuid.uuid4().hex}{path.suffix}")
+    return path.with_name(f"{_PREFIX}{host_name()}.{os.getpid()}.{uuid.uuid4().hex}{path.suffix}")
 
 
-def _host() -> str:
+def host_name() -> str:
     return platform.node() or "localhost"
 
 

@@ -22,7 +22,7 @@ _COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
 
 def scene_names() -> list[str]:
     """Return the names of the shipped scenes in alphabetical order."""
-    return sorted(path.stem for path in _folder().glob("*.xml") if not path.name.startswith("_"))
+    return sorted(path.stem for path in folder_of_scenes().glob("*.xml") if not path.name.startswith("_"))
 
 
 def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
@@ -35,7 +35,7 @@ def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
     """
     names = scene_names()
     if str(name_or_path) in names:
-        return _folder() / f"{name_or_path}.xml"
+        return folder_of_scenes() / f"{name_or_path}.xml"
     path = Path(name_or_path)
     if path.is_file():
         return path
@@ -112,6 +112,6 @@ def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str]
     return target
 
 
-def _folder() -> Path:
+def folder_of_scenes() -> Path:
     """Return the folder of the shipped scenes."""
     return Path(str(importlib.resources.files("mitransient_lidar.scenes")))

@@ -61,10 +61,10 @@ def fit_to_time(
         return renderer, 1.0, None
     began = time.perf_counter()
     trial = renderer.scaled(SMALLEST_SHARE)
-    record, kernels, rest = _timed(trial, seed, gates)
+    record, kernels, rest = timed_pass(trial, seed, gates)
     if _SMALL_PASSES * kernels < max_time:
         # Without the enlargement of buffers and the compilation of kernels in the first trial.
-        record, kernels, rest = _timed(trial, seed, gates)
+        record, kernels, rest = timed_pass(trial, seed, gates)
     left = max_time - (time.perf_counter() - began)
 
     def kernels_of(share: float) -> float:
@@ -89,7 +89,7 @@ def _rays_per_path(scene: LidarScene, start_ns: float) -> float:
     return 2.0 + scattering * length
 
 
-def _timed(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[PassRecord, float, float]:
+def timed_pass(renderer: PassRenderer, seed: int, gates: GateWeights | None) -> tuple[PassRecord, float, float]:
     """Render a pass; return it, the time of its kernels, and the other time except for their compilation [s]."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

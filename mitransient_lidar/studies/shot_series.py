@@ -165,7 +165,7 @@ def render_shots(
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
-    truth = _truth(series.session, series.lidar, places)
+    truth = true_values(series.session, series.lidar, places)
     if missed := np.count_nonzero(np.isnan(truth[-1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
     batches = series.batches(passes, share, wanted)
@@ -260,7 +260,7 @@ class _Series:
         self.session.tell_record(self._axis)
         self._renderer = self._prepare(self.session)
         self.lidar: LidarScene = self._renderer.scene
-        self._companions = self._find_companions()
+        self.companions = self._find_companions()
         origins = self._renderer.classes.count if components else 0
         check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count, origins)
         probe = probe_echoes(self.lidar, self._renderer.sampler)
@@ -302,7 +302,7 @@ class _Series:
         from mitransient_lidar.rendering.shot_batches import ShotBatches
 
         goal = None if target_error is None else (target_error, self.window)
-        return ShotBatches(self._renderer, self._place, passes, share, goal, self._companions, self._loaded_at)
+        return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions, self._loaded_at)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
         """Return the attributes of the series, with other ones."""
@@ -445,7 +445,7 @@ def _has_waves(scene: mi.Scene) -> bool:
     return sea is not None and math.isfinite(sea.cell_size)
 
 
-def _truth(session: Session, lidar: LidarScene, places: FloatArray) -> tuple[FloatArray, ...]:
+def true_values(session: Session, lidar: LidarScene, places: FloatArray) -> tuple[FloatArray, ...]:
     """Return the values of `_TRUTH` at places [m], shape (shots, 2)."""
     sea = np.array([footprint_means(_sea(session.scene), lidar.transmitter, x, y) for x, y in places])
     return *places.T, *sea.T, _bottom_depth(lidar, places)

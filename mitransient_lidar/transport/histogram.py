@@ -140,13 +140,13 @@ class TransientHistogram:
     def add(self, pixel: mi.UInt32, path_length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy [J] that arrives after an optical path (group index included) of a relative length [m]."""
         if self.gates is not None:
-            self.gates.add(path_length, energy, active, lambda k, e, on: self._add(pixel, k, e, on))
+            self.gates.add(path_length, energy, active, lambda k, e, on: self.add_at(pixel, k, e, on))
             return
         position = (path_length - self._start) * self._per_metre
         active = active & (position >= 0) & (position < mi.Float(self._length))
-        self._add(pixel, dr.minimum(mi.UInt32(position), self._last), energy, active)
+        self.add_at(pixel, dr.minimum(mi.UInt32(position), self._last), energy, active)
 
-    def _add(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
+    def add_at(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy to time bin or gate `number` of a pixel."""
         index = pixel * self._length + number
         valid = dr.isfinite(energy)

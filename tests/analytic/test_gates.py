@@ -79,12 +79,12 @@ def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
 def test_non_finite_energy_is_reported(lidar_scene, monkeypatch, caplog, share):
     """The light of pixel green is NaN; the other pixels keep theirs, in both ways of keeping gates alone."""
     scene = gated(lidar_scene)
-    add = TransientHistogram._add
+    add = TransientHistogram.add_at
 
     def spoil(self, pixel, number, energy, active):
         add(self, pixel, number, dr.select(pixel == 1, dr.nan, energy), active)
 
-    monkeypatch.setattr(TransientHistogram, "_add", spoil)
+    monkeypatch.setattr(TransientHistogram, "add_at", spoil)
     result = render(scene, gigabytes=1e-9 * share * HISTOGRAM, passes=2)
     finite = np.isfinite(result["gate_energy"]).any("gate").values
     assert finite.tolist() == [True, False, True, True]

@@ -130,8 +130,8 @@ def test_weight_outside_the_forward_lobe_is_the_backward_one():
 def test_short_segments_are_sampled_as_the_power_laws_they_are(description, monkeypatch):
     """The series against logarithm and exponential, whose own rounding grows where an exponent is close to 1."""
     series = mi.load_dict(description).tabulated
-    assert series._short
-    monkeypatch.setattr(tabulated_phase, "_is_short", lambda table: False)
+    assert series.has_short_tables
+    monkeypatch.setattr(tabulated_phase, "is_short", lambda table: False)
     law = tabulated_phase.TabulatedPhase(series.table)
     count = 2**18
     rng = mi.PCG32(count, initstate=3 + significance.seed_shift)

@@ -156,7 +156,7 @@ class DepthErrors:
         lines = self.lines
         cos_air = np.cos(lines.off_nadir)
         water = snell(lines.off_nadir, self.refractive_index)
-        scattering = np.sqrt(self._attenuation_times_backscattering(attenuation, level))
+        scattering = np.sqrt(self.attenuation_times_backscattering(attenuation, level))
         turned = self.slope * np.tan(water) * (1 - cos_air / (self.refractive_index * np.cos(water)))
         by_water = _OF_DELAY * scattering * self.beam_width + _OF_RIPPLES * self.slope_variance
         relative = np.hypot(np.hypot(_LEAST, by_water), turned)
@@ -173,7 +173,7 @@ class DepthErrors:
         of_pixel = np.hypot(relative.reshape(shape) * depth, constant.reshape(shape))
         return np.asarray(np.hypot(of_pixel, neighbours))
 
-    def _attenuation_times_backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
+    def attenuation_times_backscattering(self, attenuation: FloatArray, level: FloatArray) -> FloatArray:
         """Return K bb of the columns [1/m^2], shape (n,), with one bb for all pixels of a shot."""
         known = np.where(np.isfinite(attenuation), np.maximum(attenuation, 0), _TYPICAL_ATTENUATION)
         share = self.lines.beam_share.reshape(self.shots, -1)

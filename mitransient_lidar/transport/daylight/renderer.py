@@ -58,7 +58,7 @@ class DaylightLight(PathLight):
         self.sampler = RefractedSunSampler(scene, scene.sun_directions(u))
         self.invalid = dr.zeros(mi.Bool, dr.width(record.found))
 
-    def _add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
+    def add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
         # Sums leave out values that are not finite; the pixel is marked instead.
         dr.scatter(self.invalid, mi.Bool(True), pixel, active & ~dr.isfinite(found))
         dr.scatter_add(self.record.found, mi.Float64(found), pixel, active & (found > 0))
@@ -74,7 +74,7 @@ class DaylightLight(PathLight):
 
     def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
         """Add light of the sun."""
-        self._add(self.pixel, energy, active)
+        self.add(self.pixel, energy, active)
 
     def escape(self, path: ConnectedPath, active: mi.Bool) -> None:
         """Add the sky where paths leave the scene, and the sun where they could not be connected to it."""
@@ -82,7 +82,7 @@ class DaylightLight(PathLight):
         radiance = dr.select(path.reflected_by_sea, 0, scene.sky_radiance(path.direction))
         if scene.sun is not None:
             radiance += dr.select(path.specular, scene.sun.radiance(path.direction), 0)
-        self._add(self.pixel, self.weight * path.throughput * radiance, active & ~path.in_water)
+        self.add(self.pixel, self.weight * path.throughput * radiance, active & ~path.in_water)
 
     def reflect(self, path: ConnectedPath, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool) -> None:
         """Add the sky that the dry side of the sea surface reflects, where the ray is not blocked."""
@@ -97,7 +97,7 @@ class DaylightLight(PathLight):
         bright = active & (radiance > 0)
         bright &= ~self.scene.ray_test(ray, bright)
         path.rays += dr.select(active, mi.UInt32(1), 0)
-        self._add(self.pixel, self.weight * path.throughput * radiance, bright)
+        self.add(self.pixel, self.weight * path.throughput * radiance, bright)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add light of the sun to the losses."""

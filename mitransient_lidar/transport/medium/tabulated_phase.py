@@ -40,8 +40,8 @@ class TabulatedPhase:
         self._log_s0 = float(self.table.log_s0)
         self._step = float(self.table.step)
         self._nodes = self.table.count
-        self._short = all(_is_short(table) for table in tables)
-        records = [_records(table, self._short) for table in tables]
+        self.has_short_tables = all(is_short(table) for table in tables)
+        records = [_records(table, self.has_short_tables) for table in tables]
         # For each cell: threshold and alias, the power law for sampling, and for evaluation.
         self._choice, self._law, self._value = (
             aligned(mi.Float, np.concatenate([record[i] for record in records])) for i in range(3)
@@ -66,7 +66,7 @@ class TabulatedPhase:
         accept, alias = dr.gather(mi.Vector2f, self._choice, cell + number * self._nodes)
         cell = dr.select(fraction < accept, cell, mi.UInt32(alias))
         law = dr.gather(mi.Vector4f, self._law, cell + number * self._nodes)
-        if self._short:
+        if self.has_short_tables:
             return _within_short_segment(law, v, self._step)
         start, value, growth, inverse_k = law
         # From the start of the cell s grows by `part` to the power of 1/k = 1/(1-m), and so p = s^-m by part/s.
@@ -103,7 +103,7 @@ class NumberedPhase:
         return wo, mi.Spectrum(1), value
 
 
-def _is_short(table: PowerLawTable) -> bool:
+def is_short(table: PowerLawTable) -> bool:
     """Return whether s and p change so little over each segment that a series can replace its power law."""
     change = float(np.abs(table.exponent[:-1]).max()) * table.step
     return table.step <= _SHORT_STEP and change <= _SMALL_CHANGE and np.exp(table.log_s0) <= _SMALL_CAP

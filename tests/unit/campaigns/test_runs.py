@@ -27,10 +27,10 @@ def test_record_holds_the_light_of_all_runs():
     runs = renderer({"altitude": [150, 200, 300], "bottom_depth": [15, 3], "attenuation": [0.2, 1.0]})
     # Corners of the ranges, of which none was tried in this combination but one.
     for altitude, depth, attenuation in itertools.product([150, 300], [3, 15], [0.2, 1.0]):
-        own = runs._own_axis({"altitude": altitude, "bottom_depth": depth, "attenuation": attenuation})
+        own = runs.own_axis({"altitude": altitude, "bottom_depth": depth, "attenuation": attenuation})
         assert runs.axis.start_ns <= own.start_ns
         assert runs.axis.end_ns >= own.end_ns
-    longest = runs._own_axis({"altitude": 300, "bottom_depth": 15, "attenuation": 0.2})
+    longest = runs.own_axis({"altitude": 300, "bottom_depth": 15, "attenuation": 0.2})
     assert runs.axis.end_ns < longest.end_ns + 0.1 * (longest.end_ns - runs.axis.start_ns)
 
 

@@ -91,7 +91,7 @@ def test_renderer_of_a_store_is_that_of_its_campaign(store, monkeypatch):
 
 
 def test_store_of_other_versions(store, caplog):
-    store._attributes["mitsuba_version"] = "1.0"
+    store.attributes["mitsuba_version"] = "1.0"
     store.renderer()
     assert "the result is of mitsuba_version = 1.0" in caplog.text
 

@@ -21,7 +21,7 @@ def scene(tmp_path, monkeypatch):
     folder = tmp_path / "scenes"
     folder.mkdir()
     (folder / "fig09.xml").write_text('<!-- Flat bottom. -->\n<scene version="3.0.0"/>\n')
-    monkeypatch.setattr(catalogue, "_folder", lambda: folder)
+    monkeypatch.setattr(catalogue, "folder_of_scenes", lambda: folder)
     return "fig09"
 
 

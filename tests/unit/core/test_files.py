@@ -121,7 +121,7 @@ def test_leftovers_of_a_dead_process_are_swept(tmp_path, journal):
     """Its list of moves is completed, unless it was not written in full, so that no file had been moved."""
     dead = subprocess.Popen(["true"])
     dead.wait()
-    start = f".mitransient-lidar.{files._host()}.{dead.pid}"
+    start = f".mitransient-lidar.{files.host_name()}.{dead.pid}"
     (tmp_path / f"{start}.{'a' * 32}.moves").write_text(journal.replace(".t", f"{start}.{'b' * 32}.nc"))
     (tmp_path / f"{start}.{'b' * 32}.nc").write_text("complete")
     (tmp_path / f"{start}.{'c' * 32}").write_text("half")
@@ -131,7 +131,7 @@ def test_leftovers_of_a_dead_process_are_swept(tmp_path, journal):
 
 
 def test_files_of_running_processes_and_other_machines_stay(tmp_path):
-    here, number = files._host(), "0" * 32
+    here, number = files.host_name(), "0" * 32
     names = [f".mitransient-lidar.{here}.{os.getppid()}.{number}.nc", f".mitransient-lidar.elsewhere.1.{number}.nc"]
     names += [".mitransient-lidar.nc", ".hidden.nc"]
     for name in names:

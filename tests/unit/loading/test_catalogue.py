@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
     (folder / "profile.csv").write_text("0 1")
     (folder / "unused.ply").write_text("ply")
     (folder / "__init__.py").write_text("")
-    monkeypatch.setattr(catalogue, "_folder", lambda: folder)
+    monkeypatch.setattr(catalogue, "folder_of_scenes", lambda: folder)
     return folder
 
 

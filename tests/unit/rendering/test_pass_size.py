@@ -44,7 +44,7 @@ def clock(monkeypatch):
         state.now += state.kernels + state.rest
         return f"record {state.trials}", state.kernels, state.rest
 
-    monkeypatch.setattr(pass_size, "_timed", timed)
+    monkeypatch.setattr(pass_size, "timed_pass", timed)
     monkeypatch.setattr(pass_size.time, "perf_counter", lambda: state.now)
     monkeypatch.setattr(pass_size, "_at_once", lambda paths: 1.0)
     return state
@@ -110,7 +110,7 @@ def test_a_dense_plume_ends_within_seconds():
     ids=["some", "all"],
 )
 def test_default_renders_of_shipped_scenes_have_full_passes_without_a_trial(monkeypatch, names):
-    monkeypatch.setattr(pass_size, "_timed", None)
+    monkeypatch.setattr(pass_size, "timed_pass", None)
     for name in names:
         scene, _, _ = loading.load_scene(name)
         renderer = scene.integrator().prepare(scene, scene.sensors()[0])

@@ -81,12 +81,12 @@ def test_ratio_statistics():
 @pytest.mark.slow
 def test_non_finite_radiance_is_kept_and_reported(monkeypatch, caplog):
     """One pixel of sixteen receives a value that is not finite."""
-    original = DaylightLight._add
+    original = DaylightLight.add
 
     def add(self, pixel, found, active):
         original(self, pixel, dr.select(pixel == 5, dr.nan, found), active)
 
-    monkeypatch.setattr(DaylightLight, "_add", add)
+    monkeypatch.setattr(DaylightLight, "add", add)
     picture = render()
     assert np.flatnonzero(~np.isfinite(picture["radiance"].values)).tolist() == [5]
     assert "1 of 16 pixels have non-finite radiance" in caplog.text

@@ -72,7 +72,7 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
     scene = lidar_scene(integrator={"type": "lidar_merging"}, bottom=None, extra={"floor": bottom, "target": small})
     session = Session(scene, scene.sensors()[0], "made", {})
     lidar = LidarScene.from_scene(scene, scene.sensors()[0])
-    truth = shot_series._truth(session, lidar, np.array([*PLACES, (400.0, 0.0)]))
+    truth = shot_series.true_values(session, lidar, np.array([*PLACES, (400.0, 0.0)]))
     sine = math.sin(math.radians(20)) / 1.34
     tangent = sine / math.sqrt(1 - sine**2)
     expected = [(8 - 0.1 * x) / (1 + 0.1 * tangent) for x, _ in PLACES]
@@ -184,7 +184,7 @@ def test_random_places_are_those_of_the_seed(rendered):
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
     series = shot_series._Series("fig13_2x2", params, None, (0.3, 0.0), np.array(PLACES), None, False)
-    (target,) = series._companions
+    (target,) = series.companions
     assert target.id() == "target"
     # In the frame of the first shot, with its aim at x = 1 m.
     assert 0.5 * (target.bbox().min.x + target.bbox().max.x) == pytest.approx(1.3, abs=1e-5)

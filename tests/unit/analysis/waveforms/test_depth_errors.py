@@ -99,9 +99,9 @@ def test_backscattering_of_the_column_is_that_of_its_level():
     lines = replace(one.lines, beam_share=np.array([0.6, 0.3]))
     one = replace(one, lines=lines)
     level = 0.006 * one.gain * lines.beam_share
-    found = one._attenuation_times_backscattering(np.array([0.2, 0.2]), level)
+    found = one.attenuation_times_backscattering(np.array([0.2, 0.2]), level)
     np.testing.assert_allclose(found, 0.2 * 0.006)
-    unknown = one._attenuation_times_backscattering(np.array([0.2, np.nan]), UNKNOWN)
+    unknown = one.attenuation_times_backscattering(np.array([0.2, np.nan]), UNKNOWN)
     np.testing.assert_allclose(unknown, [0.05 * 0.2**2, 0.05 * depth_errors._TYPICAL_ATTENUATION**2])
 
 

@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from command_line import assert_refused, run
 from scipy.stats import exponnorm, norm
+from significance import largest_z
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -221,7 +222,7 @@ def test_shots_of_a_receiver_have_true_errors():
     for name, truth in (("surface", [0, 0]), ("bottom", [70.0, 75.3])):
         time_ns, error = table["time_ns"].sel(echo=name), table["time_ns_stderr"].sel(echo=name)
         z = (time_ns - SURFACE - truth) / error
-        assert np.abs(z.std("shot") - 1).max() < 4.5 / np.sqrt(2 * 600) + 0.05
+        assert np.abs(z.std("shot") - 1).max() < largest_z(600) / np.sqrt(2 * 600) + 0.05
         assert np.abs(time_ns.mean("shot") - SURFACE - truth).max() < 0.03
     energy = table["energy"].sel(echo="bottom")
     assert float(energy.mean()) == pytest.approx(6e-13 * 1e5, rel=0.01)
@@ -242,12 +243,12 @@ def test_signals_behind_a_logarithm_are_expanded():
     for one, other, ratio in ((strong, weak, 10), (weak, linear, 1)):
         difference = one["energy"].mean("shot") - ratio * other["energy"].mean("shot")
         error = np.hypot(one["energy"].std("shot"), ratio * other["energy"].std("shot")) / np.sqrt(400)
-        assert (abs(difference) < 4.5 * error).all()
+        assert (abs(difference) < largest_z(400) * error).all()
         assert (error < 4e-3 * one["energy"].mean("shot")).all()
     for table in (strong, weak):
         for name in ("energy", "time_ns"):
             ratio = table[name].std("shot") / table[f"{name}_stderr"].mean("shot")
-            assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * 400) + 0.05
+            assert np.abs(ratio - 1).max() < largest_z(400) / np.sqrt(2 * 400) + 0.05
         assert (table["flags"] & EchoFlag.SATURATED == 0).all()
     # 0.835 V is the strong record's highest sample.
     low = echo_table.extract(detect_waveforms(result(0.03 * clean), "pmt_log", 20, 3), saturation_level=0.8)
