@@ -171,6 +171,7 @@ def _temporary(path: Path) -> Path:
 
 
 def host_name() -> str:
+    """Return the name of this machine, which names of temporary files hold."""
     return platform.node() or "localhost"
 
 

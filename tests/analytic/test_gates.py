@@ -62,7 +62,7 @@ def test_short_memory_gives_the_same_gates(lidar_scene, integrator, caplog):
     pulses = {"pulses": 10}
     whole = render(gated(lidar_scene, integrator, pulses))
     assert not caplog.records
-    for share, rtol, words in ((0.5, 2e-6, "gates are kept, histograms are not"), (0.2, 0.02, "summed directly")):
+    for share, rtol, words in ((0.5, 2e-6, "gates are kept, histograms are not"), (0.2, 0.05, "summed directly")):
         result = render(gated(lidar_scene, integrator, pulses), gigabytes=1e-9 * share * HISTOGRAM)
         assert words in caplog.text
         assert "waveform" not in result

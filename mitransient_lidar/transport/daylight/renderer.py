@@ -59,6 +59,7 @@ class DaylightLight(PathLight):
         self.invalid = dr.zeros(mi.Bool, dr.width(record.found))
 
     def add(self, pixel: mi.UInt32, found: mi.Float, active: mi.Bool) -> None:
+        """Add radiance to pixels, and mark those that it makes invalid."""
         # Sums leave out values that are not finite; the pixel is marked instead.
         dr.scatter(self.invalid, mi.Bool(True), pixel, active & ~dr.isfinite(found))
         dr.scatter_add(self.record.found, mi.Float64(found), pixel, active & (found > 0))
