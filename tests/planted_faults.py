@@ -98,8 +98,8 @@ FAULTS = (
     ),
     Fault("half_of_the_group_delay", f"{_M}/segments.py", "length + along * group", "length + 0.5 * along * group"),
     Fault("obscuration_squared", f"{_T}/sensor/receiver.py", "(1 - self.obscuration)", "(1 - self.obscuration**2)"),
-    # Probes of the covered share of a patch start too close to it to meet steep surfaces.
-    Fault("short_probe_of_patches", f"{_M}/patches.py", "reach = 2 * self.width", "reach = 1.2 * self.width"),
+    # Probes of the covered share of a patch do not reach the lower half of its level.
+    Fault("short_probe_of_patches", f"{_M}/patches.py", "ray.maxt = patch.height", "ray.maxt = 0.5 * patch.height"),
     Fault("index_without_square_in_layers", f"{_T}/path_step.py", "& passes, ratio * ratio, 1)", "& passes, ratio, 1)"),
     Fault(
         *("no_complement", f"{_M}/renderer.py"),

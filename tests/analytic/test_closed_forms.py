@@ -183,6 +183,37 @@ def test_column_and_bottom_of_layered_water(lidar_scene, case, integrator):
     significance.assert_equal(energy[:, :, 0, 1][:, seen], backscatter[seen], error=0.015, bias=2e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"point_spacing": 0.4}])
+def test_column_ends_at_the_bottom(lidar_scene, passes, options):
+    """The last tenth of a column above a black bottom; cells that it cuts lost 6 and 21 % of it."""
+    height, depth, beam = 730.0, 1.4, 10.0
+    surface_ns = float(surface_time_ns(height, 0.0))
+    bottom_ns = float(bottom_time_ns(height, depth, 0.0, 1.34, GROUP_INDEX))
+    edges = surface_ns + 2.0 + (bottom_ns + 1.0 - surface_ns) / 200 * np.array([0, 137, 200])
+    system = LidarSystem(height, 0.0, ENERGY, AREA, 1.34, GROUP_INDEX)
+    water = {"attenuation": 0.15, "scattering": 2e-4, "backscattering": 1e-4, "phase_function": "hg", "phase_g": 0.0}
+    column = WaterColumn(*(np.array([value]) for value in (0.0, 0.15, 2e-4, 1e-4)))
+    seen = lambda x, y: np.hypot(x, y) < 15e-3  # noqa: E731
+    expected = column_energy_per_bin(
+        edges, system, 0.5e-3 * beam, column, [float(henyey_greenstein(np.pi, 0.0))], depth, seen
+    )
+    pose = {"altitude": height, "off_nadir_deg": 0.0}
+    scene = lidar_scene(
+        tx={**pose, "divergence_mrad": beam},
+        rx={**pose, **RECEIVER, "field_of_view_mrad": 30.0, "layout": "1x1"},
+        film={"time_start_ns": edges[0], "bin_width_ns": (edges[2] - edges[0]) / 200, "bin_count": 200},
+        integrator={"type": "lidar_merging", **options},
+        sea={"slope_variance": "2e-5"},
+        water={**water, "refractive_index": 1.34, "group_index": GROUP_INDEX},
+        bottom=depth,
+        rho=0.0,
+    )
+    found = passes(scene, 12)[:, 0]
+    significance.assert_equal(found[:, :137].sum(axis=1), expected[0], error=0.01, bias=0.005)
+    significance.assert_equal(found[:, 137:].sum(axis=1), expected[1], error=0.01, bias=0.006)
+
+
 @pytest.mark.parametrize("integrator", [pytest.param("lidar_merging", marks=pytest.mark.slow), "lidar_volpath"])
 @pytest.mark.parametrize(
     ("change", "factor"),

@@ -96,7 +96,9 @@ def test_heights_are_those_of_the_mesh(wavy_sea):
     down = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5), mi.Vector3f(0, 0, -1))
     true = np.array(lidar.mitsuba_scene.ray_intersect(down).p.z)
     assert true.std() > 0.03
-    assert np.abs(np.array(heights.at(mi.Float(x), mi.Float(y))) - true).max() < 0.01
+    surface, bed = (np.array(height) for height in heights.at(mi.Float(x), mi.Float(y)))
+    assert np.abs(surface - true).max() < 0.01
+    np.testing.assert_allclose(bed, -8, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -112,7 +114,7 @@ def test_points_fall_into_cells_by_their_volume(wavy_sea, shift):
     lean /= np.sqrt(1 - lean**2)
     below, y = rng.uniform(0, depth, count), rng.uniform(-2.0, 2.0, count)
     x = rng.uniform(-2.0, 2.0, count)
-    z = np.array(heights.at(mi.Float(x), mi.Float(y))) - below
+    z = np.array(heights.at(mi.Float(x), mi.Float(y))[0]) - below
     bucket, tag, volume = (np.array(a) for a in cells.locate(mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))))
     _, index, inverse, number = np.unique(
         bucket.astype(np.uint64) << 32 | tag, return_index=True, return_inverse=True, return_counts=True

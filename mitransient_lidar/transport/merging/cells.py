@@ -21,6 +21,9 @@ from mitransient_lidar.transport.sensor.receiver import SensorSampler
 #: Cells on each side of the table of surface heights, of a single shot and of each of several.
 _HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
 
+#: Depth of columns without a solid below [m].
+_NO_BED = 1e9
+
 #: Number of rays that find the region and the solids below it.
 PROBE_RAYS = 4096
 
@@ -104,7 +107,10 @@ def _at_sea_level(pose: Pose, directions: np.ndarray) -> np.ndarray:
 
 
 class SurfaceHeights:
-    """Height of the sea surface over a region, as a table for each place of shots, of which there are `copies`."""
+    """Heights of the sea surface over a region, and of the first solid below it.
+
+    Tables for each place of shots, of which there are `copies`.
+    """
 
     def __init__(self, scene: LidarScene, region: Region, shots: int = 1, copies: int = 1) -> None:
         n = self._cells = _HEIGHT_CELLS if shots == 1 else _HEIGHT_CELLS_OF_SHOTS
@@ -119,21 +125,28 @@ class SurfaceHeights:
         y = (mi.Float(index // n) + 0.5) / self._per_metre[1] + self._low[1]
         top = opaque(max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0)
 
-        def look_down(ray: mi.Ray3f, height: mi.Float, active: mi.Bool) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
+        def look_down(
+            ray: mi.Ray3f, height: mi.Float, bed: mi.Float, wet: mi.Bool, active: mi.Bool
+        ) -> tuple[mi.Ray3f, mi.Float, mi.Float, mi.Bool, mi.Bool]:
             si = scene.ray_intersect(ray, active)
-            at_sea = si.is_valid() & scene.is_surface(si.shape)
+            active &= si.is_valid()
+            at_sea = scene.is_surface(si.shape)
             height = dr.select(active & at_sea, si.p.z, height)
+            bed = dr.select(active & wet & ~at_sea, si.p.z, bed)
             # Continue below solids above the sea.
-            active &= si.is_valid() & ~at_sea
-            return dr.select(active, si.spawn_ray(ray.d), ray), height, active
+            active &= at_sea | ~wet
+            wet |= active & at_sea
+            return dr.select(active, si.spawn_ray(ray.d), ray), height, bed, wet, active
 
+        count = places * n * n
         state = (
             mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1)),
-            dr.zeros(mi.Float, places * n * n),
-            dr.full(mi.Bool, True, places * n * n),
+            *(dr.zeros(mi.Float, count), dr.full(mi.Float, -_NO_BED, count)),
+            *(dr.zeros(mi.Bool, count), dr.full(mi.Bool, True, count)),
         )
-        _, self._height, _ = dr.while_loop(state, lambda ray, height, active: active, look_down, label="heights")
-        dr.eval(self._height)
+        _, height, bed, _, _ = dr.while_loop(state, lambda *state: state[-1], look_down, label="heights")
+        self._table = dr.ravel(mi.Point2f(height, bed))
+        dr.eval(self._table)
 
     def of(self, lanes: Lanes) -> SurfaceHeights:
         """Return the heights of each lane's shot."""
@@ -143,19 +156,21 @@ class SurfaceHeights:
         heights._start = (lanes.shot // self._copies) * (self._cells * self._cells)
         return heights
 
-    def at(self, x: mi.Float, y: mi.Float) -> mi.Float:
-        """Return the height at (x, y) [m]; outside the region, that of its nearest point."""
+    def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Return the heights of surface and solid at (x, y) [m]; outside the region, those of its nearest point."""
         n = self._cells
         i = dr.clip(mi.Int32((x - self._low[0]) * self._per_metre[0]), 0, n - 1)
         j = dr.clip(mi.Int32((y - self._low[1]) * self._per_metre[1]), 0, n - 1)
-        return dr.gather(mi.Float, self._height, self._start + mi.UInt32(j * n + i))
+        height, bed = dr.gather(mi.Point2f, self._table, self._start + mi.UInt32(j * n + i))
+        return height, bed
 
 
 class WaterGrid:
     """Layout of cells that follow the sea surface and are arranged about the refracted beam.
 
-    Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. They are
-    sheared along the beam in still water, so that its light stays in one column of cells.
+    Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. The lowest one
+    above a solid ends there. They are sheared along the beam in still water, so that its light stays in one column of
+    cells.
 
     Parameters
     ----------
@@ -238,14 +253,20 @@ class WaterCells:
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the approximate volume of cells at points, a smooth function, for the weights of merges [m^3]."""
-        return self.grid.volume(point, dr.maximum(self.heights.at(point.x, point.y) - point.z, 0))
+        height, _ = self.heights.at(point.x, point.y)
+        return self.grid.volume(point, dr.maximum(height - point.z, 0))
 
     def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
         grid, rings = self.grid, self.grid.rings
-        depth = self.heights.at(point.x, point.y) - point.z
+        height, bed = self.heights.at(point.x, point.y)
+        depth, end = height - point.z, height - bed
         # The table of heights is approximate: points above it are just below the surface.
         layer = dr.maximum(dr.floor((depth - self._top) * (1 / grid.thickness)) + 1, 0)
+        # A part of a cell above a solid that is less than half as thick belongs to the cell above.
+        lowest = dr.maximum(dr.floor((end - self._top) * (1 / grid.thickness) - 0.5) + 1, 0)
+        is_lowest = (layer >= lowest) & (depth < end + 0.5 * grid.thickness)
+        layer = dr.select(is_lowest, lowest, layer)
         along, across = rings.offset(point.x, point.y, depth)
         upper = layer * grid.thickness
         sector = rings.sector(along, across, rings.core(upper), grid.widths(upper), self._shift)
@@ -255,7 +276,9 @@ class WaterCells:
             low_bits(j, of_sector) | (low_bits(i, of_ring) << of_sector) | (low_bits(k, z) << (of_sector + of_ring))
         )
         tag = low_bits(i >> of_ring, 12) | (low_bits(j >> of_sector, 12) << 12) | (low_bits(k >> z, 8) << 24)
-        thickness = dr.select(k == 0, self._top, grid.thickness)
+        above = dr.select(k == 0, 0, self._top + (layer - 1) * grid.thickness)
+        below = dr.select(is_lowest, end, self._top + layer * grid.thickness)
+        thickness = dr.maximum(below - above, 0.25 * grid.thickness)
         return self._start + bucket, tag, thickness * rings.area(sector)
 
 

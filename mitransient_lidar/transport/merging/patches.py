@@ -8,21 +8,25 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitransient_lidar.transport.merging.cells import ORIGIN, PROBE_RAYS, Region, low_bits
 from mitransient_lidar.transport.merging.rings import BeamRings, Sector
-from mitransient_lidar.transport.opaque import is_one_of, opaque
+from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_index
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Logarithm to base 2 of the largest number of buckets of a shot along one side.
 MOST_SIDE_BITS = 9
 
-#: Height of the levels into which patches of bounded solids are cut, over the width of a patch.
+#: Height of the levels into which patches of bounded solids are cut, over the width of each patch.
 _LEVEL_WIDTHS = 8
 
 #: Largest number of hits of a vertical ray in the search for solids of several levels.
 _MOST_LEVELS = 8
+
+#: Margin of the probes beyond a level, and of their steps beyond a surface, over the height of the level.
+_PROBE_MARGIN = 1e-3
 
 #: Largest number of coverage samples: rounding may hide a sliver of a patch from all of them.
 _MOST_COVERAGE_SAMPLES = 1000
@@ -39,19 +43,23 @@ class Patch:
     area
         Area of the surface over the patch's projection, if it covers all of it [m^2].
     corner
-        Corner of that square, and height over it, in the coordinates (u, v, w) of the projection [m].
+        Corner of that square, and start of the level over it, in the coordinates (u, v, w) of the projection [m].
+        Along the beam, w is z.
+    height
+        Height of the level [m].
     sector
-        Sector of rings that replaces the square in projections along z.
+        Sector of rings that replaces the square in projections along the beam.
     axis
-        Axis of the projection: 0, 1 or 2 for x, y or z.
+        Direction of the projection: 0, 1 or 2 for x, y or the beam.
     faces
-        Sign of the normal's component along that axis.
+        Sign of the normal's component against that direction.
     """
 
     bucket: mi.UInt32
     tag: mi.UInt32
     area: mi.Float
     corner: mi.Point3f
+    height: mi.Float
     sector: Sector
     axis: mi.UInt32
     faces: mi.Float
@@ -75,9 +83,10 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
 
 
 class SolidPatches:
-    """Patches of one pass, in projection along the axis nearest to the normal, shifted at random in each shot.
+    """Patches of one pass, in projection along the direction nearest to the normal, shifted at random in each shot.
 
-    Patches that look up or down are sectors of rings about the beam, others squares.
+    Directions are x, y and that of the refracted beam. In projection along the beam patches are sectors of rings about
+    it, whatever their depth, along the others squares.
 
     Parameters
     ----------
@@ -86,7 +95,7 @@ class SolidPatches:
     rings
         Rings about the beam.
     depth
-        Depth at which their centre lies on the beam [m].
+        Depth of the plane in which rings are cut [m], and the largest at which their core is taken.
     width
         Side of a square, and of a sector on the axis at the surface [m].
     shift
@@ -111,7 +120,12 @@ class SolidPatches:
         self.scene, self._rings, self._side_bits = scene, rings, side_bits
         self._start = mi.UInt32(0)
         self.width, self._depth = opaque(width), opaque(depth)
-        self._core = rings.core(self._depth)
+        # Sizes suit the light at the middle of a solid.
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))[0]) for solid in scene.solids]
+        depths = np.zeros(max(numbers, default=0) + 1)
+        for number, solid in zip(numbers, scene.solids, strict=True):
+            depths[number] = np.clip(-float(solid.bbox().center().z), 0, depth)
+        self._cores = rings.core(mi.Float(depths))
         self._ring_width = self.width / rings.core(mi.Float(0))
         self._shift = shift
         self._bounded = [
@@ -136,27 +150,25 @@ class SolidPatches:
 
     def locate(self, si: mi.SurfaceInteraction3f) -> Patch:
         """Return the patches of points on solids."""
-        size = dr.abs(si.n)
-        along_x = (size.x > size.y) & (size.x > size.z)
-        along_y = ~along_x & (size.y > size.z)
-        axis = dr.select(along_x, mi.UInt32(0), dr.select(along_y, mi.UInt32(1), mi.UInt32(2)))
-        normal = dr.select(along_x, si.n.x, dr.select(along_y, si.n.y, si.n.z))
+        axis, normal = self._projection(si)
+        along_x, along_y = axis == 0, axis == 1
         u = dr.select(along_x, si.p.y, si.p.x)
         v = dr.select(along_x | along_y, si.p.z, si.p.y)
         w = dr.select(along_x, si.p.x, dr.select(along_y, si.p.y, si.p.z))
         cu, cv = dr.floor(u / self.width + self._shift.x), dr.floor(v / self.width + self._shift.y)
         i, j = mi.UInt32(mi.Int32(cu) + ORIGIN), mi.UInt32(mi.Int32(cv) + ORIGIN)
-        along, across = self._rings.offset(si.p.x, si.p.y, self._depth)
-        sector = self._rings.sector(along, across, self._core, self._ring_width, self._shift)
+        along, across, core = self._offset(si)
+        sector = self._rings.sector(along, across, core, self._ring_width, self._shift)
         level_patch = axis == 2
         i, j = dr.select(level_patch, sector.ring, i), dr.select(level_patch, sector.number, j)
         projected = dr.select(level_patch, self._rings.area(sector), self.width * self.width)
         bits = self._side_bits
         side = 2 * axis + dr.select(normal > 0, mi.UInt32(1), 0)
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
-        # Solids with overhangs have several levels over one square.
-        level = mi.UInt32(mi.Int32(dr.floor(w / (_LEVEL_WIDTHS * self.width))) + ORIGIN)
-        level = dr.select(self._is_bounded(si.shape), level, 0)
+        # Solids with overhangs have several levels over one square. Sectors far from the beam are wide, and so high.
+        height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self.width)
+        start = dr.floor(w / height + self._shift.x)
+        level = dr.select(self._is_bounded(si.shape), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
         return Patch(
             bucket=self._start + (low_bits(i, bits) | (low_bits(j, bits) << bits)),
             tag=low_bits(i >> bits, 6)
@@ -165,7 +177,10 @@ class SolidPatches:
             | (side << 20)
             | (low_bits(shape, 9) << 23),
             area=projected / dr.abs(normal),
-            corner=mi.Point3f((cu - self._shift.x) * self.width, (cv - self._shift.y) * self.width, w),
+            corner=mi.Point3f(
+                (cu - self._shift.x) * self.width, (cv - self._shift.y) * self.width, (start - self._shift.x) * height
+            ),
+            height=height,
             sector=sector,
             axis=axis,
             faces=dr.sign(normal),
@@ -173,13 +188,29 @@ class SolidPatches:
 
     def typical_area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """Return the approximate area of the patches at points on solids, a smooth function on each face [m^2]."""
-        along, across = self._rings.offset(si.p.x, si.p.y, self._depth)
-        scale = dr.square(self._core) + along * along + across * across
+        axis, normal = self._projection(si)
+        along, across, core = self._offset(si)
+        scale = dr.square(core) + along * along + across * across
         sector = dr.square(self._ring_width) * scale / self._rings.cosine
-        up = dr.abs(si.n.z)
-        is_level = (up >= dr.abs(si.n.x)) & (up >= dr.abs(si.n.y))
-        area = dr.select(is_level, sector, self.width * self.width)
-        return area / dr.maximum(dr.maximum(dr.abs(si.n.x), dr.abs(si.n.y)), up)
+        return dr.select(axis == 2, sector, self.width * self.width) / dr.abs(normal)
+
+    def _projection(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        """Return the direction of projection at points on solids, and the normal's component against it."""
+        x, y = self._rings.slant
+        against = si.n.z - x * si.n.x - y * si.n.y
+        size = mi.Vector3f(dr.abs(si.n.x), dr.abs(si.n.y), dr.abs(against) * dr.rsqrt(1 + x * x + y * y))
+        along_x = (size.x > size.y) & (size.x > size.z)
+        along_y = ~along_x & (size.y > size.z)
+        axis = dr.select(along_x, mi.UInt32(0), dr.select(along_y, mi.UInt32(1), mi.UInt32(2)))
+        return axis, dr.select(along_x, si.n.x, dr.select(along_y, si.n.y, against))
+
+    def _offset(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return offsets of points on solids from the beam, and the core radius of their solid [m]."""
+        x, y = self._rings.slant
+        below = -si.p.z - self._depth
+        along, across = self._rings.offset(si.p.x - x * below, si.p.y - y * below, self._depth)
+        number = dr.minimum(dr.reinterpret_array(mi.UInt32, si.shape), opaque_index(dr.width(self._cores) - 1))
+        return along, across, dr.gather(mi.Float, self._cores, number)
 
     def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a solid may end inside the region."""
@@ -193,31 +224,41 @@ class SolidPatches:
         """
         if not self._bounded:
             return mi.Float(1)
-        reach = 2 * self.width
+        margin = _PROBE_MARGIN * patch.height
+        # From the side that the patch faces to the other side of its level.
+        first = patch.corner.z - margin + dr.select(patch.faces > 0, patch.height + 2 * margin, 0)
+        is_x, is_y, is_z = (patch.axis == axis for axis in range(3))
+        slant = mi.Vector2f(*self._rings.slant)
+        # Lengths along it are those of w.
+        inwards = -patch.faces * mi.Vector3f(
+            dr.select(is_x, 1, dr.select(is_z, -slant.x, 0)),
+            dr.select(is_y, 1, dr.select(is_z, -slant.y, 0)),
+            dr.select(is_z, 1, 0),
+        )
 
-        def probe(samples: mi.Float, rng: mi.PCG32, searching: mi.Bool) -> tuple[mi.Float, mi.PCG32, mi.Bool]:
-            along, across = rng.next_float32(), rng.next_float32()
+        def probe(
+            samples: mi.Float, rng: mi.PCG32, searching: mi.Bool, uvw: mi.Point3f, fresh: mi.Bool
+        ) -> tuple[mi.Float, mi.PCG32, mi.Bool, mi.Point3f, mi.Bool]:
+            along, across = rng.next_float32(fresh), rng.next_float32(fresh)
             u, v = patch.corner.x + self.width * along, patch.corner.y + self.width * across
             x, y = self._rings.point(*self._rings.draw(patch.sector, self._shift, along, across), self._depth)
-            u, v = dr.select(patch.axis == 2, x, u), dr.select(patch.axis == 2, y, v)
-            w = patch.corner.z + reach * patch.faces
-            is_x, is_y = patch.axis == 0, patch.axis == 1
-            origin = mi.Point3f(
-                dr.select(is_x, w, u), dr.select(is_x, u, dr.select(is_y, w, v)), dr.select(is_x | is_y, v, w)
-            )
-            down = mi.Vector3f(
-                dr.select(is_x, -patch.faces, 0),
-                dr.select(is_y, -patch.faces, 0),
-                dr.select(is_x | is_y, 0, -patch.faces),
-            )
-            ray = mi.Ray3f(origin, down)
-            ray.maxt = 2 * reach
+            drawn = mi.Point3f(dr.select(is_z, x, u), dr.select(is_z, y, v), first)
+            uvw = dr.select(fresh, drawn, uvw)
+            u, v, w = uvw
+            below = dr.select(is_z, -w - self._depth, 0)
+            u, v = u + slant.x * below, v + slant.y * below
+            origin = mi.Point3f(dr.select(is_x, w, u), dr.select(is_x, u, dr.select(is_y, w, v)), dr.select(is_z, w, v))
+            ray = mi.Ray3f(origin, inwards)
+            ray.maxt = patch.height + 2 * margin - dr.abs(w - first)
             si = self.scene.ray_intersect(ray, searching)
             found = si.is_valid() & (self.locate(si).tag == patch.tag)
+            # Other surfaces may lie before the patch.
+            fresh = ~si.is_valid()
+            uvw.z = w - patch.faces * (si.t + margin)
             searching &= ~found & (samples < _MOST_COVERAGE_SAMPLES)
-            return samples + dr.select(searching, mi.Float(1), 0), rng, searching
+            return samples + dr.select(searching & fresh, mi.Float(1), 0), rng, searching, uvw, fresh
 
-        state = mi.Float(1), mi.PCG32(rng), active & self._is_bounded(shape)
-        samples, advanced, _ = dr.while_loop(state, lambda samples, rng, searching: searching, probe, label="coverage")
+        state = mi.Float(1), mi.PCG32(rng), active & self._is_bounded(shape), mi.Point3f(0), mi.Bool(True)
+        samples, advanced, *_ = dr.while_loop(state, lambda *state: state[2], probe, label="coverage")
         rng.state = advanced.state
         return samples

@@ -18,6 +18,9 @@ _CORE_PER_METRE = 0.05
 #: Least cosine of the axis with the vertical, for axes close to the horizon and above it.
 _SMALLEST_COSINE = 0.01
 
+#: Largest slope of the axis against the vertical along which patches are projected.
+_LARGEST_SLANT = 2.0
+
 #: Core radius at the surface over the beam's standard deviation there.
 CORE_PER_SPREAD = 2.0
 
@@ -72,6 +75,8 @@ class BeamRings:
         cosine = max(math.sqrt(max(1 - (sine / index) ** 2, 0.0)), _SMALLEST_COSINE)
         #: Horizontal displacement of the axis for each metre of depth.
         self.shear = [opaque(x / (index * cosine)) for x in horizontal]
+        #: The same where patches are projected along the axis, else 0: axes close to the horizon, or above it.
+        self.slant = self.shear if np.hypot(*horizontal) < _LARGEST_SLANT * index * cosine else [opaque(0.0)] * 2
         #: Ratio of the axes of the ellipses.
         self.cosine = opaque(down)
 

@@ -22,7 +22,7 @@ SCENE_COMMANDS = {
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
     "beam-spread": ["--depths", "2,5", "--passes", 2],
-    "fov-sweep": ["--fov-mrad", "20,35", "--passes", 4],
+    "fov-sweep": ["--fov-mrad", "20,35", "--passes", 8],
     "scattering-orders": ["--passes", 2, "--orders", 2],
 }
 RESULT_COMMANDS = {

@@ -163,7 +163,7 @@ def test_command_writes_table_plot_and_file(tmp_path):
         "--fov-mrad",
         "20,5",
         "--passes",
-        "4",
+        "16",
         "--max-depth",
         "4",
         "-q",
