@@ -76,6 +76,7 @@ def test_what_leaves_the_field_of_view_is_lost_and_no_more():
     assert error[0] < 5e-3
 
 
+@pytest.mark.slow
 def test_blur_serves_every_kind_of_pixels(tmp_path):
     """A narrow beam in a label, in overlapping circles (both 1 - exp(-r^2 / 2 sigma^2)) and in hexagons."""
     ticks = np.linspace(-10, 10, 400, endpoint=False) + 0.025
@@ -114,6 +115,7 @@ def test_measured_blur_puts_light_where_the_image_does(tmp_path):
     assert np.all(error < 4e-3)
 
 
+@pytest.mark.slow
 def test_a_pixel_looks_where_its_light_comes_from(tmp_path):
     """Light is moved by (+3, -5) mrad: a pixel on the axis sees what is at (-3, +5), with or without a laser there."""
     image = np.zeros((15, 15))

@@ -107,6 +107,7 @@ def test_given_options_win(own):
     assert json.loads(fewer.attrs["plugin_parameters"])["integrator"]["paths_per_pass"] == 2048
 
 
+@pytest.mark.slow
 def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder):
     first, path = own, folder / "profile.csv"
     (file,) = json.loads(first.attrs["scene_files"])
@@ -152,6 +153,7 @@ def test_files_of_an_xml_scene_are_found_from_another_folder(tmp_path, monkeypat
     assert_same_bits(changed, mitransient_lidar.render(first, params={"profile": "profile.csv"}))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_rendered_again_is_refused(own, folder):
     loaded = mi.load_dict({"type": "scene", **scene_dict(folder)})
     first = mitransient_lidar.render(loaded, passes=2)

@@ -69,6 +69,7 @@ def test_a_result_again_with_another_instrument():
     assert other["impulse_response"].values.tobytes() == direct["impulse_response"].values.tobytes()
 
 
+@pytest.mark.slow
 def test_a_result_names_its_instrument_and_gives_the_same_bits():
     params = {**record("teledyne_czmil"), "bin_width_ns": 4, "bin_count": 40, "altitude": 380}
     first = few("table1", instrument="teledyne_czmil", params=params)

@@ -110,6 +110,7 @@ def outside(scene):
     assert error[1] < 1e-4
 
 
+@pytest.mark.slow
 def test_a_result_keeps_auto_and_lists_the_bins_used():
     first = mitransient_lidar.render("table1", params=SMALL, integrator=FEW, passes=2)
     assert (first.attrs["scene.time_start_ns"], first.attrs["scene.bin_count"]) == ("auto", "auto")
@@ -134,6 +135,7 @@ def test_a_number_wins_each_on_its_own():
     assert (both.axis.start_ns, both.axis.bin_count) == (1390, 150)
 
 
+@pytest.mark.slow
 def test_noise_is_measured_before_the_surface_echo():
     """Ten bins, to the one that the start of the record may cut, in which detection of echoes measures it."""
     for params in ({"off_nadir_deg": 45}, {"field_of_view_mrad": 100, "bin_width_ns": 2}):

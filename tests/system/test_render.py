@@ -151,6 +151,7 @@ def default_ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 def test_ctrl_c_during_a_pass_keeps_what_was_rendered(default_ctrl_c, monkeypatch):
     """Dr.Jit turns an exception inside a loop that it records into a RuntimeError."""
     original, calls = LightPath.ray, []

@@ -23,6 +23,7 @@ def renderer(parameters, fixed=FLAT, **design):
     return RunRenderer.of(campaign, columns)
 
 
+@pytest.mark.slow
 def test_record_holds_the_light_of_all_runs():
     runs = renderer({"altitude": [150, 200, 300], "bottom_depth": [15, 3], "attenuation": [0.2, 1.0]})
     # Corners of the ranges, of which none was tried in this combination but one.
@@ -76,6 +77,7 @@ def test_what_is_asked_of_a_run(asked):
     assert first["axis"] == TimeAxis(1300, 1, 300)
 
 
+@pytest.mark.slow
 def test_given_places_and_targets(asked):
     campaign = Campaign.of(
         {

@@ -14,6 +14,7 @@ WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots", "shot-statistics")
 #: Those that take most time.
 SLOW = {"detect", "target-signal", "shot-statistics", "beam-spread", "fov-sweep", "plot", "passive"}
+SLOW |= {"waveforms", "scattering-orders"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
@@ -124,6 +125,7 @@ def test_series_of_shots_from_end_to_end(scene, tmp_path):
     assert_refused(run("plot", signals, "--shot", 2), "--shot 2 must be one of the shots of")
 
 
+@pytest.mark.slow
 def test_comparison_of_a_result_with_itself(result):
     done = run("compare", result, result)
     assert done.exit_code == 0, done.stderr

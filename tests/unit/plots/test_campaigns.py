@@ -33,6 +33,7 @@ def texts(figure):
     return [ax.get_xlabel() for ax in figure.axes] + [ax.get_ylabel() for ax in figure.axes]
 
 
+@pytest.mark.slow
 def test_sample_distributions_and_responses(campaign, tmp_path):
     figure = plot_campaign(campaign, tmp_path / "campaign.png")
     assert (tmp_path / "campaign.png").stat().st_size > 10_000

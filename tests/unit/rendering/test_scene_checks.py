@@ -185,6 +185,7 @@ def smooth_scene(scattering, reflectance):
     )
 
 
+@pytest.mark.slow
 def test_black_bottom_below_smooth_water_without_scattering_is_refused(caplog):
     """Any one of scattering and reflectance returns light."""
     with pytest.raises(UserError, match=r"scattering = 0 in the water, a smooth surface, and 'bottom' in view"):

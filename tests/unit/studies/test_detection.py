@@ -113,6 +113,7 @@ def test_drawn_shots_have_the_expected_rates():
     assert np.all(np.abs(found["area"][1] - found["expected_area"][1]) < 0.03)
 
 
+@pytest.mark.slow
 def test_probability_of_detection_is_the_rate_of_drawn_shots():
     """Four pixels of noise like that of the echoes: shots with the full signal above the threshold without it."""
     light = experiment(levels=(2, 2, 1, 0.5), echoes=(0, 1, 2, 1.2), chain=NOISY, photons=2e4, scatter=0.0)

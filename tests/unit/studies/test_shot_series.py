@@ -148,6 +148,7 @@ def test_seeds_and_instrument_of_a_series(rendered):
     assert series.attrs["instrument"] == again.attrs["instrument"] == "teledyne_czmil"
 
 
+@pytest.mark.slow
 def test_description_of_the_sea_can_be_left_out(rendered):
     options = {"params": {"surface_size": 60, "surface_cell_size": 1}, "positions": PLACES[:1], "passes": 2}
     for describe_sea in (True, False):
@@ -212,6 +213,7 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     assert series.attrs["interrupted"] == 1
 
 
+@pytest.mark.slow
 def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
     whole = shot_batches.ShotBatches.render
 

@@ -88,6 +88,7 @@ def test_range_with_a_noisy_column():
     assert 0.5 < np.std((off / found.sigma)[np.abs(off) < 0.3]) < 1.3
 
 
+@pytest.mark.slow
 def test_confidence_in_noise():
     """Where there is only noise, a confidence above p comes in at most a fraction 1 - p of the pixels."""
     pixels = 20_000

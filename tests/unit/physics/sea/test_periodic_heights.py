@@ -68,6 +68,7 @@ def test_sea_of_bands_repeats_after_its_period():
     np.testing.assert_allclose(waves.sample(lines, lines), waves.sample(lines + period, lines - period), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_waves_of_all_bands_move():
     """A current of 3 m/s carries a frozen sea: nearly the same after 0.01 s at a place 3 cm further on."""
     first, cell, _ = realise_heights(SEA, 64.0, 0.03, 1, STILL, 0.0)
