@@ -21,7 +21,9 @@ _comparisons = {}
 
 
 def pytest_addoption(parser):
-    parser.addoption("--seed-shift", type=int, default=0, metavar="N", help="add N to the seeds of all random numbers")
+    parser.addoption(
+        "--seed-shift", type=int, default=0, metavar="N", help="use the Nth set of other random numbers everywhere"
+    )
 
 
 def pytest_configure(config):

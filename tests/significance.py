@@ -15,7 +15,9 @@ FALSE_ALARM = 1e-6
 
 #: Number of comparisons so far, in this process.
 comparisons = 0
-#: What ``--seed-shift`` adds to all seeds.
+#: What ``--seed-shift 1`` adds to all seeds: more than the number of passes of any comparison.
+SEED_STEP = 1_000_003
+#: What is added to all seeds.
 seed_shift = 0
 
 
@@ -128,8 +130,9 @@ def assert_distribution(test):
 
 
 def shift_seeds(shift):
-    """Add a number to every seed of NumPy's random numbers in this process, which decide those of passes, too."""
+    """Shift every seed of NumPy's random numbers in this process, which decide those of passes, too."""
     global seed_shift
+    shift *= SEED_STEP
     seed_shift = shift
     if not shift:
         return
