@@ -122,8 +122,7 @@ class TransientHistogram:
         self._start = opaque(axis.start_ns * 1e-9 * C0 - reference_length)
         self._per_metre = opaque(1 / (axis.bin_width_ns * 1e-9 * C0))
         self._units = emitted * 2.0**-_COARSE_BITS, emitted * 2.0 ** -(_COARSE_BITS + _FINE_BITS)
-        self._per_unit = [opaque(1 / unit) for unit in self._units]
-        self._largest_fine = opaque(_COARSEST_FINE * self._units[0])
+        self._per_emitted = opaque(1 / emitted)
         self.clear()
 
     def clear(self) -> None:
@@ -151,9 +150,10 @@ class TransientHistogram:
         index = pixel * self._length + number
         valid = dr.isfinite(energy)
         dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
-        coarse, fine = self._per_unit
-        small = energy < self._largest_fine
-        units = mi.Int64(dr.round(energy * dr.select(small, fine, coarse)))
+        # Units themselves are too small for single precision where pulses are weak.
+        share = energy * self._per_emitted
+        small = share < _COARSEST_FINE * 2.0**-_COARSE_BITS
+        units = mi.Int64(dr.round(share * dr.select(small, 2.0 ** (_COARSE_BITS + _FINE_BITS), 2.0**_COARSE_BITS)))
         dr.scatter_add(self._sums, units, index + dr.select(small, self._fine_sums, 0), active & valid)
 
     def energy(self) -> np.ndarray:

@@ -81,7 +81,7 @@ def pass_streams(seed: int, purpose: int, count: int) -> mi.PCG32:
     return shots.streams(purpose, shots.paths(count))
 
 
-def stratified_point(index: mi.UInt32, count: int, rng: mi.PCG32) -> mi.Point2f:
+def stratified_point(index: mi.UInt32, count: int | mi.UInt64, rng: mi.PCG32) -> mi.Point2f:
     """Return a random point of the unit square in stratum number `index` of `count`.
 
     The strata are equal pieces of a Z-order curve (Morton 1966): neighbours in number are neighbours in the square, so
@@ -93,6 +93,13 @@ def stratified_point(index: mi.UInt32, count: int, rng: mi.PCG32) -> mi.Point2f:
     x = (_even_bits(along) << 8) | (rest & 0xFF)
     y = (_even_bits(along >> 1) << 8) | ((rest >> 8) & 0xFF)
     return mi.Point2f(mi.Float(x), mi.Float(y)) * 2**-24
+
+
+def interleaved_point(index: mi.UInt32, count: int, sets: int, rng: mi.PCG32) -> mi.Point2f:
+    """Return stratified points of `sets` sets, to which the lanes number `index` of `count` belong in turn."""
+    if count % sets == 0:
+        return stratified_point(index // sets, count // sets, rng)
+    return stratified_point(index // sets, mi.UInt64((count + sets - 1 - index % sets) // sets), rng)
 
 
 def unit_points(count: int, index: mi.UInt32 | None = None) -> mi.Point2f:

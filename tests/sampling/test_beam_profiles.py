@@ -190,6 +190,18 @@ def test_beam_samples_keep_the_energy(kind, view_mrad, tmp_path):
         assert error < 2e-3
 
 
+@pytest.mark.parametrize("count", [1, 3, 17])
+def test_any_number_of_photons_keeps_the_energy(count):
+    """Sums of the energies of few photons, of which some are drawn over a small view."""
+    sampler = BeamSampler(laser(), mi.load_dict({"type": "multipixel_receiver", "field_of_view_mrad": 2.0}).receiver)
+    assert sampler.use_view
+    shots = 2**16
+    index = dr.arange(mi.UInt32, shots * count) % count
+    _, energy = sampler.sample(index, count, pass_streams(2, 0, shots * count))
+    samples = np.array(energy, dtype=np.float64).reshape(shots, count).sum(axis=1) / 4.5e-3
+    assert abs(samples.mean() - 1) < largest_z(shots) * samples.std() / np.sqrt(shots) + 1e-5
+
+
 @pytest.mark.parametrize(
     ("image", "message"),
     [

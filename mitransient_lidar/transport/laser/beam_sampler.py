@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.rng import stratified_point, unit_points
+from mitransient_lidar.transport.rng import interleaved_point, stratified_point, unit_points
 from mitransient_lidar.transport.sensor.fov_shapes import Sector
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
@@ -43,14 +43,15 @@ class BeamSampler:
         if not self.use_view:
             angle_x, angle_y = transmitter.sample_tangent(stratified_point(index, count, rng))
             return mi.Point2f(angle_x, angle_y), opaque(transmitter.energy / count)
-        point = stratified_point(index >> 1, (count + 1) // 2, rng)
+        point = interleaved_point(index, count, 2, rng)
         angle_x, angle_y = transmitter.sample_tangent(point)
         vx, vy = self.view.sample(point)
-        of_view = (index & 1) == 1
+        of_view = index % 2 == 1
         angle_x = dr.select(of_view, vx + self.centre[0], angle_x)
         angle_y = dr.select(of_view, vy + self.centre[1], angle_y)
         density = transmitter.tangent_density(angle_x, angle_y)
-        mixture = 0.5 * (density + dr.select(self._inside(angle_x, angle_y), opaque(1 / self.view.area), 0))
+        in_view = dr.select(self._inside(angle_x, angle_y), opaque(1 / self.view.area), 0)
+        mixture = dr.lerp(density, in_view, opaque(count // 2 / count))
         # A sample of the beam's rim may lie outside both by rounding.
         share = dr.select(density > 0, density / mixture, 0)
         return mi.Point2f(angle_x, angle_y), opaque(transmitter.energy / count) * share

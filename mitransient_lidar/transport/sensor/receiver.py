@@ -12,7 +12,7 @@ from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.rng import Lanes, pass_streams, stratified_point, unit_points
+from mitransient_lidar.transport.rng import Lanes, interleaved_point, pass_streams, stratified_point, unit_points
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 
@@ -22,7 +22,8 @@ _SMALLEST_FOOTPRINT_SHARE = 0.05
 #: Radius of the core around the footprint's centre over the beam's standard deviation: samples are even within it.
 _CORE_PER_SPREAD = 2.0
 
-#: Of four samples, those that are drawn over the field of view, of few pixels and of many.
+#: Of this many samples, those that are drawn over the field of view, of few pixels and of many.
+_SETS = 4
 _OF_VIEW, _OF_VIEW_IN_IMAGES = 1, 2
 
 #: Number of pixels from which a receiver is an imager.
@@ -195,8 +196,8 @@ class SensorSampler:
     def sample(self, index: mi.UInt32, count: int, rng: mi.PCG32) -> SensorSample:
         """Sample directions and pixels for paths number `index` of `count`."""
         if self.use_footprint:
-            of_footprint = (index & 3) >= self._of_view
-            point = stratified_point(index >> 2, (count + 3) // 4, rng)
+            of_footprint = index % _SETS >= self._of_view
+            point = interleaved_point(index, count, _SETS, rng)
         else:
             of_footprint, point = mi.Bool(False), stratified_point(index, count, rng)
         # Places on the detector (px, py), and directions (angle_x, angle_y) whose light falls on them.
@@ -210,7 +211,8 @@ class SensorSampler:
         pixel, pixels_here = self.receiver.pixels.pixel_at(px, py, rng.next_float32())
         density = pixels_here * opaque(1 / self.receiver.pixels.area)
         if self.use_footprint:
-            density = dr.lerp(self._footprint_density(angle_x, angle_y), density, 0.25 * self._of_view)
+            of_view = count // _SETS * self._of_view + min(count % _SETS, self._of_view)
+            density = dr.lerp(self._footprint_density(angle_x, angle_y), density, opaque(of_view / count))
         # A point in several pixels is assigned to one of them at random: weight by their number.
         collection = pixels_here * opaque(self.receiver.optics.collection / count)
         weight = collection * solid_angle_factor(angle_x, angle_y) / density
