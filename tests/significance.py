@@ -63,27 +63,29 @@ def assert_equal(samples, expected, *, error, bias=0.0):
     expected
         Expected mean of each value.
     error
-        Largest relative standard error of the sum of the values: a comparison that is noisier would say little.
+        Relative standard error of the sum of the values, which is found within chance (`largest_error`), or less: a
+        comparison that is noisier would say little.
     bias
         Relative difference to allow, of the closed form or of the estimator.
     """
     found, own = mean_and_error(_with_sum(samples))
     wanted = _with_sum(np.asarray(expected, dtype=np.float64)[None])[0]
-    assert own[-1] < error * wanted[-1], own[-1] / wanted[-1]
+    assert own[-1] < largest_error(len(samples), error) * wanted[-1], own[-1] / wanted[-1]
     _assert_close(found, wanted, own, bias, len(samples))
 
 
-def assert_same(first, second, *, error, bias=0.0, known=0.1, lacking=False):
+def assert_same(first, second, *, error, bias=0.0, known=0.1, faint=1e-3, lacking=False):
     """Assert that two sets of passes, shapes (passes, ...), have one mean in every value, and in their sum.
 
-    Values with a relative standard error above `known` in either set are left out: few large contributions make them,
-    which are not normal; so are values that one set lacks, unless `lacking` is set. `error` and `bias` as in
-    `assert_equal`.
+    Values with a relative standard error above `known` in either set, or below a share `faint` of the sum, are left
+    out: few large contributions make them, which are not normal, and which a set may happen to lack; so are values
+    that one set lacks altogether, unless `lacking` is set. `error` and `bias` as in `assert_equal`.
     """
     (a, da), (b, db) = (mean_and_error(_with_sum(samples)) for samples in (first, second))
     lit = np.hypot(da, db) > 0 if lacking else (da > 0) & (db > 0)
-    used = lit & ~(da > known * a) & ~(db > known * b)
-    assert np.hypot(da, db)[-1] < error * b[-1], np.hypot(da, db)[-1] / b[-1]
+    used = lit & ~(da > known * a) & ~(db > known * b) & (b >= faint * b[-1])
+    fewest = min(len(first), len(second))
+    assert np.hypot(da, db)[-1] < largest_error(fewest, error) * b[-1], np.hypot(da, db)[-1] / b[-1]
     assert used[:-1].any()
     a, b, da, db = a[used], b[used], da[used], db[used]
     # Welch (1947): passes whose spread would be as uncertain.
@@ -117,8 +119,8 @@ def assert_same_in_all(pairs, weights, *, error, bias=0.0):
     ratios = np.array([a / b for (a, _), (b, _) in totals])
     errors = ratios * [np.hypot(da / a, db / b) for (a, da), (b, db) in totals]
     mean, own = weights @ ratios, float(np.linalg.norm(weights * errors))
-    assert own < error, own
     fewest = min(len(samples) for pair in pairs for samples in pair)
+    assert own < largest_error(fewest, error), own
     assert abs(mean - 1) < bias + largest_z(fewest) * own, (mean, own)
 
 

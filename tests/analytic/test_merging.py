@@ -238,9 +238,9 @@ def test_light_is_not_merged_across_the_levels_of_a_mesh(lidar_scene, passes, tw
     means, errors = [], []
     for kind in ("lidar_merging", "lidar_volpath"):
         scene = lidar_scene(integrator={"type": kind}, bottom=None, water=water, extra={"levels": two_levels})
-        energy = passes(scene, 12).sum(axis=1)[:, 50:130:1].reshape(12, 16, 5).sum(axis=-1)
+        energy = passes(scene, 8).sum(axis=1)[:, 50:130].reshape(8, 16, 5).sum(axis=-1)
         means.append(energy.mean(axis=0))
-        errors.append(energy.std(axis=0, ddof=1) / np.sqrt(12))
+        errors.append(energy.std(axis=0, ddof=1) / np.sqrt(8))
     z = (means[0] - means[1]) / np.hypot(*errors)
-    assert np.all(np.abs(z) < largest_z(12, z.size)), z
-    assert np.median(errors[1] / means[1]) < 0.02
+    assert np.all(np.abs(z) < largest_z(8, z.size)), z
+    assert np.median(errors[1] / means[1]) < 0.03

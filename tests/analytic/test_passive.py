@@ -335,7 +335,7 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
 # (e) waves focus the sun
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sinusoidal_sea_focuses_the_sun(tmp_path):
     """Light on plates at five depths, seen through still water, against rays traced here.
 

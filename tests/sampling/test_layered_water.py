@@ -149,7 +149,7 @@ def test_profile_file_is_its_layers(lidar_scene, passes, tmp_path):
     }
     film = {"time_start_ns": 1410.0, "bin_width_ns": 16.0, "bin_count": 5}
     energy = [
-        passes(lidar_scene(integrator={"type": "lidar_merging"}, water=water, film=film), 6, seed).sum(axis=1)
+        passes(lidar_scene(integrator={"type": "lidar_merging"}, water=water, film=film), 4, seed).sum(axis=1)
         for seed, water in ((0, {"profile": str(path)}), (100, layers))
     ]
     # A bb/b that differs by the step of 2 % within which functions are shared.
