@@ -74,6 +74,7 @@ def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
         assert error < 0.003
 
 
+@pytest.mark.slow
 def test_light_that_leaves_for_ever_is_counted(system):
     # No bottom: the last leg of nearly all light, through the clear water below, has no end.
     water = {"layer_tops": "0, 1", "attenuation": "0.2, 0", "scattering": "0, 0"}
@@ -263,6 +264,7 @@ def test_no_crossing_is_lost_or_counted_twice(system):
     np.testing.assert_allclose(down - up, np.tile((down - up)[:, :1], (1, 5)), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_ways_through_strata(system):
     """Unscattered light arrives where and when Snell's law says, and hardly scattered light is hardly late."""
     oblique = {**PENCIL, "off_nadir_deg": 30.0}

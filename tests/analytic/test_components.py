@@ -60,6 +60,7 @@ def test_parts_are_drawn(parts, tmp_path):
         plot_components(parts.drop_dims("origin"))
 
 
+@pytest.mark.slow
 def test_memory_of_the_parts_is_limited():
     with pytest.raises(
         UserError, match=r"4 pixels x \d+ bins x 4 components takes .* more than max_memory = 0.0001 GB"

@@ -57,6 +57,7 @@ def arrivals(rise, angle_x, angle_y):
     return surface, bottom, depth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bottom", BOTTOMS)
 @pytest.mark.parametrize("count", [8, 32, 128])
 def test_gates_of_an_imager_give_the_depth_of_each_pixel(bottom, count):
@@ -80,6 +81,7 @@ def test_gates_of_an_imager_give_the_depth_of_each_pixel(bottom, count):
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.2 + 4.5 / np.sqrt(2 * z.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bottom", ["level", "falls", "rises"])
 @pytest.mark.parametrize("count", [1, 2, 8])
 @pytest.mark.parametrize("depth_from", ["echo", "mean"])

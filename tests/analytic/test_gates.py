@@ -103,6 +103,7 @@ def test_gates_by_depth_open_with_an_echo_from_there(lidar_scene):
     assert float(result["gate_start"][1]) == pytest.approx(expected + 8.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("film", "gigabytes", "words"),
     [
@@ -207,6 +208,7 @@ def test_images_do_not_show_the_cells_of_the_sea(lidar_scene, passes):
     assert visible[0.25][0] - largest_z(12) * visible[0.25][1] > 0.05**2
 
 
+@pytest.mark.slow
 def test_paths_go_with_the_pixels(lidar_scene):
     """16 a pixel, and half the points: an image needs more paths, not better ones."""
     for layout, paths, photons in (("2x2", 2**15, 2**15), ("128x128", 2**18, 2**16), ("512x512", 2**21, 2**16)):

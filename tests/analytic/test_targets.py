@@ -1,7 +1,5 @@
 """Targets and bottoms: echoes against closed forms and quadrature, both integrators, and the published figures."""
 
-import itertools
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -112,17 +110,11 @@ SPHERES = {
     "large in a narrow beam": (OBLIQUE, 5e-4, (1.5, 0.0, -1.95), 1.45),
     "in a narrow beam": (LIDAR, 5e-4, (2.375, 0.0, -9.0), 0.5),
 }
-#: In the quick tier.
-NARROW = "in a narrow beam", "lidar_merging"
 
 
-@pytest.mark.parametrize(
-    ("sphere", "integrator"),
-    [
-        pytest.param(*case, marks=[pytest.mark.slow] * (case != NARROW))
-        for case in itertools.product(SPHERES, INTEGRATORS)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("sphere", SPHERES)
 def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
     """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
     lidar, sigma, centre, radius = SPHERES[sphere]

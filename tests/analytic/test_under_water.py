@@ -138,6 +138,7 @@ def test_lines_of_sight_give_depths_below_the_mean_sea_level(build, angle, besid
     assert float(found.depth_of_time(np.array([[time]]))[0, 0]) == pytest.approx(depth, abs=0.05 if beside else 2e-3)
 
 
+@pytest.mark.slow
 def test_echoes_are_expected_when_geometry_says(build):
     scene = build(-3.0, 20.0, bottom=8.0)
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])

@@ -63,6 +63,7 @@ def own(folder):
     return mitransient_lidar.render(scene_dict(folder), passes=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".nc", ".exr"])
 def test_a_result_and_its_files_give_the_same_bits(suffix, table, tmp_path):
     first = table
@@ -168,6 +169,7 @@ def test_what_cannot_be_rendered_again_is_refused(own, folder):
             mitransient_lidar.render(own, params=params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [

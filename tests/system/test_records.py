@@ -60,6 +60,7 @@ def beside(offset, film=None):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "params", [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in GEOMETRIES]
 )
@@ -151,6 +152,7 @@ def test_water_without_a_visible_bottom():
     assert ends[2] < ends[0] < ends[1] < 1420 + 300 * 9.6
 
 
+@pytest.mark.slow
 def test_the_record_holds_its_gates():
     gates = {"gate_count": 4, "gate_width_ns": 30.0}
     for start in (1300.0, 1900.0):
@@ -181,6 +183,7 @@ def test_the_command_states_the_record(tmp_path):
     assert "record: 27" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("params", "sentence"),
     [

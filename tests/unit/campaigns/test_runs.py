@@ -40,6 +40,7 @@ def test_record_of_the_campaign():
     assert renderer({"bottom_depth": [3, 15]}, fixed).axis is None
 
 
+@pytest.mark.slow
 def test_random_seas_are_of_the_run():
     runs = renderer({"bottom_depth": [3.0, 4.0]})
     seas = [runs.inputs(number, {"bottom_depth": 3.0})["surface_seed"] for number in range(100)]
@@ -95,6 +96,7 @@ def test_given_places_and_targets(asked):
     assert options["components"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameters", "fixed", "message"),
     [

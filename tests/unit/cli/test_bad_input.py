@@ -334,6 +334,7 @@ GATES = ("--start-ns", 1410, "--width-ns", 5, "--step-ns", 5, "--count", 4)
 LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("plot", "waveforms", "retrieve", "compare")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["gates", *LONG])
 @pytest.mark.parametrize("axis", AXES)
 def test_results_with_invalid_times(folder, stored, command, axis):

@@ -76,6 +76,7 @@ def check(done, tmp_path):
     assert done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", commands(SCENE_COMMANDS))
 def test_command_of_a_scene(command, scene, tmp_path):
     options = SCENE_COMMANDS[command]
@@ -84,11 +85,13 @@ def test_command_of_a_scene(command, scene, tmp_path):
     assert (tmp_path / "figure.png").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", commands(RESULT_COMMANDS))
 def test_command_of_a_result(command, result, tmp_path):
     check(run(command, result, *RESULT_COMMANDS[command]), tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -76,6 +76,7 @@ def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
     assert sorted(file.name for file in folder.iterdir()) == sorted(names)
 
 
+@pytest.mark.slow
 def test_gates_from_a_depth(stored):
     path, _ = stored
     assert run(path, "--start-depth", 1, "--width-ns", 4, "--step-ns", 2, "--count", 5, "--no-plot").exit_code == 0
@@ -94,6 +95,7 @@ def test_few_gates_have_no_depths(stored):
     assert not path.with_name("scene_depth.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

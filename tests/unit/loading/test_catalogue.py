@@ -114,6 +114,7 @@ def test_copy_into_a_missing_folder(folder, tmp_path):
         catalogue.copy_scene("fig10", tmp_path / "missing" / "a.xml")
 
 
+@pytest.mark.slow
 def test_shipped_scenes_are_found_and_described():
     names = catalogue.scene_names()
     assert "fig09_2x2" in names

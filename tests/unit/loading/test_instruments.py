@@ -144,6 +144,7 @@ def test_a_camera_of_the_scene_is_replaced(tmp_path):
     assert sensor.film().parameters["type"] == "time_gated_film"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["riegl_vq880g2", "teledyne_czmil"])
 def test_the_printed_xml_is_included_by_a_scene(name, tmp_path):
     (tmp_path / "instrument.xml").write_text(instruments.instrument_text(name))

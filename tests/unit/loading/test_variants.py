@@ -60,6 +60,7 @@ def test_old_llvm_in_the_process_says_to_import_first(monkeypatch):
         variants.check_llvm()
 
 
+@pytest.mark.slow
 def test_importing_without_a_usable_llvm_is_a_readable_error(tmp_path):
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(tmp_path / "missing.so")}
     done = subprocess.run(
@@ -82,6 +83,7 @@ def test_the_users_own_llvm_wins():
     assert subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip() == own
 
 
+@pytest.mark.slow
 def test_plugins_follow_the_variant():
     """Another variant registers none of ours; coming back they work again."""
     ours = mi.variant()

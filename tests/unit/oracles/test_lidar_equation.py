@@ -151,6 +151,7 @@ def test_waveform_peaks(edges):
         assert np.ptp(t[bottom > bottom.max() / 2]) == pytest.approx(7.95, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("attenuation", "power"),
     [

@@ -5,6 +5,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.campaigns import plot_campaign
 
+pytestmark = pytest.mark.slow
+
 RUNS, TIME = 60, np.arange(1000, 1050.0)
 
 
@@ -33,7 +35,6 @@ def texts(figure):
     return [ax.get_xlabel() for ax in figure.axes] + [ax.get_ylabel() for ax in figure.axes]
 
 
-@pytest.mark.slow
 def test_sample_distributions_and_responses(campaign, tmp_path):
     figure = plot_campaign(campaign, tmp_path / "campaign.png")
     assert (tmp_path / "campaign.png").stat().st_size > 10_000

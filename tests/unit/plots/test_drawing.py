@@ -105,6 +105,7 @@ def test_figures_replace_a_file_only_on_success(tmp_path):
         drawing.new_figure(tmp_path / "a.gif", 2.0, 1.0)
 
 
+@pytest.mark.slow
 def test_saved_picture_is_that_of_matplotlib(tmp_path):
     def drawn():
         figure = drawing.new_figure(None, 3.0, 2.0)

@@ -76,6 +76,7 @@ def test_azimuth_points_up_for_every_direction_of_the_lidar(lidar_scene):
     assert figure.axes[0].get_ylabel() == "along (m), away from the lidar"
 
 
+@pytest.mark.slow
 def test_imager_cells_lie_on_the_sea_with_their_energy(lidar_scene):
     attributes = {"field_of_view_mrad": 30.0, "field_of_view_shape": "circle"}
     attributes |= described(lidar_scene(rx={"layout": "6x6"}))
@@ -117,6 +118,7 @@ def under_water(angle_x_mrad, z):
     return on_sea(angle_x_mrad) - z * np.tan(np.arcsin(np.sin(theta) / 1.34))
 
 
+@pytest.mark.slow
 def test_pixels_and_beam_are_drawn_at_the_depths_of_target_and_bottom(lidar_scene):
     extra = {"ball": {"type": "sphere", "center": [1.5, 0.4, -6], "radius": 0.5}}
     figure = plot_layout(result(described(lidar_scene(extra=extra))))
@@ -152,6 +154,7 @@ def test_axes_of_receiver_and_laser_are_printed(lidar_scene):
     assert len(axis_points(result(described(lidar_scene())))[0].split(",")) == 3
 
 
+@pytest.mark.slow
 def test_many_targets_share_three_planes(lidar_scene):
     heights = (-1.0, -1.02, -2.0, -5.0, -5.5, -7.0)
     extra = {f"b{i}": {"type": "sphere", "center": [0, 0, z], "radius": 0.2} for i, z in enumerate(heights)}

@@ -107,6 +107,7 @@ def test_water_without_scattering_is_drawn(tmp_path, b):
     assert [text.get_text() for text in right.texts] == ([] if any(b) else ["no backscattering"])
 
 
+@pytest.mark.slow
 def test_vacuum_is_drawn(tmp_path):
     profile = Profile([0, 1], [0, 0], [0, 0], [0, 0])
     left, right = plot_profile(profile, profile.layers(), "vacuum", tmp_path / "a.svg").axes
@@ -125,6 +126,7 @@ def test_files_are_complete_and_no_others_are_left(tmp_path, suffix):
     assert [other.name for other in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.slow
 def test_wrong_files_are_rejected_and_nothing_is_left(tmp_path):
     profile = Profile(DEPTH, A, B, 0.02 * B)
     with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):

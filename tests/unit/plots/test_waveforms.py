@@ -141,6 +141,7 @@ def test_series_shows_the_mean_and_the_band_of_most_shots():
     assert "mean and 90 % of 40 shots" in linear.figure.get_suptitle()
 
 
+@pytest.mark.slow
 def test_imagers_and_records_of_a_series_are_drawn():
     shots = xr.concat([make(4, grid=(2, 2), scale=scale) for scale in (1.0, 3.0)], "shot", combine_attrs="override")
     figure = waveforms.plot_waveforms(shots)

@@ -232,6 +232,7 @@ def test_look_at_agrees_with_altitude_and_angle():
         np.testing.assert_allclose(getattr(poses[0], name), getattr(poses[1], name), atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module", [name for name in variants.PLUGIN_MODULES if name not in ("phase.tabulated", "bases")]
 )

@@ -88,6 +88,7 @@ def test_rays_for_mitsubas_integrators_carry_aperture_and_solid_angle(sensor, so
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_view_counts_every_overlapping_pixel_in_full():
     """Two concentric circles: light shared between them would halve the small one."""
     fields = {"wide": 30.0, "narrow": 10.0}
@@ -125,6 +126,7 @@ def test_stratified_points_cover_the_square_evenly(count):
     assert np.abs(counts - count / 256).max() < 2 if count == 5000 else counts.std() == 0
 
 
+@pytest.mark.slow
 def test_stratified_points_are_uniform_in_their_strata():
     """A thousand passes of four points, one in each quarter: uniform there along both axes."""
     passes = [stratified_point(dr.arange(mi.UInt32, 4), 4, pass_streams(seed, 0, 4)) for seed in range(1000)]
@@ -158,6 +160,7 @@ def test_imager_rows_go_from_far_to_near_and_columns_from_right_to_left(lidar_sc
     assert np.all(np.diff(arrival) < -4)
 
 
+@pytest.mark.slow
 def test_film_keeps_the_last_pass(lidar_scene):
     scene = lidar_scene(rx={"layout": "5x5"}, film={"bin_count": 40, "time_start_ns": 1410.0})
     energy = np.array(mi.render(scene, seed=3))

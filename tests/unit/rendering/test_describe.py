@@ -26,6 +26,7 @@ def lines(text):
     return [[np.array(line).reshape(-1, 2) for line in pixel] for pixel in json.loads(text)]
 
 
+@pytest.mark.slow
 def test_outlines_enclose_the_areas_of_the_pixels(lidar_scene):
     """Holes turn the other way round, so that signed areas add up."""
     quarters = lines(described(lidar_scene())["pixel_outlines"])
@@ -106,6 +107,7 @@ def traced_axis(scene):
 ROTATED = {"to_world": mi.ScalarTransform4f().look_at([40, 72.794, 200], [3, 1, 0], [0, 0, 1])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose", [{}, {"off_nadir_deg": 45.0, "aim_x": 3.0}, ROTATED], ids=["20", "45", "any"])
 @pytest.mark.parametrize("bottom", ["level", "tilted"])
 def test_bottom_point_is_where_a_ray_through_the_scene_ends(lidar_scene, pose, bottom):
@@ -117,6 +119,7 @@ def test_bottom_point_is_where_a_ray_through_the_scene_ends(lidar_scene, pose, b
     np.testing.assert_allclose(described(scene)["bottom_point"], expected, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_axis_passes_targets_on_its_way_to_the_bottom(lidar_scene):
     extra = {"ball": {"type": "sphere", "center": [1.5, 0, -6], "radius": 0.5}}
     scene = lidar_scene(extra=extra)

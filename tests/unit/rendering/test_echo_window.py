@@ -89,6 +89,7 @@ def test_laser_and_receiver_apart(lidar_scene, place):
         assert found.surface_time[0] + depth / found.depth_per_ns[0] == pytest.approx(expected, abs=0.02)  # 2 mm
 
 
+@pytest.mark.slow
 def test_overlapping_pixels_all_have_their_light(lidar_scene):
     """Two concentric circles of 8 and 16 mrad about a beam of 5 mrad: 1 - exp(-r^2 / 2) of its light each."""
     fields = {

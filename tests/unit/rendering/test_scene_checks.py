@@ -37,6 +37,7 @@ def on_axis(z):
     return -z * np.tan(snell(THETA, N))
 
 
+@pytest.mark.slow
 def test_echo_after_the_record_is_told_with_its_arrival(lidar_scene, caplog):
     (message,) = check(lidar_scene(bottom=30.0), caplog)
     assert "shape 'bottom'" in message
@@ -48,6 +49,7 @@ def test_echo_after_the_record_is_told_with_its_arrival(lidar_scene, caplog):
     assert check(lidar_scene(bottom=30.0, film={"bin_count": int(bins)}), caplog) == []
 
 
+@pytest.mark.slow
 def test_record_of_the_surface_echo_alone_is_no_mistake(lidar_scene, caplog):
     surface = surface_time_ns(200, THETA)
     for length, told in ((15, 0), (40, 1)):
@@ -56,6 +58,7 @@ def test_record_of_the_surface_echo_alone_is_no_mistake(lidar_scene, caplog):
         assert len(check(lidar_scene(film={"bin_count": count}), caplog)) == told
 
 
+@pytest.mark.slow
 def test_echo_before_the_record_is_told(lidar_scene, caplog):
     """A ball at 2 m, and a record from just above the bottom."""
     extra = {"ball": BALL | {"center": [on_axis(-2), 0, -2]}}
@@ -66,6 +69,7 @@ def test_echo_before_the_record_is_told(lidar_scene, caplog):
     assert "lower time_start_ns" in message
 
 
+@pytest.mark.slow
 def test_record_of_open_water_below_a_target_is_not_refused(lidar_scene, caplog):
     """The water beside the ball returns light at any time."""
     extra = {"ball": BALL | {"center": [on_axis(-3), 0, -3]}}
@@ -73,6 +77,7 @@ def test_record_of_open_water_below_a_target_is_not_refused(lidar_scene, caplog)
     assert "the echo of shape 'ball' comes at" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "distance"),
     [([1e6, 0, -6], 1e6 - 0.5 - 1.584), ([0, 9.5, -6], np.hypot(1.584 - 0.5, 9)), ([1.5, -30, -2], 29.5)],
@@ -85,6 +90,7 @@ def test_target_out_of_view_is_told_with_its_distance(lidar_scene, caplog, targe
     assert (x, y, z) == (pytest.approx(on_axis(z), abs=0.06), 0, target[2])
 
 
+@pytest.mark.slow
 def test_seabed_in_map_coordinates_is_told(lidar_scene, caplog):
     """Its nearest corner is 500 m nearer in x and y than its centre."""
     seabed = {"bottom": {"type": "seabed", "centre_x": 674000.0, "centre_y": 658000.0}}
@@ -100,6 +106,7 @@ def test_target_in_view_outside_the_beam_is_told(lidar_scene, caplog):
     assert "shape 'ball' lies outside the beam: it is 7.5 m from the laser's axis" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts",
     [
@@ -125,6 +132,7 @@ def test_legitimate_scenes_pass_in_silence(lidar_scene, caplog, parts):
     assert check(lidar_scene(**parts), caplog) == []
 
 
+@pytest.mark.slow
 def test_axes_that_do_not_meet_are_told(lidar_scene, caplog):
     """The beam's radius is half the divergence, over the slant range of 200 m / cos 20."""
     (message,) = check(lidar_scene(rx={"aim_x": 2.0}), caplog)
@@ -134,6 +142,7 @@ def test_axes_that_do_not_meet_are_told(lidar_scene, caplog):
     assert ratio == pytest.approx(2 / radius, rel=0.05)
 
 
+@pytest.mark.slow
 def test_axes_may_meet_in_the_water(lidar_scene, caplog):
     """A receiver that looks down on the beam's axis at 6 m sees the sea 1.58 m from it."""
     straight_down = {"off_nadir_deg": 0.0, "aim_x": on_axis(-6.0)}
@@ -142,6 +151,7 @@ def test_axes_may_meet_in_the_water(lidar_scene, caplog):
     assert "on the sea level they are 3.17 m apart" in check(lidar_scene(rx=straight_down), caplog)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parts", "message"),
     [

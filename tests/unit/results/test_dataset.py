@@ -230,6 +230,7 @@ def test_format_follows_the_content_not_the_suffix(tmp_path, suffix):
     assert results.open(tmp_path / "a.dat").attrs["scene"] == "fig09"
 
 
+@pytest.mark.slow
 def test_open_rejects_missing_and_foreign_files(tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*missing\.nc: No such file"):
         results.open(tmp_path / "missing.nc")

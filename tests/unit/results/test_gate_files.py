@@ -139,6 +139,7 @@ def test_sequence_is_read_from_its_folder_and_its_first_file(tmp_path):
     xr.testing.assert_identical(gate_files.open_stack(tmp_path), stack)
 
 
+@pytest.mark.slow
 def test_a_thousand_gates_have_four_digits(tmp_path):
     stack = make(rows=0, columns=2, gates=1000)
     gate_files.save_stack(stack, tmp_path / "a.exr")

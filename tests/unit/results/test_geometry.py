@@ -110,6 +110,7 @@ def assert_same(found, lines):
         np.testing.assert_allclose(getattr(found, name), values, rtol=1e-8, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".exr", ".nc"])
 def test_lines_of_sight_survive_files_and_gates(tmp_path, suffix):
     dataset, lines = image()

@@ -73,6 +73,7 @@ def test_only_what_is_wider_than_the_beam_is_a_bottom(lidar_scene):
     assert 0.1 < float(found["transmitted"].item()) < 0.9 * float(without["transmitted"].item())
 
 
+@pytest.mark.slow
 def test_result(spread):
     assert spread["depth"].values.tolist() == [2, 8]
     assert spread["transmitted"].dims == ("depth",)
@@ -103,12 +104,14 @@ def test_result(spread):
     assert attributes["uniform_down_to"] == np.inf
 
 
+@pytest.mark.slow
 def test_light_at_the_bottom_is_light_just_above_it(lidar_scene):
     found = beam_spread(lidar_scene(), [7.9, 8.0], **QUICK)
     above, at = found["transmitted"].values
     assert 0.97 < at / above < 1
 
 
+@pytest.mark.slow
 def test_seed_decides(lidar_scene):
     scene = lidar_scene()
     first, again, other = (beam_spread(scene, 5.0, seed=seed, **QUICK)["shift_rms"].item() for seed in (1, 1, 2))
@@ -139,6 +142,7 @@ def test_share_in_view(lidar_scene, off_nadir):
     np.testing.assert_allclose(found["transmitted"], found["unscattered"])
 
 
+@pytest.mark.slow
 def test_depths_without_light_are_unknown(lidar_scene):
     # A plate that is wide enough to take all light, but not the bottom.
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(400)}
@@ -160,6 +164,7 @@ def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
     assert "passes outside it and is left out" in caplog.text
 
 
+@pytest.mark.slow
 def test_more_room_gives_the_same_light(lidar_scene):
     scene = lidar_scene()
     system = LidarScene.from_scene(scene, scene.sensors()[0])

@@ -141,6 +141,7 @@ def test_interval_of_detection_is_that_of_the_scatter_of_renders():
     np.testing.assert_allclose([low / value, high / value], [1 - reach, 1 + reach], rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pd", "verdict"), [(0.1, "detected"), (0.9, "undecided"), (0.99, "not detected")])
 def test_sentence_answers_whether_the_target_is_detected(result, pd, verdict):
     shown = result.copy().assign_attrs(pd=pd)
@@ -211,6 +212,7 @@ def result():
     return made_up()
 
 
+@pytest.mark.slow
 def test_table_lists_all(result):
     lines = detection.describe_detection(result)
     rows = [line.split()[0] for line in lines]
@@ -234,6 +236,7 @@ def test_command_writes_and_prints(result, tmp_path, monkeypatch):
         np.testing.assert_array_equal(kept["needed_target"], result["needed_target"])
 
 
+@pytest.mark.slow
 def test_figure_shows_the_numbers_of_the_result(result):
     figure = plot_detection(result)
     light, characteristic, required, gains, errors, depths = figure.axes
@@ -301,6 +304,7 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     assert "noise and 4 seas" in detection.describe_detection(found)[1]
 
 
+@pytest.mark.slow
 def test_blind_receiver_is_reported(monkeypatch):
     """A counter with a dead time of 30 ns, which the first of a million photons starts, counts no echo at 20 ns."""
     light = experiment()
@@ -311,6 +315,7 @@ def test_blind_receiver_is_reported(monkeypatch):
         detection.detect("fig13_2x2", renders=3, receiver="spad")
 
 
+@pytest.mark.slow
 def test_echo_outside_the_record_is_reported(monkeypatch):
     light = experiment()
     data = {"background": light.background[0], "difference": np.roll(light.difference[0], 15, axis=-1)}
@@ -340,6 +345,7 @@ def test_invalid_options_end_with_one_sentence(arguments, message):
     assert_refused(run("detect", *arguments), message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "params", "options", "message"),
     [

@@ -97,6 +97,7 @@ def rendered(monkeypatch):
     return asked
 
 
+@pytest.mark.slow
 def test_shots_at_given_places(rendered, tmp_path):
     done = []
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=PLACES, passes=3, progress=done.append)
@@ -133,6 +134,7 @@ def test_shots_over_a_slope_have_the_time_bins_of_the_deepest(rendered):
     assert rendered[3]["axis"] == deep
 
 
+@pytest.mark.slow
 def test_time_bins_that_leave_out_light_are_refused(rendered):
     own = shot_series.render_shots("fig09_2x2", {**FLAT, "bottom_depth": 4}, positions=[(0, 0)])
     with pytest.raises(UserError, match=r"the record of 13\d\d to 1\d\d\d ns leaves out light: it must hold 13\d\d to"):
@@ -156,6 +158,7 @@ def test_description_of_the_sea_can_be_left_out(rendered):
         assert ("slope_deviation" in series.attrs) == describe_sea
 
 
+@pytest.mark.slow
 def test_series_that_does_not_fit_the_memory(rendered):
     with pytest.raises(
         UserError, match=r"^30 shots of 4096 pixels x 19\d bins, and 3 components of each, are more than"
@@ -163,6 +166,7 @@ def test_series_that_does_not_fit_the_memory(rendered):
         shot_series.render_shots("table1", {**FLAT, "layout": "64x64"}, positions=[(0, 0)] * 30, components=True)
 
 
+@pytest.mark.slow
 def test_places_beside_the_bottom_are_told(rendered, caplog):
     """The bottom of the scene is a square of 1 km."""
     series = shot_series.render_shots("fig09_2x2", FLAT, positions=[(0, 0), (600, 0)])
@@ -194,6 +198,7 @@ def test_target_keeps_its_place_relative_to_the_aim(rendered):
     assert set(json.loads(found.attrs["series_parameters"])) == {"aim_x", "aim_y", "target_x", "target_y"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", [0, 2])
 def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     whole = shot_batches.ShotBatches.render

@@ -142,6 +142,7 @@ def test_tolerance_out_of_range(station):
     assert done.stderr == "tolerance = 2 must lie between 1e-05 and 0.5\n"
 
 
+@pytest.mark.slow
 def test_profile_without_scattering(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("depth, a, b\n0, 0.1, 0\n5, 0.1, 0\n")

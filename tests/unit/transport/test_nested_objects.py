@@ -10,6 +10,7 @@ SEABED = {"type": "seabed", "depth": 8.0, "size": 20.0}
 WATER = {"type": "ocean_surface", "spectrum": "flat", "interior": {"type": "layered_water", "plume_scattering": 1.0}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["hg", "petzold", "fournier_forand"])
 def test_no_plugin_calls_the_loader(monkeypatch, phase):
     """A loader within the loader replaces the file resolver that other threads use: 1 in 10 processes then failed."""

@@ -48,6 +48,7 @@ def test_area_of_normal_shots():
     assert found.low < found.value < found.high
 
 
+@pytest.mark.slow
 def test_standard_error_of_the_area_is_its_spread():
     random = np.random.default_rng(7)
     found = [area_under_curve(random.normal(0, 1, 60), random.normal(1, 1, 90)) for _ in range(600)]

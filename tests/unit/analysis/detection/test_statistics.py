@@ -130,6 +130,7 @@ def test_no_other_weights_do_better():
         assert weights @ rise / np.sqrt(weights @ covariance @ weights) < best
 
 
+@pytest.mark.slow
 def test_common_clutter_is_subtracted():
     """Clutter c in both samples, the target in one: s C^-1 s = (1 + c^2)/(1 + 2 c^2), and 1/(1 + c^2) of one alone."""
     random = np.random.default_rng(2)
@@ -142,6 +143,7 @@ def test_common_clutter_is_subtracted():
     assert alone == pytest.approx(np.sqrt(1 / 10), rel=5 * 0.035)
 
 
+@pytest.mark.slow
 def test_no_sea_is_judged_by_weights_that_have_seen_it():
     """Weights of 8 seas in 10 samples fit them: their own spread is below that on new seas."""
     random = np.random.default_rng(3)

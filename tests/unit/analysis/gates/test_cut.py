@@ -131,6 +131,7 @@ def test_error_is_inflated_as_measured_in_the_render():
     assert error(2.0, dataset=exaggerated) == pytest.approx(4)
 
 
+@pytest.mark.slow
 def test_error_of_correlated_passes():
     """The stated errors of gates are those of passes whose bins share light, once the inflation has been measured."""
     rng = np.random.default_rng(11)

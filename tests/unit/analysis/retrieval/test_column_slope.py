@@ -43,6 +43,7 @@ def test_slope_without_geometry():
     assert k == pytest.approx(0.2, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_standard_error_is_the_scatter_of_the_slope():
     found = np.array([effective_attenuation(record(0.2, noise=0.05, seed=seed), 1.0, 5.0) for seed in range(300)])
     # Both pixels share their noise here, and count as independent: the error comes out by sqrt(2) too small.
@@ -133,6 +134,7 @@ def test_scenes_and_options_that_do_not_serve(fields, options, params, message):
         fov_sweep("table1", fields, {**SCENE, "bin_count": 110, **params}, **{"passes": 4, **options})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

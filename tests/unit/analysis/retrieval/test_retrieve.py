@@ -105,6 +105,7 @@ def result(values=None, **attributes):
     )
 
 
+@pytest.mark.slow
 def test_a_slope_that_the_sea_cannot_have_is_refused(tmp_path):
     """A plane of 40 degrees along, in a sea whose slopes have a standard deviation of 0.1 in each direction."""
     shot = result(np.stack([waveform(delay) for delay in plane_delays(0.84, 0.05)]), surface_slope_variance=0.02)
@@ -305,6 +306,7 @@ def short(bins=0, depth=DEPTH):
     return shot.isel(time=slice(0, bins or None))
 
 
+@pytest.mark.slow
 def test_estimates_without_a_column(tmp_path, caplog):
     """A record that ends 15 ns behind the surface, and a bottom 1.6 m deep, whose echo leaves no column free."""
     for shot, depth in ((short(bins=100), math.nan), (short(depth=1.6), 1.6)):

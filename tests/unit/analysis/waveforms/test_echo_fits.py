@@ -139,6 +139,7 @@ def test_column_fit_needs_a_column():
     assert found.decay[2] == pytest.approx(0.05, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_change_points_raise_false_alarms_no_more_often_than_they_say():
     count = 4000
     records = noisy(np.exp(-0.03 * (TIME - 50)), 0.02, count)

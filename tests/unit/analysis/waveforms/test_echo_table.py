@@ -337,6 +337,7 @@ def test_the_pulse_may_be_given():
     assert float(table["time_ns"].sel(echo="surface")[0]) == pytest.approx(SURFACE + 0.2, abs=0.05)
 
 
+@pytest.mark.slow
 def test_csv_and_command(tmp_path):
     results.save(result(), tmp_path / "shot.nc")
     done = run("waveforms", tmp_path / "shot.nc", "--csv", tmp_path / "echoes.csv", "--layers", 1)

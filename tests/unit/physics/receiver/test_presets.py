@@ -155,6 +155,7 @@ def test_snr_of_photons_and_of_saturated_samples():
     assert np.isnan(stuck.snr([1e-4], 1.0)[0])
 
 
+@pytest.mark.slow
 def test_seeds():
     chain, light = RECEIVERS["apd"], power(scale=1e-7)
     one, two, three = (chain.apply(light, 1.0, 30, seed) for seed in (5, 5, 6))

@@ -86,6 +86,7 @@ def test_far_row_is_on_top_and_the_first_column_left():
     assert ax.transData.transform((0, 6.0))[1] > ax.transData.transform((0, -6.0))[1]
 
 
+@pytest.mark.slow
 def test_surface_echo_does_not_darken_the_rest():
     stack = make(16)
     # A pulse of 5 ns reaches gates that open less than 7.5 ns after the surface: 0, 1 and 2.
@@ -130,6 +131,7 @@ def test_logarithmic_colours():
     np.testing.assert_allclose(colour_at(figure, drawn[5].axes, -6.0, 6.0), 153, atol=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gates", "shown"), [(36, 36), (37, 19), (64, 32), (200, 34), (1, 1)])
 def test_at_most_36_gates_evenly(gates, shown):
     drawn = images(plot_gates(make(gates)))
@@ -139,6 +141,7 @@ def test_at_most_36_gates_evenly(gates, shown):
     assert [image.get_array()[0, 0] for image in drawn] == pytest.approx([number + 1.0 for number in numbers])  # fJ
 
 
+@pytest.mark.slow
 def test_written_sheet_is_wide_enough(tmp_path):
     plot_gates(make(2), tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as picture:
@@ -330,6 +333,7 @@ def test_contrast_curve_of_wrong_masks(tmp_path):
         plot_contrast(stack, one, ~one, tmp_path / "a.png")
 
 
+@pytest.mark.slow
 def test_wrong_files_and_datasets(tmp_path):
     for draw in (plot_gates, plot_depths):
         with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):

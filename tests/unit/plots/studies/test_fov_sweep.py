@@ -9,6 +9,7 @@ from mitransient_lidar.plots.studies.fov_sweep import plot_fov_sweep
 C, KD, A = 0.3, 0.17, 0.15
 
 
+@pytest.mark.slow
 def test_attenuation_lies_between_its_limits():
     fields = np.array([2.0, 10.0, 50.0])
     radius = 0.1 * fields  # 200 m from the surface
