@@ -192,7 +192,7 @@ def test_rays_for_mitsubas_integrators_are_blurred():
     angle_x, angle_y, _ = (np.array(g, dtype=np.float64) for g in plugin.receiver.pose.tangent(ray.d))
     for g in (angle_x, angle_y):
         assert g.std() == pytest.approx(3e-3, rel=largest_z(COUNT, 2) / np.sqrt(2 * COUNT) + 1e-4)
-    assert np.array(weight).mean() == pytest.approx(COLLECTION * np.pi * 0.05e-3**2, rel=1e-3)
+    assert np.array(weight).mean() == pytest.approx(COLLECTION * np.pi * 0.05e-3**2, rel=1e-3, abs=0)
 
 
 @pytest.mark.slow

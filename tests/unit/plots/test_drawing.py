@@ -41,7 +41,7 @@ def test_images_have_the_far_row_on_top():
     [(3.2e-6, 1e-6, "µ"), (999.0, 1.0, ""), (1000.0, 1e3, "k"), (2e-21, 1e-18, "a"), (5e12, 1e9, "G"), (0.0, 1.0, "")],
 )
 def test_prefixes_scale_to_between_1_and_1000(largest, factor, prefix):
-    assert drawing.si_prefix(largest) == (pytest.approx(factor), prefix)
+    assert drawing.si_prefix(largest) == (pytest.approx(factor, rel=1e-12, abs=0), prefix)
 
 
 @pytest.mark.parametrize(("count", "distinct"), [(1, 1), (3, 3), (4, 4), (10, 10), (40, 40)])

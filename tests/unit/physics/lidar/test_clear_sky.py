@@ -55,6 +55,6 @@ def test_invalid_parameters_are_rejected(options, message):
 
 def test_background_power():
     """10 mW m^-2 sr^-1 nm^-1 on 1 mrad^2 and 0.025 m^2 through 1 nm: 0.25 nW."""
-    assert background_power([0.01, 0.02], 0.025e-6, 1.0) == pytest.approx([2.5e-10, 5e-10])
+    assert background_power([0.01, 0.02], 0.025e-6, 1.0) == pytest.approx([2.5e-10, 5e-10], rel=1e-12, abs=0)
     with pytest.raises(ValueError, match="filter_width_nm = 0 must be greater than 0"):
         background_power(0.01, 1e-8, 0.0)
