@@ -109,16 +109,18 @@ class LidarMerging(LidarIntegrator):
     ) -> PassRenderer:
         """Return the renderer of passes of a scene, by default with one class of light and the sensor's own receiver.
 
-        `layout_of` is the renderer of another scene whose points and cells are used, so that the same seeds make the
-        same paths in scenes that differ by a target. Without `connections` paths that do not meet the target return the
-        same light with and without it, but for light in cells that are full; the errors of narrow beams are larger.
+        `layout_of` is the renderer of another scene whose time bins, points and cells are used, so that the same seeds
+        make the same paths in scenes that differ by a target. Without `connections` paths that do not meet the target
+        return the same light with and without it, but for light in cells that are full; the errors of narrow beams are
+        larger.
 
         Raises
         ------
         UserError
             When the scene lacks a part or has one that is not supported.
         """
-        lidar = LidarScene.from_scene(scene, sensor, receiver)
+        axis = None if layout_of is None else layout_of.scene.axis
+        lidar = LidarScene.from_scene(scene, sensor, receiver, axis=axis)
         classes = classes or PathClasses()
         if lidar.water is None:
             # Without water all light is connected.

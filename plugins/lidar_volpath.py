@@ -101,8 +101,9 @@ class LidarVolpath(VolpathIntegrator):
         layout_of: PassRenderer | None = None,
         connections: bool = True,
     ) -> VolpathRenderer:
-        """Return the renderer of passes of a scene, as `LidarMerging.prepare`, without use of the last two options."""
-        lidar = LidarScene.from_scene(scene, sensor, receiver)
+        """Return the renderer of passes of a scene, as `LidarMerging.prepare`; it has no cells, and always connects."""
+        axis = None if layout_of is None else layout_of.scene.axis
+        lidar = LidarScene.from_scene(scene, sensor, receiver, axis=axis)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
 
 

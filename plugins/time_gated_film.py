@@ -44,7 +44,7 @@ class TimeGatedFilm(mi.Film):
     pulses            integer  Number of pulses that each gate accumulates, 1 to 10^9. Default: 1
     ================  =======  =========================================================================================
 
-    With ``auto`` the record is chosen once the scene is loaded, and a result lists it under ``used`` in the attribute
+    With ``auto`` the record is chosen when a scene is rendered, again after each edit of it, and a result lists it under ``used`` in the attribute
     ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
     before the first light of any pixel, from the highest crest or a target above it, and ten bins before the time
     until which ``waveforms`` measures the noise, by up to 100 ns more. It ends as much, and 12 times the
@@ -82,12 +82,13 @@ class TimeGatedFilm(mi.Film):
         self.time_start_ns = None if start == _AUTO else ranged("time_start_ns", start)
         self.bin_width_ns = ranged("bin_width_ns", props.get("bin_width_ns", 0.5))
         self.bin_count = None if count == _AUTO else _bin_count(count)
-        #: Time bins of the record, None until `fit`.
+        #: Time bins of the record, None until `fit`; whether `fit` leaves them as they are.
         self.axis: TimeAxis | None = None
+        self.is_fixed = False
         #: What the last light of the record comes from where its end is chosen.
         self.end = ""
         if self.time_start_ns is not None and self.bin_count is not None:
-            self.axis = TimeAxis(self.time_start_ns, self.bin_width_ns, self.bin_count)
+            self.axis, self.is_fixed = TimeAxis(self.time_start_ns, self.bin_width_ns, self.bin_count), True
         #: Gates of the scene, or None.
         self.gates = _gate_plan(props)
         props["width"], props["height"] = self.bin_count or 1, 1
@@ -95,14 +96,14 @@ class TimeGatedFilm(mi.Film):
         self._pass: TransientHistogram | None = None
 
     def fit(self, axis: TimeAxis, end: str = "") -> None:
-        """Set the time bins of a record of automatic start or length, once, and the reason for its end."""
-        if self.axis is None:
+        """Set the time bins of a record of automatic start or length, and the reason for its end."""
+        if not self.is_fixed:
             self.axis, self.end = axis, end if self.bin_count is None else ""
 
     def share(self, axis: TimeAxis) -> None:
-        """Use the time bins of other records where start or length are automatic."""
+        """Use the time bins of other records, from now on, where start or length are automatic."""
         if self.time_start_ns is None or self.bin_count is None:
-            self.axis, self.end = axis, ""
+            self.axis, self.end, self.is_fixed = axis, "", True
 
     @property
     def used_values(self) -> dict[str, float]:

@@ -253,11 +253,12 @@ class LidarScene(WaterScene):
         sensor: mi.Sensor,
         receiver: Receiver | None = None,
         shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),),
+        axis: TimeAxis | None = None,
     ) -> LidarScene:
         """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
 
-        A record of automatic time bins holds the light of all positions of the lidar, above water displaced by `shifts`
-        (x, y) [m].
+        A record of automatic time bins is that of `axis`, or holds the light of all positions of the lidar, above water
+        displaced by `shifts` (x, y) [m].
 
         Raises
         ------
@@ -281,12 +282,12 @@ class LidarScene(WaterScene):
         submerged = _check_place(parts, transmitters[0])
         if not submerged:
             _check_cells(surfaces, transmitters[0])
-        if film.axis is None:
-            # The record is that of the sensor, whatever replaces its receiver.
+        if axis is None and not film.is_fixed:
+            # The record is that of the sensor, whatever replaces its receiver; the scene may have been edited.
             own = replace(parts, receiver=find_receiver(sensor))
             found = (own, transmitters[0], film)
             film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
-        return cls(scene, receiver, water, surfaces, variance, transmitters[0], film.axis, film.gates)
+        return cls(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
 
 
 def _moved(ray: mi.Ray3f, displacement: mi.Vector3f) -> mi.Ray3f:
