@@ -44,7 +44,7 @@ class TimeGatedFilm(mi.Film):
     pulses            integer  Number of pulses that each gate accumulates, 1 to 10^9. Default: 1
     ================  =======  =========================================================================================
 
-    With ``auto`` the record is chosen when a scene is rendered, again after each edit of it, and a result lists it under ``used`` in the attribute
+    With ``auto`` the record is chosen when a scene is rendered, anew after each edit; a result lists it as ``used`` in
     ``plugin_parameters``. It starts three widths of the pulse, or the length of a measured one, but at least 12 ns,
     before the first light of any pixel, from the highest crest or a target above it, and ten bins before the time
     until which ``waveforms`` measures the noise, by up to 100 ns more. It ends as much, and 12 times the
