@@ -224,8 +224,7 @@ def _experiment(
     # The signal of a linear detector does not depend on earlier light than the memory of its filter.
     start = 0
     if isinstance(chain.detector, LinearDetector):
-        memory = chain.amplifier.kernel(width)[1].size if chain.amplifier is not None else 0
-        start = max(0, int(chosen[0]) * stride - memory - math.ceil(pulse / width)) // stride
+        start = max(0, int(chosen[0]) * stride - chain.low_pass(width).before - math.ceil(pulse / width)) // stride
     kept = slice(start * stride, None)
     return Experiment(
         np.maximum(bare[..., kept], 0),

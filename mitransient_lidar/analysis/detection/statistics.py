@@ -11,7 +11,6 @@ import numpy.typing as npt
 from mitransient_lidar.core.constants import ELEMENTARY_CHARGE
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.receiver.detectors import photons_per_joule
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
 
@@ -31,34 +30,34 @@ def sample_moments(
 
     Notes
     -----
-    Mean and variance are those of `ReceiverChain.expected`. The correlation of samples is that of the detector's charge
+    Mean and variance are those of `ReceiverChain.expected`. The correlation of samples is that of charge and noise
     after the low-pass, which a logarithm changes little; rounding errors are assumed independent.
     """
     expected = chain.expected(power, bin_width_ns, background)
     chosen = range(*samples.indices(expected.mean.shape[-1]))
     light = np.asarray(power, dtype=np.float64)
-    sky = np.asarray(background, dtype=np.float64)[..., None]
-    bins = chain.stride(bin_width_ns) * np.array(chosen)
-    if chain.amplifier is None:
-        first, weights, white, gain = 0, np.ones(1), 0.0, 1.0
-    else:
-        first, weights = chain.amplifier.kernel(bin_width_ns)
-        white = chain.amplifier.white_noise(bin_width_ns)
-        gain = chain.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * bin_width_ns)
-    before, after = first + weights.size - 1, -first
-    padded = np.pad(light, [(0, 0)] * (light.ndim - 1) + [(before, after)]) + sky
-    photons = padded * 1e-9 * bin_width_ns * photons_per_joule(chain.wavelength_nm)
-    reach = int(bins[-1] - bins[0]) + weights.size
-    _, lags = chain.detector.moments(chain.detector.event_means(photons, bin_width_ns), bin_width_ns, reach)
-    # Covariance of the charges in the bins that the samples depend on, and weights of these bins in each sample.
+    sky = np.broadcast_to(np.asarray(background, dtype=np.float64), light.shape[:-1])
+    stride, low_pass = chain.stride(bin_width_ns), chain.low_pass(bin_width_ns)
+    # Covariance of the charges in the parts of bins that the samples depend on, and weights of them in each sample.
+    rows = stride * low_pass.parts * (np.array(chosen) - chosen[0])
+    reach, begin = int(rows[-1]) + low_pass.weights.size, low_pass.start + stride * low_pass.parts * chosen[0]
+    part = bin_width_ns / low_pass.parts
+    _, lags = chain.detector.moments(chain.events(light, bin_width_ns, sky), part, reach)
     charge = np.zeros((*light.shape[:-1], reach, reach))
     for lag, one in enumerate(lags[:reach]):
         i = np.arange(reach - lag)
-        charge[..., i, i + lag] = charge[..., i + lag, i] = one[..., bins[0] : bins[0] + reach - lag]
+        charge[..., i, i + lag] = charge[..., i + lag, i] = one[..., begin : begin + reach - lag]
     mixing = np.zeros((len(chosen), reach))
-    for row, start in enumerate(bins - bins[0]):
-        mixing[row, start : start + weights.size] = weights[::-1]
-    covariance = gain**2 * (mixing @ charge @ mixing.T) + white**2 * (mixing @ mixing.T)
+    for row, start in enumerate(rows):
+        mixing[row, start : start + low_pass.weights.size] = low_pass.weights[::-1]
+    covariance = mixing @ charge @ mixing.T
+    if chain.amplifier is not None:
+        covariance *= (chain.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * part)) ** 2
+        white, weights = chain.amplifier.noise(bin_width_ns, stride)
+        apart = np.abs(np.subtract.outer(np.arange(len(chosen)), np.arange(len(chosen))))
+        padded = np.pad(weights, (0, len(chosen)))
+        correlation = np.array([weights @ padded[k : k + weights.size] for k in range(len(chosen))])
+        covariance += white**2 * correlation[apart]
     deviation = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     rounding = np.zeros_like(deviation)
     if chain.digitiser is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -13,6 +14,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, integer, non_negative, positive
 
 _TAIL = 1e-10  # fraction of a filter's response left out at its ends
+#: Longest part of a bin, in time constants of the responses, for which steady light has its shot noise to 0.5 %.
+_PART = {"single_pole": 0.25, "gaussian": 1 / 3}
 _NODES = 48  # of the quadrature over a normal distribution within 8 standard deviations
 
 
@@ -22,6 +25,45 @@ class Expected(NamedTuple):
     mean: FloatArray
     variance: FloatArray
     saturation: FloatArray
+
+
+@dataclass(frozen=True)
+class LowPass:
+    """Response of an amplifier to charges in equal parts of the bins, sampled in the middle of each bin."""
+
+    parts: int  #: Parts of a bin, an even number, or 1 where a sample is the mean of its bin.
+    first: int  #: Parts from the end of the part of the first weight to the middle of the bin; negative after it.
+    weights: FloatArray  #: Weights of parts, from late to early ones, of unit sum.
+
+    @property
+    def before(self) -> int:
+        """Number of bins before a sample's own on which it depends."""
+        return max(math.ceil((self.weights.size + self.first - self.parts // 2) / self.parts), 0)
+
+    @property
+    def after(self) -> int:
+        """Number of bins after a sample's own on which it depends."""
+        return math.ceil((self.parts // 2 - self.first) / self.parts) - 1
+
+    @property
+    def start(self) -> int:
+        """Part of a record, with `before` bins before it, that is the first on which sample 0 depends."""
+        return self.before * self.parts + self.parts // 2 - self.first - self.weights.size
+
+    def divided(self, record: FloatArray) -> FloatArray:
+        """Return a record, shape (..., time), that holds in each part of a bin an equal part of its value."""
+        return record if self.parts == 1 else np.repeat(record / self.parts, self.parts, axis=-1)
+
+    def sampled(self, record: FloatArray, stride: int, weights: FloatArray | None = None) -> FloatArray:
+        """Filter a record of parts, with `before` and `after`; return every `stride`-th sample.
+
+        `weights` replace those of the response; N weights less need a record that is N parts shorter.
+        """
+        return filtered(record, self.weights if weights is None else weights)[..., self.start :: stride * self.parts]
+
+
+#: Without a low-pass a sample is the mean of its bin.
+MEAN_OF_BINS = LowPass(1, -1, np.ones(1))
 
 
 @dataclass(frozen=True)
@@ -68,27 +110,55 @@ class Amplifier:
         if self.response not in ("single_pole", "gaussian"):
             raise UserError(f"response = {self.response!r} must be 'single_pole' or 'gaussian'")
 
-    def white_noise(self, bin_width_ns: float) -> float:
-        """Return the standard deviation [V] of the input noise, averaged over a bin, before the low-pass."""
+    def low_pass(self, bin_width_ns: float) -> LowPass:
+        """Return the response to charges in parts of bins, short enough for the noise of steady light to 0.5 %."""
+        if self.bandwidth_mhz is None:
+            return MEAN_OF_BINS
+        from scipy.special import ndtr
+
+        scale = self._time_constant_ns()
+        longest = _PART[self.response] * scale
+        parts = 2 * math.ceil(bin_width_ns / (2 * longest))
+        decay = bin_width_ns / parts / scale
+        if self.response == "single_pole":
+            edges = np.arange(int(np.ceil(-np.log(_TAIL) / decay)) + 1)
+            return LowPass(parts, 0, _unit(-np.diff(np.exp(-edges * decay))))
+        reach = int(np.ceil(6.5 / decay))
+        return LowPass(parts, -reach, _unit(np.diff(ndtr(np.arange(-reach, reach + 1) * decay))))
+
+    def noise(self, bin_width_ns: float, stride: int = 1) -> tuple[float, FloatArray]:
+        """Return the amplifier's own noise in samples that are `stride` bins apart.
+
+        Returns
+        -------
+        deviation : float
+            Standard deviation [V]: that of the density over the noise bandwidth of the low-pass, pi/2 of the half-power
+            frequency for a single pole and sqrt(pi/ln 16) of it for a Gaussian, or half a period of the bins without.
+        weights : ndarray
+            Weights, of unit sum of squares, that give independent normal numbers the correlation of the samples.
+        """
         density = (1e-12 * self.noise_pa_per_rthz) ** 2
         if self.load_ohm is not None:
             density += 4 * BOLTZMANN * self.temperature_k / self.load_ohm
-        return float(self.transimpedance_ohm * np.sqrt(density / (2e-9 * bin_width_ns)))
-
-    def kernel(self, bin_width_ns: float) -> tuple[int, FloatArray]:
-        """Return first lag and weights of the low-pass: the fraction of a charge in the middle of bin 0 in each bin."""
+        volts = self.transimpedance_ohm * math.sqrt(density)
         if self.bandwidth_mhz is None:
-            return 0, np.ones(1)
+            return volts * math.sqrt(0.5e9 / bin_width_ns), np.ones(1)
+        step = stride * bin_width_ns / self._time_constant_ns()
         if self.response == "single_pole":
-            decay = bin_width_ns * 2e-3 * np.pi * self.bandwidth_mhz
-            last = int(np.ceil(-np.log(_TAIL) / decay))
-            edges = np.maximum(np.arange(last + 2) - 0.5, 0)
-            return 0, _unit(-np.diff(np.exp(-edges * decay)))
-        from scipy.special import ndtr
+            powers = np.exp(-step * np.arange(math.ceil(-math.log(_TAIL) / step) + 1))
+            return volts * math.sqrt(0.5e6 * math.pi * self.bandwidth_mhz), _normal(powers)
+        # A filter whose spectrum is the root of that of the correlation exp(-t^2/(4 sigma^2)).
+        lags = np.arange(math.ceil(12 / step) + 1)
+        correlation = np.exp(-0.25 * (lags * step) ** 2)
+        spectrum = np.fft.rfft(np.concatenate([correlation, correlation[:0:-1]]))
+        weights = np.fft.fftshift(np.fft.irfft(np.sqrt(np.maximum(spectrum.real, 0)), 2 * lags.size - 1))
+        return volts * math.sqrt(1e6 * math.sqrt(math.pi / math.log(16)) * self.bandwidth_mhz), _normal(weights)
 
-        sigma = np.sqrt(np.log(2)) / (2e-3 * np.pi * self.bandwidth_mhz) / bin_width_ns
-        reach = int(np.ceil(6.5 * sigma))
-        return -reach, _unit(np.diff(ndtr((np.arange(-reach, reach + 2) - 0.5) / sigma)))
+    def _time_constant_ns(self) -> float:
+        """Time constant of the single pole, or standard deviation of the Gaussian response."""
+        assert self.bandwidth_mhz is not None
+        factor = 1.0 if self.response == "single_pole" else math.sqrt(math.log(2))
+        return factor / (2e-3 * math.pi * self.bandwidth_mhz)
 
 
 @dataclass(frozen=True)
@@ -265,3 +335,8 @@ def filtered(record: FloatArray, weights: FloatArray) -> FloatArray:
 def _unit(weights: FloatArray) -> FloatArray:
     """Return weights of unit sum."""
     return np.asarray(weights / weights.sum())
+
+
+def _normal(weights: FloatArray) -> FloatArray:
+    """Return weights of unit sum of squares."""
+    return np.asarray(weights / np.sqrt(np.sum(weights**2)))

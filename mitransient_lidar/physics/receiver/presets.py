@@ -27,10 +27,12 @@ from mitransient_lidar.physics.receiver.detectors import (
     photons_per_joule,
 )
 from mitransient_lidar.physics.receiver.electronics import (
+    MEAN_OF_BINS,
     Amplifier,
     Digitiser,
     Expected,
     LogAmplifier,
+    LowPass,
     Readout,
     filtered,
 )
@@ -112,26 +114,31 @@ class ReceiverChain:
         Record
             Signal in `units`, and whether amplifier or digitiser are saturated.
         """
-        events = self._events(power, bin_width_ns, background)
+        light, sky = self._light(power, bin_width_ns, background)
         number, start = integer("shots", shots, 1, 10**9), integer("seed", seed, 0, 2**63 - 1)
-        before, after = self._padding(bin_width_ns)
-        bins = events.shape[-1] - before - after
-        shape = (number, *events.shape[:-1], -(-bins // self.stride(bin_width_ns)))
+        stride = self.stride(bin_width_ns)
+        shape = number, len(light), -(-light.shape[-1] // stride)
         record = Record(np.empty(shape, np.float32), np.empty(shape, np.bool_))
-        size = max(1, _BLOCK // events.size)
-        blocks = -(-number // size)
-        seeds = np.random.SeedSequence(start).spawn(blocks)
+        low_pass = self.low_pass(bin_width_ns)
+        length = low_pass.parts * (light.shape[-1] + low_pass.before + low_pass.after)
+        some = max(1, min(_BLOCK // length, len(light)))
+        size = max(1, _BLOCK // (some * length))
+        blocks = [(i, j) for i in range(0, number, size) for j in range(0, len(light), some)]
+        seeds = np.random.SeedSequence(start).spawn(len(blocks))
 
         def draw(block: int) -> None:
-            own = slice(block * size, min((block + 1) * size, number))
+            i, j = blocks[block]
+            own = slice(i, min(i + size, number)), slice(j, j + some)
             random = np.random.default_rng(seeds[block])
-            charge = self.detector.sample(events, bin_width_ns, own.stop - own.start, random)
+            events = self.events(light[own[1]], bin_width_ns, sky[own[1]])
+            charge = self.detector.sample(events, bin_width_ns / low_pass.parts, own[0].stop - i, random)
             record.signal[own], record.saturated[own] = self._process(charge, bin_width_ns, random)
 
-        with ThreadPoolExecutor(min(blocks, os.cpu_count() or 1, 8)) as pool:
-            for _ in pool.map(draw, range(blocks)):
+        with ThreadPoolExecutor(min(len(blocks), os.cpu_count() or 1, 8)) as pool:
+            for _ in pool.map(draw, range(len(blocks))):
                 pass
-        return record
+        whole = number, *np.shape(power)[:-1], shape[-1]
+        return Record(record.signal.reshape(whole), record.saturated.reshape(whole))
 
     def expected(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> Expected:
         """Return mean, variance and probability of saturation of the samples in closed form, in `units`.
@@ -204,21 +211,16 @@ class ReceiverChain:
         self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and variance of the samples before clipping, logarithm and rounding."""
-        events = self._events(power, bin_width_ns, background)
-        if self.amplifier is None:
-            mean, covariances = self.detector.moments(events, bin_width_ns, 1)
-            return mean, covariances[0]
-        _, weights = self.amplifier.kernel(bin_width_ns)
-        records = events.reshape(-1, events.shape[-1])
-        some = max(1, _BLOCK * 8 // (records.shape[-1] * weights.size))
+        light, sky = self._light(power, bin_width_ns, background)
+        low_pass, stride = self.low_pass(bin_width_ns), self.stride(bin_width_ns)
+        some = max(1, _BLOCK * 8 // (low_pass.parts * light.shape[-1] * low_pass.weights.size))
         parts = [
-            self._filtered_moments(records[i : i + some], bin_width_ns, weights) for i in range(0, len(records), some)
+            self._filtered_moments(light[i : i + some], bin_width_ns, sky[i : i + some], stride)
+            for i in range(0, len(light), some)
         ]
-        every = slice(None, None, self.stride(bin_width_ns))
-        mean, variance = (
-            np.concatenate(part).reshape(*events.shape[:-1], -1)[..., every] for part in zip(*parts, strict=True)
-        )
-        return mean, variance + self.amplifier.white_noise(bin_width_ns) ** 2 * np.sum(weights**2)
+        shape = *np.shape(power)[:-1], -1
+        mean, variance = (np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True))
+        return mean, variance if self.amplifier is None else variance + self.amplifier.noise(bin_width_ns)[0] ** 2
 
     def snr(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
         """Return the signal-to-noise ratio of the samples of one shot, shape (..., sample).
@@ -234,40 +236,53 @@ class ReceiverChain:
             ratio = np.where(rise == 0, 0, rise / np.sqrt(lit.variance))
         return np.where(lit.saturation > 0.5, np.nan, ratio)
 
-    def _events(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike) -> FloatArray:
-        """Mean primary events per bin, with bins of background before and after for the low-pass."""
+    def low_pass(self, bin_width_ns: float) -> LowPass:
+        """Return the response of the amplifier, if any, for a bin width [ns]."""
+        return MEAN_OF_BINS if self.amplifier is None else self.amplifier.low_pass(bin_width_ns)
+
+    def events(self, power: FloatArray, bin_width_ns: float, background: FloatArray) -> FloatArray:
+        """Return mean primary events in parts of bins, with those before and after that the low-pass needs.
+
+        Powers [W] are of shape (..., time), backgrounds [W] of shape (...).
+        """
+        low_pass = self.low_pass(bin_width_ns)
+        ends = [(0, 0)] * (power.ndim - 1) + [(low_pass.before, low_pass.after)]
+        photons = (
+            (np.pad(power, ends) + background[..., None]) * 1e-9 * bin_width_ns * photons_per_joule(self.wavelength_nm)
+        )
+        return self.detector.event_means(low_pass.divided(photons), bin_width_ns / low_pass.parts)
+
+    def _light(
+        self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return checked powers, shape (record, time), and backgrounds, shape (record,)."""
         signal, sky = non_negative_array("power", power), non_negative_array("background", background)
-        width = positive("bin_width_ns", bin_width_ns)
+        positive("bin_width_ns", bin_width_ns)
         if signal.ndim == 0 or signal.size == 0:
             raise UserError(f"power of shape {signal.shape} must have a time axis and values")
         if sky.shape not in ((), signal.shape[:-1]):
             raise UserError(f"background of shape {sky.shape} must be a number or of shape {signal.shape[:-1]}")
-        before, after = self._padding(width)
-        padded = np.pad(signal, [(0, 0)] * (signal.ndim - 1) + [(before, after)]) + sky[..., None]
-        return self.detector.event_means(padded * 1e-9 * width * photons_per_joule(self.wavelength_nm), width)
-
-    def _padding(self, bin_width_ns: float) -> tuple[int, int]:
-        """Numbers of bins that the low-pass needs before and after a record."""
-        if self.amplifier is None:
-            return 0, 0
-        first, weights = self.amplifier.kernel(bin_width_ns)
-        return first + weights.size - 1, -first
+        return signal.reshape(-1, signal.shape[-1]), np.broadcast_to(sky, signal.shape[:-1]).ravel()
 
     def _filtered_moments(
-        self, events: FloatArray, bin_width_ns: float, weights: FloatArray
+        self, power: FloatArray, bin_width_ns: float, background: FloatArray, stride: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Mean [V] and variance [V^2] of the detector's signal behind the low-pass."""
-        charge, covariances = self.detector.moments(events, bin_width_ns, weights.size)
-        volts = self._volts_per_electron(bin_width_ns)
-        variance = filtered(covariances[0], weights**2)
+        """Mean and variance of the detector's signal in the samples: of charges, or volts behind an amplifier."""
+        low_pass = self.low_pass(bin_width_ns)
+        weights = low_pass.weights
+        events = self.events(power, bin_width_ns, background)
+        charge, covariances = self.detector.moments(events, bin_width_ns / low_pass.parts, weights.size)
+        variance = low_pass.sampled(covariances[0], stride, weights**2)
         for lag, covariance in enumerate(covariances[1:], 1):
-            variance += 2 * filtered(covariance, weights[:-lag] * weights[lag:])
-        return filtered(charge, weights) * volts, np.maximum(variance, 0) * volts**2
+            variance += 2 * low_pass.sampled(covariance, stride, weights[:-lag] * weights[lag:])
+        volts = 1.0 if self.amplifier is None else self._volts_per_electron(bin_width_ns)
+        return low_pass.sampled(charge, stride) * volts, np.maximum(variance, 0) * volts**2
 
     def _volts_per_electron(self, bin_width_ns: float) -> float:
-        """Mean voltage over a bin per electron in it."""
+        """Mean voltage over a part of a bin per electron in it."""
         assert self.amplifier is not None
-        return self.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * bin_width_ns)
+        width = bin_width_ns / self.low_pass(bin_width_ns).parts
+        return self.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * width)
 
     def _readout(self) -> Readout:
         """Return the stages behind the low-pass."""
@@ -277,14 +292,17 @@ class ReceiverChain:
     def _process(
         self, charge: FloatArray, bin_width_ns: float, random: np.random.Generator
     ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Convert charges in electrons per bin to samples."""
+        """Convert charges in electrons in each part of a bin to samples."""
+        low_pass, stride = self.low_pass(bin_width_ns), self.stride(bin_width_ns)
         if self.amplifier is None:
-            return charge, np.zeros(charge.shape, np.bool_)
-        volts = charge * self._volts_per_electron(bin_width_ns)
-        if noise := self.amplifier.white_noise(bin_width_ns):
-            volts += noise * random.standard_normal(volts.shape)
-        _, weights = self.amplifier.kernel(bin_width_ns)
-        return self._readout().read(filtered(volts, weights)[..., :: self.stride(bin_width_ns)])
+            signal = low_pass.sampled(charge, stride)
+            return signal, np.zeros(signal.shape, np.bool_)
+        volts = low_pass.sampled(charge, stride) * self._volts_per_electron(bin_width_ns)
+        deviation, weights = self.amplifier.noise(bin_width_ns, stride)
+        if deviation > 0:
+            normal = random.standard_normal((*volts.shape[:-1], volts.shape[-1] + weights.size - 1))
+            volts += deviation * filtered(normal, weights)
+        return self._readout().read(volts)
 
 
 # A gain of 5 and six of 4 give an excess noise of 1.27; photomultipliers have 1.2 to 1.3 (Hamamatsu, questions and

@@ -9,37 +9,68 @@ from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser,
 
 
 @pytest.mark.parametrize("response", ["single_pole", "gaussian"])
-def test_kernel_halves_the_power_at_the_bandwidth(response):
+def test_low_pass_halves_the_power_at_the_bandwidth(response):
     width, frequency = 0.05, 100.0
-    first, weights = Amplifier(1.0, bandwidth_mhz=frequency, response=response).kernel(width)
-    assert weights.sum() == pytest.approx(1)
-    t = 1e-3 * width * (first + np.arange(weights.size))  # us
+    low_pass = Amplifier(1.0, bandwidth_mhz=frequency, response=response).low_pass(width)
+    assert low_pass.weights.sum() == pytest.approx(1)
+    # Charges in the middle of each part.
+    t = 1e-3 * width / low_pass.parts * (low_pass.first + np.arange(low_pass.weights.size) + 0.5)  # us
     for f in (0.5 * frequency, frequency, 2 * frequency):
-        gain = abs(np.sum(weights * np.exp(-2j * np.pi * f * t))) ** 2
+        gain = abs(np.sum(low_pass.weights * np.exp(-2j * np.pi * f * t))) ** 2
         ideal = 1 / (1 + (f / frequency) ** 2) if response == "single_pole" else 2 ** -((f / frequency) ** 2)
         assert gain == pytest.approx(ideal, rel=2e-3)
-    delay = np.sum(weights * t)
+    delay = np.sum(low_pass.weights * t)
     assert delay == pytest.approx(1 / (2 * np.pi * frequency) if response == "single_pole" else 0, rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.parametrize("width", [0.1, 1.0, 7.0])
+@pytest.mark.parametrize("response", ["single_pole", "gaussian"])
+def test_samples_see_each_charge_once_and_in_its_time(response, width):
+    """Steady light, an echo in one bin, and the bins that a sample depends on."""
+    low_pass = Amplifier(1.0, bandwidth_mhz=100.0, response=response).low_pass(width)
+    bins = 4 + low_pass.before + low_pass.after
+    record = np.zeros((bins, bins + low_pass.before + low_pass.after))
+    record[np.arange(bins), np.arange(bins) + low_pass.before] = 1
+    matrix = low_pass.parts * low_pass.sampled(low_pass.divided(record), 1)  # of the echo's bin and the sample's
+    sigma = np.sqrt(np.log(2)) / (2e-3 * np.pi * 100)
+    for late in range(-low_pass.after, low_pass.before + 1):
+        edges = np.array([late - 0.5, late + 0.5]) * width
+        part = (
+            norm.cdf(edges / sigma) if response == "gaussian" else -np.exp(-2e-3 * np.pi * 100 * np.maximum(edges, 0))
+        )
+        np.testing.assert_allclose(np.diagonal(matrix, late), np.diff(part)[0], atol=1e-9)
+    others = np.triu(matrix, low_pass.before + 1) + np.tril(matrix, -low_pass.after - 1)
+    assert np.abs(others).max() < 1e-12
+    every = low_pass.parts * low_pass.sampled(low_pass.divided(record), 3)
+    np.testing.assert_array_equal(every, matrix[:, ::3])
+
+
+@pytest.mark.parametrize("width", [0.1, 1.0, 4.0])
 @pytest.mark.parametrize(
     ("response", "factor"), [("single_pole", np.pi / 2), ("gaussian", np.sqrt(np.pi / np.log(16)))]
 )
-def test_thermal_noise_behind_the_bandwidth(response, factor):
-    # 4 k T/R times the equivalent noise bandwidth: 1.571 and 1.064 times that of half power.
+def test_thermal_noise_behind_the_bandwidth(response, factor, width):
+    """4 k T/R times the equivalent noise bandwidth, 1.571 and 1.064 times that of half power, for bins of any width."""
     amplifier = Amplifier(50.0, load_ohm=50.0, temperature_k=300.0, bandwidth_mhz=100.0, response=response)
-    _, weights = amplifier.kernel(0.005)
-    variance = amplifier.white_noise(0.005) ** 2 * np.sum(weights**2)
+    deviation, weights = amplifier.noise(width, 2)
     density = 4 * 1.380649e-23 * 300 / 50
-    assert variance / (50.0**2 * density * factor * 1e8) == pytest.approx(1, abs=2e-3)
+    assert deviation**2 / (50.0**2 * density * factor * 1e8) == pytest.approx(1, abs=1e-4)
+    # Correlation after two bins, by the Fourier transform of the response's power.
+    angle = 2e-3 * np.pi * 100 * 2 * width
+    rho = np.exp(-angle) if response == "single_pole" else np.exp(-(angle**2) / (4 * np.log(2)))
+    assert np.sum(weights**2) == pytest.approx(1)
+    assert np.sum(weights[1:] * weights[:-1]) == pytest.approx(rho, abs=1e-6)
 
 
 def test_amplifier_noise_without_a_low_pass_is_that_of_the_bins():
     # White noise averaged over 1 ns has the bandwidth of 500 MHz; 3 and 4 pA/sqrt(Hz) together are 5.
     density = 4 * 1.380649e-23 * 293.15 / (4e-12) ** 2
     amplifier = Amplifier(1e3, noise_pa_per_rthz=3.0, load_ohm=density)
-    assert amplifier.white_noise(1.0) == pytest.approx(1e3 * 5e-12 * np.sqrt(5e8))
-    assert amplifier.kernel(1.0) == (0, np.ones(1))
+    deviation, weights = amplifier.noise(1.0, 5)
+    assert deviation == pytest.approx(1e3 * 5e-12 * np.sqrt(5e8))
+    assert weights == np.ones(1)
+    record = np.arange(6.0)
+    np.testing.assert_array_equal(amplifier.low_pass(1.0).sampled(record, 1), record)
 
 
 def test_filtered_is_causal_and_ordered():
