@@ -91,7 +91,8 @@ def closed_form_ns(side):
 def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     """Same seeds, same light: to the bit where layers are equal, as they are joined.
 
-    Where they differ by 1e-7 flights through the edges are rounded, which moves one contribution in 1e5.
+    Where they differ by 1e-7 flights through the edges are rounded, which moves one contribution in 1e5. Rarely that
+    changes the number of stored segments, and with it the random numbers of the rest of a pass: most passes are equal.
     """
 
     def record(layer_tops, attenuation="0.9", scattering=0.7):
@@ -102,19 +103,20 @@ def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
             "backscattering": 0.014,
         }
         engine = {"type": integrator, "paths_per_pass": 2**14}
-        return passes(lidar_scene(integrator=engine, water=water, sea={"spectrum": "elfouhaily"}), 2)
+        return passes(lidar_scene(integrator=engine, water=water, sea={"spectrum": "elfouhaily"}), 7)
 
     whole = record("0")
-    lit = whole > 0
+    lit = np.sum(whole > 0, axis=(1, 2))
 
     def share_of_equal_bins(other):
-        return np.mean(np.isclose(whole, other, rtol=1e-5, atol=0)[lit])
+        equal = np.isclose(whole, other, rtol=1e-5, atol=0) & (whole > 0)
+        return np.median(equal.sum(axis=(1, 2)) / lit)
 
     np.testing.assert_array_equal(record("0, 1.1, 2.3, 5.7"), whole)
     for layer_tops, attenuation in (("0, 3", "0.9, 0.9000001"), ("0, 1.1, 2.3, 5.7", "0.9, 0.9000001, 0.9, 0.9000001")):
         divided = record(layer_tops, attenuation)
         assert share_of_equal_bins(divided) > 0.9
-        np.testing.assert_allclose(divided.sum(axis=(0, 2)), whole.sum(axis=(0, 2)), rtol=1e-4)
+        np.testing.assert_allclose(np.median(divided.sum(axis=2) / whole.sum(axis=2), axis=0), 1, atol=1e-4)
     assert share_of_equal_bins(record("0", scattering=0.701)) < 0.05
 
 
