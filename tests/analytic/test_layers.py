@@ -91,8 +91,8 @@ def closed_form_ns(side):
 def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     """Same seeds, same light: to the bit where layers are equal, as they are joined.
 
-    Where they differ by 1e-7 flights through the edges are rounded, which moves one contribution in 1e5. Rarely that
-    changes the number of stored segments, and with it the random numbers of the rest of a pass: most passes are equal.
+    Where they differ by 1e-7 flights through the edges are rounded, which moves one contribution in 1e5. A path that
+    ends elsewhere may shift the random numbers of all that follow, as in one of 50 passes: most of seven are compared.
     """
 
     def record(layer_tops, attenuation="0.9", scattering=0.7):
