@@ -173,7 +173,8 @@ def test_change_points_in_a_blurred_step():
     records = noisy(signal, 0.002, 50)
     every = np.ones(50)
     found = change_points(records, 55 * every, 150 * every, blur_ns=WIDTH)
-    np.testing.assert_allclose(found.time_ns[:, 0], 100, atol=1.0)
+    assert abs(found.time_ns[:, 0].mean() - 100) < 1
+    np.testing.assert_allclose(found.time_ns[:, 0], 100, atol=3)  # a spread of 0.4
     assert found.step[:, 0].mean() == pytest.approx(np.log(0.5), abs=0.06)  # the blur reaches farther
 
 
