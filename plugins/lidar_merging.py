@@ -43,8 +43,12 @@ class LidarMerging(LidarIntegrator):
     Cells are sectors of rings about the refracted beam, in layers below the surface. With the distance *r* from the
     axis and a core radius *q* of two standard deviations of the beam and 0.05 m for each metre of depth, rings have
     equal widths in arsinh(*r*/*q*): cells are small where the light is concentrated, and grow with the distance from a
-    narrow beam. They are half as thick as the distance of the points, at most 0.3 attenuation lengths. Patches of
-    solids that look up or down are such sectors, too.
+    narrow beam. They are half as thick as the distance of the points, at most 0.3 attenuation lengths, and thinner near
+    the surface where a narrow beam spreads fast. Patches of solids that look up or down are such sectors, too.
+
+    Within a cell, light and the receiver's paths are compared where their lines meet a common plane, at a random depth
+    in each pass, so that refraction by waves and ripples does not blur them. The profile that a Gaussian beam has at
+    the point's own depth, over that at the plane, corrects for the spread between the two.
 
     Some points of the receiver's paths are connected, over any distance, with a random point of a light path, or with
     light on a solid, by a segment in the water. Light that is scattered into a narrow beam, or out of it, far from the
@@ -75,9 +79,9 @@ class LidarMerging(LidarIntegrator):
 
     Cells blur the light by their width: where waves focus both beam and field of view, the signal is biased low. Cells
     follow the surface and are sheared along the beam; times and absorption are those of the receiver's point; patches
-    cut by edges count by their covered share. With the default cells the bias of the water's signal in the published
-    geometry is -0.5 % in the first metre, -0.1 % below, and 0 at the bottom; it falls with ``cell_size``. At 75 degrees
-    over waves of 3 m/s the first metre is 1 to 2 % low. There are no derivatives.
+    cut by edges count by their covered share. Over waves of 6 m/s the water's signal in the published geometry differs
+    from the reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below; at 75 degrees over waves of 3 m/s
+    by -1.4 +- 0.6 and -0.5 +- 0.5 %. Wider cells (``cell_size``) have more bias. There are no derivatives.
 
     .. code-block:: xml
 

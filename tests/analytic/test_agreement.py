@@ -136,6 +136,25 @@ CASES = {
         {"tx": {"divergence_mrad": 0.5}, "rx": {"field_of_view_mrad": 20.0}, "sea": WAVES, "bottom": 4.0},
         *(FROM_200_M, 5, 0.03, None),
     ),
+    # Beam and view spread by their own width within centimetres of water, far from the mean level of the sea.
+    "view as narrow as the beam": (
+        {
+            "tx": {**pose(20.0, 20.0), "divergence_mrad": 0.2},
+            "rx": {**pose(20.0, 20.0), "field_of_view_mrad": 0.6},
+            "sea": {**WAVES, "wind_speed": 6.0},
+        },
+        (140.0, 0.5, 160),
+        *(2, 0.03, None),
+    ),
+    "narrow view at 75 degrees": (
+        {
+            "tx": {**pose(20.0, 75.0), "divergence_mrad": 1.0},
+            "rx": {**pose(20.0, 75.0), "field_of_view_mrad": 3.0},
+            "sea": {**WAVES, "wind_speed": 5.0},
+        },
+        (510.0, 1.0, 110),
+        *(4, 0.02, None),
+    ),
     "elliptic beam": (
         {
             "tx": {"divergence_mrad": 2.0, "divergence_across_mrad": 15.0},
@@ -215,7 +234,7 @@ def assert_same_light(merged, reference, error):
 MIXED = "mirror and sphere in strata"
 #: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water.
 LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam", "a diver looks up"}
-LONG |= {"mast, 1 m aside over waves", "from orbit over waves"}
+LONG |= {"narrow view at 75 degrees", "mast, 1 m aside over waves", "from orbit over waves"}
 
 
 def tier_of(name):

@@ -12,7 +12,9 @@ import pytest
 import significance
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin
 from oracles.echo_times import bottom_time_ns
+from oracles.lidar_equation import column_energy
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -181,6 +183,39 @@ def test_column_and_bottom_of_layered_water(lidar_scene, case, integrator):
     # Before the bottom: light that it reflects may be scattered once, too.
     seen = (backscatter > 0.01 * backscatter.max()) & (case.edges[1:] < case.edges[:-1][bottom.any(axis=0)].min())
     significance.assert_equal(energy[:, :, 0, 1][:, seen], backscatter[seen], error=0.015, bias=2e-3)
+
+
+@pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.slow)])
+def test_ripples_spread_a_beam_and_its_view_within_decimetres(lidar_scene, passes, integrator):
+    """Beam and view of millimetres: the echo falls to a tenth in half a metre. Thick cells lost 20 % of it.
+
+    Slopes of the variance s^2 in each direction turn light and lines of sight by D s, D = 1 - 1/n, so that a share
+    1 - exp(-R^2 / 2 (sigma^2 + 2 D^2 s^2 z^2)) of the light at the depth z lies within the view of radius R.
+    """
+    height, index, variance, sigma, radius = 20.0, 1.34, 0.005, 2e-3, 6e-3
+    bin_ns, bins, parts = 0.5, 24, 16
+    water = {"attenuation": 0.05, "scattering": 2e-3, "backscattering": 1e-3, "phase_function": "hg", "phase_g": 0.0}
+    system = LidarSystem(height, 0.0, ENERGY, AREA, index, GROUP_INDEX)
+    column = WaterColumn(*(np.array([value]) for value in (0.0, 0.05, 2e-3, 1e-3)))
+    depth = 0.5 * C0 / GROUP_INDEX * 1e-9 * bin_ns / parts * np.arange(bins * parts + 1)
+    whole = column_energy(system, column, henyey_greenstein(np.pi, 0.0), depth[:-1], depth[1:], 0.0)
+    # Both cones widen on the way down.
+    wider = (1 + 0.5 * (depth[:-1] + depth[1:]) / (index * height)) ** 2
+    spread = sigma**2 * wider + 2 * (1 - 1 / index) ** 2 * variance * (0.5 * (depth[:-1] + depth[1:])) ** 2
+    expected = (whole * (1 - np.exp(-0.5 * radius**2 * wider / spread))).reshape(bins, parts).sum(axis=1)
+    pose = {"altitude": height, "off_nadir_deg": 0.0}
+    scene = lidar_scene(
+        tx={**pose, "divergence_mrad": 2e3 * sigma / height},
+        rx={**pose, **RECEIVER, "field_of_view_mrad": 2e3 * radius / height, "layout": "1x1"},
+        film={"time_start_ns": float(surface_time_ns(height, 0.0)), "bin_width_ns": bin_ns, "bin_count": 10 * bins},
+        integrator={"type": integrator, "paths_per_pass": 2**14},
+        sea={"slope_variance": str(2 * variance)},
+        water={**water, "refractive_index": index, "group_index": GROUP_INDEX},
+        bottom=None,
+    )
+    # Light of the surface falls into the first bin. The record goes on, as points are as far apart as it is long.
+    found = passes(scene, 16)[:, 0, 1:bins]
+    significance.assert_equal(found, expected[1:], error=0.02, bias=0.01)
 
 
 @pytest.mark.slow

@@ -7,8 +7,9 @@ import pytest
 from significance import largest_chi2, largest_z, mean_and_error
 
 from mitransient_lidar.rendering.session import choose_integrator, open_scene
-from mitransient_lidar.transport.merging.cells import Region, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.merging.cells import BeamProfile, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_several_levels
+from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
@@ -90,32 +91,78 @@ def test_track_length_is_the_slanted_way_to_the_bottom(wavy_sea):
 
 def test_heights_are_those_of_the_mesh(wavy_sea):
     lidar, region = wavy_sea
-    heights = SurfaceHeights(lidar, region)
+    heights = SurfaceHeights(lidar, region, 8.0)
     rng = np.random.default_rng(2)
     x, y = (rng.uniform(region.low[axis], region.high[axis], 4096) for axis in (0, 1))
     down = mi.Ray3f(mi.Point3f(mi.Float(x), mi.Float(y), 5), mi.Vector3f(0, 0, -1))
     true = np.array(lidar.mitsuba_scene.ray_intersect(down).p.z)
     assert true.std() > 0.03
-    surface, bed = (np.array(height) for height in heights.at(mi.Float(x), mi.Float(y)))
-    assert np.abs(surface - true).max() < 0.01
-    np.testing.assert_allclose(bed, -8, atol=1e-5)
+    surface, slope = (np.array(values) for values in heights.surface_at(mi.Float(x), mi.Float(y)))
+    # Cells are of 1.6 cm; those at the edges of facets have the slope of one of them.
+    assert np.abs(surface - true).max() < 0.005
+    assert np.median(np.abs(surface - true)) < 1e-6
+    beyond = mi.Ray3f(mi.Point3f(mi.Float(x + 1e-3), mi.Float(y), 5), mi.Vector3f(0, 0, -1))
+    rise = (np.array(lidar.mitsuba_scene.ray_intersect(beyond).p.z) - true) / 1e-3
+    assert np.median(np.abs(slope[0] - rise)) < 1e-3
+    # Under the beam, too, 2 m beside the region.
+    np.testing.assert_allclose(np.array(heights.bed_at(mi.Float(x + 2), mi.Float(y))), -8, atol=1e-5)
+
+
+def test_beds_are_found_where_refracted_light_is(lidar_scene):
+    """A beam of centimetres enters the water 2 m beside where it meets a bottom that falls by 20 degrees."""
+    sand = {"type": "seabed", "slope_x_deg": 20.0, "size": 100.0}
+    narrow = {"tx": {"divergence_mrad": 0.1}, "rx": {"field_of_view_mrad": 0.3}}
+    scene = lidar_scene(integrator=MERGING, bottom=None, extra={"bottom": sand}, **narrow)
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    heights = SurfaceHeights(lidar, Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter)), 8.0)
+    down = mi.Ray3f(mi.Point3f(2.0, 0.1, -0.5), mi.Vector3f(0, 0, -1))
+    true = float(lidar.mitsuba_scene.ray_intersect(down).p.z[0])
+    assert float(heights.bed_at(mi.Float(2.0), mi.Float(0.1))[0]) == pytest.approx(true, abs=0.02)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shift", [[0.0, 0.0, 0.0], [0.3, 0.9, 0.99]])
-def test_points_fall_into_cells_by_their_volume(wavy_sea, shift):
-    """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included."""
+def test_region_and_axis_follow_the_waves(lidar_scene):
+    """They are where a narrow beam meets high waves: at 60 degrees 1 m of height moves it by 1.7 m."""
+    pose = {"altitude": 100.0, "off_nadir_deg": 60.0}
+    scene = lidar_scene(
+        integrator=MERGING,
+        tx={**pose, "divergence_mrad": 0.2},
+        rx={**pose, "field_of_view_mrad": 0.4},
+        sea={"spectrum": "elfouhaily", "wind_speed": 12.0, "slope_variance": "cox_munk"},
+    )
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    axis = lidar.transmitter.pose.axis
+    ray = mi.Ray3f(mi.Point3f(lidar.transmitter.pose.origin), mi.Vector3f(axis))
+    met = np.array(scene.ray_intersect(ray).p)[:, 0]
+    assert abs(met[2]) > 0.1
+    np.testing.assert_allclose(beam_entries(lidar)[0], met, atol=0.05)
+    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    assert region.low[0] < met[0] < region.high[0]
+    assert region.high[1] - region.low[1] < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [[0.0, 0.0, 0.0, 0.0], [0.3, 0.9, 0.99, 0.4]])
+@pytest.mark.parametrize("direction", [[0.255, 0.0, -0.967], [-0.3, 0.2, 0.933]])
+def test_points_fall_into_cells_by_their_volume(wavy_sea, shift, direction):
+    """Uniform in a column of water below the waves: as many in each cell as its volume says, the topmost included.
+
+    Whatever the direction of the lines along which they are moved to the plane of their layer.
+    """
     lidar, region = wavy_sea
-    heights = SurfaceHeights(lidar, region)
+    heights = SurfaceHeights(lidar, region, 8.0)
     rings = BeamRings(lidar.transmitter.pose, 0.5, 1.34)
-    cells = WaterCells(WaterGrid(rings, heights, 0.4, 0.2, 0.25, 4.0), mi.Point3f(shift))
+    # So wide a beam has the same light everywhere.
+    profile = BeamProfile(lidar, 1e4)
+    cells = WaterCells(WaterGrid(rings, heights, profile, 0.4, 0.2, 0.25, 0.1, 4.0), mi.Point4f(shift))
     rng, count, depth = np.random.default_rng(7), 2**21, 1.5
     lean = lidar.transmitter.pose.axis[0] / 1.34
     lean /= np.sqrt(1 - lean**2)
     below, y = rng.uniform(0, depth, count), rng.uniform(-2.0, 2.0, count)
     x = rng.uniform(-2.0, 2.0, count)
-    z = np.array(heights.at(mi.Float(x), mi.Float(y))[0]) - below
-    bucket, tag, volume = (np.array(a) for a in cells.locate(mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))))
+    z = np.array(heights.surface_at(mi.Float(x), mi.Float(y))[0]) - below
+    points = mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))
+    bucket, tag, volume = (np.array(a) for a in cells.locate(points, mi.Vector3f(direction)))
     _, index, inverse, number = np.unique(
         bucket.astype(np.uint64) << 32 | tag, return_index=True, return_inverse=True, return_counts=True
     )

@@ -29,12 +29,13 @@ def store_points(
         return None
     index = dr.arange(mi.UInt32, count)
     cells = cells.of(segments.lanes(index))
-    bucket, _, _ = cells.locate(segments.points(index).point)
+    points = segments.points(index)
+    bucket, _, _ = cells.locate(points.point, points.direction)
     u = segments.random(index, shots)
     photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, classes.by_order)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
-    _, tag, _ = cells.locate(points.point)
+    _, tag, _ = cells.locate(points.point, points.direction)
     position = dr.dot(points.point, points.direction)
     photon = Photon(
         points.direction,
@@ -64,7 +65,7 @@ def merge_in_water(
     and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
     """
     water = scene.water
-    bucket, cell, volume = cells.locate(points.point)
+    bucket, cell, volume = cells.locate(points.point, points.direction)
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi = points.point, -points.direction
     mei.sh_frame = mi.Frame3f(mei.wi)

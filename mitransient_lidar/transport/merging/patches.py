@@ -10,7 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.merging.cells import ORIGIN, PROBE_RAYS, Region, low_bits
+from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
+from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, Sector
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_index
 from mitransient_lidar.transport.rng import Lanes
@@ -131,7 +132,7 @@ class SolidPatches:
         self._bounded = [
             solid
             for solid in scene.solids
-            if not region.within(solid.bbox()) or any(solid is other for other in uneven)
+            if not region.is_below(solid.bbox(), scene) or any(solid is other for other in uneven)
         ]
 
     @property
@@ -144,7 +145,8 @@ class SolidPatches:
         if lanes.shots == 1:
             return self
         patches = copy.copy(self)
-        patches.scene, patches._shift = self.scene.of(lanes), lanes.pick(self._shift)
+        patches.scene, patches._rings = self.scene.of(lanes), self._rings.of(lanes)
+        patches._shift = lanes.pick(self._shift)
         patches._start = lanes.shot << (2 * self._side_bits)
         return patches
 
@@ -208,7 +210,7 @@ class SolidPatches:
         """Return offsets of points on solids from the beam, and the core radius of their solid [m]."""
         x, y = self._rings.slant
         below = -si.p.z - self._depth
-        along, across = self._rings.offset(si.p.x - x * below, si.p.y - y * below, self._depth)
+        along, across = self._rings.offset(si.p.x - x * below, si.p.y - y * below, self._rings.depth_at(-self._depth))
         number = dr.minimum(dr.reinterpret_array(mi.UInt32, si.shape), opaque_index(dr.width(self._cores) - 1))
         return along, across, dr.gather(mi.Float, self._cores, number)
 
@@ -241,9 +243,9 @@ class SolidPatches:
         ) -> tuple[mi.Float, mi.PCG32, mi.Bool, mi.Point3f, mi.Bool]:
             along, across = rng.next_float32(fresh), rng.next_float32(fresh)
             u, v = patch.corner.x + self.width * along, patch.corner.y + self.width * across
-            x, y = self._rings.point(*self._rings.draw(patch.sector, self._shift, along, across), self._depth)
-            drawn = mi.Point3f(dr.select(is_z, x, u), dr.select(is_z, y, v), first)
-            uvw = dr.select(fresh, drawn, uvw)
+            drawn = self._rings.draw(patch.sector, self._shift, along, across)
+            x, y = self._rings.point(*drawn, self._rings.depth_at(-self._depth))
+            uvw = dr.select(fresh, mi.Point3f(dr.select(is_z, x, u), dr.select(is_z, y, v), first), uvw)
             u, v, w = uvw
             below = dr.select(is_z, -w - self._depth, 0)
             u, v = u + slant.x * below, v + slant.y * below

@@ -10,12 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
-from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, Region, SurfaceHeights, WaterCells, WaterGrid
+from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, BeamProfile, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids, store_points
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
 from mitransient_lidar.transport.merging.photon_map import PhotonBuffer, PhotonMap
+from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import CORE_PER_SPREAD, BeamRings
 from mitransient_lidar.transport.merging.segments import SegmentBuffer
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells, SphericalGrid, reach_under_water
@@ -61,6 +63,9 @@ _PATCH_PER_SOLID = 2**-20
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 
+#: Thickness of the uppermost cells, over the depth at which the sea doubles the variance of the beam.
+_UPPERMOST_PER_SPREAD = 0.25
+
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
 
@@ -100,6 +105,8 @@ class MergingLayout:
     ----------
     region
         Region of the sea that is lit or seen.
+    entry
+        Where the beam meets the sea, relative to where it meets its mean level [m], shape (3,).
     uneven
         Solids of several levels.
     grid
@@ -121,6 +128,7 @@ class MergingLayout:
     """
 
     region: Region
+    entry: FloatArray
     uneven: list[mi.Shape]
     grid: WaterGrid | SphericalGrid
     rings: BeamRings
@@ -142,15 +150,17 @@ class MergingLayout:
         bits = math.ceil(math.log2(photons))
         wider = min((_PHOTONS / photons) ** (1 / 3), _WIDEST) if self.widens else 1.0
         side_bits = min(MOST_SIDE_BITS, -(-(bits + _SIDE_BITS_OF_PATCHES) // 2))
-        grid = self.grid
+        grid, rings = self.grid, self.rings
         if isinstance(grid, WaterGrid):
-            heights = SurfaceHeights(scene, self.region, shots, copies)
+            entries = beam_entries(scene, shots, copies)
+            heights = SurfaceHeights(scene, self.region, self.depth, entries[:, :2] - self.entry[:2], copies)
             buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, grid.bits_z + 2))
-            grid = grid.of_shots(heights, max(wider, 1.0), buckets)
+            grid = grid.of_shots(heights, entries, max(wider, 1.0), buckets)
+            rings = grid.rings
         # A copy has capacities of its own.
         uneven = solids_of_several_levels(scene, self.region, shots)
         patch_width = self.patch_width * max(wider, 1.0)
-        return replace(self, grid=grid, uneven=uneven, side_bits=side_bits, patch_width=patch_width)
+        return replace(self, grid=grid, rings=rings, uneven=uneven, side_bits=side_bits, patch_width=patch_width)
 
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler, options: MergingOptions) -> MergingLayout:
@@ -179,11 +189,12 @@ class MergingLayout:
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
             patches = _patch_width(scene, width)
             return cls(
-                *(region, uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
+                *(region, np.zeros(3), uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
                 widens=not options.cell_size,
             )
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
-        rings = BeamRings(pose, footprint, scene.refractive_index)
+        entries = beam_entries(scene)
+        rings = BeamRings(pose, footprint, scene.refractive_index).of_entries(entries)
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         receiver = scene.receiver.pose
@@ -192,12 +203,15 @@ class MergingLayout:
         width = options.cell_size or min(widths)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
-        grid = WaterGrid(rings, SurfaceHeights(scene, region), width / core, growth, thickness, reach)
         sine = np.hypot(*pose.axis[:2]) / scene.refractive_index
         depth = reach * float(np.sqrt(1 - sine**2))
+        heights = SurfaceHeights(scene, region, depth)
+        profile = BeamProfile(scene, footprint)
+        uppermost = _UPPERMOST_PER_SPREAD * profile.depth
+        grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
         patches = _patch_width(scene, width)
         return cls(
-            *(region, uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
+            *(region, entries[0], uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
             widens=not options.cell_size,
         )
 
@@ -263,15 +277,15 @@ class MergingRenderer(PassRenderer):
     def _attempt(self, record: PassRecord, shots: Shots, paths: int) -> bool:
         """Trace one pass; return False, with larger capacities, when a buffer was too small."""
         scene, layout = self.scene, self.layout
-        shifts = shots.uniform(_COMMON_STREAM, 5)
-        cells = layout.grid.cells(mi.Point3f(shifts[:3]))
+        shifts = shots.uniform(_COMMON_STREAM, 6)
+        cells = layout.grid.cells(mi.Point4f(shifts[:4]))
         patches = SolidPatches(
             scene,
             layout.region,
             layout.rings,
             layout.depth,
             layout.patch_width,
-            mi.Point2f(shifts[3:]),
+            mi.Point2f(shifts[4:]),
             layout.uneven,
             layout.side_bits,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -9,8 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import Lanes
 
 #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
 _CORE_PER_METRE = 0.05
@@ -62,10 +65,13 @@ class BeamRings:
         Refractive index of the water over that at the laser.
     growth
         Growth of the core radius with depth [m/m].
+
+    The axis begins where it meets the mean sea level, or where each shot's beam meets the sea (`of_entries`).
     """
 
     def __init__(self, pose: Pose, spread: float, index: float, growth: float = _CORE_PER_METRE) -> None:
         self.spread, self._growth = opaque(spread), opaque(growth)
+        self._entry = mi.Vector3f(opaque(0.0))
         horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
@@ -80,23 +86,46 @@ class BeamRings:
         #: Ratio of the axes of the ellipses.
         self.cosine = opaque(down)
 
+    def of_entries(self, entries: FloatArray) -> BeamRings:
+        """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3)."""
+        rings = copy.copy(self)
+        rings._entry = mi.Vector3f(*(aligned(mi.Float, column.astype(np.float32)) for column in entries.T))
+        return rings
+
+    def of(self, lanes: Lanes) -> BeamRings:
+        """Return the rings of each lane's shot."""
+        if lanes.shots == 1:
+            return self
+        rings = copy.copy(self)
+        rings._entry = lanes.pick(self._entry)
+        return rings
+
+    def depth_at(self, z: mi.Float) -> mi.Float:
+        """Return the depth of a height [m] below the beginning of the axis [m]."""
+        return self._entry.z - z
+
     def core(self, depth: mi.Float) -> mi.Float:
         """Return the core radius at a depth [m]."""
         return CORE_PER_SPREAD * self.spread + self._growth * depth
 
     def offset(self, x: mi.Float, y: mi.Float, depth: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Return offsets from the axis, scaled along it so that the ellipses are circles [m]."""
-        dx = x - self._spot[0] - self.shear[0] * depth
-        dy = y - self._spot[1] - self.shear[1] * depth
-        ax, ay = self._azimuth
-        return (ax * dx + ay * dy) * self.cosine, ax * dy - ay * dx
+        dx = x - self._spot[0] - self._entry.x - self.shear[0] * depth
+        dy = y - self._spot[1] - self._entry.y - self.shear[1] * depth
+        along, across = self.along_and_across(mi.Vector2f(dx, dy))
+        return along * self.cosine, across
+
+    def along_and_across(self, horizontal: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
+        """Return the components of horizontal vectors along and across the azimuth of the axis."""
+        (x, y), (ax, ay) = horizontal, self._azimuth
+        return ax * x + ay * y, ax * y - ay * x
 
     def point(self, along: mi.Float, across: mi.Float, depth: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Invert `offset`."""
         ax, ay = self._azimuth
         along = along / self.cosine
-        x = self._spot[0] + self.shear[0] * depth + ax * along - ay * across
-        return x, self._spot[1] + self.shear[1] * depth + ay * along + ax * across
+        x = self._spot[0] + self._entry.x + self.shear[0] * depth + ax * along - ay * across
+        return x, self._spot[1] + self._entry.y + self.shear[1] * depth + ay * along + ax * across
 
     def sector(self, along: mi.Float, across: mi.Float, core: mi.Float, width: mi.Float, shift: mi.Point2f) -> Sector:
         """Return the sectors at offsets, of rings of a `width` over the core radius, shifted by random numbers."""

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.merging.cells import PROBE_RAYS, Region
+from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.opaque import opaque, opaque_point
 from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
@@ -56,15 +56,15 @@ class SphericalGrid:
         self.thickness = opaque(thickness)
         self.even = opaque(thickness / _THICKNESS_PER_RADIUS)
 
-    def cells(self, shift: mi.Point3f) -> SphericalCells:
-        """Return the cells of a pass, shifted by three uniform random numbers of each shot."""
+    def cells(self, shift: mi.Point4f) -> SphericalCells:
+        """Return the cells of a pass, shifted by the first three of four uniform random numbers of each shot."""
         return SphericalCells(self, shift)
 
 
 class SphericalCells:
-    """The cells of one pass: a `SphericalGrid` shifted by three uniform random numbers of each shot."""
+    """The cells of one pass: a `SphericalGrid` shifted by uniform random numbers of each shot."""
 
-    def __init__(self, grid: SphericalGrid, shift: mi.Point3f) -> None:
+    def __init__(self, grid: SphericalGrid, shift: mi.Point4f) -> None:
         self.grid = grid
         self._shift = shift
         self._start = mi.UInt32(0)
@@ -81,8 +81,11 @@ class SphericalCells:
         """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
         return self.locate(point)[2]
 
-    def locate(self, point: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag."""
+    def locate(self, point: mi.Point3f, direction: mi.Vector3f | None = None) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag.
+
+        They do not depend on the direction of the points' lines.
+        """
         grid = self.grid
         offset = point - grid.origin
         radius = dr.maximum(dr.norm(offset), _SMALLEST_RADIUS)
@@ -137,5 +140,4 @@ def reach_under_water(scene: LidarScene, sampler: SensorSampler) -> tuple[Region
     points = np.vstack(places)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = np.maximum(_MARGIN * (high - low), _LEAST_MARGIN)
-    x, y = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)
-    return Region((x[0], y[0]), (x[1], y[1])), float(lengths.mean()), shortest
+    return Region.between(low, high, margin), float(lengths.mean()), shortest

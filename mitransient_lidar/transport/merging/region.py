@@ -1,0 +1,256 @@
+"""The part of the sea that is lit or seen, and the heights of surface and solids there."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
+from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.sensor.receiver import SensorSampler
+
+#: Number of rays that find the region and the solids below it.
+PROBE_RAYS = 4096
+
+#: Number of rays that find where the beam of each shot meets the sea.
+_ENTRY_RAYS = 64
+
+#: Share of rays that may fall outside the region on either side, and margin over its size.
+_REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
+
+#: Distance beside the beam within which light spreads, over the depth.
+_SPREAD_PER_DEPTH = 0.25
+
+#: Cells on each side of the tables of heights, of a single shot and of each of several.
+_HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
+
+#: Height of the bed of columns without a solid below [m].
+_NO_BED = -1e9
+
+
+@dataclass(frozen=True)
+class Region:
+    """Rectangle of the sea that is lit or seen: corners (x, y) [m]."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    @classmethod
+    def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
+        """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
+        seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+        places = [
+            meet_sea(scene, scene.receiver.pose, seen.angles)[np.array(seen.weight) > 0],
+            meet_sea(scene, scene.transmitter.pose, scene.transmitter.sample_tangent(unit_points(PROBE_RAYS))),
+        ]
+        places = [place[np.isfinite(place[:, 0]), :2] for place in places]
+        ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
+        if not ends:
+            raise UserError("laser and receiver look above the horizon: at least one must look down at the sea")
+        low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+        return cls.between(low, high, _REGION_MARGIN * (high - low))
+
+    @classmethod
+    def between(cls, low: FloatArray, high: FloatArray, margin: FloatArray | float) -> Region:
+        """Return the region between corners, shape (2,), with a margin on all sides [m]."""
+        x, y = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)
+        return cls((x[0], y[0]), (x[1], y[1]))
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Sides along x and y [m]."""
+        return self.high[0] - self.low[0], self.high[1] - self.low[1]
+
+    def below(self, scene: LidarScene, depth: float) -> Region:
+        """Return the region that holds light and view down to a depth [m], along their axes in level water."""
+        sines = [pose.axis[:2] / scene.refractive_index for pose in (scene.transmitter.pose, scene.receiver.pose)]
+        shifts = [np.zeros(2), *(depth * sine / np.sqrt(1 - sine @ sine) for sine in sines)]
+        low, high = np.array(self.low) + np.min(shifts, axis=0), np.array(self.high) + np.max(shifts, axis=0)
+        return Region.between(low, high, _SPREAD_PER_DEPTH * depth)
+
+    def probe_points(self, index: mi.UInt32 | None = None) -> tuple[mi.Float, mi.Float]:
+        """Return points (x, y) of the region [m] by number, by default all of 4096, evenly distributed."""
+        x, y = unit_points(PROBE_RAYS, index)
+        return dr.lerp(opaque(self.low[0]), opaque(self.high[0]), x), dr.lerp(
+            opaque(self.low[1]), opaque(self.high[1]), y
+        )
+
+    def track_length(self, scene: LidarScene) -> float:
+        """Return the mean distance in the water along the axis to a solid, or to the depth of the record's end [m]."""
+        transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
+        spot = transmitter.ground_point()
+        sine = transmitter.axis[:2] / scene.refractive_index
+        down = np.append(sine, -np.sqrt(1 - sine @ sine))
+        air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
+        longest = (scene.axis.path_end - air) / (2 * scene.group_index)
+        x, y = self.probe_points()
+        lowest = min(float(surface.bbox().min.z) for surface in scene.surfaces)
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, opaque(lowest - 1e-3)), mi.Vector3f(down.tolist())))
+        length = dr.mean(dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), max(longest, 0.1)))
+        return float(length[0])
+
+    def is_below(self, box: mi.ScalarBoundingBox3f, scene: LidarScene) -> bool:
+        """Return whether a bounding box extends beyond light and view at its depth, by their size on every side."""
+        below = self.below(scene, max(-float(box.min.z), 0.0))
+        return all(
+            float(box.min[axis]) < below.low[axis] - below.size[axis]
+            and float(box.max[axis]) > below.high[axis] + below.size[axis]
+            for axis in (0, 1)
+        )
+
+
+def meet_sea(scene: LidarScene, pose: Pose, angles: mi.Point2f) -> FloatArray:
+    """Return where rays from a pose at tangent-plane angles meet the sea, or else its mean level [m], shape (n, 3).
+
+    NaN for rays that do not go down.
+    """
+    direction = pose.direction(*angles)
+    start, _ = scene.first_points(pose, angles, direction)
+    si = scene.ray_intersect(mi.Ray3f(start, direction))
+    level = start - direction * (start.z / direction.z)
+    point = dr.select(si.is_valid() & scene.is_surface(si.shape), si.p, level)
+    return np.where(np.array(direction.z)[:, None] < 0, np.array(point, np.float64).T, np.nan)
+
+
+def beam_entries(scene: LidarScene, shots: int = 1, copies: int = 1) -> FloatArray:
+    """Return where the beam of each shot meets the sea, relative to where it meets its mean level [m].
+
+    Means over the beam, shape (shots, 3). Each `copies` successive shots are at one place.
+    """
+    places = shots // copies
+    lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * _ENTRY_RAYS), places, _ENTRY_RAYS)
+    moved = scene.of(Lanes(shots, lanes.shot * opaque_index(copies), lanes.number))
+    pose = scene.transmitter.pose
+    angles = mi.Point2f(scene.transmitter.sample_tangent(unit_points(_ENTRY_RAYS, lanes.number)))
+    direction = np.array(pose.direction(*angles), np.float64).T
+    height = meet_sea(moved, pose, angles)[:, 2]
+    offset = np.where(np.isfinite(height), height / direction[:, 2], 0.0)[:, None] * direction
+    return np.repeat(offset.reshape(places, _ENTRY_RAYS, 3).mean(axis=1), copies, axis=0)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Grids of equal cells over a region, one for each place of shots, and values in their cells.
+
+    Attributes
+    ----------
+    values, kind
+        Values of all cells, and their type.
+    low, per_metre
+        Corner of the grid of each shot [m], and inverse sides of its cells [1/m].
+    cells
+        Number of cells on each side.
+    start
+        Number of the first cell.
+    """
+
+    values: mi.Float
+    kind: Any
+    low: mi.Point2f
+    per_metre: mi.Point2f
+    cells: int
+    start: mi.UInt32
+
+    def of(self, lanes: Lanes, copies: mi.UInt32) -> _Grid:
+        """Return the grid of each lane's shot, of which `copies` successive ones share one."""
+        start = (lanes.shot // copies) * (self.cells * self.cells)
+        return replace(self, low=lanes.pick(self.low), start=start)
+
+    def at(self, x: mi.Float, y: mi.Float) -> tuple[Any, mi.Float, mi.Float]:
+        """Return values at (x, y) [m], or those of the nearest point; and offsets from the centres of cells [m]."""
+        along, across = (x - self.low.x) * self.per_metre.x, (y - self.low.y) * self.per_metre.y
+        i, j = (dr.clip(mi.Int32(dr.floor(number)), 0, self.cells - 1) for number in (along, across))
+        values = dr.gather(self.kind, self.values, self.start + mi.UInt32(j * self.cells + i))
+        dx, dy = (dr.clip(u - mi.Float(k) - 0.5, -0.5, 0.5) for u, k in ((along, i), (across, j)))
+        return values, dx / self.per_metre.x, dy / self.per_metre.y
+
+
+class SurfaceHeights:
+    """Heights of the sea surface where it is lit or seen, and of the first solids below the surface there.
+
+    Parameters
+    ----------
+    region
+        Region of the sea.
+    depth
+        Largest depth of light [m]: solids are found beside the region, too, where light of that depth is.
+    moves
+        Displacements of the region (x, y) of each shot [m], shape (shots, 2).
+    copies
+        Number of successive shots at one place, which share a grid.
+    """
+
+    def __init__(
+        self, scene: LidarScene, region: Region, depth: float, moves: FloatArray | None = None, copies: int = 1
+    ) -> None:
+        moves = np.zeros((1, 2)) if moves is None else moves
+        self._copies = opaque_index(copies)
+        self._surface = self._look_down(scene, region, moves, copies, solids=False)
+        self._bed = self._look_down(scene, region.below(scene, depth), moves, copies, solids=True)
+
+    def _look_down(self, scene: LidarScene, region: Region, moves: FloatArray, copies: int, *, solids: bool) -> _Grid:
+        """Return heights and slopes of the surface, or heights of solids under water, found with vertical rays."""
+        shots = len(moves)
+        n, places = _HEIGHT_CELLS if shots == 1 else _HEIGHT_CELLS_OF_SHOTS, shots // copies
+        corner = (moves + np.array(region.low)).astype(np.float32)
+        low = mi.Point2f(*(aligned(mi.Float, column) for column in corner.T))
+        per_metre = mi.Point2f(*(opaque(n / size) for size in region.size))
+        lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * n * n), places, n * n)
+        index, lanes = lanes.number, Lanes(shots, lanes.shot * self._copies, lanes.number)
+        scene = scene.of(lanes)
+        x = (mi.Float(index % n) + 0.5) / per_metre.x + lanes.pick(low.x)
+        y = (mi.Float(index // n) + 0.5) / per_metre.y + lanes.pick(low.y)
+        top = opaque(max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0)
+
+        def look_down(
+            ray: mi.Ray3f, found: mi.Vector4f, wet: mi.Bool, active: mi.Bool
+        ) -> tuple[mi.Ray3f, mi.Vector4f, mi.Bool, mi.Bool]:
+            si = scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            at_sea = scene.is_surface(si.shape)
+            wanted = wet & ~at_sea if solids else at_sea
+            found = dr.select(active & wanted, mi.Vector4f(si.p.z, -si.n.x / si.n.z, -si.n.y / si.n.z, 0), found)
+            active &= ~wanted & (at_sea | ~wet)
+            wet |= active & at_sea
+            return dr.select(active, si.spawn_ray(ray.d), ray), found, wet, active
+
+        count = places * n * n
+        found = dr.zeros(mi.Vector4f, count)
+        found.x = _NO_BED if solids else 0.0
+        state = (
+            mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1)),
+            *(found, dr.zeros(mi.Bool, count), dr.full(mi.Bool, True, count)),
+        )
+        _, found, _, _ = dr.while_loop(state, lambda *state: state[-1], look_down, label="heights")
+        values = found.x if solids else dr.ravel(found)
+        dr.eval(values)
+        return _Grid(values, mi.Float if solids else mi.Vector4f, low, per_metre, n, mi.UInt32(0))
+
+    def of(self, lanes: Lanes) -> SurfaceHeights:
+        """Return the heights of each lane's shot."""
+        if lanes.shots == 1:
+            return self
+        heights = copy.copy(self)
+        heights._surface, heights._bed = (grid.of(lanes, self._copies) for grid in (self._surface, self._bed))
+        return heights
+
+    def surface_at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Vector2f]:
+        """Return height [m] and slopes of the surface at (x, y) [m]: outside the region, level at the edge's height."""
+        (height, slope_x, slope_y, _), dx, dy = self._surface.at(x, y)
+        inside = (dr.abs(dx) * self._surface.per_metre.x < 0.5) & (dr.abs(dy) * self._surface.per_metre.y < 0.5)
+        slope = dr.select(inside, mi.Vector2f(slope_x, slope_y), 0)
+        return height + slope.x * dx + slope.y * dy, slope
+
+    def bed_at(self, x: mi.Float, y: mi.Float) -> mi.Float:
+        """Return the height of the first solid below the surface at (x, y) [m], -1e9 where there is none."""
+        height, _, _ = self._bed.at(x, y)
+        return height
