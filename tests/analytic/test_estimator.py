@@ -250,6 +250,7 @@ def test_nothing_returns_more_than_was_sent(lidar_scene, passes):
 def test_sample_count_per_pixel_and_default(lidar_scene):
     scene = lidar_scene(integrator={"paths_per_pass": 2**12})
     # 1024 for each of four pixels are the 4096 paths of a pass; as many again are other paths.
-    default, same, more = (np.array(mi.render(scene, spp=spp, seed=1)).sum() for spp in (0, 1024, 2048))
-    assert same == pytest.approx(default, rel=1e-5)
-    assert abs(more / default - 1) > 1e-3
+    default, same, more = (np.array(mi.render(scene, spp=spp, seed=1)) for spp in (0, 1024, 2048))
+    np.testing.assert_allclose(same, default, rtol=1e-5)
+    lit = default > 0
+    assert np.mean(np.isclose(more, default, rtol=1e-3, atol=0)[lit]) < 0.5
