@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from significance import largest_z
+from significance import assert_same, largest_error, mean_and_error
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
@@ -131,12 +131,7 @@ def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, wa
     edges = np.round((GATES_NS - GATES_NS[0]) / 0.5).astype(int)
     rendered = np.array([energy[:, a:b].sum(axis=1) for a, b in pairwise(edges)]).T[:, 1:]
     reference = references[:, 1:]
-    error = np.hypot(*(a.std(axis=0, ddof=1) / np.sqrt(len(a)) for a in (rendered, reference)))
-    z = (rendered.mean(axis=0) - reference.mean(axis=0)) / error
-    assert np.all(np.abs(z) < largest_z(min(count, len(reference)), z.size)), (
-        z,
-        rendered.mean(axis=0) / reference.mean(axis=0),
-    )
-    relative = error / reference.mean(axis=0)
-    assert np.median(relative) < 0.03, relative
-    assert np.all(relative < 0.15), relative
+    # Few bright walks make the light of the last gates: its mean is compared where it happens to be known to 10 %.
+    early = np.hypot(*(np.divide(*mean_and_error(energies[:, :9])[::-1]) for energies in (rendered, reference)))
+    assert np.all(early < largest_error(min(count, len(reference)), 0.03)), early
+    assert_same(rendered, reference, error=0.01)
