@@ -424,9 +424,14 @@ def test_records_of_a_series_have_true_errors():
     bottoms = echo_table.extract(shots).sel(echo="bottom")
     for half in (slice(0, 200), slice(200, 400)):
         time, error = (bottoms[name].isel(shot=half).values.ravel() for name in ("time_ns", "time_ns_stderr"))
-        assert np.std(time) / np.median(error) == pytest.approx(1, abs=0.25)
+        # One electron's avalanche is the last peak of one in 3000 weak records.
+        real = np.abs(time - np.nanmedian(time)) < 5
+        assert real.mean() > 0.98
+        assert np.std(time[real]) / np.median(error[real]) == pytest.approx(
+            1, abs=largest_z(400) / np.sqrt(2 * 400) + 0.07
+        )
     errors = bottoms["time_ns_stderr"].values
-    assert np.median(errors[200:]) > 2 * np.median(errors[:200])
+    assert np.nanmedian(errors[200:]) > 2 * np.nanmedian(errors[:200])
 
 
 def test_flag_names():
