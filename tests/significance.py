@@ -6,7 +6,7 @@ The run of all tests counts them and fails when they add up to more than `SUITE_
 """
 
 import numpy as np
-from scipy.stats import chi2, t
+from scipy.stats import binom, chi2, t
 
 #: Chance that any test of the suite fails though nothing is wrong.
 SUITE_FALSE_ALARM = 1e-3
@@ -45,6 +45,12 @@ def largest_chi2(freedom):
     """Return the limit of a sum of squares of `freedom` standard normal numbers."""
     _count()
     return float(chi2.isf(FALSE_ALARM, freedom))
+
+
+def largest_count(trials, chance):
+    """Return the limit of the number of `trials` that have a property, each with at most this chance."""
+    _count()
+    return int(binom.isf(FALSE_ALARM, trials, chance))
 
 
 def mean_and_error(samples):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import exponnorm, norm
-from significance import largest_z
+from significance import largest_count, largest_z
 
 from mitransient_lidar.analysis.waveforms import echo_estimators
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
@@ -116,7 +116,8 @@ def test_errors_are_those_of_the_noise(method):
     rng = np.random.default_rng(7)
     arrivals = 60 + rng.random(count)
     records = Records.of(echoes(arrivals) + noise * rng.normal(size=(count, TIME.size)), TIME, noise)
-    found = find_echoes(records, TEMPLATE.fwhm_ns)
+    # From early on, in one of 100 sets noise would be a first peak.
+    found = find_echoes(records, TEMPLATE.fwhm_ns, earliest_ns=55)
     width = TEMPLATE.fwhm_ns
     window = echo_estimators.Window.around(records, found.surface, width)
     top = echo_estimators.summit(window, found.flags[0])
@@ -167,8 +168,8 @@ def test_a_weak_bottom_is_found_as_often_as_its_signal_allows_and_noise_hardly_e
     found = find_echoes(Records.of(noisy, TIME, noise), FWHM)
     assert np.mean(np.abs(TIME[found.bins[2]] - 120) < 3) > 0.99
     dark = find_echoes(Records.of(noise * rng.normal(size=(2000, TIME.size)), TIME, noise), FWHM)
-    # Some 130 independent values of 5 sigma, each with the chance 2.9e-7: 0.07 alarms are expected.
-    assert np.count_nonzero(dark.surface >= 0) <= 3
+    # Some 130 independent values of 5 sigma, each with the chance 2.9e-7.
+    assert np.count_nonzero(dark.surface >= 0) <= largest_count(2000, 130 * 2.9e-7)
     assert (dark.flags[0][dark.surface < 0] == EchoFlag.NO_ECHO).all()
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import exponnorm
-from significance import largest_z
+from significance import largest_count, largest_z
 
 from mitransient_lidar.analysis.waveforms.column_fits import change_points, column_fit
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records
@@ -63,7 +63,7 @@ def test_a_surface_low_beside_its_column_has_one_time_with_a_true_error(height, 
     """Without a height the surface is 1 to 2 ns earlier and fits alike: choosing gave two groups with 5 to 60 errors.
 
     The height is the same in all records and unknown to each, so that errors are true over heights, not in each: the
-    root mean square of error over stated error was 0.8 to 2.2.
+    root mean square of error over stated error is 0.6 to 2.2.
     """
     signal = onset(SURFACE) + gauss(SURFACE, height)
     bins, flags = np.full(300, int(np.argmax(signal))), np.zeros(300, int)
@@ -73,8 +73,8 @@ def test_a_surface_low_beside_its_column_has_one_time_with_a_true_error(height, 
     assert np.median(found.time_stderr) < 1.0
     if height == 0:
         # Those that took noise for a height were a second group, 1.6 ns late.
-        assert np.mean(error > 1.4) < 0.04
-        assert np.mean(found.amplitude / found.amplitude_stderr > 3) < 0.02
+        assert np.count_nonzero(error > 1.4) <= largest_count(300, 0.01)
+        assert np.count_nonzero(found.amplitude / found.amplitude_stderr > 3) <= largest_count(300, 0.005)
 
 
 def test_the_onset_of_a_column_without_noise_is_the_surface():

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from command_line import assert_refused, run
 from scipy.stats import exponnorm, norm
-from significance import largest_z
+from significance import largest_count, largest_z
 
 import mitransient_lidar
 from mitransient_lidar import results
@@ -184,7 +184,7 @@ def test_a_surface_echo_within_its_error_is_not_listed():
         assert np.isnan(none[name]).all()
         assert np.isfinite(some[name]).all()
     assert (some["flags"] == 0).all()
-    assert np.abs(none["time_ns"] - SURFACE).max() < 1.5
+    assert np.abs(none["time_ns"] - SURFACE).max() < 2  # a spread of 0.27
     assert np.isfinite(table["depth_m"].sel(echo="bottom")).all()
 
 
@@ -221,9 +221,13 @@ def test_shots_of_a_receiver_have_true_errors():
     assert table["energy"].attrs["units"] == "V s"
     for name, truth in (("surface", [0, 0]), ("bottom", [70.0, 75.3])):
         time_ns, error = table["time_ns"].sel(echo=name), table["time_ns_stderr"].sel(echo=name)
-        z = (time_ns - SURFACE - truth) / error
+        off = time_ns - SURFACE - truth
+        # In one of 100 sets noise is a first peak.
+        real = np.abs(off) < 5
+        assert (~real).sum() <= largest_count(1200, 1e-5)
+        z = (off / error).where(real)
         assert np.abs(z.std("shot") - 1).max() < largest_z(600) / np.sqrt(2 * 600) + 0.05
-        assert np.abs(time_ns.mean("shot") - SURFACE - truth).max() < 0.03
+        assert np.abs(off.where(real).mean("shot")).max() < 0.03
     energy = table["energy"].sel(echo="bottom")
     assert float(energy.mean()) == pytest.approx(6e-13 * 1e5, rel=0.01)
 
@@ -282,7 +286,8 @@ def test_correlated_noise_has_larger_errors():
     table = echo_table.extract(dataset)
     bottom = table.sel(echo="bottom")
     ratio = float(bottom["time_ns"].std() / bottom["time_ns_stderr"].mean())
-    assert 0.8 < ratio < 1.25  # as if independent: 1.6
+    # 1.07 in the mean of many records; as if independent, it would be 1.6.
+    assert abs(ratio - 1) < largest_z(400) / np.sqrt(2 * 400) + 0.08
 
 
 def test_waveforms_in_the_noise_are_flagged():
@@ -424,9 +429,9 @@ def test_records_of_a_series_have_true_errors():
     bottoms = echo_table.extract(shots).sel(echo="bottom")
     for half in (slice(0, 200), slice(200, 400)):
         time, error = (bottoms[name].isel(shot=half).values.ravel() for name in ("time_ns", "time_ns_stderr"))
-        # One electron's avalanche is the last peak of one in 3000 weak records.
+        # One electron's avalanche is the last peak of one in 3000 weak records, and some bottoms are not found.
         real = np.abs(time - np.nanmedian(time)) < 5
-        assert real.mean() > 0.98
+        assert np.count_nonzero(~real) <= largest_count(400, 2e-3)
         assert np.std(time[real]) / np.median(error[real]) == pytest.approx(
             1, abs=largest_z(400) / np.sqrt(2 * 400) + 0.07
         )

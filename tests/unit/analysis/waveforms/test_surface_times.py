@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from significance import largest_chi2, largest_z
+from significance import largest_chi2, largest_count, largest_z
 
 from mitransient_lidar.analysis.waveforms.surface_times import surface_times
 from mitransient_lidar.core.constants import C0
@@ -41,7 +41,8 @@ def test_times_of_tilted_seas_are_kept_and_the_dark_pixel_follows_them():
     seen = truth + noise
     seen[:, 4] += 9.0  # scattered light rises a metre late
     found = infer(seen)
-    assert np.mean(found.own[:, :4]) > 0.999
+    # One in 1400 looks late by chance.
+    assert np.count_nonzero(~found.own[:, :4]) <= largest_count(4 * shots, 1e-3)
     assert not found.own[:, 4].any()
     np.testing.assert_array_equal(found.time_ns[found.own], seen[found.own])
     z = (found.time_ns - truth)[:, 4] / found.stderr_ns[:, 4]
