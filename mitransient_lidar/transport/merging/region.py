@@ -48,9 +48,10 @@ class Region:
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler) -> Region:
         """Find the region with rays of the beam and of the field of view; raise UserError if none goes down."""
         seen = sampler.sample(dr.arange(mi.UInt32, PROBE_RAYS), PROBE_RAYS, pass_streams(0, 0, PROBE_RAYS))
+        tangents = mi.Point2f(scene.transmitter.sample_tangent(unit_points(PROBE_RAYS)))
         places = [
             meet_sea(scene, scene.receiver.pose, seen.angles)[np.array(seen.weight) > 0],
-            meet_sea(scene, scene.transmitter.pose, scene.transmitter.sample_tangent(unit_points(PROBE_RAYS))),
+            meet_sea(scene, scene.transmitter.pose, tangents),
         ]
         places = [place[np.isfinite(place[:, 0]), :2] for place in places]
         ends = [np.quantile(place, [_REGION_TAIL, 1 - _REGION_TAIL], axis=0) for place in places if len(place)]
