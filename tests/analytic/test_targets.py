@@ -90,6 +90,25 @@ def test_quadrature_agrees_with_the_closed_form_of_the_bottom():
 
 
 @pytest.mark.slow
+def test_edge_of_a_large_plate_below_a_narrow_beam(lidar_scene, passes):
+    """Its edge lies where the beam has moved to at 8 m: half of the light misses the plate.
+
+    The plate covers all of the lit sea, 2 m aside; without its edge, patches that it cuts would return too little.
+    """
+    edge, half = 8.0 * np.tan(np.arcsin(np.sin(OFF_NADIR) / INDEX)), 10.0
+    narrow = {"tx": {"divergence_mrad": 0.1}, "rx": {"layout": "1x1", "field_of_view_mrad": 1.0}}
+    few = {"type": "lidar_merging", "paths_per_pass": 2**13, "photons_per_pass": 2**13}
+    energies = []
+    for x in (edge, edge - half):
+        target = {"plate": plate(x, 0.0, -8.0, half, diffuse(0.5))}
+        film = {"time_start_ns": 1470.0, "bin_width_ns": 30.0, "bin_count": 1}
+        scene = lidar_scene(**{**ONE, **narrow}, bottom=None, extra=target, integrator=few, film=film)
+        energies.append(passes(scene, 16).sum(axis=(1, 2)))
+    whole, cut = energies
+    significance.assert_equal(cut, 0.5 * whole.mean(), error=0.01, bias=0.01)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_plate_that_fills_the_beam_is_a_bottom(lidar_scene, passes, integrator):
     column = WaterColumn.from_text(0, ABSORPTION, 0, 0)
