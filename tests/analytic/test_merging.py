@@ -153,7 +153,7 @@ def test_points_fall_into_cells_by_their_volume(wavy_sea, shift, direction):
     heights = SurfaceHeights(lidar, region, 8.0)
     rings = BeamRings(lidar.transmitter.pose, 0.5, 1.34)
     # So wide a beam has the same light everywhere.
-    profile = BeamProfile(lidar, 1e4)
+    profile = BeamProfile(lidar, (1e4, 1e4))
     cells = WaterCells(WaterGrid(rings, heights, profile, 0.4, 0.2, 0.25, 0.1, 4.0), mi.Point4f(shift))
     rng, count, depth = np.random.default_rng(7), 2**21, 1.5
     lean = lidar.transmitter.pose.axis[0] / 1.34

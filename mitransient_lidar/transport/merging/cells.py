@@ -34,8 +34,8 @@ _LEAST_DESCENT = 0.5
 #: Steps to the surface above a point along the beam, and least volume below a slope over that below level water.
 _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 
-#: Least growth of the beam's profile [m/m], against division by zero, and share of its halo.
-_LEAST_GROWTH, _HALO = 1e-9, 0.02
+#: Least slope of the sea, against division by zero, and share of the halo in the beam's profile.
+_LEAST_SLOPE, _HALO = 1e-9, 0.02
 
 #: Step of the planes' places from one layer to the next, which distributes them evenly: the golden ratio.
 _PLANE_STEP = 0.618034
@@ -49,29 +49,31 @@ class BeamProfile:
 
     Parameters
     ----------
-    spread
-        Standard deviation of the beam on the sea, across the axis [m].
+    spreads
+        Standard deviations of the beam on the sea along and across its azimuth, both normal to the axis [m].
     """
 
-    def __init__(self, scene: LidarScene, spread: float) -> None:
+    def __init__(self, scene: LidarScene, spreads: tuple[float, float]) -> None:
         index, down = scene.refractive_index, max(-float(scene.transmitter.pose.axis[2]), _LEAST_DESCENT)
         cosine = math.sqrt(1 - (1 - down * down) / index**2)
         # The direction in water turns by so much for each radian by which the surface tilts.
-        turn = abs(1 - down / (index * cosine))
+        turn = max(abs(1 - down / (index * cosine)), _LEAST_SLOPE)
         # Displacement for each metre of depth and unit of slope, along and across the azimuth of the beam, with the
         # scale of `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
         ripples = 0.5 * max((sum(getattr(surface, "ripple_variance", ())) for surface in scene.surfaces), default=0.0)
-        self._spread, self._shifts = opaque(spread), [opaque(shift) for shift in shifts]
+        self._spreads, self._shifts = ([opaque(value) for value in values] for values in (spreads, shifts))
         self._growths = [opaque(shift * math.sqrt(ripples)) for shift in shifts]
         #: Depth at which the sea's slopes double the variance [m].
-        self.depth = spread / max(max(shifts) * math.sqrt(0.5 * scene.slope_variance), _LEAST_GROWTH)
+        slopes = max(math.sqrt(0.5 * scene.slope_variance), _LEAST_SLOPE)
+        self.depth = min(spread / (shift * slopes) for spread, shift in zip(spreads, shifts, strict=True))
 
     def at(self, offset: tuple[mi.Float, mi.Float], depth: mi.Float, slopes: tuple[mi.Float, mi.Float]) -> mi.Float:
         """Return the light at offsets from the axis and a depth [m], under slopes along and across it, unscaled."""
         squares, area = mi.Float(0), mi.Float(1)
-        for place, shift, growth, slope in zip(offset, self._shifts, self._growths, slopes, strict=True):
-            variance = dr.square(self._spread) + dr.square(growth * depth)
+        axes = zip(self._spreads, self._shifts, self._growths, offset, slopes, strict=True)
+        for spread, shift, growth, place, slope in axes:
+            variance = dr.square(spread) + dr.square(growth * depth)
             squares += dr.square(place - shift * slope * depth) / variance
             area *= variance
         return (dr.exp(-0.5 * squares) + _HALO * dr.rcp(1 + squares)) * dr.rsqrt(area)

@@ -206,7 +206,11 @@ class MergingLayout:
         sine = np.hypot(*pose.axis[:2]) / scene.refractive_index
         depth = reach * float(np.sqrt(1 - sine**2))
         heights = SurfaceHeights(scene, region, depth)
-        profile = BeamProfile(scene, footprint)
+        beam = scene.transmitter.profile
+        squares = np.square([np.cos(beam.rotation), np.sin(beam.rotation)])
+        spreads = np.sqrt([squares @ np.square(beam.spreads), squares[::-1] @ np.square(beam.spreads)])
+        along, across = (spreads * footprint / scene.transmitter.angular_spread).tolist()
+        profile = BeamProfile(scene, (along, across))
         uppermost = _UPPERMOST_PER_SPREAD * profile.depth
         grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
         patches = _patch_width(scene, width)

@@ -75,7 +75,7 @@ class BeamRings:
         horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
-        azimuth = horizontal / sine if sine > 0 else np.array([1.0, 0.0])
+        azimuth = horizontal / sine if sine > 0 else pose.far[:2]
         self._spot = [opaque(x) for x in spot]
         self._azimuth = [opaque(x) for x in azimuth]
         cosine = max(math.sqrt(max(1 - (sine / index) ** 2, 0.0)), _SMALLEST_COSINE)
