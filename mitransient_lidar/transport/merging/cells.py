@@ -44,7 +44,7 @@ _PLANE_STEP = 0.618034
 ORIGIN = 1 << 20
 
 
-class BeamProfile:
+class RefractedProfile:
     """Approximate profile of the beam's light at a depth: a Gaussian function that ripples widen, and a faint halo.
 
     Parameters
@@ -107,7 +107,7 @@ class WaterGrid:
         self,
         rings: BeamRings,
         heights: SurfaceHeights,
-        profile: BeamProfile,
+        profile: RefractedProfile,
         width: float,
         growth: float,
         thickness: float,

@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
-from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, BeamProfile, WaterCells, WaterGrid
+from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
 from mitransient_lidar.transport.merging.merge import merge_in_water, merge_on_solids, store_points
 from mitransient_lidar.transport.merging.patches import MOST_SIDE_BITS, SolidPatches, solids_of_several_levels
@@ -210,7 +210,7 @@ class MergingLayout:
         squares = np.square([np.cos(beam.rotation), np.sin(beam.rotation)])
         spreads = np.sqrt([squares @ np.square(beam.spreads), squares[::-1] @ np.square(beam.spreads)])
         along, across = (spreads * footprint / scene.transmitter.angular_spread).tolist()
-        profile = BeamProfile(scene, (along, across))
+        profile = RefractedProfile(scene, (along, across))
         uppermost = _UPPERMOST_PER_SPREAD * profile.depth
         grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
         patches = _patch_width(scene, width)
