@@ -10,9 +10,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.transport.opaque import is_one_of, opaque_point
+from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
 
@@ -25,7 +26,7 @@ _LONGEST_TEXT = 60_000
 #: Largest distance of simplified outlines from their points, relative to the size.
 _TOLERANCE = 5e-4
 
-#: Rays along each side of the view that tell targets from bottoms.
+#: Rays along each side of the view that tell which targets are near it.
 _VIEW_TICKS = 9
 
 #: Most shapes that the receiver's axis passes on its way to the bottom.
@@ -67,20 +68,24 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     """Return the attributes of a result that `plot_layout` draws.
 
     ``receiver_pose`` and ``transmitter_pose`` are origin [m], axis, far and left, 12 numbers each. ``bottom_point`` is
-    the point x, y, z [m] where the receiver's axis, refracted by a level sea, meets a solid that is not a target;
+    the point x, y, z [m] where the receiver's axis, refracted by a level sea, meets the bottom (`WaterScene.bottoms`);
     missing without one. Water of several index layers has ``index_layers``, their refractive indices, and
     ``index_boundaries``, the depths between them [m].
 
     JSON texts are ``beam_outlines`` (share of the peak, and lines), ``pixel_outlines`` (lines of each pixel; not of
-    imagers) and ``target_outlines``, for each solid smaller than the view at its depth: ``id``, ``z`` (lowest and
+    imagers) and ``target_outlines``, for each target in or near the view: ``id``, ``z`` (lowest and
     highest point [m]), ``line`` (its vertical projection), ``seen`` (its outline on the sea level along the receiver's
     refracted lines of sight) and, with a ``bottom_point``, ``shadow`` (that of its shadow in the laser's light at the
     height of this point). A line is closed, with the coordinates angle_x, angle_y [mrad] of its points, or x, y [m] for
     targets. Texts above the limit are omitted.
     """
     transmitter, receiver = scene.transmitter, scene.receiver
-    targets = [solid for solid in scene.solids if _is_target(scene, solid)]
-    bottom = _axis_on_bottom(scene, targets)
+    bottoms = scene.bottoms
+    targets = [
+        solid for solid in scene.solids if not any(solid is other for other in bottoms) and _is_near(scene, solid)
+    ]
+    found = axis_on_bottom(scene)[0]
+    bottom = found if np.isfinite(found).all() else None
     texts: dict[str, list[Any]] = {
         "target_outlines": [_describe_target(scene, target, bottom) for target in targets],
         "beam_outlines": [],
@@ -106,8 +111,8 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     return described
 
 
-def _is_target(scene: LidarScene, solid: mi.Shape) -> bool:
-    """Return whether a solid is smaller than the square about the view at its mean height, and in or near it."""
+def _is_near(scene: LidarScene, solid: mi.Shape) -> bool:
+    """Return whether a solid is in or near the square about the view at its mean height."""
     pose, box = scene.receiver.pose, solid.bbox()
     low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
     ticks = 0.5 * scene.receiver.pixels.field_of_view * np.linspace(-1, 1, _VIEW_TICKS)
@@ -119,32 +124,50 @@ def _is_target(scene: LidarScene, solid: mi.Shape) -> bool:
         return False
     first, last = seen.min(axis=0), seen.max(axis=0)
     near = 0.5 * (last - first)
-    covers = np.all(low[:2] < first) and np.all(high[:2] > last)
-    return not (covers or np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
+    return not (np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
 
 
-def _axis_on_bottom(scene: LidarScene, targets: list[mi.Shape]) -> FloatArray | None:
-    """Return where the receiver's axis, refracted by a level sea, meets a solid that is not a target [m]."""
-    bottoms = [solid for solid in scene.solids if not any(solid is target for target in targets)]
+def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),)) -> FloatArray:
+    """Return where the receiver's axis, refracted by a level sea, first meets a bottom.
+
+    Parameters
+    ----------
+    scene
+        The scene; `WaterScene.bottoms` are its bottoms.
+    shifts
+        Horizontal displacements of the lidar, x and y [m], shape (places, 2).
+
+    Returns
+    -------
+    ndarray
+        Points x, y, z [m], shape (places, 3); NaN where the axis meets no bottom.
+    """
+    moved, bottoms = np.pad(np.asarray(shifts, dtype=np.float64), ((0, 0), (0, 1))), scene.bottoms
     pose, sea = scene.receiver.pose, scene.level_sea
+    found = np.full((len(moved), 3), np.nan)
     if not bottoms or pose.axis[2] >= 0:
-        return None
+        return found
     # Corners of the axis: receiver, sea level, boundaries of the index layers, and a point below everything.
     lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
     heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
     corners = [pose.origin, *(np.append(sea.at_height(pose.origin, pose.axis, z), z) for z in heights)]
+    active = aligned(mi.Bool, np.ones(len(moved), dtype=bool))
     for start, end in itertools.pairwise(corners):
-        ray = mi.Ray3f(opaque_point(start), dr.normalize(opaque_point(end) - opaque_point(start)))
-        length = float(np.linalg.norm(end - start))
+        origin = mi.Point3f(*(aligned(mi.Float, column) for column in (moved + start).T))
+        ray = mi.Ray3f(origin, dr.normalize(opaque_point(end) - opaque_point(start)))
+        length, on_leg = opaque(float(np.linalg.norm(end - start))), mi.Bool(active)
         for _ in range(_MOST_HITS):
-            hit = scene.ray_intersect(ray)
-            point = np.array(hit.p, dtype=np.float64).ravel()
-            if not hit.is_valid()[0] or float(np.linalg.norm(point - start)) > length:
+            hit = scene.ray_intersect(ray, on_leg)
+            on_leg &= hit.is_valid() & (dr.norm(hit.p - origin) <= length)
+            ends = on_leg & is_one_of(hit.shape, bottoms)
+            dr.eval(hit, ends)
+            at_end = np.array(ends)
+            found[at_end] = np.array(hit.p, dtype=np.float64).T[at_end]
+            active, on_leg = active & ~ends, on_leg & ~ends
+            if not dr.any(on_leg):
                 break
-            if is_one_of(hit.shape, bottoms)[0]:
-                return point
             ray = hit.spawn_ray(ray.d)
-    return None
+    return found
 
 
 def _describe_target(scene: LidarScene, target: mi.Shape, bottom: FloatArray | None) -> dict[str, Any]:

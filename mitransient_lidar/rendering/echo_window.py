@@ -55,7 +55,7 @@ class EchoProbe:
     missed_beam
         Share of the beam inside the field of view that passes outside the surface mesh.
     pierced
-        Solids visible both in the air and through the sea, and whether each is larger than the field of view.
+        Solids visible both in the air and through the sea.
     solids
         Echoes of the solids that rays of beam and view meet, in the air and under water.
     """
@@ -63,7 +63,7 @@ class EchoProbe:
     surface_ns: NDArray[np.float64]
     bottom_ns: NDArray[np.float64]
     missed_beam: float
-    pierced: list[tuple[mi.Shape, bool]]
+    pierced: list[mi.Shape]
     solids: list[SolidEcho]
 
 
@@ -133,20 +133,19 @@ def _pierced(
     below: mi.SurfaceInteraction3f,
     at_sea: mi.Bool,
     under_water: mi.Bool,
-) -> list[tuple[mi.Shape, bool]]:
-    """Return the solids that rise through the sea in the field of view, and whether each is larger than it."""
-    wet = np.array(first.p)[:2, np.array(at_sea)]
-    pierced = []
+) -> list[mi.Shape]:
+    """Return the solids that rise through the sea in the field of view."""
+    if not dr.any(at_sea):
+        return []
     # Solids visible outside a small surface mesh lie lower.
     lowest = min((float(surface.bbox().min.z) for surface in scene.surfaces), default=0.0)
     in_air = first.is_valid() & (first.p.z > lowest)
-    for solid in scene.solids if wet.size else []:
-        pointer = mi.ShapePtr(solid)
-        if dr.any(in_air & (first.shape == pointer)) and dr.any(under_water & (below.shape == pointer)):
-            box = solid.bbox()
-            low, high = np.array(box.min)[:2], np.array(box.max)[:2]
-            pierced.append((solid, bool(np.all(low < wet.min(axis=1)) and np.all(high > wet.max(axis=1)))))
-    return pierced
+    return [
+        solid
+        for solid in scene.solids
+        if dr.any(in_air & (first.shape == mi.ShapePtr(solid)))
+        and dr.any(under_water & (below.shape == mi.ShapePtr(solid)))
+    ]
 
 
 def _quantiles(

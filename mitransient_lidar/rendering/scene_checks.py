@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -248,19 +247,20 @@ def _check_reflection(scene: LidarScene, view: _Rays) -> None:
 
 def _check_solids(scene: LidarScene, probe: EchoProbe) -> None:
     """Refuse a bottom above the sea in the field of view and a target below the bottom; warn of a target in the air."""
-    bottom: Any = max(scene.solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x), default=None)
+    bottoms = scene.bottoms
+    lowest = min(bottoms, key=lambda bottom: float(bottom.bbox().min.z), default=None)
     highest = max((float(surface.bbox().max.z) for surface in scene.surfaces), default=np.inf)
     for solid in scene.solids:
         low, high = float(solid.bbox().min.z), float(solid.bbox().max.z)
-        if solid is not bottom and high < float(bottom.bbox().min.z):
+        if lowest is not None and high < float(lowest.bbox().min.z):
             raise UserError(
-                f"shape {solid.id()!r} lies below the bottom {bottom.id()!r}, up to z = {high:.3g} m: "
-                f"it must lie above {float(bottom.bbox().min.z):.3g} m"
+                f"shape {solid.id()!r} lies below the bottom {lowest.id()!r}, up to z = {high:.3g} m: "
+                f"it must lie above {float(lowest.bbox().min.z):.3g} m"
             )
         if low > highest:
             logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
-    for solid, is_bottom in probe.pierced:
-        if is_bottom:
+    for solid in probe.pierced:
+        if any(solid is bottom for bottom in bottoms):
             raise UserError(
                 f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
                 "receiver looks: a bottom must lie below the waves"

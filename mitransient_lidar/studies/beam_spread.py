@@ -158,15 +158,8 @@ def beam_spread(
 
 
 def _planes(lidar: LidarScene, depths: FloatArray) -> FloatArray:
-    """Return the depths of the planes [m]; reject those below a bottom."""
-    transmitter = lidar.transmitter
-    spot = transmitter.pose.ground_point()
-    reach = 3 * transmitter.widest_angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
-    boxes = [(np.array(solid.bbox().min), np.array(solid.bbox().max)) for solid in lidar.solids]
-    # Light passes around a solid smaller than the footprint.
-    wide = [np.all(low[:2] < spot[:2] - reach) and np.all(high[:2] > spot[:2] + reach) for low, high in boxes]
-    bottoms = [-float(low[2]) for (low, _), covers in zip(boxes, wide, strict=True) if covers and low[2] < 0]
-    deepest = max(bottoms, default=np.inf)
+    """Return the depths of the planes [m]; reject those below the bottom."""
+    deepest = max((-float(bottom.bbox().min.z) for bottom in lidar.bottoms), default=np.inf)
     if depths[-1] > deepest:
         raise UserError(f"depths = {depths[-1]:g} m must not lie below the bottom, at {deepest:g} m")
     return np.minimum(depths, deepest - _ABOVE_BOTTOM)

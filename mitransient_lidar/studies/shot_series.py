@@ -136,10 +136,10 @@ def render_shots(
         ``shot``: ``aim_x``, ``aim_y`` [m]; the means over the beam's footprint ``true_slope_along`` (positive for a
         face towards the lidar), ``true_slope_across`` (positive for a rise to the left) [1] and ``true_surface_height``
         [m] above the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a
-        level sea, meets the largest solid of the scene, NaN where it misses. Attributes such as ``surface_time_ns`` and
-        the limits of the echo window are those of the first shot; positions are left out. ``series_parameters``: JSON
-        of the scene's parameters that shots replace. ``slope_deviation``: standard deviations of the two slopes of a
-        sea with waves. After Ctrl-C the dataset holds the completed shots, and the attribute ``interrupted`` is 1.
+        level sea, meets the bottom (`WaterScene.bottoms`), NaN where it misses. Attributes such as ``surface_time_ns``
+        and the limits of the echo window are those of the first shot; positions are left out. ``series_parameters``:
+        JSON of the scene's parameters that shots replace. ``slope_deviation``: standard deviations of the two slopes of
+        a sea with waves. After Ctrl-C the dataset holds the completed shots, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -447,8 +447,12 @@ def _has_waves(scene: mi.Scene) -> bool:
 
 def true_values(session: Session, lidar: LidarScene, places: FloatArray) -> tuple[FloatArray, ...]:
     """Return the values of `_TRUTH` at places [m], shape (shots, 2)."""
+    from mitransient_lidar.rendering.describe import axis_on_bottom
+
     sea = np.array([footprint_means(_sea(session.scene), lidar.transmitter, x, y) for x, y in places])
-    return *places.T, *sea.T, _bottom_depth(lidar, places)
+    depth = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2])[:, 2]
+    # Rays in single precision are known to a tenth of a millimetre.
+    return *places.T, *sea.T, np.round(depth, 4)
 
 
 def footprint_means(sea: Any, transmitter: Any, x: float, y: float) -> tuple[float, float, float]:
@@ -474,24 +478,3 @@ def footprint_means(sea: Any, transmitter: Any, x: float, y: float) -> tuple[flo
     values = (cos * right + sin * up, cos * up - sin * right, heights)
     slope_along, slope_across, height = (float(np.sum(weight * value)) for value in values)
     return slope_along, slope_across, height
-
-
-def _bottom_depth(lidar: LidarScene, places: FloatArray) -> FloatArray:
-    """Return the depth [m] of the largest solid where the axis of a shot at each place, refracted, meets it."""
-    import mitsuba as mi
-
-    from mitransient_lidar.transport.opaque import aligned
-
-    solids: list[Any] = lidar.solids
-    if not solids:
-        return np.full(len(places), np.nan)
-    bottom = max(solids, key=lambda solid: float(solid.bbox().max.x - solid.bbox().min.x))
-    axis = lidar.receiver.pose.axis
-    x, y = (float(part) / lidar.refractive_index for part in axis[:2])
-    down = mi.Vector3f(x, y, -math.sqrt(1 - x * x - y * y))
-    count = len(places)
-    origin = mi.Point3f(*(aligned(mi.Float, column) for column in (*places.T, np.zeros(count))))
-    met = mi.load_dict({"type": "scene", "bottom": bottom}, parallel=False).ray_intersect(mi.Ray3f(origin, down))
-    depth = -np.array(met.p.z, dtype=np.float64)
-    # Rays in single precision are known to a tenth of a millimetre.
-    return np.where(np.array(met.is_valid()), np.round(depth, 4), np.nan).astype(np.float64)

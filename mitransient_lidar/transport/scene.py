@@ -37,6 +37,9 @@ _ROUNDING = 2.0**-21
 #: Length over which slopes change, over the shortest wavelength.
 _FACET_PER_WAVE = 0.25
 
+#: Smallest side of a bottom, over that of the largest solid.
+_BOTTOM_PER_LARGEST = 0.25
+
 
 SceneT = TypeVar("SceneT", bound="WaterScene")
 
@@ -86,8 +89,29 @@ class WaterScene:
 
     @property
     def solids(self) -> list[mi.Shape]:
-        """All shapes that do not bound the water: bottom and targets."""
+        """All shapes that do not bound the water: bottoms and targets."""
         return _solids(self.mitsuba_scene, self.surfaces)
+
+    @property
+    def bottoms(self) -> list[mi.Shape]:
+        """Solids that are the bottom, or a part of it; all others are targets.
+
+        The shorter horizontal side of a bottom's bounding box is at least the width of the field of view at its
+        distance, and at least a quarter of that of the largest solid.
+        """
+        boxes = [np.array([solid.bbox().min, solid.bbox().max], dtype=np.float64) for solid in self.solids]
+        sides = [float((high - low)[:2].min()) for low, high in boxes]
+        origin, field_of_view = self.receiver.pose.origin, self.receiver.pixels.field_of_view
+        widths = [field_of_view * float(np.linalg.norm(np.clip(origin, *box) - origin)) for box in boxes]
+        smallest = _BOTTOM_PER_LARGEST * max(sides, default=0.0)
+        rows = zip(self.solids, sides, widths, strict=True)
+        return [solid for solid, side, width in rows if side >= max(width, smallest)]
+
+    @property
+    def targets(self) -> list[mi.Shape]:
+        """Solids that are not `bottoms`."""
+        bottoms = self.bottoms
+        return [solid for solid in self.solids if not any(solid is bottom for bottom in bottoms)]
 
     @property
     def clear_water(self) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.physics.lidar.refraction import refracted_path
-from mitransient_lidar.rendering.describe import describe_layout
+from mitransient_lidar.rendering.describe import axis_on_bottom, describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.snell import refract
@@ -126,6 +126,26 @@ def test_axis_passes_targets_on_its_way_to_the_bottom(lidar_scene):
     assert traced_axis(scene)[1][2] > -6
     np.testing.assert_allclose(described(scene)["bottom_point"], [2.1119, 0, -8], atol=1e-3)
     assert "bottom_point" not in described(lidar_scene(bottom=None))
+
+
+def test_bottom_is_every_wide_solid_and_no_other(lidar_scene):
+    """A step of two plates; a pipe that is longer than the bottom, a mine, and a plate in a view wider than it."""
+    place = mi.ScalarTransform4f
+    near = {"type": "rectangle", "to_world": place().translate([-30, 0, -6]).scale(30)}
+    far = {"type": "rectangle", "to_world": place().translate([0, 0, -8]).scale(100), "bsdf": {"type": "conductor"}}
+    pipe = {"type": "cylinder", "p0": [-300, 3, -5], "p1": [300, 3, -5], "radius": 0.3}
+    mine = {"type": "sphere", "center": [1.0, 0, -4], "radius": 0.5}
+    extra = {"far": far, "near": near, "pipe": pipe, "mine": mine}
+    narrow = lidar_scene(bottom=None, extra=extra, rx={"field_of_view_mrad": 1.0})
+    scene = LidarScene.from_scene(narrow, narrow.sensors()[0])
+    assert sorted(solid.id() for solid in scene.bottoms) == ["far", "near"]
+    assert sorted(solid.id() for solid in scene.targets) == ["mine", "pipe"]
+    # Past mine and pipe, on either side of the step, and beside everything.
+    points = axis_on_bottom(scene, [(0.0, 0.0), (0.0, 3.0 - 1e-3), (-5.0, 0.0), (500.0, 0.0)])
+    np.testing.assert_allclose(points[:, 2], [-8, -8, -6, np.nan], atol=1e-3)
+    np.testing.assert_allclose(points[0, :2], [2.1119, 0], atol=1e-3)
+    wide = lidar_scene(bottom=None, extra={"mine": mine})
+    assert LidarScene.from_scene(wide, wide.sensors()[0]).bottoms == []
 
 
 def test_index_layers_bend_the_axis(lidar_scene):
