@@ -22,6 +22,7 @@ from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water_phases import KINDS, ScattererPhases, phases_of_layers
 from mitransient_lidar.transport.nested_objects import create_object
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 
 #: Attenuation, scattering and backscattering [1/m] unless they are given.
@@ -182,7 +183,7 @@ class LayeredWater(mi.Medium):
         if self.plume is None:
             return flight.attenuation(scatterer)
         layer = dr.minimum(scatterer, self.column.count - 1)
-        return dr.select(scatterer == self.column.count, mi.Float(self.plume.scattering), flight.attenuation(layer))
+        return dr.select(scatterer == self.column.count, opaque(self.plume.scattering), flight.attenuation(layer))
 
     def albedo(self, scatterer: mi.UInt32) -> mi.Float:
         """Return the single-scattering albedo of a scatterer; bubbles absorb nothing."""

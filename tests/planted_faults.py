@@ -75,7 +75,12 @@ FAULTS = (
     # The cosine of the photon stays in the BSDF of merges on solids.
     Fault("cosine_at_the_bottom", f"{_M}/merge.py", "outgoing, within)[0] / cosine", "outgoing, within)[0]"),
     Fault("merged_light_2_percent_more", f"{_M}/merge.py", "= points.weight / vol", "= 1.02 * points.weight / vol"),
-    Fault("phase_index_times_water_leg", f"{_T}/volpath.py", "above.t * scene.group", "above.t * scene.refractive"),
+    Fault(
+        "phase_index_times_water_leg",
+        f"{_T}/volpath.py",
+        "above.t * opaque(scene.group",
+        "above.t * opaque(scene.refractive",
+    ),
     # All photons enter the water.
     Fault(
         *("no_fresnel_at_entry", f"{_T}/random_walk.py"),

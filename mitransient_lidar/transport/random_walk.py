@@ -220,7 +220,7 @@ class RandomWalk:
 
     def _enter_outside(self, path: RandomWalkPath, outside: mi.Bool) -> None:
         """Refract paths outside the surface mesh into level water, to measure the loss."""
-        index = self.scene.refractive_index
+        index = opaque(self.scene.refractive_index)
         entered, _ = refract_level(path.direction, 1 / index)
         path.direction = dr.select(outside, entered, path.direction)
         path.throughput *= dr.select(outside, 4 * index / (1 + index) ** 2, 1)

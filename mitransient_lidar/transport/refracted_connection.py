@@ -47,7 +47,7 @@ class RefractedEmitterSampler(ABC):
     """
 
     def __init__(self, scene: WaterScene) -> None:
-        self.index = scene.refractive_index
+        self.index = opaque(scene.refractive_index)
         self.slope_variance = opaque(scene.slope_variance)
         self._layers = scene.index_layers
 
@@ -226,14 +226,14 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
     for number in range(layers.count - 1, 0, -1):
         here = active & (layer == number) & (traced.ray.d.z > 0)
         segment = mi.Ray3f(traced.ray.o, traced.ray.d)
-        distance = dr.maximum((-segment.o.z - float(layers.boundaries[number - 1])) / segment.d.z, 0)
+        distance = dr.maximum((-segment.o.z - opaque(layers.boundaries[number - 1])) / segment.d.z, 0)
         segment.maxt = distance
         blocked = scene.ray_test(segment, here)
         optical_depth = scene.water.optical_depth(segment.o, segment.d, distance)
         absorption = scene.water.absorption_flight.optical_depth(-segment.o.z, -segment.d.z, distance)
         above = mi.UInt32(number - 1)
         direction, ratio, passes = layers.refract(segment.d, mi.UInt32(number), above)
-        traced.optical_length += dr.select(here, distance * float(layers.group_index[number]), 0)
+        traced.optical_length += dr.select(here, distance * layers.group(mi.UInt32(number)), 0)
         traced.optical_depth += dr.select(here, optical_depth, 0)
         traced.absorption_depth += dr.select(here, absorption, 0)
         traced.factor *= dr.select(here, dr.select(passes & ~blocked, ratio * ratio, 0), 1)
@@ -273,7 +273,7 @@ class StraightConnection:
         length = relative.distance(point)
         if scene.submerged:
             irradiance *= dr.exp(-scene.water.optical_depth(point, direction, distance))
-            length += (scene.group_index - 1) * distance
+            length += opaque(scene.group_index - 1) * distance
         return cls(direction, irradiance, distance, length)
 
 

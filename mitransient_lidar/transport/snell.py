@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 
-def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: float) -> mi.Vector3f:
+def refract(direction: mi.Vector3f, normal: mi.Normal3f, eta: mi.Float | float) -> mi.Vector3f:
     """Refract at a facet: return the unit direction, beyond the facet, from which light arrives at it.
 
     Parameters

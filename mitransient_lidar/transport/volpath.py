@@ -173,7 +173,7 @@ class LaserLight(PathLight):
 
 def level_transmittance(scene: WaterScene, emitter: EmitterDirection) -> mi.Float:
     """Return the transmittance of radiance through a level surface, with Fresnel's factor for normal incidence."""
-    index = scene.refractive_index
+    index = opaque(scene.refractive_index)
     return 4 * index / (1 + index) ** 2 * emitter.in_air.z / emitter.in_water.z
 
 
@@ -274,7 +274,7 @@ class PathTracer:
         crossing = dr.select(met, above, si)
         direct = vertex.at_sea | (vertex.on_solid & ~vertex.in_water)
         radiance, air_length = light.connect(crossing, emitter, met | direct)
-        water_length = dr.select(met, top.optical_length + above.t * scene.group_index, 0)
+        water_length = dr.select(met, top.optical_length + above.t * opaque(scene.group_index), 0)
         energy = light.weight * path.throughput * factor * radiance
         if self.options.complement_only:
             energy = dr.select(self._merged(path, vertex, first), 0, energy)

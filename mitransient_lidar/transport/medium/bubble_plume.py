@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import finite, in_range
+from mitransient_lidar.transport.opaque import opaque, opaque_point
 
 
 @dataclass(frozen=True)
@@ -53,30 +54,35 @@ class BubblePlume:
         )
         return plume if plume.scattering > 0 else None
 
+    def _from_stern(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float]:
+        """Return the distances of a point from the stern, astern and across [m]."""
+        return self._frame(point - opaque_point((self.x, self.y, 0.0)))
+
     def _frame(self, vector: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Return the components of a vector astern and across."""
-        cos, sin = float(np.cos(self.bearing)), float(np.sin(self.bearing))
+        cos, sin = opaque(np.cos(self.bearing)), opaque(np.sin(self.bearing))
         return -(cos * vector.x + sin * vector.y), cos * vector.y - sin * vector.x
 
     def holds(self, point: mi.Point3f) -> mi.Bool:
         """Return whether a point is in the plume."""
-        astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
-        return (astern >= 0) & (astern <= self.length) & (dr.abs(across) <= self.width / 2) & (point.z >= -self.depth)
+        astern, across = self._from_stern(point)
+        length, half_width, bottom = map(opaque, (self.length, self.width / 2, -self.depth))
+        return (astern >= 0) & (astern <= length) & (dr.abs(across) <= half_width) & (point.z >= bottom)
 
     def scattering_at(self, point: mi.Point3f) -> mi.Float:
         """Return the scattering coefficient of the bubbles at a point [1/m]."""
-        return dr.select(self.holds(point), mi.Float(self.scattering), 0)
+        return dr.select(self.holds(point), opaque(self.scattering), 0)
 
     def crossing(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Return the distances at which a ray enters and leaves the plume [m], in reverse order where it misses."""
         near, far = mi.Float(0), mi.Float(dr.inf)
-        astern, across = self._frame(point - mi.Point3f(self.x, self.y, 0))
+        astern, across = self._from_stern(point)
         along_astern, along_across = self._frame(direction)
         slabs = (
-            (astern, along_astern, 0.0, self.length),
-            (across, along_across, -self.width / 2, self.width / 2),
+            (astern, along_astern, 0.0, opaque(self.length)),
+            (across, along_across, opaque(-self.width / 2), opaque(self.width / 2)),
             # The plume reaches up into the wave crests.
-            (point.z, direction.z, -self.depth, 1e4),
+            (point.z, direction.z, opaque(-self.depth), 1e4),
         )
         for place, speed, low, high in slabs:
             # A ray parallel to a slab's faces is inside everywhere or nowhere.
@@ -88,10 +94,10 @@ class BubblePlume:
     def optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float) -> mi.Float:
         """Return the optical depth that the bubbles add to a segment."""
         near, far = self.crossing(point, direction)
-        return self.scattering * dr.maximum(dr.minimum(far, length) - near, 0)
+        return opaque(self.scattering) * dr.maximum(dr.minimum(far, length) - near, 0)
 
     def distance(self, point: mi.Point3f, direction: mi.Vector3f, optical_depth: mi.Float) -> mi.Float:
         """Return the distance at which a ray has crossed an optical depth of bubbles [m], infinite if it never does."""
         near, far = self.crossing(point, direction)
-        end = near + optical_depth / self.scattering
+        end = near + optical_depth / opaque(self.scattering)
         return dr.select(end < far, end, dr.inf)

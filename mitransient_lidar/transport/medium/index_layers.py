@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.snell import refract_level
 
 #: Largest number of index layers: connections are traced through each of them.
@@ -42,21 +43,21 @@ class IndexLayers:
             raise UserError(
                 f"refractive_index has {self.count} different index layers but must have at most {MOST_INDEX_LAYERS}"
             )
-        self._top = mi.Float(np.append(-np.inf, self.boundaries))
-        self._bottom = mi.Float(np.append(self.boundaries, np.inf))
-        self._index = mi.Float(self.refractive_index)
-        self._group = mi.Float(self.group_index)
+        edges = np.append(-np.inf, self.boundaries), np.append(self.boundaries, np.inf)
+        self._top, self._bottom, self._index, self._group = (
+            aligned(mi.Float, values) for values in (*edges, self.refractive_index, self.group_index)
+        )
 
     def at(self, depth: mi.Float) -> mi.UInt32:
         """Return the number of the index layer at a depth [m]."""
         layer = mi.UInt32(0)
         for boundary in self.boundaries:
-            layer += dr.select(depth >= float(boundary), mi.UInt32(1), 0)
+            layer += dr.select(depth >= opaque(boundary), mi.UInt32(1), 0)
         return layer
 
     def group(self, layer: mi.UInt32) -> mi.Float:
         """Return the group index of an index layer."""
-        return mi.Float(float(self.group_index[0])) if self.count == 1 else dr.gather(mi.Float, self._group, layer)
+        return opaque(self.group_index[0]) if self.count == 1 else dr.gather(mi.Float, self._group, layer)
 
     def to_boundary(self, depth: mi.Float, downward: mi.Float, layer: mi.UInt32, active: mi.Bool) -> mi.Float:
         """Return the distance to the boundary at which rays leave their index layer [m], infinite if they never do."""

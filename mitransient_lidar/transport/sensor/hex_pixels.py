@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.pixels import MOST_PIXELS, PixelArray
 
 _ROOT3 = math.sqrt(3.0)
@@ -68,25 +69,26 @@ class HexPixels(PixelArray):
         # The rhombic cell of the lattice has the same points as the hexagon, moved by lattice vectors.
         column, row = across - a, along - b
         near_column, near_row = _round(column, row)
-        angle_x, angle_y = self._position(column - near_column, row - near_row)
+        side, shrink = opaque(self._side), opaque(self._shrink)
+        angle_x, angle_y = _position(column - near_column, row - near_row, side)
         # In the first parallelogram, next to the centre; the others are rotated by 120 and 240 degrees.
         column, row = dr.select(of_centre, 0, a + 1 - b), dr.select(of_centre, 0, b)
         for rotation in (1, 2):
             rotated = ~of_centre & (third >= rotation)
             column, row = dr.select(rotated, -column - row, column), dr.select(rotated, column, row)
-        x, y = self._position(column, row)
-        return dr.fma(angle_x, self._shrink, x), dr.fma(angle_y, self._shrink, y)
+        x, y = _position(column, row, side)
+        return dr.fma(angle_x, shrink, x), dr.fma(angle_y, shrink, y)
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether a hexagon contains it (1 or 0)."""
-        rings = self._rings
-        row = angle_x / (1.5 * self._side)
-        column, row = _round(angle_y / (_ROOT3 * self._side) - 0.5 * row, row)
+        rings, side = self._rings, opaque(self._side)
+        row = angle_x / (1.5 * side)
+        column, row = _round(angle_y / (_ROOT3 * side) - 0.5 * row, row)
         inside = dr.maximum(dr.maximum(dr.abs(column), dr.abs(row)), dr.abs(column + row)) <= rings
         if self._shrink < 1:
-            x, y = self._position(column, row)
+            x, y = _position(column, row, side)
             x, y = dr.abs(angle_x - x), dr.abs(angle_y - y)
-            inside &= dr.maximum(y, 0.5 * (_ROOT3 * x + y)) <= 0.5 * _ROOT3 * self._side * self._shrink
+            inside &= dr.maximum(y, 0.5 * (_ROOT3 * x + y)) <= opaque(0.5 * _ROOT3 * self._side * self._shrink)
         i, k = mi.Int32(dr.select(inside, column, 0)), rings - mi.Int32(dr.select(inside, row, 0))
         # Hexagons in the rows before this one: rows grow from rings + 1 hexagons to 2 rings + 1, and shrink again.
         past = dr.maximum(k - rings, 0)
@@ -96,11 +98,8 @@ class HexPixels(PixelArray):
 
     def centres(self) -> NDArray[np.float64]:
         """Return the centres of the hexagons (angle_x, angle_y) [rad], shape (pixels, 2)."""
-        return np.stack(self._position(*self._axial.T.astype(np.float64)), axis=1)
-
-    def _position(self, column: mi.Float, row: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Return (angle_x, angle_y) of axial coordinates."""
-        return 1.5 * self._side * row, _ROOT3 * self._side * (column + 0.5 * row)
+        column, row = self._axial.T.astype(np.float64)
+        return np.stack(_position(column, row, self._side), axis=1)
 
 
 def hexagon_count(layout: str) -> int:
@@ -129,3 +128,8 @@ def _round(column: mi.Float, row: mi.Float) -> tuple[mi.Float, mi.Float]:
     worst_c = (off_c > off_r) & (off_c > off_t)
     worst_r = ~worst_c & (off_r > off_t)
     return dr.select(worst_c, -r - t, c), dr.select(worst_r, -c - t, r)
+
+
+def _position(column: mi.Float, row: mi.Float, side: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Return (angle_x, angle_y) of axial coordinates, for the side of a hexagon."""
+    return 1.5 * side * row, _ROOT3 * side * (column + 0.5 * row)

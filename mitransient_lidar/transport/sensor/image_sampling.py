@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.opaque import aligned
 
 _SUFFIXES = (".png", ".npy", ".exr")
 
@@ -60,10 +61,10 @@ class ImageSampler:
     def __init__(self, weights: NDArray[np.float64]) -> None:
         self.shape = weights.shape
         of_rows = weights.sum(axis=1)
-        self._rows = mi.Float(np.cumsum(of_rows) / of_rows.sum())
+        self._rows = aligned(mi.Float, np.cumsum(of_rows) / of_rows.sum())
         # Rows without weight are never drawn.
         columns = np.cumsum(weights, axis=1) / np.where(of_rows > 0, of_rows, 1)[:, None]
-        self._columns = mi.Float(columns.ravel())
+        self._columns = aligned(mi.Float, columns)
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to points (row, column), counted in cells from the top left corner."""

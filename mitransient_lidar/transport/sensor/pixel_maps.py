@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.sensor.image_sampling import ImageSampler, read_image
 from mitransient_lidar.transport.sensor.pixels import MOST_PIXELS, PixelArray
 
@@ -35,7 +36,7 @@ class MappedPixels(PixelArray):
         if numbers[0] == 0:
             numbers, pixel = numbers[1:], pixel - 1
         self._pixel = pixel
-        self._table = mi.Int32(pixel.ravel())
+        self._table = aligned(mi.Int32, pixel)
         self._sampler = ImageSampler(np.asarray(pixel >= 0, dtype=np.float64))
         self.names = [f"label{number}" for number in numbers]
         self.layout = "map"
@@ -63,13 +64,13 @@ class MappedPixels(PixelArray):
         """Map uniform numbers to uniform points of the labelled cells."""
         row, column = self._sampler.sample(u)
         rows, columns = self._pixel.shape
-        half, full = 0.5 * self.field_of_view, self.field_of_view
+        half, full = opaque(0.5 * self.field_of_view), opaque(self.field_of_view)
         return half - row * (full / rows), column * (full / columns) - half
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether its cell has a label (1 or 0)."""
         rows, columns = self._pixel.shape
-        half, full = 0.5 * self.field_of_view, self.field_of_view
+        half, full = opaque(0.5 * self.field_of_view), opaque(self.field_of_view)
         row = mi.Int32(dr.floor((half - angle_x) * (rows / full)))
         column = mi.Int32(dr.floor((angle_y + half) * (columns / full)))
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)

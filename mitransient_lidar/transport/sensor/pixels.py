@@ -139,8 +139,9 @@ class LayoutPixels(PixelArray):
             return self.field.sample(u)
         height, width = self.sides
         row, column = u.x * self._rows, u.y * self._columns
-        row, column = (dr.lerp(dr.floor(g) + 0.5, g, self._shrink) for g in (row, column))
-        return 0.5 * height - row * (height / self._rows), column * (width / self._columns) - 0.5 * width
+        row, column = (dr.lerp(dr.floor(g) + 0.5, g, opaque(self._shrink)) for g in (row, column))
+        top, left, down, across = map(opaque, (0.5 * height, 0.5 * width, height / self._rows, width / self._columns))
+        return top - row * down, column * across - left
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether the field of view contains it (1 or 0)."""
@@ -152,7 +153,7 @@ class LayoutPixels(PixelArray):
         inside = self.field.contains(angle_x, angle_y)
         if self._shrink < 1:
             off_centre = dr.maximum(dr.abs(down - row - 0.5), dr.abs(across - column - 0.5))
-            inside &= off_centre <= 0.5 * self._shrink
+            inside &= off_centre <= opaque(0.5 * self._shrink)
         return mi.UInt32(row * self._columns + column), dr.select(inside, mi.Float(1), 0)
 
     def centres(self) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, positive
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.sensor.image_sampling import ImageSampler, read_image
 
 #: Widest blur [mrad].
@@ -64,7 +65,7 @@ class GaussianPointSpread(PointSpread):
 
         Box and Muller 1958, doi:10.1214/aoms/1177706645.
         """
-        radius = self.sigma * dr.sqrt(-2 * dr.log(1 - u.x))
+        radius = opaque(self.sigma) * dr.sqrt(-2 * dr.log(1 - u.x))
         sin, cos = dr.sincos(dr.two_pi * u.y)
         return radius * cos, radius * sin
 
@@ -90,4 +91,5 @@ class MeasuredPointSpread(PointSpread):
         """Map uniform numbers to displacements (angle_x, angle_y) [rad]."""
         row, column = self._sampler.sample(u)
         rows, columns = self._sampler.shape
-        return (0.5 * rows - row) * self._cell, (column - 0.5 * columns) * self._cell
+        cell = opaque(self._cell)
+        return (0.5 * rows - row) * cell, (column - 0.5 * columns) * cell
