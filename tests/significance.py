@@ -80,14 +80,18 @@ def assert_equal(samples, expected, *, error, bias=0.0):
     _assert_close(found, wanted, own, bias, len(samples))
 
 
-def assert_same(first, second, *, error, bias=0.0, known=0.1, faint=1e-3, lacking=False):
+def assert_same(first, second, *, error, bias=0.0, known=0.1, faint=1e-3, lacking=False, alike=False):
     """Assert that two sets of passes, shapes (passes, ...), have one mean in every value, and in their sum.
 
     Values with a relative standard error above `known` in either set, or below a share `faint` of the sum, are left
     out: few large contributions make them, which are not normal, and which a set may happen to lack; so are values
-    that one set lacks altogether, unless `lacking` is set. `error` and `bias` as in `assert_equal`.
+    that one set lacks altogether, unless `lacking` is set. With `alike`, values along the second axis, such as those of
+    pixels, are known only as well as the least known of them: one that happens to lack large contributions seems to be
+    known best, and is too small. `error` and `bias` as in `assert_equal`.
     """
     (a, da), (b, db) = (mean_and_error(_with_sum(samples)) for samples in (first, second))
+    if alike:
+        da, db = (_largest_along_pixels(mean, own, first.shape[1:]) for mean, own in ((a, da), (b, db)))
     lit = np.hypot(da, db) > 0 if lacking else (da > 0) & (db > 0)
     used = lit & ~(da > known * a) & ~(db > known * b) & (b >= faint * b[-1])
     fewest = min(len(first), len(second))
@@ -103,6 +107,12 @@ def _with_sum(samples):
     """Return the values of each pass in a row, with their sum as a last column."""
     flat = np.asarray(samples, dtype=np.float64).reshape(len(samples), -1)
     return np.concatenate([flat, flat.sum(axis=1, keepdims=True)], axis=1)
+
+
+def _largest_along_pixels(mean, error, shape):
+    """Return errors of values, and of their sum, with the largest relative error along the first axis of `shape`."""
+    relative = np.divide(error, mean, out=np.zeros_like(error), where=mean > 0)[:-1].reshape(shape)
+    return np.append(relative.max(axis=0, keepdims=True) * mean[:-1].reshape(shape), error[-1])
 
 
 def _assert_close(found, wanted, error, bias, passes):

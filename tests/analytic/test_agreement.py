@@ -224,8 +224,8 @@ def pair(scene, classes, gate):
 
 def assert_same_light(merged, reference, error):
     """Compare pixels, and all of them together, where more is known; the blur of cells is allowed 0.5 %."""
-    significance.assert_same(merged, reference, error=error, bias=0.005)
-    significance.assert_same(merged.sum(axis=1), reference.sum(axis=1), error=error, bias=0.005)
+    significance.assert_same(merged, reference, error=error, bias=0.005, known=0.08, alike=True)
+    significance.assert_same(merged.sum(axis=1), reference.sum(axis=1), error=error, bias=0.005, known=0.05)
     # Each class, however noisy: one integrator may lack it.
     classes = merged.sum(axis=(1, 3)), reference.sum(axis=(1, 3))
     significance.assert_same(*classes, error=error, bias=0.005, known=0.3, faint=1e-4, lacking=True)

@@ -136,7 +136,7 @@ def test_sampling_does_not_change_the_image(layers):
     for other in found[1:]:
         error = np.hypot(*(samples.std(ddof=1) / np.sqrt(len(samples)) for samples in (found[0], other)))
         assert abs(other.mean() - found[0].mean()) < largest_z(12, 4) * error, (other.mean(), found[0].mean(), error)
-        assert error < 0.03 * found[0].mean()
+        assert error < largest_error(12, 0.016) * found[0].mean()
 
 
 # (c) sun glint
@@ -319,7 +319,10 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
     ratio = {"rayleigh": 0.5, "petzold": 0.01826}[phase]
     water = {"attenuation": 1.0, "scattering": albedo, "backscattering": ratio * albedo, "phase": {"type": phase}}
     scene = build(
-        sun={"zenith_deg": 60.0}, water=water, integrator={"guiding_probability": 0.05 if ratio > 0.1 else 0.3}
+        # Of 0.02 to 0.6 for Petzold's, 0.1 has the fewest bright paths; 0.3 has a pass of three times the mean in 60.
+        sun={"zenith_deg": 60.0},
+        water=water,
+        integrator={"guiding_probability": 0.05 if ratio > 0.1 else 0.1},
     )
     renderer = scene.integrator().prepare(scene, scene.sensors()[0])
     count, found = 2**14 if ratio > 0.1 else 2**17, []
@@ -330,7 +333,7 @@ def test_canonical_problems_1_and_2(phase, albedo, expected, spread):
         record = renderer.follow(path, pass_streams(seed, 4, count), dr.zeros(mi.UInt32, count), weight)
         found.append([float(record.found[0])])
     error = agrees(np.array(found), expected, 4, bias=spread)
-    assert error < largest_error(8, 0.004 if ratio > 0.1 else 0.028)
+    assert error < largest_error(8, 0.004 if ratio > 0.1 else 0.018)
 
 
 # (e) waves focus the sun

@@ -47,7 +47,7 @@ def test_bottom_below_a_boat(build, passes, z_score, integrator):
     expected = SYSTEM * 0.1 / np.pi * np.exp(-0.2 * distance) / distance**2
     z, error = z_score(energy.sum(axis=1), expected)
     assert abs(z) < largest_z(8) + 1e-3 / error  # the beam's rim is 0.1 % weaker
-    assert error < largest_error(8, 0.003)
+    assert error < largest_error(8, 0.005)
     due = 2e9 * GROUP * distance / C0
     assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
 
@@ -83,7 +83,7 @@ def test_surface_above_a_diver(build, passes, z_score, integrator):
     expected = SYSTEM * reflectance * np.exp(-0.2 * depth) / (4 * np.pi * variance * depth**2)
     z, error = z_score(energy.sum(axis=1), expected)
     assert abs(z) < largest_z(8) + 1e-3 / error
-    assert error < largest_error(8, 0.002)
+    assert error < largest_error(8, 0.004)
     due = 2e9 * GROUP * depth / C0
     assert energy[:, int(due - START)].sum() > 0.99 * energy.sum()
 
