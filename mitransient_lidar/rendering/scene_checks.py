@@ -19,6 +19,7 @@ from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.sensor.records import total_reflection_ns
 from mitransient_lidar.transport.snell import refract
 
 logger = logging.getLogger(__name__)
@@ -124,7 +125,7 @@ def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> 
 
 
 def _check_under_water(scene: LidarScene, probe: EchoProbe) -> None:
-    """Check the record of a lidar under water: it must not include the laser itself, and should hold every echo."""
+    """Check the record of a lidar under water: without the laser itself and total reflection, and with every echo."""
     axis = scene.axis
     apart = float(np.linalg.norm(scene.transmitter.pose.origin - scene.receiver.pose.origin))
     first_ns = 2e9 * scene.group_index * _NEAREST_RANGE / C0
@@ -132,6 +133,13 @@ def _check_under_water(scene: LidarScene, probe: EchoProbe) -> None:
         raise UserError(
             f"time_start_ns = {axis.start_ns:g} must be at least {first_ns:.2g} under water, {_NEAREST_RANGE:g} m from "
             "the lidar: at one place, laser and receiver return without limit from less and less range"
+        )
+    reflected_ns = total_reflection_ns(scene, scene.transmitter)
+    if axis.end_ns > reflected_ns:
+        raise UserError(
+            f"time_start_ns = {axis.start_ns:g} and bin_count = {axis.bin_count} bins of {axis.bin_width_ns:g} ns end "
+            f"the record at {axis.end_ns:g} ns: it must end by {reflected_ns:.1f} ns, when the sea reflects beam or "
+            "view totally; what lies beyond is not rendered"
         )
     for echo in probe.solids:
         _warn_of_time(scene, probe, echo)

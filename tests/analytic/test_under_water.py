@@ -7,7 +7,9 @@ import pytest
 from scipy.integrate import quad
 from significance import largest_error, largest_z
 
+import mitransient_lidar
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.water.phase import henyey_greenstein
 from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
@@ -25,13 +27,13 @@ INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 def build(lidar_scene):
     """Builder of scenes with a lidar under water."""
 
-    def scene(altitude, off_nadir_deg, integrator="lidar_merging", tx=None, rx=None, paths=2**15, **options):
+    def scene(altitude, off_nadir_deg, integrator="lidar_merging", tx=None, rx=None, paths=2**15, bins=BINS, **options):
         pose = {"altitude": altitude, "off_nadir_deg": off_nadir_deg}
         return lidar_scene(
             integrator={"type": integrator, "paths_per_pass": paths},
             tx={**pose, "divergence_mrad": 4.0, **(tx or {})},
             rx={**pose, "layout": "1x1", "field_of_view_mrad": 40.0, **(rx or {})},
-            film={"time_start_ns": START, "bin_width_ns": 1.0, "bin_count": BINS},
+            film={"time_start_ns": START, "bin_width_ns": 1.0, "bin_count": bins},
             **options,
         )
 
@@ -97,7 +99,8 @@ CASES = {
     "slanted": (-1.0, 50.0, {"bottom": 6.0}),
     "at a target": (-1.0, 0.0, {"extra": {"ball": BALL}}),
     "up": (-5.0, 180.0, {}),
-    "up beyond the critical angle": (-4.0, 125.0, {}),
+    # The sea reflects the beam after the record.
+    "up beyond the critical angle": (-10.0, 125.0, {}),
     "beside": (-1.0, 0.0, {"rx": {"aim_x": 0.5, "field_of_view_mrad": 400.0}}),
 }
 
@@ -136,6 +139,20 @@ def test_lines_of_sight_give_depths_below_the_mean_sea_level(build, angle, besid
     time = 1e9 * GROUP / C0 * (way + np.hypot(way, beside))
     # Beside the laser, depth is linear in time to a few centimetres.
     assert float(found.depth_of_time(np.array([[time]]))[0, 0]) == pytest.approx(depth, abs=0.05 if beside else 2e-3)
+
+
+def test_records_end_where_the_sea_reflects_the_beam(build):
+    """Beyond the critical angle, 48.3 degrees, light goes on to the bottom; at 45 degrees most leaves the water."""
+    distance = 3.0 / np.cos(np.radians(60))
+    due = 2e9 * GROUP * distance / C0
+    scene = build(-3.0, 120.0, tx={"divergence_mrad": 0.1}, rx={"field_of_view_mrad": 1.0}, bins="auto")
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    assert lidar.axis.start_ns == START
+    assert due - 2 < lidar.axis.end_ns <= due
+    with pytest.raises(UserError, match=r"^time_start_ns = 9 .* must end by 5\d\.\d ns, when the sea reflects beam"):
+        mitransient_lidar.render(build(-3.0, 120.0), passes=2)
+    scene = build(-3.0, 135.0, bins="auto")
+    assert LidarScene.from_scene(scene, scene.sensors()[0]).axis.end_ns > 2e9 * GROUP * 3 / np.cos(np.pi / 4) / C0 + 12
 
 
 @pytest.mark.slow

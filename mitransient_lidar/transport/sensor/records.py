@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -21,6 +22,9 @@ from mitransient_lidar.transport.rng import unit_points
 
 #: Rays of beam and view from which the record of a lidar under water follows.
 _RECORD_RAYS = 1024
+
+#: Share of these rays that the sea must reflect totally for the record to end there.
+_REFLECTED = 0.1
 
 #: Least time of a fitted record before the first and after the last light [ns], and more after it in response times.
 _MARGIN_NS, _RESPONSE_TIMES = 12.0, 12.0
@@ -80,20 +84,17 @@ def submerged_record(scene: Any, transmitter: Any, film: Any) -> tuple[TimeAxis,
 
     The record begins with the light scattered at the lidar. It ends after the farthest echo of beam and view, with a
     quarter of its time and 40 ns more for light that is scattered several times, or at the range where the signal of
-    the water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer.
+    the water, exp(-2 K s) by the least diffuse attenuation K of the column, has fallen to 1e-6 if that is nearer; at
+    the latest where `total_reflection_ns` says.
 
     Raises
     ------
     UserError
         If the bins are too many.
     """
-    points, ranges, column = unit_points(_RECORD_RAYS), [], scene.water.column
-    for pose, angles in (
-        (scene.receiver.pose, scene.receiver.pixels.sample(points)),
-        (transmitter.pose, transmitter.sample_tangent(points)),
-    ):
-        si = scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), pose.direction(*angles)))
-        ranges.append(np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64))
+    column = scene.water.column
+    hits = _first_hits(scene, transmitter)
+    ranges = [np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64) for si in hits]
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     least = min(InherentProperties(*map(float, row)).kd for row in rows)
     visible = -0.5 * np.log(COLUMN_LEVEL) / max(least, 1e-9)
@@ -106,7 +107,41 @@ def submerged_record(scene: Any, transmitter: Any, film: Any) -> tuple[TimeAxis,
     lead, tail = (max(span, _MARGIN_NS) for span in transmitter.pulse.span_ns)
     tail += _RESPONSE_TIMES * scene.receiver.optics.response_time_ns
     fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
-    return TimeAxis.covering(-lead, 1.25 * echo + 40.0 + tail, *fixed), end
+    last, mirrored = 1.25 * echo + 40.0 + tail, total_reflection_ns(scene, transmitter)
+    axis = TimeAxis.covering(-lead, last, *fixed)
+    if film.bin_count is None and axis.end_ns > mirrored:
+        bins = max(int((mirrored - axis.start_ns) / axis.bin_width_ns), 1)
+        return replace(axis, bin_count=bins), "where the sea reflects beam or view totally"
+    return axis, end
+
+
+def total_reflection_ns(scene: Any, transmitter: Any) -> float:
+    """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
+
+    Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
+    by few paths and in cells about an axis that light has left: it is not rendered.
+    """
+    found = [np.inf]
+    lidar = [opaque_point(each.pose.origin) for each in (transmitter, scene.receiver)]
+    for si in _first_hits(scene, transmitter):
+        beyond = si.is_valid() & scene.is_surface(si.shape)
+        beyond &= scene.refractive_index**2 * (1 - dr.square(si.wi.z)) > 1
+        time_ns = 1e9 / C0 * scene.group_index * (dr.norm(si.p - lidar[0]) + dr.norm(si.p - lidar[1]))
+        if dr.count(beyond)[0] > _REFLECTED * _RECORD_RAYS:
+            found.append(float(dr.min(dr.select(beyond, time_ns, dr.inf))[0]))
+    return min(found)
+
+
+def _first_hits(scene: Any, transmitter: Any) -> list[mi.SurfaceInteraction3f]:
+    """Return what rays of view and beam meet first."""
+    points = unit_points(_RECORD_RAYS)
+    return [
+        scene.ray_intersect(mi.Ray3f(opaque_point(pose.origin), pose.direction(*angles)))
+        for pose, angles in (
+            (scene.receiver.pose, scene.receiver.pixels.sample(points)),
+            (transmitter.pose, transmitter.sample_tangent(points)),
+        )
+    ]
 
 
 def _lidar_view(scene: Any, transmitter: Any, shift: tuple[float, float]) -> LidarView:
