@@ -8,6 +8,7 @@ import importlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from xml.dom import minidom
 
@@ -22,6 +23,9 @@ LARGEST_COORDINATE = 1e6
 
 #: Deepest nesting of the objects of a scene; Mitsuba's parser is recursive.
 DEEPEST_NESTING = 64
+
+#: Name of a plugin, and endings of the libraries of plugins.
+_TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
 
 _COORDINATES = ("x", "y", "z", "value")
 #: Attributes that hold one number or several, by the tag of the element.
@@ -90,6 +94,47 @@ def check_elements(root: minidom.Element, parameters: Mapping[str, str]) -> set[
     return used
 
 
+def check_types(root: minidom.Element, parameters: Mapping[str, str], folder: Path) -> None:
+    """Check the types of the objects of an XML scene without includes, with the values of its parameters in place.
+
+    Raises
+    ------
+    UserError
+        If a type is not the name of a plugin, or a library of plugins lies where `check_libraries` forbids it: in the
+        scene's folder, or in one that its ``<path>`` names.
+    """
+    elements = root.getElementsByTagName("*")
+    types = [each.getAttribute("type") for each in elements if each.hasAttribute("type")]
+    folders = [each.getAttribute("value") for each in elements if each.tagName == "path"]
+    for text in types:
+        check_type(with_values(text, parameters)[0])
+    check_libraries(folder, *(folder / with_values(text, parameters)[0] for text in folders))
+
+
+def check_type(plugin: object) -> None:
+    """Raise `UserError` if the type of an object is not the name of a plugin: Mitsuba loads any path as a library."""
+    if not isinstance(plugin, str) or not _TYPE.fullmatch(plugin):
+        raise UserError(f"type = {shown(plugin)} must be the name of a plugin, of letters, digits and underscores")
+
+
+def check_libraries(*folders: Path) -> None:
+    """Raise `UserError` if a folder has a subfolder ``plugins`` with libraries.
+
+    Mitsuba loads plugins from there, its own ones last: beside a scene, or in the current folder, they would run the
+    code of whoever made the scene.
+    """
+    import mitsuba as mi
+
+    own = Path(mi.__file__).parent.resolve()
+    for folder in (*folders, *(Path(str(path)) for path in mi.file_resolver())):
+        place = folder.resolve() / "plugins"
+        if place.parent == own or not place.is_dir():
+            continue
+        for library in place.iterdir():
+            if library.suffix in _LIBRARIES:
+                raise UserError(f"{library} would run as a plugin of Mitsuba; remove it, or work in another folder")
+
+
 def with_values(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
     """Return a text with parameters in place, the longest names first, and those that it refers to."""
     referred: list[str] = []
@@ -100,7 +145,8 @@ def with_values(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str
 
 
 def check_dict(scene: Mapping[str, Any]) -> None:
-    """Check the values of a scene given as a dict; same rules and errors as `check_elements`."""
+    """Check the values of a scene given as a dict; same rules and errors as `check_elements` and `check_types`."""
+    check_libraries()
     pending: list[tuple[str, Mapping[str, Any], int]] = [("", scene, 1)]
     while pending:
         path, part, depth = pending.pop()
@@ -110,6 +156,8 @@ def check_dict(scene: Mapping[str, Any]) -> None:
             label = f"{path}{key}"
             if not isinstance(key, str):
                 raise UserError(f"scene: the key {shown(key)} must be a name")
+            if key == "type":
+                check_type(value)
             if isinstance(value, Mapping):
                 pending.append((f"{label}.", value, depth + 1))
                 if _SHARE.search(key) and _is_plain(value.get("value")):

@@ -17,7 +17,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import catalogue
-from mitransient_lidar.loading.checks import check_dict, check_elements, unknown_parameters
+from mitransient_lidar.loading.checks import check_dict, check_elements, check_types, unknown_parameters
 from mitransient_lidar.loading.includes import flat_text, parse_scene, text_of
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.scene_record import SceneRecord
@@ -131,10 +131,11 @@ def _load_xml(
         known = {key: source.parameters.get(key, value) for key, value in known.items()} | own
     _empty_alternatives(known, own)
     parameters, given = _filled(f"{name} with instrument {instrument}" if instrument else name, known, params)
+    folder = source.parent if isinstance(source, Path) else Path()
+    check_types(root, parameters, folder)
     used = check_elements(root, parameters)
     if unused := [key for key in given if key not in used]:
         raise UserError(f"parameter {unused[0]} = {given[unused[0]]} is used by nothing in scene {name}")
-    folder = source.parent if isinstance(source, Path) else Path()
     record = SceneRecord.of_xml(name, text, root, parameters, folder, instrument or former)
     if isinstance(source, SceneRecord):
         # Files that given parameters name are found as in any scene.

@@ -107,10 +107,10 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
     else:
         if not isinstance(wanted, (str, Mapping)):
             raise UserError(f"integrator = {shown(wanted)} must be the name or the dict of an integrator plugin")
-        if not isinstance(wanted, str):
-            check_dict(wanted)
+        given = {"type": wanted} if isinstance(wanted, str) else dict(wanted)
+        check_dict(given)
         with as_user_error():
-            chosen = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted), parallel=False)
+            chosen = mi.load_dict(given, parallel=False)
     if not hasattr(chosen, "plugin") and isinstance(wanted, str):
         raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
     if not hasattr(chosen, "plugin"):
