@@ -162,6 +162,33 @@ def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
 
 
 @pytest.mark.slow
+def test_cylinder_as_narrow_as_the_patches_of_its_light(lidar_scene, passes):
+    """A cylinder across the look direction, 0.6 m wide, with patches of 0.5 m: quadrature over its lit half.
+
+    Where patches lay along x on all that is steeper than 45 degrees, light was spread evenly over them: -6 %.
+    """
+    radius, half, centre = 0.3, 0.6, np.array([5.0 * np.tan(np.arcsin(np.sin(OFF_NADIR) / INDEX)), 0.1, -5.0])
+    (angle, dangle), (y, dy) = grid(0.0, 2 * np.pi, 1200), grid(-half, half, 600)
+    angle, y = np.meshgrid(angle, y)
+    normal = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
+    places = centre + radius * normal + y[..., np.newaxis] * np.array([0.0, 1.0, 0.0])
+    irradiance, received, towards, _ = gain(*np.moveaxis(places, -1, 0))
+    facing = np.maximum(np.sum(normal * towards, axis=-1), 0)
+    expected = np.sum(0.3 / np.pi * irradiance * received * facing**2) * radius * dangle * dy
+    ends = {name: [centre[0], centre[1] + shift, centre[2]] for name, shift in (("p0", -half), ("p1", half))}
+    cylinder = {"type": "cylinder", **ends, "radius": radius, "bsdf": {"type": "twosided", "bsdf": diffuse(0.3)}}
+    scene = lidar_scene(
+        **{**ONE, "rx": {"layout": "1x1", "field_of_view_mrad": 50.0}},
+        integrator={"type": "lidar_merging", "paths_per_pass": 2**14, "cell_size": 0.15},
+        film={"time_start_ns": 1430.0, "bin_width_ns": 120.0, "bin_count": 1},
+        bottom=None,
+        extra={"target": cylinder},
+    )
+    energy = passes(scene, 64).sum(axis=(1, 2))
+    significance.assert_equal(energy, expected, error=0.007, bias=0.005)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
     """Straight back: reflectance over 2 pi sigma^2 per steradian, 170 times a Lambertian plate."""

@@ -23,6 +23,9 @@ MOST_SIDE_BITS = 9
 #: Height of the levels into which patches of bounded solids are cut, over the width of each patch.
 _LEVEL_WIDTHS = 8
 
+#: Component of a normal along the beam, over the larger horizontal one, below which a surface counts as steep.
+_STEEP = 0.3
+
 #: Largest number of hits of a vertical ray in the search for solids of several levels.
 _MOST_LEVELS = 8
 
@@ -84,10 +87,11 @@ def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) 
 
 
 class SolidPatches:
-    """Patches of one pass, in projection along the direction nearest to the normal, shifted at random in each shot.
+    """Patches of one pass, in projection along the beam, or along x or y where steep, shifted at random in each shot.
 
-    Directions are x, y and that of the refracted beam. In projection along the beam patches are sectors of rings about
-    it, whatever their depth, along the others squares.
+    In projection along the refracted beam patches are sectors of rings about it, whatever their depth, along the others
+    squares. Its light is spread evenly over the projection of a patch, however curved its surface is; along x or y what
+    is curved within a patch loses light, a twentieth of the echo of a sphere of a patch's radius if half of it did.
 
     Parameters
     ----------
@@ -201,8 +205,8 @@ class SolidPatches:
         x, y = self._rings.slant
         against = si.n.z - x * si.n.x - y * si.n.y
         size = mi.Vector3f(dr.abs(si.n.x), dr.abs(si.n.y), dr.abs(against) * dr.rsqrt(1 + x * x + y * y))
-        along_x = (size.x > size.y) & (size.x > size.z)
-        along_y = ~along_x & (size.y > size.z)
+        along_x = (size.x > size.y) & (_STEEP * size.x > size.z)
+        along_y = (size.x <= size.y) & (_STEEP * size.y > size.z)
         axis = dr.select(along_x, mi.UInt32(0), dr.select(along_y, mi.UInt32(1), mi.UInt32(2)))
         return axis, dr.select(along_x, si.n.x, dr.select(along_y, si.n.y, against))
 
