@@ -33,6 +33,9 @@ _SPREAD_PER_DEPTH = 0.25
 #: Cells on each side of the tables of heights, of a single shot and of each of several.
 _HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
 
+#: Largest number of times that a line through the mean sea level crosses the waves.
+_MOST_CROSSINGS = 4
+
 #: Height of the bed of columns without a solid below [m].
 _NO_BED = -1e9
 
@@ -93,11 +96,15 @@ class Region:
         down = np.append(sine, -np.sqrt(1 - sine @ sine))
         air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
         longest = (scene.axis.path_end - air) / (2 * scene.group_index)
-        x, y = self.probe_points()
-        lowest = min(float(surface.bbox().min.z) for surface in scene.surfaces)
-        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, opaque(lowest - 1e-3)), mi.Vector3f(down.tolist())))
-        length = dr.mean(dr.minimum(dr.select(si.is_valid(), si.t, dr.inf), max(longest, 0.1)))
-        return float(length[0])
+        # From the mean sea level: below the deepest trough, which lies anywhere, may be below a shallow bottom here.
+        ray = mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), mi.Vector3f(down.tolist()))
+        length, at_sea = dr.zeros(mi.Float, PROBE_RAYS), dr.full(mi.Bool, True, PROBE_RAYS)
+        for _ in range(_MOST_CROSSINGS):
+            si = scene.ray_intersect(ray, at_sea)
+            length += dr.select(at_sea, dr.select(si.is_valid(), si.t, dr.inf), 0)
+            at_sea &= si.is_valid() & scene.is_surface(si.shape)
+            ray = si.spawn_ray(ray.d)
+        return float(dr.mean(dr.minimum(length, max(longest, 0.1)))[0])
 
     def is_below(self, box: mi.ScalarBoundingBox3f, scene: LidarScene) -> bool:
         """Return whether a bounding box extends beyond light and view at its depth, by their size on every side."""
