@@ -16,6 +16,7 @@ INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 WAVES = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"}
 ROUGH = {"slope_variance": "0.01"}
 LAYERS = {"layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35", "backscattering": "0.014, 0.007"}
+LAYERS |= {"phase_function": "hg", "phase_g": 0.6}
 BUBBLES = {"plume_scattering": 1.5, "plume_width": 3.0, "plume_depth": 2.0, "plume_bearing_deg": 60.0, "plume_x": 1.0}
 TURBID = {"attenuation": 1.0, "scattering": 0.8, "backscattering": 0.016}
 #: Scattering by a smooth phase function: the reference connects forward peaks to the laser with few large values.
@@ -155,6 +156,17 @@ CASES = {
         },
         (510.0, 1.0, 110),
         *(4, 0.02, None),
+    ),
+    # Scattered light prevails where the beam itself stays narrow.
+    "narrow beam in turbid, smooth water": (
+        {
+            "tx": {"divergence_mrad": 0.2},
+            "rx": {"field_of_view_mrad": 3.0},
+            **{"sea": {"slope_variance": "1e-4"}, "bottom": None},
+            "water": {**TURBID, "attenuation": 0.5, "scattering": 0.4, "phase_function": "hg", "phase_g": 0.5},
+        },
+        (1410.0, 5.0, 18),
+        *(2, 0.02, None),
     ),
     "elliptic beam": (
         {

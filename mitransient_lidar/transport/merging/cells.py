@@ -34,8 +34,14 @@ _LEAST_DESCENT = 0.5
 #: Steps to the surface above a point along the beam, and least volume below a slope over that below level water.
 _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 
-#: Least slope of the sea, against division by zero, and share of the halo in the beam's profile.
-_LEAST_SLOPE, _HALO = 1e-9, 0.02
+#: Least slope of the sea, against division by zero.
+_LEAST_SLOPE = 1e-9
+
+#: Halo of the beam's profile over its core: at the surface, and for each scattered photon over one that is not.
+_HALO, _HALO_PER_SCATTERED = 0.02, 0.15
+
+#: Largest optical depth of scattering of which the halo is taken.
+_MOST_SCATTERING = 4.0
 
 #: Step of the planes' places from one layer to the next, which distributes them evenly: the golden ratio.
 _PLANE_STEP = 0.618034
@@ -45,7 +51,10 @@ ORIGIN = 1 << 20
 
 
 class RefractedProfile:
-    """Approximate profile of the beam's light at a depth: a Gaussian function that ripples widen, and a faint halo.
+    """Approximate profile of the beam's light at a depth: a Gaussian function that ripples widen, and a halo.
+
+    The halo is light that has been scattered. It grows with depth: where it prevails, light changes little between a
+    point and the plane on which it is counted.
 
     Parameters
     ----------
@@ -61,6 +70,7 @@ class RefractedProfile:
         # Displacement for each metre of depth and unit of slope, along and across the azimuth of the beam, with the
         # scale of `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
+        self._scattering = opaque(float(scene.water.column.scattering.max()) / cosine)
         ripples = 0.5 * max((sum(getattr(surface, "ripple_variance", ())) for surface in scene.surfaces), default=0.0)
         self._spreads, self._shifts = ([opaque(value) for value in values] for values in (spreads, shifts))
         self._growths = [opaque(shift * math.sqrt(ripples)) for shift in shifts]
@@ -76,7 +86,10 @@ class RefractedProfile:
             variance = dr.square(spread) + dr.square(growth * depth)
             squares += dr.square(place - shift * slope * depth) / variance
             area *= variance
-        return (dr.exp(-0.5 * squares) + _HALO * dr.rcp(1 + squares)) * dr.rsqrt(area)
+        # Light that has been scattered, over the rest.
+        scattered = dr.exp(dr.minimum(depth * self._scattering, _MOST_SCATTERING)) - 1
+        halo = dr.fma(_HALO_PER_SCATTERED, scattered, _HALO)
+        return (dr.exp(-0.5 * squares) + halo * dr.rcp(1 + squares)) * dr.rsqrt(area)
 
 
 class WaterGrid:
