@@ -89,6 +89,17 @@ def test_track_length_is_the_slanted_way_to_the_bottom(wavy_sea):
     assert region.track_length(lidar) == pytest.approx(slanted, rel=0.05)
 
 
+def test_points_are_as_dense_above_a_bottom_that_lies_higher_than_a_trough_elsewhere(lidar_scene):
+    """Waves of 10 m/s reach 1.5 m below the mean sea level somewhere on the sea, a bottom is at 1.25 m."""
+    pose = {"altitude": 20.0, "off_nadir_deg": 0.0}
+    sea = {"spectrum": "elfouhaily", "wind_speed": 10.0}
+    scene = lidar_scene(integrator=MERGING, tx=pose, rx=pose, sea=sea, bottom=1.25)
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    assert min(float(surface.bbox().min.z) for surface in lidar.surfaces) < -1.25
+    region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
+    assert region.track_length(lidar) == pytest.approx(1.25, rel=0.01)
+
+
 def test_heights_are_those_of_the_mesh(wavy_sea):
     lidar, region = wavy_sea
     heights = SurfaceHeights(lidar, region, 8.0)
