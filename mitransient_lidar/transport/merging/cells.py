@@ -38,7 +38,10 @@ _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 _LEAST_SLOPE = 1e-9
 
 #: Halo of the beam's profile over its core: at the surface, and for each scattered photon over one that is not.
-_HALO, _HALO_PER_SCATTERED = 0.02, 0.15
+_HALO, _HALO_PER_SCATTERED = 0.02, 0.2
+
+#: Spread of scattered light over the depth.
+_SPREAD_OF_SCATTERING = 0.1
 
 #: Largest optical depth of scattering of which the halo is taken.
 _MOST_SCATTERING = 4.0
@@ -86,8 +89,10 @@ class RefractedProfile:
             variance = dr.square(spread) + dr.square(growth * depth)
             squares += dr.square(place - shift * slope * depth) / variance
             area *= variance
-        # Light that has been scattered, over the rest.
+        # Light that has been scattered, over the rest; about a beam wider than its spread it has the beam's profile.
         scattered = dr.exp(dr.minimum(depth * self._scattering, _MOST_SCATTERING)) - 1
+        spread = dr.square(_SPREAD_OF_SCATTERING * depth)
+        scattered *= spread / (spread + dr.sqrt(area))
         halo = dr.fma(_HALO_PER_SCATTERED, scattered, _HALO)
         return (dr.exp(-0.5 * squares) + halo * dr.rcp(1 + squares)) * dr.rsqrt(area)
 
