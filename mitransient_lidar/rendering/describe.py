@@ -80,10 +80,7 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     targets. Texts above the limit are omitted.
     """
     transmitter, receiver = scene.transmitter, scene.receiver
-    bottoms = scene.bottoms
-    targets = [
-        solid for solid in scene.solids if not any(solid is other for other in bottoms) and _is_near(scene, solid)
-    ]
+    targets = [solid for solid in scene.targets if _is_near(scene, solid)]
     found = axis_on_bottom(scene)[0]
     bottom = found if np.isfinite(found).all() else None
     texts: dict[str, list[Any]] = {

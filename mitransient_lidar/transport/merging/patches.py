@@ -90,8 +90,8 @@ class SolidPatches:
     """Patches of one pass, in projection along the beam, or along x or y where steep, shifted at random in each shot.
 
     In projection along the refracted beam patches are sectors of rings about it, whatever their depth, along the others
-    squares. Its light is spread evenly over the projection of a patch, however curved its surface is; along x or y what
-    is curved within a patch loses light, a twentieth of the echo of a sphere of a patch's radius if half of it did.
+    squares. The beam's light is even over its own projection, however curved the surface is. Along x or y it is not:
+    there the merged light of surfaces that curve within a patch is too weak.
 
     Parameters
     ----------
