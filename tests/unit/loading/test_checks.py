@@ -12,7 +12,7 @@ from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.rendering.session import choose_integrator
 
 #: A library outside, reached from each folder in which Mitsuba looks for plugins.
-PATH = "../" * 12 + "tmp/evil"
+PATH = "../" * 12 + "elsewhere/evil"
 NOT_A_NAME = r"^type = .*evil.* must be the name of a plugin, of letters, digits and underscores$"
 
 
@@ -22,7 +22,7 @@ def scene_file(folder, old, new):
     return path
 
 
-@pytest.mark.parametrize("value", [PATH, "/tmp/evil", "evil.so", "", "evil\n"])
+@pytest.mark.parametrize("value", [PATH, "/elsewhere/evil", "evil.so", "", "evil\n"])
 def test_types_that_are_paths_are_refused(tmp_path, value):
     written = scene_file(tmp_path, '<integrator type="lidar_merging"/>', f'<integrator type="{value}"/>')
     with pytest.raises(UserError, match="must be the name of a plugin"):
