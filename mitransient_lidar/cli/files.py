@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, replacing, together
 
 if TYPE_CHECKING:
@@ -156,6 +156,8 @@ def _draw_depths(stack: xr.Dataset, path: Path, quiet: bool) -> None:
 
     try:
         plot_depths(stack, path)
+    except WriteError:
+        raise
     except UserError as error:
         if not quiet:
             typer.echo(f"no drawing of depths: {error}", err=True)

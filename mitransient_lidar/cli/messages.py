@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
-from mitransient_lidar.rendering.interruption import TerminationAsInterrupt
+from mitransient_lidar.core.interruption import TerminationAsInterrupt
 
 if TYPE_CHECKING:
     import xarray as xr

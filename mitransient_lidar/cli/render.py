@@ -11,7 +11,8 @@ import typer
 from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
 from mitransient_lidar.cli.options import Define, OptionalSeed, Quiet, SceneOrResult, parameters
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, WriteError
+from mitransient_lidar.core.interruption import DeferredInterrupt
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -77,30 +78,31 @@ def render(
     from mitransient_lidar.rendering import again
     from mitransient_lidar.rendering import render as rendering
 
-    with reporting(quiet) as progress:
-        dataset = (again.render_again if again.is_result(scene) else rendering.render)(
-            scene,
-            params=params,
-            instrument=instrument,
-            integrator=integrator,
-            target_error=target_error,
-            target_quantile=target_quantile,
-            max_time=max_time,
-            passes=passes,
-            **({} if seed is None else {"seed": seed}),
-            max_memory=max_memory,
-            components=components or None,
-            variant=variant,
-            progress=progress,
-        )
-    output.mkdir(parents=True, exist_ok=True)
-    if "waveform" not in dataset:
-        targets = [output / f"{name}.nc"]
-    with announced():
-        for target in targets:
-            _write(dataset, target)
-        if "gate_energy" in dataset:
-            gates.write(dataset, dataset, quiet)
+    with DeferredInterrupt(at_once=False):
+        with reporting(quiet) as progress:
+            dataset = (again.render_again if again.is_result(scene) else rendering.render)(
+                scene,
+                params=params,
+                instrument=instrument,
+                integrator=integrator,
+                target_error=target_error,
+                target_quantile=target_quantile,
+                max_time=max_time,
+                passes=passes,
+                **({} if seed is None else {"seed": seed}),
+                max_memory=max_memory,
+                components=components or None,
+                variant=variant,
+                progress=progress,
+            )
+        output.mkdir(parents=True, exist_ok=True)
+        if "waveform" not in dataset:
+            targets = [output / f"{name}.nc"]
+        with announced():
+            for target in targets:
+                _write(dataset, target)
+            if "gate_energy" in dataset:
+                gates.write(dataset, dataset, quiet)
     if not quiet:
         summarise(dataset)
     exit_if_interrupted(dataset)
@@ -128,6 +130,8 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
 
         try:
             plot_layout(dataset, target)
+        except WriteError:
+            raise
         except UserError as error:
             typer.echo(f"no drawing of the pixels: {error}", err=True)
 
@@ -178,17 +182,20 @@ def passive(
         "variant": variant,
     }
     given = {option: value for option, value in options.items() if value is not None}
-    with reporting(quiet) as progress:
-        image = (render_again if is_result(scene) else render_passive)(scene, params=params, progress=progress, **given)
-    output.mkdir(parents=True, exist_ok=True)
-    writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
-        ".gif": passive_plots.animate_passive,
-        ".png": passive_plots.plot_passive,
-    }
-    with announced():
-        for target in targets:
-            if target.suffix != ".gif" or "row" in image.dims:
-                writers.get(target.suffix, save_radiance)(image, target)
+    with DeferredInterrupt(at_once=False):
+        with reporting(quiet) as progress:
+            image = (render_again if is_result(scene) else render_passive)(
+                scene, params=params, progress=progress, **given
+            )
+        output.mkdir(parents=True, exist_ok=True)
+        writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
+            ".gif": passive_plots.animate_passive,
+            ".png": passive_plots.plot_passive,
+        }
+        with announced():
+            for target in targets:
+                if target.suffix != ".gif" or "row" in image.dims:
+                    writers.get(target.suffix, save_radiance)(image, target)
     if not quiet:
         typer.echo(f"mean radiance: {image.attrs['background_radiance']:.4g} W m^-2 sr^-1 nm^-1")
         if "background_power" in image:

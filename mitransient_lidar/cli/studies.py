@@ -23,6 +23,7 @@ from mitransient_lidar.cli.options import (
     parameters,
 )
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.interruption import DeferredInterrupt
 
 TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
 Passes = Annotated[int, typer.Option(help="Number of independent passes of each render.")]
@@ -117,11 +118,12 @@ def shots(
     options |= {"components": True} if components else {}
     default = {} if is_result(scene) else {"count": 20}
     render = study.render_shots_again if is_result(scene) else study.render_shots
-    with reporting(quiet) as progress:
-        series = render(scene, params=parameters(define), progress=progress, **{**default, **options})
-    output.parent.mkdir(parents=True, exist_ok=True)
-    results.save(series, output)
-    typer.echo(output)
+    with DeferredInterrupt(at_once=False):
+        with reporting(quiet) as progress:
+            series = render(scene, params=parameters(define), progress=progress, **{**default, **options})
+        output.parent.mkdir(parents=True, exist_ok=True)
+        results.save(series, output)
+        typer.echo(output)
     if not quiet:
         _print(study.describe_shots(series))
     exit_if_interrupted(series)

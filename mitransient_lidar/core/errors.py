@@ -11,6 +11,10 @@ class UserError(ValueError):
     """
 
 
+class WriteError(UserError):
+    """A file that cannot be written, for want of space or permission."""
+
+
 def is_interruption(error: BaseException) -> bool:
     """Return whether an exception is a Ctrl-C, or one that Mitsuba or Dr.Jit has wrapped in a ``RuntimeError``."""
     wrapped = "KeyboardInterrupt" in str(error) or isinstance(error.__cause__, KeyboardInterrupt)

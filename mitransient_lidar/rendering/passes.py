@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
+from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.validation import FloatArray, in_range, integer, positive
-from mitransient_lidar.rendering.interruption import DeferredInterrupt
 
 logger = logging.getLogger(__name__)
 

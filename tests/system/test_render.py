@@ -16,7 +16,6 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.rendering import accuracy
-from mitransient_lidar.rendering.interruption import DeferredInterrupt
 from mitransient_lidar.rendering.passes import SMALLEST_PASS_COUNT
 from mitransient_lidar.transport.path import Path as LightPath
 
@@ -166,19 +165,6 @@ def test_ctrl_c_during_a_pass_keeps_what_was_rendered(default_ctrl_c, monkeypatc
     shot = small(passes=100)
     assert len(calls) > 0
     assert (shot.attrs["interrupted"], shot.attrs["passes"]) == (1, 2)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_second_ctrl_c_acts_at_once(default_ctrl_c):
-    def press(times):
-        with DeferredInterrupt():
-            for _ in range(times):
-                os.kill(os.getpid(), signal.SIGINT)
-                time.sleep(0.01)
-
-    press(1)
-    with pytest.raises(KeyboardInterrupt):
-        press(2)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

@@ -1,5 +1,8 @@
 """The command line: output, sentences and exit codes."""
 
+import errno
+import os
+import signal
 import subprocess
 import sys
 from types import ModuleType
@@ -10,6 +13,7 @@ from command_line import assert_refused, run
 
 from mitransient_lidar import __version__, results
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
 from mitransient_lidar.loading import catalogue, variants
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Progress
@@ -123,6 +127,38 @@ def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):
     assert result.exit_code == 130
     assert result.stderr == "interrupted.\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene, calls, tmp_path, monkeypatch):
+    """Its sentence once passed for one of pixels that do not see the sea, with exit code 0 and a stale picture."""
+
+    def full(dataset, path):
+        with replacing(path):
+            raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr("mitransient_lidar.plots.layout.plot_layout", full)
+    (tmp_path / "fig09_layout.png").write_text("old")
+    assert_refused(run("render", scene, "-o", tmp_path, "--quiet"), "fig09_layout.png: No space left on device")
+    assert [(path.name, path.read_text()) for path in tmp_path.glob("fig09*")] == [("fig09_layout.png", "old")]
+
+
+def test_an_interruption_while_the_files_are_written_keeps_them(scene, calls, tmp_path, monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    save = results.save
+
+    def interrupted(dataset, path):
+        if path.suffix == ".nc":
+            os.kill(os.getpid(), signal.SIGINT)
+        save(dataset, path)
+
+    monkeypatch.setattr(results, "save", interrupted)
+    try:
+        result = run("render", scene, "-o", tmp_path / "out", "--quiet", "--no-plot")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert result.exit_code == 130
+    assert results.open(tmp_path / "out" / "fig09.nc").attrs["passes"] == 4
+    assert (tmp_path / "out" / "fig09.exr").exists()
 
 
 @pytest.mark.parametrize(

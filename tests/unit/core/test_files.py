@@ -1,5 +1,6 @@
 """Files that replace others alone or together, and the leftovers of killed processes."""
 
+import contextlib
 import errno
 import os
 import signal
@@ -11,6 +12,7 @@ import pytest
 from mitransient_lidar.core import files
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
+from mitransient_lidar.core.interruption import DeferredInterrupt
 
 #: Writes a.txt and b.txt together; the process is killed at an event.
 KILLED = """
@@ -105,9 +107,9 @@ def test_a_failure_while_files_are_moved_restores_the_former_ones(tmp_path, monk
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("event", "kept"),
-    [("a.txt", {"b.txt": "old"}), ("b.txt", {"b.txt": "old"}), ("moving", {"a.txt": "new", "b.txt": "new"})],
+    [("a.txt", {"b.txt": "old"}), ("b.txt", {"b.txt": "old"}), ("moving", {"a.txt": "new", "b.txt": "old"})],
 )
-def test_the_next_run_sweeps_or_completes_what_a_killed_one_left(tmp_path, event, kept):
+def test_the_next_run_sweeps_what_a_killed_one_left(tmp_path, event, kept):
     (tmp_path / "b.txt").write_text("old")
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), event], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
@@ -116,18 +118,110 @@ def test_the_next_run_sweeps_or_completes_what_a_killed_one_left(tmp_path, event
     assert contents(tmp_path) == kept | {"next.txt": "new"}
 
 
-@pytest.mark.parametrize("journal", ['[[".t", "b"], [".gone", "a"]]', '[[".t", "b"', ""])
-def test_leftovers_of_a_dead_process_are_swept(tmp_path, journal):
-    """Its list of moves is completed, unless it was not written in full, so that no file had been moved."""
-    dead = subprocess.Popen(["true"])
-    dead.wait()
-    start = f".mitransient-lidar.{files.host_name()}.{dead.pid}"
-    (tmp_path / f"{start}.{'a' * 32}.moves").write_text(journal.replace(".t", f"{start}.{'b' * 32}.nc"))
-    (tmp_path / f"{start}.{'b' * 32}.nc").write_text("complete")
-    (tmp_path / f"{start}.{'c' * 32}").write_text("half")
-    (tmp_path / "b").write_text("old")
+@pytest.fixture
+def dead():
+    """Beginning of the names of the temporary files of a process that has ended."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return f".mitransient-lidar.{files.host_name()}.{process.pid}"
+
+
+def test_leftovers_of_a_dead_process_are_removed(tmp_path, dead):
+    (tmp_path / f"{dead}.{'b' * 32}.nc").write_text("half")
+    folder = tmp_path / f"{dead}.{'c' * 32}.zarr"
+    (folder / "waveform").mkdir(parents=True)
+    (folder / "zarr.json").write_text("{}")
     write(tmp_path, "c")
-    assert contents(tmp_path) == {"b": "complete" if journal.endswith("]]") else "old", "c": "new"}
+    assert contents(tmp_path) == {"c": "new"}
+
+
+def test_no_leftover_moves_or_removes_a_file_of_another_name(tmp_path, dead):
+    """A list of moves once did, in any folder that a command wrote into; a link would reach another folder."""
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "a").write_text("old")
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "evil").write_text("new")
+    (out / f"{dead}.{'a' * 32}.moves").write_text(f'[["evil", "../victim/a"], ["evil", "{victim / "a"}"]]')
+    (out / f"{dead}.{'b' * 32}.zarr").symlink_to(victim)
+    write(out, "c")
+    assert contents(victim) == {"a": "old"}
+    assert contents(out) == {"evil": "new", "c": "new"}
+
+
+def test_leftovers_of_another_user_stay(tmp_path, dead, monkeypatch):
+    name = f"{dead}.{'a' * 32}.nc"
+    (tmp_path / name).write_text("theirs")
+    monkeypatch.setattr(files.os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {name: "theirs", "c": "new"}
+
+
+@pytest.fixture
+def default_ctrl_c():
+    """Python's own handler: a shell that starts the tests in the background leaves Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("presses", [1, 2])
+def test_an_interruption_waits_until_the_files_are_in_place(tmp_path, default_ctrl_c, presses):
+    """The second one does not."""
+    (tmp_path / "a").write_text("old")
+
+    def interrupted():
+        with together(), replacing(tmp_path / "a") as temporary:
+            for _ in range(presses):
+                os.kill(os.getpid(), signal.SIGINT)
+            temporary.write_text("new")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert contents(tmp_path) == {"a": "new" if presses == 1 else "old"}
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(("presses", "survived"), [(1, 1), (3, 1)])
+def test_a_second_ctrl_c_acts_at_once(default_ctrl_c, presses, survived):
+    done = []
+
+    def press():
+        with DeferredInterrupt():
+            for number in range(presses):
+                os.kill(os.getpid(), signal.SIGINT)
+                done.append(number)
+
+    with pytest.raises(KeyboardInterrupt):
+        press()
+    assert len(done) == survived
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interruption_between_a_render_and_its_files_waits(tmp_path, default_ctrl_c):
+    def render():
+        with DeferredInterrupt(at_once=False):
+            with DeferredInterrupt() as passes, contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                passes.check()
+            os.kill(os.getpid(), signal.SIGINT)
+            write(tmp_path, "a")
+
+    with pytest.raises(KeyboardInterrupt):
+        render()
+    assert contents(tmp_path) == {"a": "new"}
+
+
+def test_an_interruption_before_a_render_acts_at_once(tmp_path, default_ctrl_c):
+    def render():
+        with DeferredInterrupt(at_once=False):
+            os.kill(os.getpid(), signal.SIGINT)
+            write(tmp_path, "a")
+
+    with pytest.raises(KeyboardInterrupt):
+        render()
+    assert contents(tmp_path) == {}
 
 
 def test_files_of_running_processes_and_other_machines_stay(tmp_path):
