@@ -35,7 +35,7 @@ KINDS = ("grid", "sobol", "latin_hypercube", "random", "table")
 KEPT = ("waveform", "stderr", "components", "echoes", "truth")
 
 #: Most runs of a campaign, and most shots of a run.
-MOST_RUNS, MOST_SHOTS = 10**9, 10_000
+MOST_RUNS, MOST_SHOTS = 10**7, 10_000
 
 Column = npt.NDArray[Any]
 

@@ -1,8 +1,11 @@
 """Rendering of a shard of a campaign in a process of its own.
 
 The process ends with its shard, and with it the memory that Mitsuba does not give back. It ends, too, when the process
-that has started it does. Its standard input holds the store, the shard, and the runs that are not to be rendered, with
-the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run, ``done`` or ``error``.
+that has started it does, and after an error of the program, since what Dr.Jit was recording is in an unknown state. Its
+standard input holds the store, the shard, and the runs that are not to be rendered, with the reasons; it writes one
+line of JSON for each event: ``begin`` and ``end`` of a run, ``done``, ``error`` or ``bug``.
+
+A log beside the store, of its name with the suffix ``.log``, holds what such a process has told before it ended.
 """
 
 from __future__ import annotations
@@ -13,20 +16,29 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from mitransient_lidar.campaigns.runs import Array, RunRenderer
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
 
 #: Time between two writes of a shard that is not finished [s].
 _INTERVAL_S = 60.0
 
-#: Number of times that the process may end while it renders a run before this run has failed.
-_MOST_DEATHS = 2
+#: Number of times that the process may end while it renders a run before this run has failed, or before its first run.
+_MOST_DEATHS, _MOST_STARTS = 2, 3
+
+#: Number of runs with an error of the program after which the rest of a shard is left.
+_MOST_BUGS = 3
+
+#: Length of the reason of an error of the program, whose traceback is in the log.
+_LONGEST_REASON = 200
 
 #: Variables of the environment with numbers of threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -34,8 +46,27 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 Report = Callable[[int, int], None]
 
 
-def render_in_process(path: str, shard: int, retry: bool = False, report: Report | None = None) -> tuple[int, int]:
-    """Render the runs of a shard that are not done in a new process; return the numbers of runs done and failed.
+class Outcome(NamedTuple):
+    """Numbers of runs of a shard that are done and that have failed, and why the others are left, empty if none are."""
+
+    done: int
+    failed: int
+    left: str = ""
+
+
+class _End(NamedTuple):
+    """End of a process before that of its shard: the run that it was rendering, why, and whether by a bug."""
+
+    run: int | None
+    reason: str
+    is_bug: bool = False
+
+
+def render_in_process(path: str, shard: int, retry: bool = False, report: Report | None = None) -> Outcome:
+    """Render the runs of a shard that are not done in a new process.
+
+    A run in which the process ends twice has failed. Runs that meet an error of the program stay planned, and so do all
+    where the process ends three times before the first run.
 
     Parameters
     ----------
@@ -52,23 +83,48 @@ def render_in_process(path: str, shard: int, retry: bool = False, report: Report
     ------
     UserError
         If the store cannot be read or written.
-    RuntimeError
-        If the process ends before its first run.
     """
     reasons: dict[int, str] = {}
-    deaths: Counter[int] = Counter()
+    left: dict[int, str] = {}
+    deaths: Counter[int | None] = Counter()
     while True:
-        ended = _one_process({"store": path, "shard": shard, "retry": retry, "failed": reasons}, report)
-        if isinstance(ended, tuple):
-            return ended
-        run, reason = ended
-        deaths[run] += 1
-        if deaths[run] >= _MOST_DEATHS:
-            reasons[run] = reason
+        order = {"store": path, "shard": shard, "retry": retry, "failed": reasons, "left": list(left)}
+        ended = _one_process(order, report)
+        if isinstance(ended, Outcome):
+            return ended._replace(left=next(iter(left.values()), ""))
+        deaths[ended.run] += 1
+        if ended.run is not None and ended.is_bug:
+            left[ended.run] = f"run {ended.run}: {ended.reason}"
+            if len(left) < _MOST_BUGS:
+                continue
+        elif ended.run is not None:
+            if deaths[ended.run] >= _MOST_DEATHS:
+                reasons[ended.run] = ended.reason
+            continue
+        elif deaths[None] < _MOST_STARTS:
+            continue
+        status = Store(path).status(Store(path).runs_of(shard))
+        done, failed = (int(np.count_nonzero(status == value)) for value in (DONE, FAILED))
+        return Outcome(done, failed, next(iter(left.values()), f"shard {shard}: {ended.reason}"))
 
 
-def _one_process(order: dict[str, Any], report: Report | None) -> tuple[int, int] | list[Any]:
-    """Return the numbers of runs done and failed, or the run in which the process ended, and why."""
+def log_path(store: str | os.PathLike[str]) -> Path:
+    """Return the path of the log of a store."""
+    return Path(store).with_suffix(".log")
+
+
+def _log(store: str, shard: int, text: str) -> None:
+    """Add what a process has told to the log of its store."""
+    try:
+        with log_path(store).open("a", encoding="utf-8") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} shard {shard}\n{text.rstrip()}\n\n")
+    except OSError:
+        # The run tells its reason without it.
+        pass
+
+
+def _one_process(order: dict[str, Any], report: Report | None) -> Outcome | _End:
+    """Return the outcome of a shard, or how its process ended before."""
     environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
     # A session of its own: Ctrl-C is for the process that has started it.
     with subprocess.Popen(
@@ -95,9 +151,12 @@ def _one_process(order: dict[str, Any], report: Report | None) -> tuple[int, int
                     continue
                 event = json.loads(line)
                 if "done" in event:
-                    return event["done"], event["failed"]
+                    return Outcome(event["done"], event["failed"])
                 if "error" in event:
                     raise UserError(event["error"])
+                if "bug" in event:
+                    _log(order["store"], order["shard"], event["traceback"])
+                    return _End(run, event["bug"], is_bug=True)
                 run = event.get("begin", run)
                 if "end" in event and report is not None:
                     report(*event["end"])
@@ -107,15 +166,17 @@ def _one_process(order: dict[str, Any], report: Report | None) -> tuple[int, int
             process.kill()
         code = process.wait()
         reader.join(timeout=5)
+        if told:
+            _log(order["store"], order["shard"], "".join(told))
         last = " ".join((told or ["without a message"])[-1].split())
         why = f"by signal {-code}" if code < 0 else f"with exit code {code}: {last}"
-        if run is None:
-            raise RuntimeError(f"the process of shard {order['shard']} ended {why}")
-        return [run, f"the process ended {why}"]
+        return _End(run, f"the process ended {why}")
 
 
-def render_shard(path: str, shard: int, retry: bool, failed: dict[int, str], tell: Callable[..., None]) -> None:
-    """Render the runs of a shard that are not done, and write them."""
+def render_shard(
+    path: str, shard: int, retry: bool, failed: dict[int, str], left: set[int], tell: Callable[..., None]
+) -> None:
+    """Render the runs of a shard that are not done nor to be left, and write them."""
     store = Store(path)
     renderer, runs = store.renderer(), store.runs_of(shard)
     inputs = store.inputs(runs)
@@ -126,6 +187,8 @@ def render_shard(path: str, shard: int, retry: bool, failed: dict[int, str], tel
     written = time.monotonic()
     for place in np.flatnonzero(status == PLANNED):
         number = runs.start + int(place)
+        if number in left:
+            continue
         values = {name: column[place].item() for name, column in inputs.items()}
         tell(begin=number)
         # The random sea, of runs that fail too.
@@ -135,7 +198,7 @@ def render_shard(path: str, shard: int, retry: bool, failed: dict[int, str], tel
         try:
             if number in failed:
                 raise UserError(failed[number])
-            found = renderer.arrays(number, values)
+            found = _arrays(renderer, number, values)
             for name, array in found.items():
                 if name not in arrays or array.values.shape != arrays[name].shape[1:]:
                     raise UserError(
@@ -147,6 +210,9 @@ def render_shard(path: str, shard: int, retry: bool, failed: dict[int, str], tel
             status[place], errors[place] = DONE, ""
         except UserError as error:
             status[place], errors[place] = FAILED, " ".join(str(error).split())
+        except Exception:
+            store.write(shard, status, errors, arrays)
+            raise
         counts[0 if status[place] == DONE else 1] += 1
         tell(end=counts)
         if time.monotonic() - written > _INTERVAL_S:
@@ -154,6 +220,15 @@ def render_shard(path: str, shard: int, retry: bool, failed: dict[int, str], tel
             written = time.monotonic()
     store.write(shard, status, errors, arrays)
     tell(done=counts[0], failed=counts[1])
+
+
+def _arrays(renderer: RunRenderer, number: int, values: dict[str, Any]) -> dict[str, Array]:
+    """Return the arrays of a run; raise `UserError` where memory runs out."""
+    try:
+        return renderer.arrays(number, values)
+    except (MemoryError, RuntimeError) as error:
+        raise_if_out_of_memory(error)
+        raise
 
 
 def _main() -> None:
@@ -177,9 +252,12 @@ def _main() -> None:
 
     try:
         failed = {int(run): reason for run, reason in order["failed"].items()}
-        render_shard(order["store"], order["shard"], order["retry"], failed, tell)
+        render_shard(order["store"], order["shard"], order["retry"], failed, set(order["left"]), tell)
     except UserError as error:
         tell(error=str(error))
+    except Exception as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        tell(bug=reason[:_LONGEST_REASON], traceback=traceback.format_exc())
 
 
 def _end_with_parent() -> None:

@@ -1,11 +1,19 @@
-"""The Zarr store of a campaign: made whole at first, then filled shard by shard."""
+"""The Zarr store of a campaign: made whole at first, then filled shard by shard.
+
+Every chunk ends in its CRC32C, and the attributes that a store is read by have a SHA-256, so that damage is found where
+it is read. Chunks of a shard are written even where all values are fill values: one that is missing is lost.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import hashlib
 import json
+import logging
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +21,19 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from mitransient_lidar.campaigns.design import Campaign, Column
+from mitransient_lidar.campaigns.design import MOST_RUNS, Campaign, Column
 from mitransient_lidar.campaigns.runs import Array, RunRenderer, record_of
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import check_encodable
+from mitransient_lidar.core.errors import UserError, WriteError
+from mitransient_lidar.core.files import check_encodable, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
+
+_LOG = logging.getLogger(__name__)
 
 #: Values of the variable ``status``.
 PLANNED, DONE, FAILED = 0, 1, 2
@@ -33,8 +44,20 @@ _FEWEST, _MOST, _SHARDS = 64, 1024, 16
 #: Largest size of a shard in memory [bytes], by default.
 _MOST_BYTES = 2**29
 
+#: Most runs of a shard that is asked for, and of a chunk of an array of all runs.
+_LARGEST = 10**6
+
 #: Suffix of parameters of the scene that have the name of a variable.
 _INPUT = "_input"
+
+#: Attributes that a store is read by, and that of their SHA-256.
+_SEALED, _SEAL = ("campaign", "scene", "record", "runs", "shard_size", "inputs", "variables"), "sha256"
+
+#: What zarr and its codecs raise for damaged files.
+_DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError, MemoryError)
+
+#: Options of a store's arrays when they are written.
+_WRITING = {"array.write_empty_chunks": True}
 
 _STATUS = {"long_name": "state of the run", "flag_values": [0, 1, 2], "flag_meanings": "planned done failed"}
 
@@ -59,15 +82,20 @@ class Store:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
+            with zarr.config.set(_WRITING):
+                self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
             self.attributes: dict[str, Any] = dict(self._group.attrs)
             self.campaign = Campaign.from_json(self.attributes["campaign"])
-        except (OSError, KeyError, ValueError, TypeError) as error:
-            if isinstance(error, UserError):
-                raise
-            raise UserError(f"{path} is no store of a campaign.") from error
-        #: Number of runs, and of runs of a shard.
-        self.count, self.shard_size = int(self.attributes["runs"]), int(self.attributes["shard_size"])
+            #: Number of runs, and of runs of a shard.
+            self.count = integer("runs", self.attributes["runs"], 1, MOST_RUNS)
+            self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, _LARGEST)
+            self.variables = [str(name) for name in self.attributes["variables"]]
+        except _DAMAGE as error:
+            raise UserError(f"{path} is no store of a campaign, or is damaged.") from error
+        if self.attributes.get(_SEAL) != _seal(self.attributes):
+            reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
+            raise UserError(f"{path} cannot be used: {reason}.")
+        self._check_arrays()
 
     @classmethod
     def create(
@@ -81,6 +109,8 @@ class Store:
     ) -> Store:
         """Make the store of a campaign, for arrays like those of one run; nothing is left of it on a failure.
 
+        Where another process has just made one, that one is returned.
+
         Raises
         ------
         UserError
@@ -88,19 +118,23 @@ class Store:
         """
         path = Path(path)
         check_encodable(path)
+        sweep(path.parent)
         count = len(next(iter(columns.values())))
         bytes_of_run = sum(array.values.nbytes for array in arrays.values())
         size = _shard_size(count, bytes_of_run)
-        size = size if shard_size is None else integer("shard_size", shard_size, 1, 10**6)
+        size = size if shard_size is None else integer("shard_size", shard_size, 1, _LARGEST)
         # Beside its place, so that a store is always whole.
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        temporary = temporary_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             group = zarr.create_group(str(temporary), zarr_format=3)
-            _fill(group, renderer, columns, arrays, coordinates, count, size)
+            with zarr.config.set(_WRITING):
+                _fill(group, renderer, columns, arrays, coordinates, count, size)
             os.rename(temporary, path)
         except OSError as error:
-            raise UserError(f"cannot write {path}: {error.strerror or error}.") from error
+            if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
+                return cls(path)
+            raise WriteError(f"cannot write {path}: {error.strerror or error}.") from error
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
         return cls(path)
@@ -139,18 +173,88 @@ class Store:
         return range(-(-self.count // self.shard_size))
 
     def status(self, runs: slice = slice(None)) -> npt.NDArray[np.uint8]:
-        """Return the status of runs."""
-        return np.asarray(self._array("status")[runs])
+        """Return the status of runs; those of a shard that has lost an array are planned."""
+        status = np.array(self._read("status", runs))
+        first = runs.start or 0
+        for shard in np.unique((first + np.flatnonzero(status != PLANNED)) // self.shard_size):
+            if self._lost(int(shard)):
+                of_shard = self.runs_of(int(shard))
+                status[max(of_shard.start - first, 0) : of_shard.stop - first] = PLANNED
+        return status
 
     def errors(self, runs: slice = slice(None)) -> npt.NDArray[Any]:
         """Return why runs failed, empty for others."""
         return self._values("error", runs).astype(object)
 
     def read(self, shard: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[Any], dict[str, npt.NDArray[Any]]]:
-        """Return status, errors and arrays of a shard."""
+        """Return status, errors and arrays of a shard; all runs of one that cannot be read are planned."""
         runs = self.runs_of(shard)
-        arrays = {name: np.array(self._array(name)[runs]) for name in self.attributes["variables"]}
-        return self.status(runs).copy(), self.errors(runs), arrays
+        names = ("error", *self.variables)
+        try:
+            arrays = {name: np.array(self._read(name, runs)) for name in names}
+            status = self.status(runs)
+        except UserError:
+            fill = {name: self._array(name) for name in names}
+            shapes = {name: (runs.stop - runs.start, *array.shape[1:]) for name, array in fill.items()}
+            arrays = {name: np.full(shapes[name], array.fill_value, dtype=array.dtype) for name, array in fill.items()}
+            status = np.full(runs.stop - runs.start, PLANNED, dtype=np.uint8)
+        return status, _texts(arrays.pop("error")).astype(object), arrays
+
+    def mend(self) -> None:
+        """Plan the runs of shards that are damaged or have lost an array again, and warn of them.
+
+        Raises
+        ------
+        UserError
+            If an array of all runs is damaged, or the operating system reports an error.
+        """
+        self.inputs(slice(0, self.count))
+        for shard in self.shards:
+            runs = self.runs_of(shard)
+            damage = self._lost(shard) if self._is_begun(runs) else None
+            for name in ("status", "error", *self.variables):
+                try:
+                    self._read(name, runs)
+                except UserError as error:
+                    damage = str(error)
+            if damage:
+                _LOG.warning("%s: runs %d to %d are rendered again", damage, runs.start, runs.stop - 1)
+                with _writing(self.path):
+                    self._array("status")[runs] = np.full(runs.stop - runs.start, PLANNED, dtype=np.uint8)
+
+    def _check_arrays(self) -> None:
+        """Raise `UserError` if an array has another shape than the attributes say, or one of all runs is lost."""
+        with reading(self.path, "the list of its arrays"):
+            names = list(self._group.array_keys())
+        of_runs = ("status", "error", *self.variables)
+        for name in {*names, *of_runs}:
+            array = self._array(name)
+            if name not in of_runs:
+                lost = [one for one in range(-(-[*array.shape, 1][0] // _LARGEST)) if not self._has(name, one)]
+                if lost and array.size:
+                    raise UserError(f"{self.path} is damaged: it has lost {name}.")
+            elif array.shape[:1] != (self.count,) or array.chunks[:1] != (min(self.shard_size, self.count),):
+                raise UserError(f"{self.path} is damaged: {name} has the shape {array.shape}.")
+
+    def _has(self, name: str, chunk: int) -> bool:
+        """Return whether a chunk of an array is there."""
+        array = self._array(name)
+        key = array.metadata.encode_chunk_key((chunk, *[0] * (array.ndim - 1)) if array.ndim else ())
+        return (self.path / name / key).is_file()
+
+    def _is_begun(self, runs: slice) -> bool:
+        """Return whether a run is done or failed, or it is not known."""
+        try:
+            return bool(np.any(self._read("status", runs) != PLANNED))
+        except UserError:
+            return True
+
+    def _lost(self, shard: int) -> str | None:
+        """Return the sentence of an array that a shard has lost."""
+        for name in ("error", *self.variables):
+            if not self._has(name, shard):
+                return f"{self.path} is damaged: it has lost {name} of the runs from {shard * self.shard_size} on"
+        return None
 
     def write(
         self,
@@ -163,29 +267,55 @@ class Store:
 
         Raises
         ------
-        UserError
+        WriteError
             If the operating system reports an error.
         """
         runs = self.runs_of(shard)
         if np.all(self.status(runs) == DONE):
             return
-        try:
+        with _writing(self.path):
             for name, values in arrays.items():
                 self._array(name)[runs] = values
             self._array("error")[runs] = errors.astype(str)
             self._array("status")[runs] = status
-        except OSError as error:
-            raise UserError(f"cannot write {self.path}: {error.strerror or error}.") from error
 
     def _values(self, name: str, runs: slice) -> Column:
-        """Return values of runs; texts have NumPy's fixed length, as in the table of the runs."""
-        values = np.asarray(self._array(name)[runs])
-        return values if values.dtype.kind in "biuf" else np.array([str(one) for one in values], dtype=np.str_)
+        """Return values of runs."""
+        values = self._read(name, runs)
+        return values if values.dtype.kind in "biuf" else _texts(values)
+
+    def _read(self, name: str, runs: slice) -> npt.NDArray[Any]:
+        """Return values of runs as they are stored; raise `UserError` where they are damaged."""
+        array = self._array(name)
+        with reading(self.path, name):
+            return np.asarray(array[runs])
 
     def _array(self, name: str) -> zarr.Array[Any]:
-        found = self._group[name]
-        assert isinstance(found, zarr.Array)
-        return found
+        with reading(self.path, name), zarr.config.set(_WRITING):
+            found = self._group[name]
+            if not isinstance(found, zarr.Array):
+                raise TypeError(name)
+            return found
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike[str], name: str = "an array") -> Iterator[None]:
+    """Convert what zarr raises for a damaged store to a `UserError`."""
+    try:
+        yield
+    except UserError:
+        raise
+    except _DAMAGE as error:
+        raise UserError(f"{path} is damaged: {name} cannot be read.") from error
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Convert an error of the operating system to a `WriteError`."""
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(f"cannot write {path}: {error.strerror or error}.") from error
 
 
 def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -194,15 +324,18 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     Over ``run``: the parameters of the scene as coordinates; ``status`` (0 planned, 1 done, 2 failed), ``error`` (why a
     run failed), ``error_median`` (relative standard error of the median bin) and ``passes``; then ``shot`` if runs have
     several, the dimensions of the pixels, and those of each variable: what `campaigns.design.Campaign` keeps. Values of
-    runs that are not done are NaN, or 0 for integers.
+    runs that are not done are NaN, or 0 for integers. Runs of which the store has lost an array are planned; a damaged
+    array raises ``ValueError`` when it is read.
 
     Raises
     ------
     UserError
-        If there is no store of a campaign.
+        If there is no store of a campaign, or its coordinates are damaged.
     """
-    Store(path)
-    dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, mask_and_scale=False, decode_times=False)
+    store = Store(path)
+    with reading(path, "a coordinate"):
+        dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, mask_and_scale=False, decode_times=False)
+    dataset["status"] = dataset["status"].copy(data=store.status())
     return dataset
 
 
@@ -245,6 +378,7 @@ def _fill(
             shape=shape,
             chunks=(min(chunk, shape[0]), *shape[1:]) if shape else (),
             dtype=str if is_text else values.dtype,
+            compressors=[ZstdCodec(), Crc32cCodec()],
             fill_value="" if is_text else np.nan if values.dtype.kind == "f" else 0,
             dimension_names=dims,
             attributes=like.attributes,
@@ -253,12 +387,12 @@ def _fill(
             array[...] = whole.astype(str) if is_text else whole
 
     for name, found in coordinates.items():
-        make(name, found, found.values, chunk=10**6)
+        make(name, found, found.values, chunk=_LARGEST)
     numbers = np.arange(count)
-    make("run", Array(("run",), numbers, {"long_name": "number of the run"}), numbers, chunk=10**6)
+    make("run", Array(("run",), numbers, {"long_name": "number of the run"}), numbers, chunk=_LARGEST)
     for name, column in columns.items():
-        about = {"long_name": f"parameter {name} of the scene"}
-        make(inputs[name], Array(("run",), column, about), column, chunk=10**6)
+        text = {"long_name": f"parameter {name} of the scene"}
+        make(inputs[name], Array(("run",), column, text), column, chunk=_LARGEST)
     make("status", Array((), np.zeros((), dtype=np.uint8), _STATUS))
     make("error", Array((), np.array("", dtype=object), {"long_name": "why the run failed"}))
     for name, found in arrays.items():
@@ -269,23 +403,33 @@ def _fill(
         make("shot", Array(("shot",), shots, {"long_name": "number of the shot over the sea of the run"}), shots)
     axis, time = renderer.axis, coordinates["time"].values
     secondary = [name for name in (*coordinates, *inputs.values(), "surface_seed") if name not in dims]
-    group.attrs.update(
-        {
-            "Conventions": "CF-1.11",
-            "title": f"Campaign of {count} runs, scene {renderer.scene.name}",
-            "campaign": renderer.campaign.text,
-            "scene": {"scene": renderer.scene.name, **renderer.scene.attributes()},
-            "record": None if axis is None else [axis.start_ns, axis.bin_width_ns, axis.bin_count],
-            "bin_width_ns": (width := float(time[1] - time[0]) if len(time) > 1 else 1.0),
-            "time_start_ns": float(time[0]) - 0.5 * width,
-            "runs": count,
-            "shard_size": size,
-            "inputs": inputs,
-            "variables": list(arrays),
-            "coordinates": " ".join(name for name in secondary if name in group),
-            **versions(),
-        }
-    )
+    about: dict[str, Any] = {
+        "Conventions": "CF-1.11",
+        "title": f"Campaign of {count} runs, scene {renderer.scene.name}",
+        "campaign": renderer.campaign.text,
+        "scene": {"scene": renderer.scene.name, **renderer.scene.attributes()},
+        "record": None if axis is None else [axis.start_ns, axis.bin_width_ns, axis.bin_count],
+        "bin_width_ns": (width := float(time[1] - time[0]) if len(time) > 1 else 1.0),
+        "time_start_ns": float(time[0]) - 0.5 * width,
+        "runs": count,
+        "shard_size": size,
+        "inputs": inputs,
+        "variables": list(arrays),
+        "coordinates": " ".join(name for name in secondary if name in group),
+        **versions(),
+    }
+    group.attrs.update({**about, _SEAL: _seal(about)})
+
+
+def _seal(attributes: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the attributes that a store is read by."""
+    text = json.dumps({name: attributes.get(name) for name in _SEALED}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _texts(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return texts in NumPy's fixed length, as in the table of the runs."""
+    return np.array([str(one) for one in values], dtype=np.str_)
 
 
 def _shard_size(count: int, bytes_of_run: int) -> int:

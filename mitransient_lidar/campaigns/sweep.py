@@ -18,10 +18,10 @@ import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import RunRenderer
-from mitransient_lidar.campaigns.shard import render_in_process
+from mitransient_lidar.campaigns.shard import Outcome, log_path, render_in_process
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import integer
+from mitransient_lidar.core.validation import integer, shown
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ _LOG = logging.getLogger(__name__)
 
 #: Shards for each worker that are with the scheduler at a time.
 _AHEAD = 4
+
+#: Shards with runs that could not be rendered after which the campaign ends.
+_MOST_LEFT = 8
 
 #: Runs that are tried until one of them shows the arrays of a store.
 _TRIALS = 8
@@ -80,8 +83,9 @@ def sweep(
     Raises
     ------
     UserError
-        If the campaign is invalid, the store holds another one or cannot be written, the first runs all fail, or the
-        scheduler cannot be reached.
+        If the campaign is invalid, the store holds another one or cannot be written, the first runs all fail, the
+        scheduler or one of its workers cannot be reached, or runs could not be rendered for another reason than their
+        parameters, after the others.
     KeyboardInterrupt
         After Ctrl-C; runs that are written stay.
     """
@@ -142,6 +146,8 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
             raise UserError(
                 f"{path} holds another campaign, or its scene has changed: choose another place, or remove it"
             )
+        if shard_size not in (None, store.shard_size):
+            raise UserError(f"shard_size = {shown(shard_size)} must be that of {path}, {store.shard_size}")
         return store
     renderer = RunRenderer.of(campaign, columns)
     count = len(next(iter(columns.values())))
@@ -153,7 +159,9 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
         except UserError as error:
             first = first or error
         else:
-            return Store.create(path, renderer, columns, arrays, coordinates, shard_size)
+            made = Store.create(path, renderer, columns, arrays, coordinates, shard_size)
+            # Another process may have made the store of another campaign in the meantime.
+            return made if made.campaign.text == campaign.text else _prepare(campaign, path, shard_size)
     raise UserError(f"the first {min(_TRIALS, count)} runs all fail, the first of them so: {first}")
 
 
@@ -172,6 +180,7 @@ def _swept(
         # A scheduler that is away leaves no store.
         client = None if scheduler is None else stack.enter_context(_connected(scheduler))
         store = prepare()
+        store.mend()
         status = store.status()
         wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
         shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
@@ -202,23 +211,36 @@ def _render(
     client.subscribe_topic(topic, tally.receive)
     path, waiting = str(store.path.resolve()), iter(shards)
     futures = as_completed(loop=client.loop)
+    reached: set[str] = set()
 
     def submit() -> None:
         # Workers may come and go.
-        wanted = _AHEAD * max(sum(client.nthreads().values()), 1) - futures.count()
+        threads = client.nthreads()
+        _check_workers(client, set(threads) - reached)
+        reached.update(threads)
+        wanted = _AHEAD * max(sum(threads.values()), 1) - futures.count()
         for shard in itertools.islice(waiting, max(wanted, 0)):
             key = f"shard-{shard}-{topic}"
             futures.add(client.submit(_task, path, shard, retry_failed, topic, pure=False, key=key))
 
+    left: list[str] = []
     try:
         if not client.nthreads():
             _LOG.warning("the scheduler has no workers: the campaign waits for the first one")
+            while not client.nthreads():
+                time.sleep(_REPORT_S)
         submit()
         for future in futures:
             found = future.result()
             if isinstance(found, str):
                 raise UserError(found)
-            tally.finish(*found)
+            shard, outcome = found
+            tally.finish(shard, outcome)
+            if outcome.left:
+                left.append(outcome.left)
+                _LOG.warning("runs of shard %d are left: %s", shard, outcome.left)
+                if len(left) >= _MOST_LEFT:
+                    break
             submit()
     except KilledWorker as error:
         raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
@@ -230,10 +252,26 @@ def _render(
     finally:
         with contextlib.suppress(OSError):
             client.unsubscribe_topic(topic)
+    if left:
+        raise UserError(
+            f"{len(left)} of {len(shards)} shards are not complete, the first for {left[0]}; {log_path(store.path)} "
+            "tells more, and the same command goes on"
+        )
 
 
-def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, int, int] | str:
-    """Render a shard on a worker; return the message of a `UserError`, which Dask would log with its traceback."""
+def _check_workers(client: Client, addresses: set[str]) -> None:
+    """Raise `UserError` if the scheduler cannot reach a worker, which would wait for ever."""
+    answers = client.run(os.getpid, workers=sorted(addresses), on_error="return") if addresses else {}
+    for address, answer in answers.items():
+        if isinstance(answer, BaseException) and address in client.nthreads():
+            raise UserError(f"the scheduler cannot reach its worker at {address}: check its address and the firewall")
+
+
+def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, Outcome] | str:
+    """Render a shard on a worker; return its number and outcome, or the message of a `UserError`.
+
+    Dask would log the error itself with its traceback.
+    """
     from distributed import get_worker
 
     worker = get_worker()
@@ -246,7 +284,7 @@ def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, i
             worker.log_event(topic, {"shard": shard, "done": done, "failed": failed})
 
     try:
-        return shard, *render_in_process(path, shard, retry_failed, report)
+        return shard, render_in_process(path, shard, retry_failed, report)
     except UserError as error:
         return str(error)
 
@@ -272,10 +310,10 @@ class _Tally:
             self._shards[news["shard"]] = news["done"], news["failed"]
             self._tell()
 
-    def finish(self, shard: int, done: int, failed: int) -> None:
+    def finish(self, shard: int, outcome: Outcome) -> None:
         """Count the runs of a shard that is written."""
         self._finished.add(shard)
-        self._shards[shard] = done, failed
+        self._shards[shard] = outcome.done, outcome.failed
         state = self._tell()
         _LOG.info(
             "shard %d written: %d of %d runs, %d failed, %.3g a second, ends in %.0f s",

@@ -97,11 +97,12 @@ def _render_row(campaign: Path, row: int, path: Path, quiet: bool) -> None:
 def _show(store: Path, path: Path) -> None:
     """Draw a store."""
     check_figure(path)
-    from mitransient_lidar.campaigns.store import describe_campaign, open_campaign
+    from mitransient_lidar.campaigns.store import describe_campaign, open_campaign, reading
     from mitransient_lidar.plots.campaigns import plot_campaign
 
     dataset = open_campaign(store)
     path.parent.mkdir(parents=True, exist_ok=True)
-    plot_campaign(dataset, path)
+    with reading(store):
+        plot_campaign(dataset, path)
     typer.echo(path)
     typer.echo("\n".join(describe_campaign(store)))

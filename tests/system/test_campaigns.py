@@ -20,6 +20,7 @@ from few_paths import few_paths
 
 from mitransient_lidar import results
 from mitransient_lidar.campaigns import shard as shards
+from mitransient_lidar.campaigns import sweep as sweeping
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
 from mitransient_lidar.core.errors import UserError
@@ -348,6 +349,8 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
     other = write_toml(tmp_path / "other.toml", {**campaign, "target_error": 0.2})
     assert_refused(run("sweep", other, "-o", quick, "-q"), "holds another campaign, or its scene has changed")
     assert_refused(run("sweep", quick, "-o", out, "-q"), "--output is fixed in the store")
+    same = write_toml(tmp_path / "same.toml", campaign)
+    assert_refused(run("sweep", same, "-o", quick, "--shard-size", 5, "-q"), "shard_size = 5 must be that of", "6")
     assert files_of(quick) == before
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
@@ -378,22 +381,96 @@ def test_disk_that_is_full(quick, tmp_path):
     assert (Store(path).status() == PLANNED).all()
 
 
-@pytest.mark.long
-def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatch):
-    path = tmp_path / "dying.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+def shard_code(monkeypatch, arrays, start="pass"):
+    """Let the processes of shards run a statement at their start, and an expression for the arrays of a run."""
     code = (
-        "import os; from mitransient_lidar.campaigns import runs, shard; arrays = runs.RunRenderer.arrays\n"
-        "def dying(self, number, values): return os.abort() if number == 8 else arrays(self, number, values)\n"
-        "runs.RunRenderer.arrays = dying; shard._main()"
+        f"import os, signal; from mitransient_lidar.campaigns import runs, shard\n{start}\n"
+        f"arrays = runs.RunRenderer.arrays\nrender = lambda self, number, values: {arrays}\n"
+        "runs.RunRenderer.arrays = render; shard._main()"
     )
     original = subprocess.Popen
     monkeypatch.setattr(
         shards.subprocess, "Popen", lambda command, **given: original([sys.executable, "-c", code], **given)
     )
+
+
+@pytest.mark.slow
+def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_path, monkeypatch):
+    """It once was tried twice, and stored as a failure of the run without its traceback."""
+    path = tmp_path / "bug.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    shard_code(monkeypatch, "{}[3] if number == 8 else arrays(self, number, values)")
+    assert shards.render_in_process(str(path), 1) == (5, 0, "run 8: KeyError: 3")
+    assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE, DONE, PLANNED, DONE, DONE, DONE]
+    log = (tmp_path / "bug.log").read_text()
+    assert log.count("Traceback (most recent call last)") == 1
+    assert "shard 1\n" in log
+
+
+@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.long)])
+def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch, deaths):
+    """Twice; it once ended the campaign."""
+    path = tmp_path / "early.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    (tmp_path / "deaths").mkdir()
+    place = str(tmp_path / "deaths")
+    die = f"open({place!r} + f'/{{n}}', 'w').close(); os.kill(os.getpid(), 9)"
+    start = f"n = len(os.listdir({place!r}))\nif n < {deaths}: {die}"
+    shard_code(monkeypatch, "arrays(self, number, values)", start)
+    outcome = shards.render_in_process(str(path), 1)
+    assert outcome == ((6, 0, "") if deaths == 2 else (0, 0, "shard 1: the process ended by signal 9"))
+
+
+@pytest.mark.long
+def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
+    """The others are rendered, and the command says which ones to look at."""
+    path = tmp_path / "left.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    original = sweeping._task
+
+    def task(path, shard, *rest):
+        return (shard, shards.Outcome(0, 0, "shard 0: lost")) if shard == 0 else original(path, shard, *rest)
+
+    from distributed import Client, LocalCluster
+
+    with LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster, Client(cluster) as client:
+        monkeypatch.setattr(sweeping, "_task", task)
+        with pytest.raises(
+            UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.log"
+        ):
+            resume(path, scheduler=client)
+    assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE] * 6
+
+
+@pytest.mark.long
+def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
+    """The campaign once waited for ever."""
+    path = tmp_path / "unreachable.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    nowhere = "tcp://127.0.0.1:9"
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
+    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
+    with subprocess.Popen(
+        [*command, "--listen-address", "tcp://127.0.0.1:0", "--contact-address", nowhere], **SILENT
+    ) as worker:
+        address = json.loads(scheduler[1].read_text())["address"]
+        with pytest.raises(UserError, match=r"cannot reach its worker at tcp://127\.0\.0\.1:9"):
+            resume(path, scheduler=address)
+        worker.kill()
+
+
+@pytest.mark.long
+def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatch):
+    path = tmp_path / "dying.zarr"
+    shutil.copytree(quick, path)
+    shutil.rmtree(path / "status" / "c")
+    shard_code(monkeypatch, "os.abort() if number == 8 else arrays(self, number, values)")
     told = []
-    assert shards.render_in_process(str(path), 1, report=lambda *counts: told.append(counts)) == (5, 1)
+    assert shards.render_in_process(str(path), 1, report=lambda *counts: told.append(counts)) == (5, 1, "")
     assert told[-1] == (5, 1)
     store = Store(path)
     assert store.status(store.runs_of(1)).tolist() == [DONE, DONE, FAILED, DONE, DONE, DONE]
@@ -403,6 +480,6 @@ def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatc
         open_campaign(quick)["waveform"].values[[6, 7, 9, 10, 11]],
     )
     monkeypatch.undo()
-    assert shards.render_in_process(str(path), 1) == (5, 1)
+    assert shards.render_in_process(str(path), 1) == (5, 1, "")
     assert shards.render_in_process(str(path), 1, retry=True) == (6, 0)
     np.testing.assert_array_equal(open_campaign(path)["waveform"].values[8], open_campaign(quick)["waveform"].values[8])

@@ -13,7 +13,7 @@ import zarr
 from mitransient_lidar.campaigns import store as campaign_store
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import Array, RunRenderer
-from mitransient_lidar.campaigns.store import DONE, FAILED, Store, describe_campaign, open_campaign
+from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, describe_campaign, open_campaign, reading
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -135,6 +135,116 @@ def test_status_is_written_last(store, path, monkeypatch):
     with pytest.raises(UserError, match=r"cannot write .*campaign\.zarr: No space left on device"):
         store.write(0, np.full_like(status, DONE), errors, arrays)
     assert not Store(path).status().any()
+
+
+@pytest.fixture
+def full(store):
+    """A store all of whose runs are done, with values that are fill values, too."""
+    for shard in store.shards:
+        status, errors, arrays = filled(store, shard, 0)
+        arrays["waveform"][...] = np.nan if shard else 7
+        store.write(shard, np.full_like(status, DONE), errors, arrays)
+    assert (store.status() == DONE).all()
+    return store
+
+
+def flip(path):
+    """Flip a bit in the middle of a file."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+CHUNKS = ["waveform/c/1/0/0/0", "echo_flags/c/1/0/0", "error/c/1", "status/c/1", "surface_seed/c/1"]
+
+
+@pytest.mark.parametrize("chunk", CHUNKS)
+@pytest.mark.parametrize("damage", [flip, Path.unlink, lambda path: path.write_bytes(b"")])
+def test_damaged_shards_are_planned_again(full, path, caplog, chunk, damage):
+    """Three flipped bits, or a missing chunk, once gave other numbers of runs that are done."""
+    damage(path / chunk)
+    store = Store(path)
+    store.mend()
+    if not (chunk.startswith("status") and damage is Path.unlink):
+        assert "runs 4 to 7 are rendered again" in caplog.text
+        assert chunk.split("/")[0] in caplog.text
+    assert store.status().tolist() == [DONE] * 4 + [PLANNED] * 4 + [DONE] * 2
+    status, errors, arrays = store.read(1)
+    assert status.tolist() == [PLANNED] * 4
+    assert errors.tolist() == [""] * 4
+    store.write(1, np.full_like(status, DONE), errors, arrays)
+    caplog.clear()
+    store.mend()
+    assert not caplog.text
+    assert (store.status() == DONE).all()
+
+
+def test_a_store_with_a_lost_chunk_is_read_without_its_runs(full, path):
+    (path / "waveform/c/0/0/0/0").unlink()
+    data = open_campaign(path)
+    assert data["status"].values.tolist() == [PLANNED] * 4 + [DONE] * 6
+    assert describe_campaign(path) == ["10 runs: 6 done, 0 failed, 4 planned"]
+
+
+def test_damaged_values_are_not_read(full, path):
+    flip(path / "waveform/c/0/0/0/0")
+    data = open_campaign(path)
+    with pytest.raises(ValueError, match="checksum"):
+        data["waveform"].load()
+    with (
+        pytest.raises(UserError, match=r"campaign\.zarr is damaged: waveform cannot be read"),
+        reading(path, "waveform"),
+    ):
+        data["waveform"].load()
+
+
+@pytest.mark.parametrize("name", ["time", "time_input", "pixel", "run", "shot", "layout"])
+@pytest.mark.parametrize("damage", [flip, Path.unlink])
+def test_damaged_coordinates_are_refused(full, path, name, damage):
+    """They are those of all runs, and nothing else has them."""
+    damage(path / name / "c" / "0")
+    with pytest.raises(ValueError, match=r"campaign\.zarr is damaged|checksum"):
+        open_campaign(path).load()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"runs": 10**9}, "is no store"),
+        ({"runs": 11}, "has the shape"),
+        ({"runs": "ten"}, "is no store"),
+        ({"shard_size": 5}, "has the shape"),
+        ({"variables": 3}, "is no store"),
+        ({"variables": ["nothing"]}, "nothing cannot be read"),
+        ({"campaign": "{}"}, "is no store"),
+        ({"record": [0, 1, 2]}, ""),
+    ],
+)
+@pytest.mark.parametrize("sealed", [True, False])
+def test_edited_attributes_are_refused(full, path, change, message, sealed):
+    """Those of an author who has made the checksum anew, too, where they do not fit the arrays."""
+    group = zarr.open_group(str(path), mode="r+")
+    attributes = {**group.attrs, **change}
+    group.attrs.update({**change, **({"sha256": campaign_store._seal(attributes)} if sealed else {})})
+    if sealed and not message:
+        Store(path)
+        return
+    with pytest.raises(UserError, match=message if sealed else "is no store|its attributes have changed"):
+        Store(path)
+
+
+def test_an_array_whose_metadata_are_damaged(full, path):
+    (path / "waveform" / "zarr.json").write_text("{")
+    with pytest.raises(UserError, match=r"campaign\.zarr is damaged"):
+        Store(path)
+
+
+def test_a_store_that_another_process_has_just_made(full, path):
+    """The second one of two sweeps that begin together goes on with the store of the first one."""
+    renderer = RunRenderer(CAMPAIGN, RECORD, AXIS)
+    made = Store.create(path, renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
+    assert (made.status() == DONE).all()
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
 
 
 def test_failed_creation_leaves_nothing(path, monkeypatch):
