@@ -17,6 +17,7 @@ import tomllib
 
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import (
     FloatArray,
     finite,
@@ -36,6 +37,9 @@ KEPT = ("waveform", "stderr", "components", "echoes", "truth")
 
 #: Most runs of a campaign, and most shots of a run.
 MOST_RUNS, MOST_SHOTS = 10**7, 10_000
+
+#: Largest table of runs [bytes], a million rows of ten numbers.
+_LARGEST_TABLE = 2**27
 
 Column = npt.NDArray[Any]
 
@@ -133,11 +137,7 @@ class Campaign:
     def read(cls, path: str | os.PathLike[str]) -> Campaign:
         """Read a TOML file; raise `UserError` if it cannot be read, is not TOML, or describes no campaign."""
         try:
-            given = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise UserError(f"cannot read {path}: {error.strerror}.") from error
-        except UnicodeDecodeError as error:
-            raise UserError(f"{path} is not a text file in UTF-8.") from error
+            given = tomllib.loads(read_text(path))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise UserError(f"{path} is not a TOML file: {' '.join(str(error).split())}") from error
         return cls.of(given, Path(path).resolve().parent)
@@ -210,13 +210,11 @@ class Campaign:
         path = Path(_resolved(self.design.file, self.folder))
         if free := [name for name, one in self.parameters.items() if not isinstance(one, Expression)]:
             raise UserError(f"parameters.{free[0]}: the table gives the values; only expressions may be added to it")
+        lines = read_text(path, _LARGEST_TABLE).splitlines(keepends=True)
         try:
-            with path.open(encoding="utf-8-sig", newline="") as file:
-                rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
-        except OSError as error:
-            raise UserError(f"cannot read {path}: {error.strerror}.") from error
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise UserError(f"{path} is not a CSV file in UTF-8.") from error
+            rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(map(str.strip, row))]
+        except csv.Error as error:
+            raise UserError(f"{path} is not a CSV file.") from error
         if len(rows) < 2:
             raise UserError(f"{path} must have a heading with the names of parameters, and a row for each run")
         names = rows[0]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, shown
 
 _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -32,6 +32,9 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "min": np.minimum,
     "max": np.maximum,
 }
+
+#: Most characters of an expression: its evaluation is recursive.
+_LONGEST = 500
 
 _ALLOWED = f"numbers, parameters, + - * / ** ( ) and {', '.join(_FUNCTIONS)}"
 
@@ -62,10 +65,12 @@ class Expression:
 
     def __init__(self, name: str, text: str) -> None:
         self.name, self.text = name, text
+        if len(text) > _LONGEST:
+            raise UserError(f"{name} = {shown(text)} has {len(text)} characters: it may have {_LONGEST}")
         try:
             self._tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError):
-            raise UserError(f"{name} = {text!r} is no expression: it may hold {_ALLOWED}") from None
+            raise UserError(f"{name} = {shown(text)} is no expression: it may hold {_ALLOWED}") from None
         functions = {id(node.func) for node in ast.walk(self._tree) if isinstance(node, ast.Call)}
         for node in ast.walk(self._tree):
             self._check(node, functions)
@@ -84,8 +89,8 @@ class Expression:
         elif isinstance(node, ast.Constant):
             known = isinstance(node.value, (int, float)) and not isinstance(node.value, bool)
         if not known:
-            part = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
-            raise UserError(f"{self.name} = {self.text!r} holds {part!r}: it may hold {_ALLOWED}")
+            part = ast.get_source_segment(self.text.strip(), node) or type(node).__name__
+            raise UserError(f"{self.name} = {self.text!r} holds {shown(part)}: it may hold {_ALLOWED}")
 
     def evaluate(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """Return the value for arrays of equal shape by name; raise `UserError` where it is not finite."""

@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import warnings
 import zipfile
-import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import integer, positive
+
+#: Largest arrays of a map, a table or an image that a scene names [bytes].
+LARGEST_ARRAY = 2**28
 
 EXR_SIGNATURE = b"\x76\x2f\x31\x01"  #: The first four bytes of every OpenEXR file.
 
@@ -65,20 +69,57 @@ def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
 
 def read_npy(path: Path) -> Array:
     """Read an array in NumPy's format; pickled objects are rejected."""
-    try:
-        with path.open("rb") as file:
-            return np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} is damaged, or is not one array of numbers in NumPy's format.") from error
+    with damaged_file(f"{path} is damaged, or is not one array of numbers in NumPy's format."), path.open("rb") as file:
+        return _read_array(path, file)
 
 
 def read_npz(path: Path, names: Collection[str]) -> dict[str, Array]:
     """Read those arrays of an archive in NumPy's format that have one of the names."""
+    found = {}
+    with (
+        damaged_file(f"{path} is damaged, or is not an archive of arrays in NumPy's format."),
+        zipfile.ZipFile(path) as archive,
+    ):
+        held = archive.namelist()
+        for name in [name for name in names if f"{name}.npy" in held]:
+            with archive.open(f"{name}.npy") as file:
+                found[name] = _read_array(path, file)
+    return found
+
+
+def _read_array(path: Path, file: IO[bytes]) -> Array:
+    """Read an array in NumPy's format; raise `UserError` by its header if it is larger than `LARGEST_ARRAY`."""
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, _, dtype = readers[np.lib.format.read_magic(file)](file)
+    check_size(path, math.prod(shape) * dtype.itemsize)
+    file.seek(0)
+    return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def check_size(path: str | os.PathLike[str], size: float, most: int = LARGEST_ARRAY) -> None:
+    """Raise `UserError` if the arrays of a file have more bytes than allowed, which may be many times its own."""
+    if size > most:
+        sizes = f"{size / 2**20:.4g} MiB, and {most / 2**20:.4g} MiB are the most for a file of this kind"
+        raise UserError(f"{path} holds arrays of {sizes}.")
+
+
+def largest_result() -> int:
+    """Return the size of the largest arrays of a result that is read: half of the memory of this machine [bytes]."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+
+
+@contextlib.contextmanager
+def damaged_file(sentence: str) -> Iterator[None]:
+    """Convert the errors of a reader of foreign files to a `UserError` with a sentence.
+
+    Damaged headers make NumPy's parser raise almost any exception: SyntaxError, TokenError, OverflowError, ...
+    """
     try:
-        with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in names if name in archive}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged, or is not an archive of arrays in NumPy's format.") from error
+        yield
+    except (UserError, MemoryError):
+        raise
+    except Exception as error:
+        raise UserError(sentence) from error
 
 
 def read_exr(path: Path) -> dict[str, Array]:
@@ -90,22 +131,31 @@ def read_exr(path: Path) -> dict[str, Array]:
         # OpenEXR prints its own message for a file of another format.
         if file.read(len(EXR_SIGNATURE)) != EXR_SIGNATURE:
             raise UserError(damaged)
-    with silence_openexr():
-        try:
-            with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
-                return {name: channel.pixels.copy() for name, channel in file.channels().items()}
-        except (RuntimeError, ValueError) as error:
-            raise UserError(damaged) from error
+    check_exr(path, damaged, LARGEST_ARRAY)
+    with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), separate_channels=True) as image:
+        return {name: channel.pixels.copy() for name, channel in image.channels().items()}
+
+
+def check_exr(path: str | os.PathLike[str], damaged: str, most: int) -> None:
+    """Raise `UserError` if an OpenEXR file is damaged, or has more bytes of pixels than allowed by its headers."""
+    import OpenEXR
+
+    with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), header_only=True) as file:
+        for part in file.parts:
+            first, last = (np.asarray(end, dtype=np.float64) for end in part.header["dataWindow"])
+            check_size(path, 4.0 * float(np.prod(last - first + 1)) * max(len(part.header["channels"]), 1), most)
 
 
 def read_netcdf(path: Path) -> dict[str, Variable]:
     """Read the variables of a NetCDF-4 file, coordinates included; times are not decoded."""
     import xarray as xr
 
-    try:
-        dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path} is damaged, or is not a NetCDF-4 file.") from error
+    with (
+        damaged_file(f"{path} is damaged, or is not a NetCDF-4 file."),
+        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,
+    ):
+        check_size(path, file.nbytes)
+        dataset = file.load()
     return {
         str(name): Variable(
             dims=tuple(map(str, variable.dims)),
@@ -124,10 +174,7 @@ def read_ascii_grid(path: Path) -> Grid:
     and dy [m], and nodata_value, by default -9999. A file of the same name that ends in .prj may describe the
     coordinates; degrees are refused.
     """
-    try:
-        words = path.read_text("utf-8-sig").replace(",", ".").split()
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} is damaged, or is not an ESRI ASCII grid: it is not text.") from error
+    words = read_text(path, LARGEST_ARRAY).replace(",", ".").split()
     length = next((i for i in range(0, len(words), 2) if not words[i][0].isalpha() or words[i].lower() == "nan"), 0)
     try:
         header = {words[i].lower(): float(words[i + 1]) for i in range(0, length, 2)}
@@ -173,6 +220,7 @@ def read_geotiff(path: Path) -> Grid:
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             with rasterio.open(path, driver="GTiff") as file:
                 _check_geotiff(path, file)
+                check_size(path, 8.0 * file.width * file.height)
                 masked, place = file.read(1, masked=True), file.transform
                 scale, offset = file.scales[0], file.offsets[0]
     except rasterio.errors.RasterioError as error:

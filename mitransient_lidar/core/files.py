@@ -36,6 +36,26 @@ def check_encodable(path: Path) -> None:
         raise UserError(f"cannot write {text!a}: its name contains the character NUL.")
 
 
+def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
+    """Return the text of a file in UTF-8, without a byte order mark.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read, is not such a text, or is larger than `most_bytes`.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(most_bytes + 1)
+        if len(data) <= most_bytes:
+            return data.decode("utf-8-sig")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not a text file in UTF-8.") from error
+    raise UserError(f"{path} is larger than {most_bytes / 2**20:g} MiB, the most for a file of this kind.")
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield the path of a temporary file in the folder of `path`, which replaces `path` on success.

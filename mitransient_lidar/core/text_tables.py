@@ -7,12 +7,12 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.headings import (
     TIME,
     Column,
@@ -30,6 +30,9 @@ _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--",
 
 #: Values that instruments write for missing ones.
 _FILL_VALUES = (-99.0, -999.0, -9999.0, -99999.0, -9.99e-29)
+
+#: Most lines of a table.
+_MOST_LINES = 10**6
 
 #: Lines in which the number of columns shows.
 _LINES_FOR_WIDTH = 10_000
@@ -162,12 +165,9 @@ def complete_rows(path: str | PathLike[str], columns: Mapping[str, FloatArray], 
 
 def _read_lines(path: str | PathLike[str]) -> tuple[list[_Line], list[_Line]]:
     """Return the lines of a file, and its comments."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file in UTF-8.") from error
+    text = read_text(path)
+    if (count := text.count("\n")) > _MOST_LINES:
+        raise UserError(f"{path} has {count} lines: a table may have {_MOST_LINES}.")
     lines: list[_Line] = []
     comments: list[_Line] = []
     for number, line in enumerate(text.splitlines(), start=1):

@@ -2,7 +2,7 @@
 
 import math
 import operator
-from typing import Any, SupportsIndex
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,13 +54,18 @@ def in_range(name: str, value: object, low: float, high: float) -> float:
     return number
 
 
-def integer(name: str, value: object, low: int, high: int) -> int:
+def integer(name: str, value: Any, low: int, high: int) -> int:
     """Return `value`, an integer or a float without decimals but no text, as an integer in [`low`, `high`]."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
     if isinstance(value, (float, np.floating)) and value.is_integer():
         value = int(value)
-    if isinstance(value, bool) or not isinstance(value, SupportsIndex) or getattr(value, "ndim", 0) > 0:
+    try:
+        number = None if isinstance(value, bool) or getattr(value, "ndim", 0) > 0 else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None:
         raise UserError(f"{name} = {shown(value)} must be an integer between {low} and {high}")
-    number = operator.index(value)
     if not low <= number <= high:
         raise UserError(f"{name} = {shown(number)} must lie between {low} and {high}")
     return number
@@ -78,7 +83,7 @@ def finite_array(name: str, values: npt.ArrayLike) -> FloatArray:
     """Return `values` as a new float64 array without NaN or infinity."""
     try:
         array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UserError(f"{name} = {shown(values)} must hold numbers only") from None
     if not np.all(np.isfinite(array)):
         bad = array[~np.isfinite(array)][0]

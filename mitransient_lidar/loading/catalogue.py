@@ -15,7 +15,8 @@ from pathlib import Path
 from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading.includes import flat_text, parse_scene, read_scene
+from mitransient_lidar.core.files import read_text
+from mitransient_lidar.loading.includes import flat_text, parse_scene
 
 _COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
 
@@ -56,7 +57,7 @@ def scene_text(name: str | os.PathLike[str]) -> str:
 
 def scene_summary(name: str | os.PathLike[str]) -> str:
     """Return the first line of a scene's first comment, empty without a comment; name and errors as in `scene_path`."""
-    comment = _COMMENT.search(read_scene(scene_path(name)))
+    comment = _COMMENT.search(read_text(scene_path(name)))
     lines = comment[1].strip().splitlines() if comment else []
     return lines[0].strip() if lines else ""
 

@@ -24,6 +24,9 @@ LARGEST_COORDINATE = 1e6
 #: Deepest nesting of the objects of a scene; Mitsuba's parser is recursive.
 DEEPEST_NESTING = 64
 
+#: Most characters of an attribute with the values of parameters in place.
+_LONGEST_TEXT = 10**6
+
 #: Name of a plugin, and endings of the libraries of plugins.
 _TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
 
@@ -136,11 +139,19 @@ def check_libraries(*folders: Path) -> None:
 
 
 def with_values(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
-    """Return a text with parameters in place, the longest names first, and those that it refers to."""
+    """Return a text with parameters in place, the longest names first, and those that it refers to.
+
+    Raises
+    ------
+    UserError
+        If the text becomes longer than a million characters.
+    """
     referred: list[str] = []
     while "$" in text and (found := [name for name in parameters if f"${name}" in text and name not in referred]):
         referred.append(max(found, key=len))
         text = text.replace(f"${referred[-1]}", parameters[referred[-1]])
+        if len(text) > _LONGEST_TEXT:
+            raise UserError(f"{referred[0]} = {shown(parameters[referred[0]])} has more than a million characters")
     return text, referred
 
 

@@ -10,7 +10,11 @@ from xml.parsers.expat import ExpatError
 from xml.sax.saxutils import quoteattr
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
 from mitransient_lidar.loading.checks import check_depth
+
+#: Most files that a scene and its parts include.
+_MOST_FILES = 256
 
 
 @dataclass
@@ -20,16 +24,6 @@ class _Default:
     element: minidom.Element
     above: list[str]
     same_line: str = ""
-
-
-def read_scene(path: Path) -> str:
-    """Return the text of a scene file; raise UserError if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise UserError(f"scene {path} is not a UTF-8 text file.") from error
-    except OSError as error:
-        raise UserError(f"cannot read scene {path}: {error.strerror}.") from error
 
 
 def parse_scene(text: str, path: Path | str) -> minidom.Element:
@@ -61,9 +55,9 @@ def flat_text(path: Path) -> str:
     Raises
     ------
     UserError
-        If a file is missing, unreadable, not well-formed XML, or includes itself.
+        If a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than 256.
     """
-    text = read_scene(path)
+    text = read_text(path)
     return text_of(expanded(path)) if "<include" in text else text
 
 
@@ -81,12 +75,13 @@ def text_of(root: minidom.Element) -> str:
     return "\n".join([*head, *_element(root, [*parameters, *objects, ""]), ""])
 
 
-def expanded(path: Path, includers: tuple[Path, ...] = ()) -> minidom.Element:
+def expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | None = None) -> minidom.Element:
     """Return the root element of a scene file, with includes replaced by what Mitsuba takes from them.
 
-    Format and errors as for `flat_text`.
+    Format and errors as for `flat_text`; `count` holds the number of files that are included so far.
     """
-    root = parse_scene(read_scene(path), path)
+    root = parse_scene(read_text(path), path)
+    count = [0] if count is None else count
     files = (path.resolve(), *includers)
     for include in root.getElementsByTagName("include"):
         name = include.getAttribute("filename")
@@ -95,7 +90,10 @@ def expanded(path: Path, includers: tuple[Path, ...] = ()) -> minidom.Element:
             raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
         if part.resolve() in files:
             raise UserError(f"scene {path} includes {name!r}, which includes it in turn.")
-        included = expanded(part, files)
+        count[0] += 1
+        if count[0] > _MOST_FILES:
+            raise UserError(f"scene {files[-1]} includes more than {_MOST_FILES} files, which is the limit.")
+        included = expanded(part, files, count)
         content = list(included.childNodes)
         if included.tagName != "scene":
             included.removeAttribute("version")

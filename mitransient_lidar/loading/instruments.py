@@ -16,10 +16,11 @@ from pathlib import Path
 from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import parameters_of
 from mitransient_lidar.loading.checks import with_values
-from mitransient_lidar.loading.includes import expanded, flat_text, parse_scene, read_scene, text_of
+from mitransient_lidar.loading.includes import expanded, flat_text, parse_scene, text_of
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
 _RECORD = ("time_start_ns", "bin_count")
@@ -62,7 +63,7 @@ def instrument_names() -> list[str]:
 def read_instrument(name: str) -> Instrument:
     """Return an instrument by its name; raise UserError if there is none."""
     path = _path(name)
-    root = parse_scene(read_scene(path), path)
+    root = parse_scene(read_text(path), path)
     title, _, description = _head(root).data.strip().partition("\n")
     parameters = tuple(_parameters(root))
     pixels = [tag for tag in root.getElementsByTagName("sensor") if tag.getAttribute("type") == "pixel_fov"]
@@ -114,7 +115,7 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
         If there is no such instrument.
     """
     path = _path(name)
-    own, part = parse_scene(read_scene(path), path), expanded(path)
+    own, part = parse_scene(read_text(path), path), expanded(path)
     shared = parameters_of(part)
     former = parameters_of(root)
     values = {record: shared[record] for record in _RECORD}

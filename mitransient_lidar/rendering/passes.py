@@ -84,9 +84,8 @@ class Goal:
         target_quantile: float | None = None,
     ) -> Goal:
         """Check the options of a render; without any of them, return the default."""
-        for name, value in (("target_error", target_error), ("max_time", max_time)):
-            if value is not None:
-                positive(name, value)
+        target_error = None if target_error is None else positive("target_error", target_error)
+        max_time = None if max_time is None else positive("max_time", max_time)
         if passes is not None:
             # Their spread gives the standard error.
             passes = integer("passes", passes, 2, MOST_PASSES)

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from mitransient_lidar.core.array_files import silence_openexr
+from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result, silence_openexr
 from mitransient_lidar.core.errors import UserError
 
 _EXACT = "mitransientLidar"
@@ -160,22 +160,23 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
     Raises
     ------
     UserError
-        If the file is damaged or truncated.
+        If the file is damaged, truncated, or larger than half of the memory.
     """
-    with silence_openexr():
-        try:
-            with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
-                # Closing the file clears its dictionaries and frees the pixels.
-                parts = [
-                    Part(
-                        str(part.header.get("name", "")),
-                        dict(part.header),
-                        {name: channel.pixels.copy() for name, channel in part.channels.items()},
-                    )
-                    for part in file.parts
-                ]
-        except (RuntimeError, ValueError) as error:
-            raise UserError(_damaged(path)) from error
+    check_exr(path, _damaged(path), largest_result())
+    with (
+        damaged_file(_damaged(path)),
+        silence_openexr(),
+        OpenEXR.File(os.fspath(path), separate_channels=True) as file,
+    ):
+        # Closing the file clears its dictionaries and frees the pixels.
+        parts = [
+            Part(
+                str(part.header.get("name", "")),
+                dict(part.header),
+                {name: channel.pixels.copy() for name, channel in part.channels.items()},
+            )
+            for part in file.parts
+        ]
     if not parts:
         raise UserError(_damaged(path))
     return parts

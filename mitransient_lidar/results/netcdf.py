@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from xarray.backends import H5NetCDFStore
 
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.array_files import check_size, damaged_file, largest_result
 from mitransient_lidar.results.formats import attribute
 
 _LISTS = "mitransient_lidar_lists"  # NetCDF attribute with the names of the attributes to read back as lists
@@ -60,19 +60,20 @@ def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises
     ------
     UserError
-        If the file is damaged or truncated.
+        If the file is damaged, truncated, or larger than half of the memory.
     """
-    try:
-        dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False)
+    with (
+        damaged_file(f"{path} is damaged or truncated: its NetCDF data cannot be read."),
+        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,
+    ):
+        check_size(path, file.nbytes, largest_result())
+        dataset = file.load().drop_encoding()
         lists = json.loads(dataset.attrs.pop(_LISTS, "[]"))
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path} is damaged or truncated: its NetCDF data cannot be read.") from error
-    dataset = dataset.drop_encoding()
-    dataset.attrs = {
-        str(name): np.atleast_1d(value).tolist() if name in lists else attribute(str(name), value)
-        for name, value in dataset.attrs.items()
-    }
-    for name, coordinate in dataset.coords.items():
-        if coordinate.dtype.kind == "O":
-            dataset[name] = coordinate.astype(str)
+        dataset.attrs = {
+            str(name): np.atleast_1d(value).tolist() if name in lists else attribute(str(name), value)
+            for name, value in dataset.attrs.items()
+        }
+        for name, coordinate in dataset.coords.items():
+            if coordinate.dtype.kind == "O":
+                dataset[name] = coordinate.astype(str)
     return dataset

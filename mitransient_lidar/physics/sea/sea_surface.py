@@ -41,6 +41,9 @@ _SMALLEST_RIPPLE_VARIANCE = 1e-5
 #: not depend on the resolution, so that a seed defines one sea.
 _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 
+#: Wind speed [m/s] below which there are no waves.
+_CALM = 1e-6
+
 #: Largest number of cells per side of the fine patch, and smallest number per period for waves to be resolved.
 _MOST_CELLS, _FEWEST_CELLS = 4096, 16
 
@@ -92,6 +95,7 @@ class SeaSurface:
         if spectrum not in _SPECTRA:
             raise UserError(f"spectrum = {spectrum!r} must be one of {', '.join(_SPECTRA)}")
         wind_speed = in_range("wind_speed", get("wind_speed", 3.0), 0.0, MAX_WIND_SPEED)
+        wind_speed = wind_speed if wind_speed >= _CALM else 0.0
         wind_direction = _read_angle(get, "wind_direction_deg")
         state = _read_waves(get, spectrum, wind_speed, wind_direction)
         slope_variance = get("slope_variance", "cox_munk")

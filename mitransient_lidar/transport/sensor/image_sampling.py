@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mitransient_lidar.core.array_files import check_size, damaged_file, read_exr, read_npy, readable_suffix
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.transport.opaque import aligned
-
-_SUFFIXES = (".png", ".npy", ".exr")
 
 
 def read_image(name: str, path: str) -> NDArray[np.float64]:
@@ -26,19 +26,11 @@ def read_image(name: str, path: str) -> NDArray[np.float64]:
         When the file cannot be read, or does not hold finite real numbers in two dimensions.
     """
     where = f"{name} = {path!r}"
-    if Path(path).suffix.lower() not in _SUFFIXES:
-        raise UserError(f"{where} must be a {', '.join(_SUFFIXES[:-1])} or {_SUFFIXES[-1]} file")
     try:
-        with Path(path).open("rb"):
-            pass
-    except OSError as error:
-        raise UserError(f"{where} cannot be read: {error.strerror}") from error
-    try:
-        is_array = Path(path).suffix.lower() == ".npy"
-        values = np.load(path, allow_pickle=False) if is_array else np.array(mi.Bitmap(path))
-    except (RuntimeError, ValueError, EOFError, OSError) as error:
-        raise UserError(f"{where} cannot be read: it is damaged, or of another format than its name") from error
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
+        values = _READERS[readable_suffix(Path(path), _READERS, "grey image")](Path(path))
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+    if values.dtype.kind not in "biuf":
         raise UserError(f"{where} must hold real numbers")
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
@@ -47,6 +39,22 @@ def read_image(name: str, path: str) -> NDArray[np.float64]:
     if not np.isfinite(values).all():
         raise UserError(f"{where} must hold finite numbers")
     return values.astype(np.float64)
+
+
+def _read_png(path: Path) -> NDArray[Any]:
+    """Read a PNG file, unless its header says that it is too large."""
+    with damaged_file(f"{path} is damaged, or is not a PNG file."), path.open("rb") as file:
+        width, height = np.frombuffer(file.read(24)[16:], dtype=">u4").tolist()
+        check_size(path, 8.0 * width * height)
+        return np.array(mi.Bitmap(str(path)))
+
+
+def _read_channel(path: Path) -> NDArray[Any]:
+    """Read the channels of an OpenEXR file, the last axis."""
+    return np.stack(list(read_exr(path).values()), axis=-1)
+
+
+_READERS = {".png": _read_png, ".npy": read_npy, ".exr": _read_channel}
 
 
 class ImageSampler:

@@ -47,7 +47,9 @@ def test_names_are_those_of_parameters():
         ("~a", "may hold"),
         ("sqrt(x=2)", "may hold"),
         ("round(2)", "may hold"),
-        ("(" * 300 + "1" + ")" * 300, "no expression"),
+        ("(" * 240 + "1" + ")" * 240, "no expression"),
+        ("+".join(["a"] * 300), "has 599 characters: it may have 500"),
+        ("a" + ".b" * 240, "may hold"),
     ],
 )
 def test_anything_else_is_refused(text, part):

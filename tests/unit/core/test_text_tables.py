@@ -109,6 +109,16 @@ def test_unclear_tables_are_rejected(path, text, message):
     assert "\n" not in str(error.value)
 
 
+def test_large_files_are_rejected_at_once(path):
+    """Three million rows would take half a minute."""
+    path.write_text("time,power\n" + "1,2\n" * 3_000_000)
+    with pytest.raises(UserError, match=r"table.txt has 3000001 lines: a table may have 1000000"):
+        read_time_samples(path, POWER)
+    path.write_text("time,power\n" + "100,200\n" * 3_000_000)
+    with pytest.raises(UserError, match=r"table.txt is larger than 16 MiB, the most for a file of this kind"):
+        read_time_samples(path, POWER)
+
+
 def test_unreadable_files_are_rejected(path):
     with pytest.raises(UserError, match=r"cannot read .*table.txt: No such file or directory"):
         read_time_samples(path, POWER)

@@ -27,6 +27,7 @@ def test_clean_values():
     assert positive("x", 1) == 1.0
     assert integer("x", 3.0, 1, 5) == 3
     assert in_range("x", "7", 1, np.inf) == 7.0
+    assert integer("x", np.array(2.0), 0, 9) == integer("x", np.array(2), 0, 9) == 2
     values = np.arange(3)
     assert not np.shares_memory(finite_array("x", values), values)
     assert increasing_array("x", values).dtype == np.float64
@@ -41,6 +42,10 @@ def test_clean_values():
         (lambda: in_range("x", 2, 0, 1), "x = 2 must lie between 0 and 1"),
         (lambda: in_range("x", 0.5, 1, np.inf), r"x = 0\.5 must be at least 1$"),
         (lambda: integer("x", 1.5, 0, 9), r"x = 1\.5 must be an integer"),
+        (lambda: integer("x", np.array(2.5), 0, 9), r"x = 2\.5 must be an integer"),
+        (lambda: integer("x", np.array([2.0]), 0, 9), r"x = array\(\[2.\]\) must be an integer"),
+        (lambda: integer("x", "2", 0, 9), r"x = '2' must be an integer"),
+        (lambda: finite_array("x", [10**400]), "must hold numbers only"),
         (lambda: finite_array("x", [1, np.nan]), "x holds nan but every value must be finite"),
         (lambda: finite_array("x", ["a"]), "must hold numbers only"),
         (lambda: non_negative_array("x", [1, -2, -3]), "x = -3 must not be negative"),

@@ -83,7 +83,7 @@ def test_text_that_is_no_xml_or_no_text(folder):
     with pytest.raises(UserError, match=r"scene .*bad.xml is not well-formed XML: .*line 1"):
         catalogue.scene_parameters("bad")
     (folder / "bad.xml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UserError, match="not a UTF-8 text file"):
+    with pytest.raises(UserError, match="not a text file in UTF-8"):
         catalogue.scene_text("bad")
 
 

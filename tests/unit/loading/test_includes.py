@@ -185,7 +185,7 @@ def test_part_beside_the_including_file_is_found(scene):
             '<scene><include filename="ball.xml"/></scene>',
             r"includes 'ball\.xml', which includes it",
         ),
-        ("parts/point.xml", b"\xff\xfe\x00", r"scene .*point\.xml is not a UTF-8 text file"),
+        ("parts/point.xml", b"\xff\xfe\x00", r"point\.xml is not a text file in UTF-8"),
     ],
 )
 def test_wrong_includes(scene, part, text, sentence):
@@ -193,3 +193,25 @@ def test_wrong_includes(scene, part, text, sentence):
     for use in (flat_text, catalogue.scene_parameters, catalogue.copy_scene, scenes.load_scene):
         with pytest.raises(UserError, match=sentence):
             use(scene)
+
+
+def test_includes_that_double_are_refused_at_once(tmp_path):
+    """27 files that include the next one twice are 134 million parts."""
+    for number in range(27):
+        part = f'<include filename="{number + 1}.xml"/>'
+        (tmp_path / f"{number}.xml").write_text(f'<scene version="3.0.0">{part}{part}</scene>')
+    (tmp_path / "27.xml").write_text('<scene version="3.0.0"/>')
+    for use in (flat_text, catalogue.scene_parameters, scenes.load_scene):
+        with pytest.raises(UserError, match=r"scene .*0\.xml includes more than 256 files, which is the limit"):
+            use(tmp_path / "0.xml")
+
+
+def test_parameters_that_double_are_refused_at_once(tmp_path):
+    """40 parameters that name the next one twice are a text of a terabyte."""
+    parameters = [f'<default name="p{n:02}" value="$p{n + 1:02},$p{n + 1:02}"/>' for n in range(40)]
+    parameters += ['<default name="p40" value="1"/>']
+    shape = '<shape type="sphere"><float name="radius" value="$p00"/></shape>'
+    path = tmp_path / "bomb.xml"
+    path.write_text(f'<scene version="3.0.0">{"".join(parameters)}{shape}</scene>')
+    with pytest.raises(UserError, match=r"p00 = .* has more than a million characters"):
+        scenes.load_scene(path)

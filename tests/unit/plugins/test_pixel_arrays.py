@@ -165,11 +165,13 @@ def test_images_that_are_no_maps_are_refused(png, values, name, message):
 def test_files_that_are_no_images_are_refused(tmp_path):
     for name in ("bad.png", "bad.npy", "bad.exr"):
         (tmp_path / name).write_text("nothing")
-        assert re.search(
-            rf"pixel_map = '.*{name}' cannot be read: it is damaged", refused({"pixel_map": str(tmp_path / name)})
-        )
-    assert "'none.png' cannot be read: No such file" in refused({"pixel_map": "none.png"})
-    assert "'map.jpg' must be a .png, .npy or .exr file" in refused({"pixel_map": "map.jpg"})
+        assert re.search(rf"pixel_map = '.*{name}': .* is damaged, or", refused({"pixel_map": str(tmp_path / name)}))
+    # The pixels of an image are refused by their number in its header.
+    header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (10**5).to_bytes(4, "big") * 2
+    (tmp_path / "bomb.png").write_bytes(header)
+    assert "bomb.png holds arrays of 7.629e+04 MiB, and 256 MiB" in refused({"pixel_map": str(tmp_path / "bomb.png")})
+    assert "'none.png': cannot read none.png: No such file" in refused({"pixel_map": "none.png"})
+    assert "'map.jpg': cannot read map.jpg: the name of a grey image must end in" in refused({"pixel_map": "map.jpg"})
     mi.Bitmap(np.ones((2, 2, 3), np.uint8)).write(str(tmp_path / "colour.png"))
     assert "one (grey) channel" in refused({"pixel_map": str(tmp_path / "colour.png")})
 

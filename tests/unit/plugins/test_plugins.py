@@ -57,11 +57,11 @@ REFUSED = [
     ),
     (
         {"type": "lidar_transmitter", "beam_profile": "image", "profile_file": "nowhere.npy", "profile_mrad": 5.0},
-        "profile_file = 'nowhere.npy' cannot be read: No such file or directory",
+        "profile_file = 'nowhere.npy': cannot read nowhere.npy: No such file or directory",
     ),
     (
         {"type": "lidar_transmitter", "beam_profile": "image", "profile_file": "beam.jpg", "profile_mrad": 5.0},
-        "profile_file = 'beam.jpg' must be a .png, .npy or .exr file",
+        "profile_file = 'beam.jpg': cannot read beam.jpg: the name of a grey image must end in .png, .npy, .exr",
     ),
     ({"type": "lidar_transmitter", "pulse_file": "nowhere.txt"}, "cannot read nowhere.txt: No such file or directory"),
     ({"type": "lidar_transmitter", "pulse_fwhm_ns": float("nan")}, "pulse_fwhm_ns = nan"),
@@ -132,7 +132,7 @@ REFUSED = [
     ),
     (
         {"type": "multipixel_receiver", "blur_file": "none.npy", "blur_file_mrad": 2.0},
-        "blur_file = 'none.npy' cannot be read: No such file or directory",
+        "blur_file = 'none.npy': cannot read none.npy: No such file or directory",
     ),
     ({"type": "time_gated_film", "bin_width_ns": 0.0}, "bin_width_ns = 0 must be greater than 0"),
     ({"type": "time_gated_film", "bin_count": 0}, "bin_count = 0 must lie between 1"),
