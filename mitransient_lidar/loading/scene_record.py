@@ -33,6 +33,7 @@ from xml.dom import minidom
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.checks import is_own_plugin, plugin_parameters, with_values
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ class SceneRecord:
         Raises
         ------
         UserError
-            If the attributes hold no scene.
+            If the attributes hold no scene, or are damaged.
         """
         kinds = [kind for kind in ("xml", "dict") if f"scene_{kind}" in attributes]
         if not kinds:
@@ -110,14 +111,19 @@ class SceneRecord:
                 "the result does not hold its scene (attribute scene_xml or scene_dict): it was rendered from loaded "
                 "objects, or by an older release; render the scene itself"
             )
-        prefix = "scene."
+        prefix, kind = "scene.", f"scene_{kinds[0]}"
         parameters = {name[len(prefix) :]: value for name, value in attributes.items() if name.startswith(prefix)}
-        files = {
-            (file["plugin"], file["name"]): (file["path"], file["sha256"])
-            for file in (json_attribute(attributes, "scene_files") if "scene_files" in attributes else [])
-        }
-        text, instrument = attributes[f"scene_{kinds[0]}"], str(attributes.get("instrument", ""))
-        return cls(str(attributes["scene"]), text, kinds[0] == "xml", parameters, files, instrument)
+        texts = {kind: attributes[kind], **{f"{prefix}{name}": value for name, value in parameters.items()}}
+        for name, value in texts.items():
+            if not isinstance(value, str):
+                raise UserError(f"the attribute {name} = {shown(value)} of the result is damaged: it must be a text")
+        rows = json_attribute(attributes, "scene_files") if "scene_files" in attributes else []
+        try:
+            files = {(row["plugin"], row["name"]): (str(row["path"]), str(row["sha256"])) for row in rows}
+        except (KeyError, TypeError) as error:
+            raise UserError("the attribute scene_files of the result is damaged: it must be a list of files") from error
+        name, instrument = (str(attributes.get(key, "")) for key in ("scene", "instrument"))
+        return cls(name or "scene", attributes[kind], kinds[0] == "xml", parameters, files, instrument)
 
     def attributes(self) -> dict[str, str]:
         """Return the attributes of a result from which `from_attributes` returns this record."""
@@ -151,7 +157,12 @@ class SceneRecord:
                 found[key] = _unchanged(*self.files[file]) if is_file else nested
             return found
 
-        restored: dict[str, Any] = _from_json(placed(json.loads(self.text)))
+        try:
+            restored: dict[str, Any] = _from_json(placed(json.loads(self.text)))
+        except UserError:
+            raise
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, RuntimeError) as error:
+            raise UserError("the scene of the result is damaged: its text must be JSON of a scene") from error
         return restored
 
 
@@ -161,7 +172,7 @@ def json_attribute(attributes: Mapping[str, Any], name: str) -> Any:
         raise UserError(f"the result has no attribute {name}, without which it is not rendered again")
     try:
         return json.loads(attributes[name])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise UserError(f"the attribute {name} of the result is damaged: it must be a text of JSON") from error
 
 

@@ -33,6 +33,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format, text
 from mitransient_lidar.results.geometry import optional_number
+from mitransient_lidar.results.schema import check_attributes, check_coordinates
 
 _LOG = logging.getLogger(__name__)
 
@@ -307,9 +308,7 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
         If the file is missing, damaged, truncated, or not a result of this package, or its times are invalid.
     """
     path = Path(path)
-    if input_format(path) == "exr":
-        return _read_exr(path)
-    dataset = netcdf.read_netcdf(path)
+    dataset = _read_exr(path) if input_format(path) == "exr" else netcdf.read_netcdf(path)
     if "signal" in dataset and "waveform" not in dataset:
         raise UserError(f"{path} holds signals of a receiver; give the result that they were recorded from.")
     if any(name not in dataset for name in _VARIABLES):
@@ -319,7 +318,11 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
-    """Raise `UserError` if a variable has no times, pixels or bins, or times that are not finite or not increasing."""
+    """Raise `UserError` if a variable has no times, pixels or bins, or times that are not finite or not increasing.
+
+    The known attributes and coordinates of the dataset are checked, too.
+    """
+    check_attributes(place, dataset.attrs)
     dims = tuple(str(dim) for dim in dataset[name].dims)
     if "time" not in dims or "time" not in dataset.coords:
         raise UserError(f"{place} has no coordinate time: its {name} has the dimensions {', '.join(dims)}.")
@@ -334,6 +337,7 @@ def check_axes(place: object, dataset: xr.Dataset, name: str) -> None:
         raise UserError(
             f"{place} has the coordinate time = {times[index]:g}, {times[index + 1]:g} ns: it must increase strictly."
         )
+    check_coordinates(place, dataset, name)
 
 
 def _write_exr(dataset: xr.Dataset, path: Path, temporary: Path) -> None:

@@ -26,6 +26,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing, together
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format
+from mitransient_lidar.results.schema import check_attributes, check_coordinates
 
 _LOG = logging.getLogger(__name__)
 
@@ -57,6 +58,8 @@ def check_stack(dataset: xr.Dataset) -> xr.Dataset:
     for name, dims in needed.items():
         if name not in dataset.coords or set(dataset[name].dims) != dims:
             raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
+    check_attributes("the gate stack", dataset.attrs)
+    check_coordinates("the gate stack", dataset, "gate_energy")
     gates = dataset.drop_vars([name for name in _HISTOGRAM if name in dataset])
     unused = [name for name in gates.coords if name == "time" or "time" in gates[name].dims]
     return gates.drop_vars(unused).transpose(*pixels, "gate", ...)

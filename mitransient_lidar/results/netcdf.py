@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import Any
 
 import h5netcdf
@@ -15,8 +15,10 @@ import xarray as xr
 from xarray.backends import H5NetCDFStore
 
 from mitransient_lidar.core.array_files import check_size, damaged_file, largest_result
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results.formats import attribute
 
+_CHECKSUM = b"mitransient-lidar sha256 "  # what the SHA-256 of a file follows at its end
 _LISTS = "mitransient_lidar_lists"  # NetCDF attribute with the names of the attributes to read back as lists
 
 
@@ -51,7 +53,32 @@ def dump(dataset: xr.Dataset, path: str | os.PathLike[str], encoding: Mapping[st
     buffer = io.BytesIO()
     with h5netcdf.File(buffer, "w") as file:
         dataset.dump_to_store(H5NetCDFStore(file), encoding=encoding)
-    Path(path).write_bytes(buffer.getbuffer())
+    with open(path, "wb") as output:
+        output.write(buffer.getbuffer())
+        output.write(_CHECKSUM + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+
+
+def check_sum(path: str | os.PathLike[str]) -> None:
+    """Raise `UserError` if a file ends in another checksum than its own; HDF5 may hang in damaged files for ever.
+
+    `dump` writes it behind the end of the HDF5 data, where other programs do not look, and cut it off when they change
+    the file.
+    """
+    length = len(_CHECKSUM) + 2 * hashlib.sha256().digest_size
+    with open(path, "rb") as file:
+        if (size := file.seek(0, os.SEEK_END) - length) <= 0:
+            return
+        file.seek(size)
+        known = file.read()
+        if _CHECKSUM not in known:
+            return
+        file.seek(0)
+        found = hashlib.sha256()
+        while size and (block := file.read(min(size, 2**20))):
+            found.update(block)
+            size -= len(block)
+    if known != _CHECKSUM + found.hexdigest().encode():
+        raise UserError(f"{path} is damaged or truncated: its SHA-256 is another one than when it was written.")
 
 
 def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -62,6 +89,7 @@ def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
     UserError
         If the file is damaged, truncated, or larger than half of the memory.
     """
+    check_sum(path)
     with (
         damaged_file(f"{path} is damaged or truncated: its NetCDF data cannot be read."),
         xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,

@@ -1,0 +1,138 @@
+"""Kinds and ranges of the attributes and arrays of results, checked where a result is read or used."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
+
+_POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
+
+#: Lowest and highest value of attributes that are numbers; NaN is unknown.
+_NUMBERS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("bin_width_ns", "aperture_area", "divergence_mrad", "divergence_across_mrad"), _POSITIVE),
+    **dict.fromkeys(("field_of_view_mrad", "pulse_energy_mj", "wavelength_nm", "gate_step_ns"), _POSITIVE),
+    **dict.fromkeys(("pulse_fwhm_ns", "response_time_ns", "obscuration", "two_way_efficiency"), _NOT_NEGATIVE),
+    **dict.fromkeys(("surface_slope_variance", "gate_rise_ns", "gate_fall_ns", "max_memory_gb"), _NOT_NEGATIVE),
+    **dict.fromkeys(("passes", "pulses", "shots", "elapsed_s", "pass_share"), _NOT_NEGATIVE),
+    **dict.fromkeys(("time_start_ns", "altitude", "surface_time_ns", "window_start_ns", "window_end_ns"), _ANY),
+    **dict.fromkeys(("off_nadir_deg", "ellipse_deg"), (-360.0, 360.0)),
+    **dict.fromkeys(("refractive_index", "group_index"), _INDEX),
+    **dict.fromkeys(("gain", "optical_density", "noise_bandwidth_hz", "background_power_w"), _NOT_NEGATIVE),
+}
+
+#: Number of values of attributes that are lists of finite numbers, None for any.
+_LISTS: dict[str, int | None] = {
+    "transmitter_pose": 12,
+    "receiver_pose": 12,
+    "bottom_point": 3,
+    "field_of_view_sides_mrad": 2,
+    "surface_heights_m": 2,
+    "slope_deviation": 2,
+    "error_inflation_bins": None,
+    "error_inflation": None,
+}
+
+_TEXTS = ("scene", "beam_profile", "field_of_view_shape", "layout", "variant", "integrator", "instrument")
+
+#: Attributes that are texts of JSON: lists of outlines, each a list of lines x, y, x, y, ...; or with a name.
+_OUTLINES, _LISTED = ("pixel_outlines",), {"beam_outlines": ("share", "lines"), "target_outlines": ("id", "z", "line")}
+
+#: Coordinates that hold finite numbers, or NaN where they are unknown.
+_COORDINATES = (
+    *("angle_x", "angle_y", "sight_x", "sight_y", "off_nadir", "surface_time", "surface_spread", "depth_per_ns"),
+    *("beam_share", "gate_start", "gate_width", "gate_depth", "aim_x", "aim_y", "shot"),
+    *("true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth"),
+)
+
+
+def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
+    """Raise `UserError` if a known attribute of a result is of another kind than a render writes, or out of range."""
+    for name, (low, high) in _NUMBERS.items():
+        value = attributes.get(name, low)
+        if not _is_number(value) or value < low or value > high:
+            raise _refusal(place, name, value, f"a number between {low:g} and {high:g}")
+    for name, length in _LISTS.items():
+        value = attributes.get(name, ())
+        if name in attributes and not (_are_numbers(value) and length in (None, np.size(value))):
+            raise _refusal(place, name, value, f"{length or 'one or more'} finite numbers")
+    pairs = [np.size(attributes[name]) for name in ("error_inflation_bins", "error_inflation") if name in attributes]
+    if len(set(pairs)) > 1:
+        raise _refusal(place, "error_inflation", attributes["error_inflation"], f"{pairs[0]} numbers")
+    for name in _TEXTS:
+        if not isinstance(attributes.get(name, ""), str):
+            raise _refusal(place, name, attributes[name], "a text")
+    for name in (*_OUTLINES, *_LISTED):
+        if name in attributes and not _are_outlines(attributes[name], _LISTED.get(name)):
+            raise _refusal(place, name, attributes[name], "a text of JSON with outlines")
+
+
+def check_coordinates(place: object, dataset: xr.Dataset, name: str) -> None:
+    """Raise `UserError` if a known coordinate or a variable of a result does not hold numbers over its dimensions."""
+    dims = set(dataset[name].dims)
+    for one in (*_COORDINATES, name, f"{name}_stderr"):
+        if one not in dataset.variables:
+            continue
+        values = dataset[one]
+        if values.dtype.kind not in "fiu":
+            kind = "texts" if values.dtype.kind in "USO" else f"values of type {values.dtype}"
+            raise UserError(f"{place} has {one} with {kind}: it must hold numbers.")
+        if one in _COORDINATES and np.isinf(values.values).any():
+            raise UserError(f"{place} has {one} = {values.values[np.isinf(values.values)][0]}: it must be finite.")
+        if one == f"{name}_stderr" and values.dims != dataset[name].dims:
+            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), unlike {name}.")
+        if one in ("angle_x", "angle_y") and not set(values.dims) <= dims:
+            raise UserError(f"{place} has {one} over ({', '.join(map(str, values.dims))}), not over its pixels.")
+    if ("angle_x" in dataset.coords) != ("angle_y" in dataset.coords):
+        raise UserError(f"{place} has one of the coordinates angle_x and angle_y: it must have both.")
+
+
+def _refusal(place: object, name: str, value: object, allowed: str) -> UserError:
+    return UserError(f"{place} has the attribute {name} = {shown(value)}: it must be {allowed}.")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+
+
+def _are_numbers(value: Any) -> bool:
+    """Return whether a value is a list of finite numbers."""
+    listed = isinstance(value, (list, tuple, np.ndarray)) and len(value) > 0
+    return listed and all(_is_number(one) and math.isfinite(one) for one in value)
+
+
+def _are_outlines(text: object, keys: tuple[str, ...] | None) -> bool:
+    """Return whether a text is JSON of lists of lines, or of objects with these keys, whose lists hold numbers."""
+    try:
+        listed = json.loads(text) if isinstance(text, str) else None
+    except (ValueError, RecursionError):
+        return False
+    if not isinstance(listed, list):
+        return False
+    if keys is None:
+        return all(isinstance(one, list) and all(_is_line(line) for line in one) for one in listed)
+    return all(isinstance(one, dict) and set(keys) <= one.keys() and _has_lines(one) for one in listed)
+
+
+def _has_lines(described: Mapping[str, Any]) -> bool:
+    """Return whether the parts of an outline are a text, a number, numbers, a line or lines."""
+    kinds: dict[str, Callable[[Any], bool]] = {
+        "id": lambda value: isinstance(value, str),
+        "share": _is_number,
+        "z": lambda value: _are_numbers(value) and len(value) == 2,
+        "line": _is_line,
+        "lines": lambda value: isinstance(value, list) and all(map(_is_line, value)),
+    }
+    return all(kinds[key](value) for key, value in described.items() if key in kinds)
+
+
+def _is_line(value: object) -> bool:
+    """Return whether a value is a list of points x, y, x, y, ..."""
+    return isinstance(value, list) and len(value) % 2 == 0 and (not value or _are_numbers(value))

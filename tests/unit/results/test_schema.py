@@ -1,0 +1,117 @@
+"""Kinds and ranges of the attributes and arrays of results, and checksums of their files."""
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+GOOD = {
+    "altitude": 200.0,
+    "off_nadir_deg": 20,
+    "refractive_index": 1.34,
+    "error_median": float("nan"),
+    "receiver_pose": [0.0] * 12,
+    "error_inflation_bins": [1, 2],
+    "error_inflation": [1.0, 1.5],
+    "pixel_outlines": "[[[0, 1, 2, 3]], []]",
+    "beam_outlines": '[{"share": 0.6, "lines": [[0, 1], []]}]',
+    "target_outlines": '[{"id": "mine", "z": [-4, -3], "line": [0, 1]}]',
+}
+
+
+@pytest.fixture
+def dataset():
+    values = np.ones((2, 5))
+    return results.build(
+        values,
+        values,
+        values,
+        values,
+        time=TimeAxis(1400.0, 0.5, 5),
+        pixel_names=["a", "b"],
+        pixel_centres_mrad=[(1, 0), (-1, 0)],
+        attributes=GOOD,
+    )
+
+
+def refusal(tmp_path, dataset):
+    """Return the sentence of a file that is written by another program, and of the dataset itself."""
+    path = tmp_path / "a.nc"
+    dataset.to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(UserError) as caught:
+        results.open(path)
+    with pytest.raises(UserError) as direct:
+        results.record_dims(dataset, "waveform")
+    assert str(caught.value) == str(direct.value).replace("the dataset", str(path))
+    return str(direct.value)
+
+
+def test_what_a_render_writes_is_read(tmp_path, dataset):
+    results.save(dataset, tmp_path / "a.nc")
+    assert results.open(tmp_path / "a.nc").identical(dataset)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("altitude", "high", "a number between -1e+30 and 1e+30"),
+        ("altitude", [1.0, 2.0], "a number between"),
+        ("bin_width_ns", 0.0, "a number between 1e-30 and 1e+30"),
+        ("refractive_index", -1.34, "a number between 1 and 10"),
+        ("off_nadir_deg", np.inf, "a number between -360 and 360"),
+        ("receiver_pose", [1.0] * 11, "12 finite numbers"),
+        ("receiver_pose", 3.0, "12 finite numbers"),
+        ("transmitter_pose", [np.nan] * 12, "12 finite numbers"),
+        ("error_inflation", [1.0, 2.0, 3.0], "2 numbers"),
+        ("scene", 3, "a text"),
+        ("pixel_outlines", "[[[0, 1, 2]]]", "a text of JSON with outlines"),
+        ("pixel_outlines", "[" * 5000, "a text of JSON with outlines"),
+        ("pixel_outlines", 3.0, "a text of JSON with outlines"),
+        ("beam_outlines", '[{"lines": []}]', "a text of JSON with outlines"),
+        ("target_outlines", '[{"id": 3, "z": [0, 1], "line": []}]', "a text of JSON with outlines"),
+    ],
+)
+def test_attributes_of_another_kind_are_refused(tmp_path, dataset, name, value, allowed):
+    dataset.attrs[name] = value
+    told = refusal(tmp_path, dataset)
+    assert f"the attribute {name} = " in told
+    assert told.endswith(f"it must be {allowed}.") or (allowed.endswith("between") and allowed in told)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: one.assign_coords(angle_x=("pixel", ["x", "y"])), "has angle_x with texts: it must hold numbers"),
+        (lambda one: one.assign_coords(angle_y=("pixel", [np.inf, 0])), "has angle_y = inf: it must be finite"),
+        (lambda one: one.assign_coords(angle_x=("other", [0.0, 1])), "has angle_x over (other), not over its pixels"),
+        (lambda one: one.drop_vars("angle_y"), "has one of the coordinates angle_x and angle_y"),
+        (lambda one: one.assign(waveform=one["waveform"].astype(str)), "has waveform with texts"),
+        (lambda one: one.assign(waveform_stderr=one["waveform_stderr"][:, 0]), "has waveform_stderr over (pixel)"),
+    ],
+)
+def test_arrays_of_another_kind_are_refused(tmp_path, dataset, change, message):
+    assert message in refusal(tmp_path, change(dataset))
+
+
+def test_a_damaged_file_is_refused_before_hdf5_reads_it(tmp_path, dataset):
+    """A few bytes within its heaps can make HDF5 read for ever; and others change numbers without a word."""
+    path = tmp_path / "a.nc"
+    results.save(dataset, path)
+    whole = path.read_bytes()
+    for place in (100, len(whole) // 2, len(whole) - 100):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        with pytest.raises(UserError, match=r"a\.nc is damaged or truncated: its SHA-256 is another one"):
+            results.open(path)
+
+
+def test_files_that_other_programs_have_changed_are_read(tmp_path, dataset):
+    path = tmp_path / "a.nc"
+    results.save(dataset, path)
+    assert xr.load_dataset(path, engine="h5netcdf", decode_times=False).sizes == dataset.sizes
+    with h5py.File(path, "r+") as file:
+        file.attrs["notes"] = "changed"
+    assert results.open(path).attrs["notes"] == "changed"
