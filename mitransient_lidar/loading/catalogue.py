@@ -12,11 +12,10 @@ import os
 import re
 import shutil
 from pathlib import Path
-from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.loading.includes import flat_text, parse_scene
+from mitransient_lidar.loading.document import read_document
 
 _COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
 
@@ -50,9 +49,9 @@ def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
 def scene_text(name: str | os.PathLike[str]) -> str:
     """Return the self-contained XML text of a scene, with included files in place.
 
-    Name as in `scene_path`; format and further errors as in `loading.includes.flat_text`.
+    Name as in `scene_path`; format and further errors as in `loading.document`.
     """
-    return flat_text(scene_path(name))
+    return read_document(scene_path(name)).text
 
 
 def scene_summary(name: str | os.PathLike[str]) -> str:
@@ -67,16 +66,7 @@ def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:
 
     Name and errors as in `scene_text`.
     """
-    path = scene_path(name)
-    return parameters_of(parse_scene(flat_text(path), path))
-
-
-def parameters_of(root: minidom.Element) -> dict[str, str]:
-    """Return names and default values of the parameters of an XML scene without includes, in their order."""
-    parameters: dict[str, str] = {}
-    for tag in root.getElementsByTagName("default"):
-        parameters.setdefault(tag.getAttribute("name"), tag.getAttribute("value"))
-    return parameters
+    return dict(read_document(scene_path(name)).parameters)
 
 
 def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str] = ".") -> Path:
@@ -95,7 +85,7 @@ def copy_scene(name: str | os.PathLike[str], destination: str | os.PathLike[str]
         If there is no such scene, a file exists already, or one cannot be read or written.
     """
     source = scene_path(name)
-    text = flat_text(source)
+    text = read_document(source).text
     destination = Path(destination)
     target = destination / source.name if destination.is_dir() else destination
     neighbours = (file for file in source.parent.iterdir() if file.is_file() and file != source)

@@ -1,10 +1,7 @@
-"""Checks of the values of a scene before Mitsuba reads it, and of the parameters that its plugins have."""
+"""Checks of the values of a scene before Mitsuba reads it."""
 
 from __future__ import annotations
 
-import difflib
-import functools
-import importlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,15 +14,10 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import limits
 from mitransient_lidar.core.validation import finite, in_range, integer, is_number, shown
+from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, Setting
 
 #: Largest coordinate [m] and scale of a transform: 32-bit coordinates are accurate to 6 cm there.
 LARGEST_COORDINATE = 1e6
-
-#: Deepest nesting of the objects of a scene; Mitsuba's parser is recursive.
-DEEPEST_NESTING = 64
-
-#: Most characters of an attribute with the values of parameters in place.
-_LONGEST_TEXT = 10**6
 
 #: Name of a plugin, and endings of the libraries of plugins.
 _TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
@@ -48,70 +40,46 @@ _NUMBERS = {
 _SHARE = re.compile(r"(^|_)(reflectance|transmittance)$")
 
 
-def check_depth(root: minidom.Element) -> None:
-    """Raise `UserError` if elements are nested more deeply than `DEEPEST_NESTING`."""
-    level, depth = [root], 0
-    while level:
-        depth += 1
-        if depth > DEEPEST_NESTING:
-            raise UserError(f"scene: its elements are nested more than {DEEPEST_NESTING} deep, which is the limit")
-        level = [child for node in level for child in node.childNodes if isinstance(child, minidom.Element)]
-
-
-def check_elements(root: minidom.Element, parameters: Mapping[str, str]) -> set[str]:
-    """Check the numbers of an XML scene without includes, with the values of its parameters in place.
-
-    Returns
-    -------
-    set of str
-        Names of the parameters that the scene uses.
+def check(document: SceneDocument) -> None:
+    """Check the types of the objects of an XML scene and its numbers, with the values of its parameters in place.
 
     Raises
     ------
     UserError
-        If a number is not finite or not a number, a share of light is not within 0 to 1, a size is not positive, or a
-        coordinate exceeds `LARGEST_COORDINATE`.
+        If a type is not the name of a plugin; a library of plugins lies where `check_libraries` forbids it, in the
+        scene's folder or in one that its ``<path>`` names; a number is not finite or not a number, a share of light is
+        not within 0 to 1, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
     """
-    used: set[str] = set()
-    for element in root.getElementsByTagName("*"):
-        if element.tagName == "default":
-            continue
-        if element.tagName == "sensor" and element.parentNode is root and not element.getElementsByTagName("film"):
+    folders = [document.folder]
+    for setting in document.settings:
+        if setting.attribute == "type":
+            check_type(setting.value)
+        elif setting.element.tagName == "path":
+            folders.append(document.folder / setting.value)
+    check_libraries(*folders)
+    for element in document.root.getElementsByTagName("sensor"):
+        if element.parentNode is document.root and not element.getElementsByTagName("film"):
             raise UserError(f"film: sensor {element.getAttribute('id')!r} has none; add a time_gated_film inside it")
-        for attribute, text in element.attributes.items():
-            value, referred = with_values(text, parameters)
-            used.update(referred)
-            owner = element.getAttribute("name") or element.tagName
-            own = owner if attribute == "value" else f"{owner} {attribute}"
-            label = _Label(referred[0], parameters[referred[0]], text) if referred else _Label(own, text, text)
-            if attribute in _NUMBERS.get(element.tagName, ()):
-                _check_numbers(label, element.tagName, attribute, value)
-            elif element.tagName in ("spectrum", "rgb") and attribute == "value":
-                _check_spectrum(label, value)
-            if attribute == "value" and element.tagName in ("float", "integer", "string"):
-                for number in _numbers_in(value):
-                    _check_range(label.name, owner, number)
-            if attribute == "value" and _is_share(element):
-                for word in re.split(r"[\s,]+", value.strip()):
-                    in_range(label.name, word.rpartition(":")[2], 0, 1)
-    return used
+    for setting in document.settings:
+        _check_setting(setting, document.parameters)
 
 
-def check_types(root: minidom.Element, parameters: Mapping[str, str], folder: Path) -> None:
-    """Check the types of the objects of an XML scene without includes, with the values of its parameters in place.
-
-    Raises
-    ------
-    UserError
-        If a type is not the name of a plugin, or a library of plugins lies where `check_libraries` forbids it: in the
-        scene's folder, or in one that its ``<path>`` names.
-    """
-    elements = root.getElementsByTagName("*")
-    types = [each.getAttribute("type") for each in elements if each.hasAttribute("type")]
-    folders = [each.getAttribute("value") for each in elements if each.tagName == "path"]
-    for text in types:
-        check_type(with_values(text, parameters)[0])
-    check_libraries(folder, *(folder / with_values(text, parameters)[0] for text in folders))
+def _check_setting(setting: Setting, parameters: Mapping[str, str]) -> None:
+    """Check the numbers of an attribute of an element."""
+    element, attribute, value, owner = setting.element, setting.attribute, setting.value, setting.owner
+    own = owner if attribute == "value" else f"{owner} {attribute}"
+    first = setting.referred[:1]
+    label = _Label(first[0] if first else own, parameters[first[0]] if first else setting.template, setting.template)
+    if attribute in _NUMBERS.get(element.tagName, ()):
+        _check_numbers(label, element.tagName, attribute, value)
+    elif element.tagName in ("spectrum", "rgb") and attribute == "value":
+        _check_spectrum(label, value)
+    if attribute == "value" and element.tagName in ("float", "integer", "string"):
+        for number in _numbers_in(value):
+            _check_range(label.name, owner, number)
+    if attribute == "value" and _is_share(element):
+        for word in re.split(r"[\s,]+", value.strip()):
+            in_range(label.name, word.rpartition(":")[2], 0, 1)
 
 
 def check_type(plugin: object) -> None:
@@ -138,25 +106,8 @@ def check_libraries(*folders: Path) -> None:
                 raise UserError(f"{library} would run as a plugin of Mitsuba; remove it, or work in another folder")
 
 
-def with_values(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
-    """Return a text with parameters in place, the longest names first, and those that it refers to.
-
-    Raises
-    ------
-    UserError
-        If the text becomes longer than a million characters.
-    """
-    referred: list[str] = []
-    while "$" in text and (found := [name for name in parameters if f"${name}" in text and name not in referred]):
-        referred.append(max(found, key=len))
-        text = text.replace(f"${referred[-1]}", parameters[referred[-1]])
-        if len(text) > _LONGEST_TEXT:
-            raise UserError(f"{referred[0]} = {shown(parameters[referred[0]])} has more than a million characters")
-    return text, referred
-
-
 def check_dict(scene: Mapping[str, Any]) -> None:
-    """Check the values of a scene given as a dict; same rules and errors as `check_elements` and `check_types`."""
+    """Check the values of a scene given as a dict; same rules and errors as `check`."""
     check_libraries()
     pending: list[tuple[str, Mapping[str, Any], int]] = [("", scene, 1)]
     while pending:
@@ -184,54 +135,6 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                     _check_shares(label, value)
             elif hasattr(value, "matrix"):
                 _check_matrix(label, np.array(value.matrix, dtype=np.float64))
-
-
-def unknown_parameters(message: str) -> str | None:
-    """Return the sentence for Mitsuba's message about parameters that a plugin does not have, or about no plugin."""
-    if found := re.search(r'unreferenced propert\w+ in [\w ]+ of type "(\w+)":((?:\s+- \w+ "[^"]+"[^"]*)+)', message):
-        allowed = plugin_parameters(found[1])
-        names = re.findall(r'- \w+ "([^"]+)"', found[2])
-        close = [near for name in names for near in difflib.get_close_matches(name, allowed, n=1)]
-        hint = f"did you mean {' and '.join(close)}" if close else f"it has {', '.join(allowed)}"
-        return f"{found[1]}: there is no parameter {' or '.join(names)}" + (f"; {hint}" if allowed else "")
-    if found := re.search(r'Plugin "([^"]*)" not found', message):
-        close = difflib.get_close_matches(found[1], [*_plugin_modules(), *_OTHERS], n=2)
-        return f"type = {found[1]!r} is not a plugin" + (f"; did you mean {' or '.join(close)}" if close else "")
-    return None
-
-
-@functools.cache
-def plugin_parameters(plugin: str) -> list[str]:
-    """Return the names of the parameters in the manual page of one of our plugins, empty for other plugins."""
-    module = _plugin_modules().get(plugin)
-    if module is None:
-        return []
-    pages = [page.__doc__ or "" for page in vars(importlib.import_module(module)).values() if isinstance(page, type)]
-    names: list[str] = []
-    for page in pages:
-        rules = list(re.finditer(r"^ *(=+)  =[= ]+$", page, re.MULTILINE))
-        if f"``{plugin}``" in page and len(rules) >= 3:
-            start, width = rules[0].start(1) - page.rfind("\n", 0, rules[0].start(1)) - 1, len(rules[0][1])
-            rows = page[rules[1].end() : rules[2].start()].splitlines()
-            cells = ", ".join(row[start : start + width] for row in rows)
-            names += re.findall(r"(?<![\w(.])[a-z]\w*(?![\w).])", cells)
-    return list(dict.fromkeys(names))
-
-
-#: Plugins of Mitsuba that lidar scenes use.
-_OTHERS = ("rectangle", "sphere", "cylinder", "cube", "disk", "ply", "obj", "diffuse", "twosided", "dielectric", "hg")
-
-
-def is_own_plugin(plugin: str) -> bool:
-    """Return whether a plugin is one of ours."""
-    return plugin in _plugin_modules()
-
-
-def _plugin_modules() -> dict[str, str]:
-    """Return the modules of our plugins by the plugins' names."""
-    from mitransient_lidar.loading.variants import PLUGIN_MODULES
-
-    return {name.rpartition(".")[2]: f"mitransient_lidar.plugins.{name}" for name in PLUGIN_MODULES}
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,15 @@ import difflib
 import importlib.resources
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.dom import minidom
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.catalogue import parameters_of
-from mitransient_lidar.loading.checks import with_values
-from mitransient_lidar.loading.includes import expanded, flat_text, parse_scene, text_of
+from mitransient_lidar.loading.document import SceneDocument, parameters_of, parse_document, read_document, text_of
+from mitransient_lidar.loading.parameters import without_alternatives
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
 _RECORD = ("time_start_ns", "bin_count")
@@ -63,7 +62,7 @@ def instrument_names() -> list[str]:
 def read_instrument(name: str) -> Instrument:
     """Return an instrument by its name; raise UserError if there is none."""
     path = _path(name)
-    root = parse_scene(read_text(path), path)
+    root = _own_document(path).root
     title, _, description = _head(root).data.strip().partition("\n")
     parameters = tuple(_parameters(root))
     pixels = [tag for tag in root.getElementsByTagName("sensor") if tag.getAttribute("type") == "pixel_fov"]
@@ -84,30 +83,17 @@ def read_instrument(name: str) -> Instrument:
 
 def instrument_text(name: str) -> str:
     """Return the XML of an instrument, self-contained, to be included by a scene; raise UserError if there is none."""
-    path = _path(name)
-    root = parse_scene(flat_text(path), path)
-    _drop_unused(root)
-    return text_of(root)
+    document = read_document(_path(name))
+    _drop_unused(document.root)
+    return text_of(document.root)
 
 
-def mount(name: str, root: minidom.Element) -> dict[str, str]:
-    """Replace laser and receiver of an XML scene without includes by those of an instrument.
+def mount(name: str, scene: SceneDocument) -> SceneDocument:
+    """Replace laser and receiver of a scene by those of an instrument.
 
     The scene keeps its film, with the instrument's time bins, its integrator, the point at which the lidar aims, and
     its other emitters. Place of the record and resolution of the sea, which fit the scene's own lidar, return to their
     defaults, and parameters that nothing uses any longer are removed.
-
-    Parameters
-    ----------
-    name
-        Name of the instrument.
-    root
-        Root element of the scene, which is changed.
-
-    Returns
-    -------
-    dict of str to str
-        Values of the parameters that the instrument sets, in place of those of the scene.
 
     Raises
     ------
@@ -115,7 +101,12 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
         If there is no such instrument.
     """
     path = _path(name)
-    own, part = parse_scene(read_text(path), path), expanded(path)
+    own, part = _own_document(path).root, read_document(path).root
+    assert scene.root.ownerDocument is not None
+    copied = scene.root.ownerDocument.cloneNode(True)
+    assert isinstance(copied, minidom.Document)
+    root = copied.documentElement
+    assert root is not None
     shared = parameters_of(part)
     former = parameters_of(root)
     values = {record: shared[record] for record in _RECORD}
@@ -145,7 +136,13 @@ def mount(name: str, root: minidom.Element) -> dict[str, str]:
         if not (has_integrator and isinstance(child, minidom.Element) and child.tagName == "integrator"):
             root.appendChild(child)
     _drop_unused(root)
-    return values
+    known = {key: scene.parameters.get(key, value) for key, value in parameters_of(root).items()} | values
+    return replace(scene, root=root, parameters=without_alternatives(known, values), instrument=name, source=None)
+
+
+def _own_document(path: Path) -> SceneDocument:
+    """Return the document of an instrument's file without what it includes."""
+    return parse_document(path.stem, read_text(path))
 
 
 def _keep_film(film: minidom.Element, own: minidom.Element) -> None:
@@ -188,10 +185,7 @@ def _comment(element: minidom.Element) -> minidom.Comment | None:
 
 def _drop_unused(root: minidom.Element) -> None:
     """Remove the parameters of a scene that no element refers to, with the comments on their lines."""
-    parameters = parameters_of(root)
-    elements = [tag for tag in root.getElementsByTagName("*") if tag.tagName != "default"]
-    values = [value for tag in elements for _, value in tag.attributes.items()]
-    used = {name for value in values for name in with_values(value, parameters)[1]}
+    used = SceneDocument("", root, parameters=parameters_of(root)).used
     for default in root.getElementsByTagName("default"):
         if default.getAttribute("name") not in used:
             assert default.parentNode is not None

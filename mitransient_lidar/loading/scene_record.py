@@ -25,16 +25,16 @@ import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.dom import minidom
 
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.checks import is_own_plugin, plugin_parameters, with_values
+from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
+from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -74,18 +74,15 @@ class SceneRecord:
     instrument: str = ""
 
     @classmethod
-    def of_xml(
-        cls,
-        name: str,
-        text: str,
-        root: minidom.Element,
-        parameters: Mapping[str, str],
-        folder: Path,
-        instrument: str = "",
-    ) -> SceneRecord:
-        """Return the record of an XML scene, whose text and root have no includes, in a folder."""
-        references = ((plugin, value) for plugin, value, _, _ in _files_of_xml(root, parameters))
-        return cls(name, text, True, dict(parameters), _found(references, folder), instrument)
+    def of_document(cls, document: SceneDocument, former: SceneRecord | None = None) -> SceneRecord:
+        """Return the record of an XML scene, with the files of the record that it was read from.
+
+        Files that given parameters name are found as in any scene.
+        """
+        files = _found(((plugin, setting.value) for plugin, setting in _files_of(document)), document.folder)
+        if former is not None:
+            files |= {file: found for file, found in former.files.items() if file[1] not in document.given.values()}
+        return cls(document.name, document.text, True, dict(document.parameters), files, document.instrument)
 
     @classmethod
     def of_dict(cls, scene: Mapping[str, Any]) -> SceneRecord | None:
@@ -139,11 +136,26 @@ class SceneRecord:
             described["scene_files"] = json.dumps(rows)
         return described
 
-    def place_files(self, root: minidom.Element, parameters: Mapping[str, str]) -> None:
-        """Replace the names of recorded files in an XML scene by their paths; raise UserError if a file has changed."""
-        for plugin, value, element, attribute in _files_of_xml(root, parameters):
-            if (plugin, value) in self.files:
-                element.setAttribute(attribute, _unchanged(*self.files[plugin, value]))
+    def document(self) -> SceneDocument:
+        """Return the document of an XML scene, with the values of its parameters; raise UserError if it is damaged."""
+        document = parse_document(self.name, self.text)
+        parameters = {name: self.parameters.get(name, value) for name, value in document.parameters.items()}
+        return replace(document, parameters=parameters, instrument=self.instrument)
+
+    def place_files(self, document: SceneDocument) -> str:
+        """Return the XML of a scene without parameters, with the paths of its files.
+
+        Raises
+        ------
+        UserError
+            If a file is missing or has changed.
+        """
+        paths = {
+            id(setting): _unchanged(*self.files[plugin, setting.value])
+            for plugin, setting in _files_of(document)
+            if (plugin, setting.value) in self.files
+        }
+        return document.filled(lambda setting: paths.get(id(setting), setting.value))
 
     def scene_dict(self) -> dict[str, Any]:
         """Return the scene given as a dict, with paths of its files; raise UserError if a file has changed."""
@@ -274,19 +286,14 @@ def _from_json(value: Any) -> Any:
     return {key: _from_json(item) for key, item in value.items()}
 
 
-def _files_of_xml(
-    root: minidom.Element, parameters: Mapping[str, str]
-) -> Iterator[tuple[str, str, minidom.Element, str]]:
-    """Yield the plugin, the name of a file, and the element and its attribute that name it."""
-    for element in list(root.getElementsByTagName("*")):
-        attribute = "filename" if element.tagName == "spectrum" else "value"
-        named = element.tagName == "string" and element.getAttribute("name") in FILE_PARAMETERS
-        if not named and not (element.tagName == "spectrum" and element.hasAttribute("filename")):
-            continue
-        owner = element.parentNode
-        plugin = owner.getAttribute("type") if isinstance(owner, minidom.Element) else ""
-        plugin, value = (with_values(text, parameters)[0] for text in (plugin, element.getAttribute(attribute)))
-        yield plugin, value, element, attribute
+def _files_of(document: SceneDocument) -> Iterator[tuple[str, Setting]]:
+    """Yield the plugin and the attribute that names a file."""
+    types = {id(one.element): one.value for one in document.settings if one.attribute == "type"}
+    for setting in document.settings:
+        tag = setting.element.tagName
+        named = tag == "string" and setting.attribute == "value" and setting.owner in FILE_PARAMETERS
+        if named or (tag == "spectrum" and setting.attribute == "filename"):
+            yield types.get(id(setting.element.parentNode), ""), setting
 
 
 def _files_of_dict(scene: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

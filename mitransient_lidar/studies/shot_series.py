@@ -20,8 +20,8 @@ from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer, positive
+from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
-from mitransient_lidar.loading.scenes import check_params
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
 from mitransient_lidar.studies.sea_map import SeaMap

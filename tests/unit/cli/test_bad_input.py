@@ -14,7 +14,7 @@ from command_line import assert_refused, run
 import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading import catalogue, checks, scenes
+from mitransient_lidar.loading import catalogue, plugin_pages, scenes
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import Goal, run_passes
 from mitransient_lidar.rendering.passive import render_passive
@@ -480,6 +480,7 @@ def test_unknown_backend_of_matplotlib_does_not_matter(tmp_path):
 
 
 def test_parameters_of_plugins_are_those_of_their_manual_pages():
-    assert checks.plugin_parameters("time_gated_film")[:3] == ["time_start_ns", "bin_width_ns", "bin_count"]
-    assert {"aim_x", "aim_y", "divergence_fwhm_mrad", "pulse_file"} < set(checks.plugin_parameters("lidar_transmitter"))
-    assert checks.plugin_parameters("diffuse") == []
+    assert plugin_pages.plugin_parameters("time_gated_film")[:3] == ["time_start_ns", "bin_width_ns", "bin_count"]
+    names = plugin_pages.plugin_parameters("lidar_transmitter")
+    assert {"aim_x", "aim_y", "divergence_fwhm_mrad", "pulse_file"} < set(names)
+    assert plugin_pages.plugin_parameters("diffuse") == []

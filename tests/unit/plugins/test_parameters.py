@@ -7,7 +7,7 @@ import re
 import mitsuba as mi
 import pytest
 
-from mitransient_lidar.loading.checks import plugin_parameters
+from mitransient_lidar.loading.plugin_pages import plugin_parameters
 from mitransient_lidar.loading.scene_record import FILE_PARAMETERS, object_values, plugin_values
 from mitransient_lidar.loading.variants import PLUGIN_MODULES
 

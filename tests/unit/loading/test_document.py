@@ -5,7 +5,7 @@ import pytest
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue, scenes
-from mitransient_lidar.loading.includes import flat_text
+from mitransient_lidar.loading.document import read_document
 
 SCENE = """<?xml version="1.0" encoding="utf-8"?>
 <!-- A level sea -->
@@ -106,17 +106,17 @@ def scene(tmp_path):
     return path
 
 
-def test_flat_text(scene):
-    assert flat_text(scene) == FLAT
+def test_text_with_includes_in_place(scene):
+    assert read_document(scene).text == FLAT
     assert catalogue.scene_parameters(scene) == {"radius": "2", "depth": "3", "grey": "0.5", "power": "7", "gain": "1"}
 
 
 def test_text_without_includes_is_unchanged(scene):
     text = '<scene  version="3.0.0"><default name="a" value="1"/>\n\n\n<!-- b --></scene>'
     scene.write_text(text, "utf-8")
-    assert flat_text(scene) == text
+    assert read_document(scene).text == text
     scene.write_text(FLAT, "utf-8")
-    assert flat_text(scene) == FLAT
+    assert read_document(scene).text == FLAT
 
 
 def test_mitsuba_reads_the_same(scene):
@@ -124,7 +124,7 @@ def test_mitsuba_reads_the_same(scene):
     for given in ({}, {"radius": "5", "grey": "0.2"}):
         states = (
             mi.parser.parse_file(config, str(scene), **given),
-            mi.parser.parse_string(config, flat_text(scene), **given),
+            mi.parser.parse_string(config, read_document(scene).text, **given),
         )
         first, second = ([(node.type, str(node.props)) for node in state.nodes] for state in states)
         assert first == second
@@ -154,16 +154,16 @@ def test_value_that_refers_to_a_parameter_follows_it(scene):
     scene.with_name("part.xml").write_text(part, "utf-8")
     assert list(catalogue.scene_parameters(scene).items()) == [("a", "1"), ("b", "$a")]
     assert '<default name="a" value="1"/>  <!-- m -->\n    <default name="b" value="$a"/>  <!-- as a -->' in (
-        flat_text(scene)
+        read_document(scene).text
     )
     config = mi.parser.ParserConfig(mi.variant())
-    assert mi.parser.parse_string(config, flat_text(scene), a="9").nodes[1].props["radius"] == 9
+    assert mi.parser.parse_string(config, read_document(scene).text, a="9").nodes[1].props["radius"] == 9
 
 
 def test_part_beside_the_including_file_is_found(scene):
     """Mitsuba looks in the folder of the part first, then in those of the files that include it."""
     (scene.parent / "parts" / "point.xml").rename(scene.with_name("point.xml"))
-    assert flat_text(scene) == FLAT
+    assert read_document(scene).text == FLAT
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_part_beside_the_including_file_is_found(scene):
 )
 def test_wrong_includes(scene, part, text, sentence):
     (scene.parent / part).write_bytes(text if isinstance(text, bytes) else text.encode())
-    for use in (flat_text, catalogue.scene_parameters, catalogue.copy_scene, scenes.load_scene):
+    for use in (read_document, catalogue.scene_parameters, catalogue.copy_scene, scenes.load_scene):
         with pytest.raises(UserError, match=sentence):
             use(scene)
 
@@ -201,7 +201,7 @@ def test_includes_that_double_are_refused_at_once(tmp_path):
         part = f'<include filename="{number + 1}.xml"/>'
         (tmp_path / f"{number}.xml").write_text(f'<scene version="3.0.0">{part}{part}</scene>')
     (tmp_path / "27.xml").write_text('<scene version="3.0.0"/>')
-    for use in (flat_text, catalogue.scene_parameters, scenes.load_scene):
+    for use in (read_document, catalogue.scene_parameters, scenes.load_scene):
         with pytest.raises(UserError, match=r"scene .*0\.xml includes more than 256 files, which is the limit"):
             use(tmp_path / "0.xml")
 

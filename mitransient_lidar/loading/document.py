@@ -1,0 +1,300 @@
+"""Documents of XML scenes: a tree of elements without includes, its parameters, and the values of its attributes.
+
+A scene goes one way: a document is read from a file or a record, an instrument may be mounted (`instruments.mount`),
+its parameters are filled (`parameters.fill`), its values are checked (`checks.check`) and recorded (`scene_record`),
+and Mitsuba loads it (`scenes.load`). Each step takes the document of the step before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+from xml.dom import minidom
+from xml.parsers.expat import ExpatError
+from xml.sax.saxutils import quoteattr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.validation import shown
+
+#: Most files that a scene and its parts include.
+_MOST_FILES = 256
+
+#: Deepest nesting of the objects of a scene; Mitsuba's parser is recursive.
+DEEPEST_NESTING = 64
+
+#: Most characters of an attribute with the values of parameters in place.
+_LONGEST_TEXT = 10**6
+
+
+class Setting(NamedTuple):
+    """Attribute of an element: its text, the text with parameters in place, and the names of those parameters."""
+
+    element: minidom.Element
+    attribute: str
+    template: str
+    value: str
+    referred: tuple[str, ...]
+
+    @property
+    def owner(self) -> str:
+        """Name of the parameter of a plugin that the element sets, else its tag."""
+        return self.element.getAttribute("name") or self.element.tagName
+
+
+@dataclass(frozen=True)
+class SceneDocument:
+    """An XML scene without includes.
+
+    Attributes
+    ----------
+    name
+        Name of the scene.
+    root
+        Root element; it is not changed.
+    folder
+        Folder that names of files refer to.
+    parameters
+        Values of all parameters, as text.
+    given
+        Those that the user has given.
+    instrument
+        Name of the instrument whose laser and receiver the scene has; empty if they are its own.
+    source
+        Text of the file, if the document is as it was read.
+    """
+
+    name: str
+    root: minidom.Element
+    folder: Path = Path()
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    given: Mapping[str, str] = field(default_factory=dict)
+    instrument: str = ""
+    source: str | None = None
+
+    @cached_property
+    def text(self) -> str:
+        """Text of the scene; of a changed one or one with includes, indented XML with parameters before objects.
+
+        Each parameter has one ``<default>``: at the place of its last declaration, with the value of its first one,
+        which is the one that Mitsuba uses, and with the first comment on the line of any of them.
+        """
+        return text_of(self.root) if self.source is None else self.source
+
+    @cached_property
+    def settings(self) -> list[Setting]:
+        """Attributes of all elements but ``<default>``, with the values of parameters in place."""
+        found = []
+        for element in self.root.getElementsByTagName("*"):
+            if element.tagName != "default":
+                for attribute, template in element.attributes.items():
+                    value, referred = _resolved(template, self.parameters)
+                    found.append(Setting(element, attribute, template, value, tuple(referred)))
+        return found
+
+    @cached_property
+    def used(self) -> set[str]:
+        """Names of the parameters that an attribute refers to."""
+        return {name for setting in self.settings for name in setting.referred}
+
+    def filled(self, replaced: Callable[[Setting], str]) -> str:
+        """Return the XML of the scene without parameters and comments, with the attributes that a function returns.
+
+        Elements stay on their lines.
+        """
+        values: dict[int, list[str]] = {}
+        for setting in self.settings:
+            pair = f" {setting.attribute}={quoteattr(replaced(setting))}"
+            values.setdefault(id(setting.element), []).append(pair)
+
+        def written(node: minidom.Node) -> str:
+            if not isinstance(node, minidom.Element):
+                return "\n" * (node.nodeValue or "").count("\n")
+            if node.tagName == "default":
+                return ""
+            attributes, content = "".join(values.get(id(node), ())), "".join(map(written, node.childNodes))
+            return f"<{node.tagName}{attributes}>{content}</{node.tagName}>"
+
+        # The root's own attributes have no parameters.
+        version = "".join(f" {name}={quoteattr(value)}" for name, value in self.root.attributes.items())
+        content = "".join(map(written, self.root.childNodes))
+        return f"<{self.root.tagName}{version}>{content}</{self.root.tagName}>"
+
+
+@dataclass
+class _Default:
+    """The ``<default>`` of a parameter with the comments above it ("" for a blank line) and on its line."""
+
+    element: minidom.Element
+    above: list[str]
+    same_line: str = ""
+
+
+def read_document(path: Path) -> SceneDocument:
+    """Read a scene file with all included files in place.
+
+    Names of included files are relative to the file that names them and contain no parameters.
+
+    Raises
+    ------
+    UserError
+        If a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than 256.
+    """
+    text = read_text(path)
+    if "<include" in text:
+        text = text_of(_expanded(path))
+    return parse_document(path.stem, text, path)
+
+
+def parse_document(name: str, text: str, path: Path | None = None) -> SceneDocument:
+    """Return the document of a text without includes; raise UserError if it is malformed or nested too deeply."""
+    root = _parsed(text, path or name)
+    return SceneDocument(name, root, path.parent if path else Path(), parameters_of(root), source=text)
+
+
+def parameters_of(root: minidom.Element) -> dict[str, str]:
+    """Return names and default values of the parameters of an XML scene without includes, in their order."""
+    parameters: dict[str, str] = {}
+    for tag in root.getElementsByTagName("default"):
+        parameters.setdefault(tag.getAttribute("name"), tag.getAttribute("value"))
+    return parameters
+
+
+def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]:
+    """Return a text with parameters in place, the longest names first, and those that it refers to.
+
+    Raises
+    ------
+    UserError
+        If the text becomes longer than a million characters.
+    """
+    referred: list[str] = []
+    while "$" in text and (found := [name for name in parameters if f"${name}" in text and name not in referred]):
+        referred.append(max(found, key=len))
+        text = text.replace(f"${referred[-1]}", parameters[referred[-1]])
+        if len(text) > _LONGEST_TEXT:
+            raise UserError(f"{referred[0]} = {shown(parameters[referred[0]])} has more than a million characters")
+    return text, referred
+
+
+def _parsed(text: str, place: Path | str) -> minidom.Element:
+    """Return the root element of a scene's text."""
+    try:
+        root = minidom.parseString(text).documentElement
+    except ExpatError as error:
+        raise UserError(f"scene {place} is not well-formed XML: {error}.") from error
+    assert root is not None
+    level, depth = [root], 0
+    while level:
+        depth += 1
+        if depth > DEEPEST_NESTING:
+            raise UserError(f"scene: its elements are nested more than {DEEPEST_NESTING} deep, which is the limit")
+        level = [child for node in level for child in node.childNodes if isinstance(child, minidom.Element)]
+    return root
+
+
+def text_of(root: minidom.Element) -> str:
+    """Return the text of a scene without includes in the format of `SceneDocument.text`."""
+    assert root.parentNode is not None
+    head = [node.toxml() for node in root.parentNode.childNodes if isinstance(node, minidom.Comment)]
+    defaults: list[_Default] = []
+    objects = _content(root, defaults)
+    parameters: list[str] = []
+    for default in _unique(defaults):
+        parameters += [*default.above, _element(default.element)[0] + default.same_line]
+    if objects[:1] != [""]:
+        objects.insert(0, "")
+    return "\n".join([*head, *_element(root, [*parameters, *objects, ""]), ""])
+
+
+def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | None = None) -> minidom.Element:
+    """Return the root element of a scene file, with includes replaced by what Mitsuba takes from them.
+
+    `count` holds the number of files that are included so far.
+    """
+    root = _parsed(read_text(path), path)
+    count = [0] if count is None else count
+    files = (path.resolve(), *includers)
+    for include in root.getElementsByTagName("include"):
+        name = include.getAttribute("filename")
+        part = next((found for file in files if (found := file.parent / name).is_file()), None)
+        if part is None:
+            raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
+        if part.resolve() in files:
+            raise UserError(f"scene {path} includes {name!r}, which includes it in turn.")
+        count[0] += 1
+        if count[0] > _MOST_FILES:
+            raise UserError(f"scene {files[-1]} includes more than {_MOST_FILES} files, which is the limit.")
+        included = _expanded(part, files, count)
+        content = list(included.childNodes)
+        if included.tagName != "scene":
+            included.removeAttribute("version")
+            if include.hasAttribute("name"):
+                included.setAttribute("name", include.getAttribute("name"))
+            content = [included]
+        parent = include.parentNode
+        assert isinstance(parent, minidom.Element)
+        for node in content:
+            parent.insertBefore(node, include)
+        parent.removeChild(include)
+    return root
+
+
+def _content(parent: minidom.Element, defaults: list[_Default]) -> list[str]:
+    """Return the lines within an element, "" for a blank one, and append its parameters to ``defaults`` instead."""
+    lines: list[str] = []
+    above: list[str] = []
+    latest: _Default | None = None
+    line_breaks = 0
+    for node in parent.childNodes:
+        if not isinstance(node, (minidom.Comment, minidom.Element)):
+            line_breaks += (node.nodeValue or "").count("\n")
+            continue
+        if line_breaks > 1:
+            above.append("")
+        if isinstance(node, minidom.Comment) and line_breaks == 0 and not above and (latest or lines):
+            if latest:
+                latest.same_line += f"  {node.toxml()}"
+            else:
+                lines[-1] += f"  {node.toxml()}"
+        elif isinstance(node, minidom.Comment):
+            above.append(node.toxml())
+        else:
+            latest = None
+            if node.tagName == "default":
+                latest = _Default(node, above)
+                defaults.append(latest)
+            else:
+                lines += [*above, *_element(node, _content(node, defaults))]
+            above = []
+        line_breaks = 0
+    return lines + above
+
+
+def _unique(defaults: list[_Default]) -> list[_Default]:
+    """Return one default per parameter; see `SceneDocument.text` for its place, value and comment."""
+    # A value that refers to another parameter must stay behind the first declaration of that one.
+    in_order = any("$" in item.element.getAttribute("value") for item in defaults)
+    declarations: dict[str, list[_Default]] = {}
+    for item in defaults:
+        name = item.element.getAttribute("name")
+        earlier = declarations.get(name, []) if in_order else declarations.pop(name, [])
+        declarations[name] = [*earlier, item]
+    kept = []
+    for same in declarations.values():
+        first, last = same[0], same[-1]
+        same_line = next((item.same_line for item in same if item.same_line), "")
+        above = first.above if first is last or in_order else [*last.above, *filter(None, first.above)]
+        kept.append(_Default(first.element, above, same_line))
+    return kept
+
+
+def _element(element: minidom.Element, content: Sequence[str] = ()) -> list[str]:
+    """Return the lines of an element with its content indented."""
+    start = f"<{element.tagName}" + "".join(f" {name}={quoteattr(value)}" for name, value in element.attributes.items())
+    if not content:
+        return [f"{start}/>"]
+    return [f"{start}>", *(line and f"    {line}" for line in content), f"</{element.tagName}>"]
