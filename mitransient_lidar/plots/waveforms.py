@@ -125,7 +125,10 @@ class _Curves(NamedTuple):
 def _curves(dataset: xr.Dataset) -> _Curves:
     """Return the curves of a result, or the means of the shots of a series with the band that holds 90 % of them."""
     recorded = "signal" in dataset
-    values = dataset["signal" if recorded else "waveform"]
+    name = "signal" if recorded else "waveform"
+    values = dataset[name]
+    if {*values.dims} - {"shot"} not in ({"pixel", "time"}, {"row", "column", "time"}):
+        raise UserError(f"{name} has the dimensions {values.dims}: it must be over (pixel, time) or (row, column, time)")
     error = dataset["signal_deviation" if recorded else "waveform_stderr"]
     if "pixel" not in values.dims:
         # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.
