@@ -128,7 +128,8 @@ def _curves(dataset: xr.Dataset) -> _Curves:
     name = "signal" if recorded else "waveform"
     values = dataset[name]
     if {*values.dims} - {"shot"} not in ({"pixel", "time"}, {"row", "column", "time"}):
-        raise UserError(f"{name} has the dimensions {values.dims}: it must be over (pixel, time) or (row, column, time)")
+        allowed = "(pixel, time) or (row, column, time)"
+        raise UserError(f"{name} has the dimensions {values.dims}: it must be over {allowed}")
     error = dataset["signal_deviation" if recorded else "waveform_stderr"]
     if "pixel" not in values.dims:
         # Pixels share photons: their errors do not add up in quadrature, and the error of the sum is unknown.

@@ -3,11 +3,13 @@
 import subprocess
 import sys
 
+import mitsuba as mi
 import pytest
 
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.rendering.session import choose_integrator
 
@@ -29,6 +31,33 @@ def test_types_that_are_paths_are_refused(tmp_path, value):
         load_scene(written)
     with pytest.raises(UserError, match="must be the name of a plugin"):
         load_scene({"sea": {"type": "ocean_surface", "interior": {"type": value}}})
+
+
+def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
+    """Mitsuba looks for files, and for libraries of plugins, in all folders that it knows."""
+    before = [str(path) for path in mi.file_resolver()]
+    part = f'<path value="{tmp_path}"/><integrator type="lidar_merging"/>'
+    load_scene(scene_file(tmp_path, '<integrator type="lidar_merging"/>', part))
+    assert [str(path) for path in mi.file_resolver()] == before
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"scene_xml": 3}, "the attribute scene_xml = 3 of the result is damaged: it must be a text"),
+        ({"scene_xml": "<scene/>", "scene.depth": [1, 2]}, r"scene.depth = \[1, 2\] of the result is damaged"),
+        ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
+        ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
+        ({"scene_xml": "<scene>"}, "is not well-formed XML"),
+        ({"scene_dict": "[" * 10**5}, "its text must be JSON of a scene"),
+        ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
+        ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
+        ({}, "does not hold its scene"),
+    ],
+)
+def test_damaged_records_are_refused(attributes, message):
+    with pytest.raises(UserError, match=message):
+        load_scene(SceneRecord.from_attributes(attributes))
 
 
 def test_types_are_checked_with_parameters_in_place(tmp_path):

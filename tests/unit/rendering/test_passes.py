@@ -81,6 +81,10 @@ def test_empty_passes_end_with_an_error(monkeypatch, goal, ended):
     assert clock.passes == ended
 
 
+def test_numbers_as_texts_are_numbers():
+    assert Goal.from_options("0.1", "5", None, Goal()) == Goal(0.1, 5.0)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

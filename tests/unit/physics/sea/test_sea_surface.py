@@ -51,6 +51,13 @@ def test_facets_have_the_slope_variance_of_the_waves_that_they_hold(wind, shorte
     assert np.all((lost[0] > lost[1]) & (lost[0] - lost[1] < (2 * np.pi / 12) ** 2 / 12 / 2))
 
 
+@pytest.mark.parametrize("wind", [1e-300, 1e-150, 1e-30, 0])
+def test_a_breath_of_wind_makes_no_waves(wind):
+    """The wavenumber of its peak overflows."""
+    sea = read(spectrum="elfouhaily", wind_speed=wind)
+    assert np.all(sea.heights(np.arange(5.0), np.arange(4.0)) == 0)
+
+
 def test_finer_cells_show_the_same_waves():
     """Points of both grids: the same heights, whether in one grid or, too fine for one, as a sum of waves."""
     spectrum = MatchedSpectrum(ElfouhailySpectrum(6.0), *cox_munk(6.0))
