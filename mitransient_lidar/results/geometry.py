@@ -317,7 +317,7 @@ def two_way_efficiency(attributes: Attributes, given: float | None = None) -> fl
     names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
     try:
         optics, atmosphere = (float(attributes[name]) for name in names)
-    except (KeyError, ValueError):
+    except (KeyError, TypeError, ValueError):
         raise UserError("efficiency must be given: the dataset has no attribute two_way_efficiency") from None
     return optics**2 * atmosphere
 

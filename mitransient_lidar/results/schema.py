@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import RANGES
 from mitransient_lidar.core.validation import shown
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
@@ -56,6 +57,7 @@ _COORDINATES = (
 def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
     """Raise `UserError` if a known attribute of a result is of another kind than a render writes, or out of range."""
     for name, (low, high) in _NUMBERS.items():
+        high = min(high, RANGES[name][1]) if name in RANGES else high
         value = attributes.get(name, low)
         if not _is_number(value) or value < low or value > high:
             raise _refusal(place, name, value, f"a number between {low:g} and {high:g}")

@@ -61,11 +61,15 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
             "outlines; slope_deviation does not"
         )
     if speed is None:
-        known = float(attributes.get("scene.wind_speed", 0)) if sea == ("elfouhaily", "cox_munk") else 0.0
+        known = (
+            finite("scene.wind_speed", attributes.get("scene.wind_speed", 0))
+            if sea == ("elfouhaily", "cox_munk")
+            else 0.0
+        )
         if not usable or not LEAST_WIND_SPEED <= known <= MAX_WIND_SPEED:
             return None
         speed = known
-    direction = float(attributes.get("scene.wind_direction_deg", 0)) if direction_deg is None else direction_deg
+    direction = attributes.get("scene.wind_direction_deg", 0) if direction_deg is None else direction_deg
     axis = np.asarray(attributes.get("receiver_pose", [0.0, 0, 0, 1, 0]), dtype=np.float64)[3:5]
     azimuth = math.atan2(axis[1], axis[0]) if np.hypot(*axis) > 1e-9 else 0.0
     return speed, math.radians(finite("wind_direction_deg", direction)) - azimuth

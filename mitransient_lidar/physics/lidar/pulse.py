@@ -21,6 +21,7 @@ logger = logging.getLogger(__name__)
 
 FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 _TAIL = 1e-10  # energy left out at each end of a kernel
+_MOST_BINS = 10**7  # of a kernel
 
 #: Lowest sample of a file relative to the largest one; what lies below 0 is noise.
 _LOWEST_SAMPLE = -0.1
@@ -148,6 +149,11 @@ class Pulse:
         weights : ndarray, shape (M,)
             weights[m] is the fraction of an echo in the centre of bin 0 that arrives in bin first_lag + m: exact
             integrals over the bins, truncated where less than 1e-10 lies outside, with the sum 1.
+
+        Raises
+        ------
+        UserError
+            If a number is out of range, or pulse and response have more than 10 million bins.
         """
         dt = positive("bin_width_ns", bin_width_ns)
         tau = non_negative("response_time_ns", response_time_ns)
@@ -156,6 +162,8 @@ class Pulse:
         else:
             start, end = self.times_ns[0], self.times_ns[-1]
         first, last = int(np.floor(start / dt - 0.5)), int(np.ceil((end + 30 * tau) / dt + 0.5))
+        if last - first > _MOST_BINS:
+            raise UserError(f"bin_width_ns = {dt:g} is too short for the pulse: it would have {last - first:.3g} bins")
         edges = (np.arange(first, last + 2, dtype=np.float64) - 0.5) * dt
         arrived = self.cumulative(edges) if tau == 0 else self._response(edges, tau)
         kept = np.flatnonzero((arrived[1:] > _TAIL) & (arrived[:-1] < 1 - _TAIL))
