@@ -58,9 +58,9 @@ def test_what_a_render_writes_is_read(tmp_path, dataset):
 @pytest.mark.parametrize(
     ("name", "value", "allowed"),
     [
-        ("altitude", "high", "a number between -1e+30 and 1e+30"),
+        ("altitude", "high", "a number between -1e+30 and 1e+06"),
         ("altitude", [1.0, 2.0], "a number between"),
-        ("bin_width_ns", 0.0, "a number between 1e-30 and 1e+30"),
+        ("bin_width_ns", 0.0, "a number between 1e-30 and 1e+06"),
         ("refractive_index", -1.34, "a number between 1 and 10"),
         ("off_nadir_deg", np.inf, "a number between -360 and 360"),
         ("receiver_pose", [1.0] * 11, "12 finite numbers"),
