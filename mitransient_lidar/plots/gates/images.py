@@ -165,7 +165,7 @@ def reached_by_surface(stack: xr.Dataset) -> npt.NDArray[np.bool_]:
         return np.zeros(stack.sizes["gate"], dtype=bool)
     if "surface_time" in stack.coords and "beam_share" in stack.coords:
         lit = stack["beam_share"].values >= _LIT * stack["beam_share"].values.max()
-        surface = max(surface, float(stack["surface_time"].values[lit].max()))
+        surface = max(surface, float(stack["surface_time"].values[lit].max(initial=surface)))
     # Waves and the width of the image lengthen the echo beyond the pulse.
     names = ("pulse_fwhm_ns", "response_time_ns", "gate_rise_ns")
     length = 1.5 * sum(optional_number(stack.attrs, name) or 0.0 for name in names)
