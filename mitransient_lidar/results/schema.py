@@ -41,6 +41,9 @@ _LISTS: dict[str, int | None] = {
     "error_inflation": None,
 }
 
+#: Those that are empty where there are none: views of hexagons and of separate pixels have no sides.
+_MAY_BE_EMPTY = ("field_of_view_sides_mrad", "error_inflation_bins", "error_inflation")
+
 _TEXTS = ("scene", "beam_profile", "field_of_view_shape", "layout", "variant", "integrator", "instrument")
 
 #: Attributes that are texts of JSON: lists of outlines, each a list of lines x, y, x, y, ...; or with a name.
@@ -63,6 +66,8 @@ def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
             raise _refusal(place, name, value, f"a number between {low:g} and {high:g}")
     for name, length in _LISTS.items():
         value = attributes.get(name, ())
+        if name in _MAY_BE_EMPTY and np.size(value) == 0:
+            continue
         if name in attributes and not (_are_numbers(value) and length in (None, np.size(value))):
             raise _refusal(place, name, value, f"{length or 'one or more'} finite numbers")
     pairs = [np.size(attributes[name]) for name in ("error_inflation_bins", "error_inflation") if name in attributes]

@@ -15,6 +15,7 @@ GOOD = {
     "refractive_index": 1.34,
     "error_median": float("nan"),
     "receiver_pose": [0.0] * 12,
+    "field_of_view_sides_mrad": [],
     "error_inflation_bins": [1, 2],
     "error_inflation": [1.0, 1.5],
     "pixel_outlines": "[[[0, 1, 2, 3]], []]",
