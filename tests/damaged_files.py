@@ -28,11 +28,12 @@ import tempfile
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from input_files import KINDS
 
 LIMIT_S = 30
 
@@ -59,18 +60,6 @@ _ODD_VALUES: tuple[Any, ...] = (
     *(np.nan, np.inf, -1.0, 0.0, 0, 1e300, -1e-300, 2**62, "", "x", "nan", "{", "[1", '{"a": 1}', "null"),
     *([], [1.0], [1.0, 2.0, 3.0], ["a", "b"], [np.nan, np.nan], "[" * 5000),
 )
-
-
-class Kind:
-    """A kind of file: `make` writes a good one, `damage` changes it, and `read` is what a user does with it."""
-
-    def __init__(
-        self,
-        make: Callable[[Path], Path],
-        read: Callable[[Path], object],
-        damage: Callable[[Path, random.Random], None] | None = None,
-    ) -> None:
-        self.make, self.read, self.damage = make, read, damage or damage_bytes
 
 
 def damage_bytes(path: Path, rng: random.Random) -> None:
@@ -156,305 +145,7 @@ def damage_attributes(path: Path, rng: random.Random) -> None:
     dataset.to_netcdf(path, engine="h5netcdf")
 
 
-def shot() -> Any:
-    """Return a small result, rendered once."""
-    import mitransient_lidar
-
-    params = {"layout": "2x2", "time_start_ns": 1400, "bin_count": 150, "spectrum": "flat"}
-    return mitransient_lidar.render("table1", params=params, passes=4)
-
-
-def series() -> Any:
-    """Return a small series of shots."""
-    import mitransient_lidar
-
-    return mitransient_lidar.render_shots("table1", params={"layout": "2x2"}, count=3, passes=2)
-
-
-def saved(dataset: Callable[[], Any], name: str) -> Callable[[Path], Path]:
-    """Return what writes a result."""
-
-    def make(folder: Path) -> Path:
-        from mitransient_lidar import results
-
-        results.save(dataset(), folder / name)
-        return folder / name
-
-    return make
-
-
-def written(name: str, text: str) -> Callable[[Path], Path]:
-    """Return what writes a text."""
-
-    def make(folder: Path) -> Path:
-        (folder / name).write_text(text)
-        return folder / name
-
-    return make
-
-
-def analyse(path: Path) -> None:
-    """Use a result as the commands waveforms, retrieve and plot do."""
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis.retrieval.retrieve import retrieve
-    from mitransient_lidar.analysis.waveforms import records
-    from mitransient_lidar.analysis.waveforms.echo_table import extract
-    from mitransient_lidar.plots.waveforms import plot_waveforms
-
-    _each(
-        lambda: extract(records.open_waveforms(path), ["gaussian", "leading_edge"]),
-        lambda: retrieve(results.open(path)),
-        lambda: plot_waveforms(results.open(path)),
-    )
-
-
-def use_again(path: Path) -> None:
-    """Use a result as a scene, and cut gates and a record of a receiver from it."""
-    from mitransient_lidar import results
-    from mitransient_lidar.analysis.gates.cut import cut_gates
-    from mitransient_lidar.analysis.receiver import detect_waveforms
-    from mitransient_lidar.physics.lidar.gate_train import GateTrain
-    from mitransient_lidar.rendering.again import describe_result, render_again
-
-    _each(
-        lambda: describe_result(path),
-        lambda: render_again(path, passes=2),
-        lambda: cut_gates(results.open(path), GateTrain(start_ns=1420.0, width_ns=10.0, step_ns=10.0, count=3)),
-        lambda: detect_waveforms(results.open(path), "apd"),
-    )
-
-
-def _each(*uses: Callable[[], object]) -> None:
-    """Call all; raise a refusal at the end."""
-    from mitransient_lidar.core.errors import UserError
-
-    refusal = None
-    for use in uses:
-        try:
-            use()
-        except UserError as error:
-            refusal = error
-    if refusal is not None:
-        raise refusal
-
-
-def scene(folder: Path) -> Path:
-    """Write a self-contained scene."""
-    from mitransient_lidar.loading.catalogue import copy_scene
-
-    return copy_scene("fig13_2x2", folder / "scene.xml")
-
-
-def load(path: Path) -> None:
-    """Load a scene, and plan the record of its lidar."""
-    from mitransient_lidar.rendering.session import open_scene
-    from mitransient_lidar.transport.scene import LidarScene
-
-    session = open_scene(path, None)
-    LidarScene.from_scene(session.scene, session.sensor)
-
-
-def gates(name: str) -> Callable[[Path], Path]:
-    """Return what writes a gate stack."""
-
-    def make(folder: Path) -> Path:
-        import mitransient_lidar
-        from mitransient_lidar.results.gate_files import save_stack
-
-        save_stack(mitransient_lidar.render("gated_waves", passes=2), folder / name)
-        return folder / name
-
-    return make
-
-
-def draw_gates(path: Path) -> None:
-    """Open and draw a gate stack."""
-    from mitransient_lidar.plots.gates.images import plot_gates
-    from mitransient_lidar.results.gate_files import open_stack
-
-    plot_gates(open_stack(path))
-
-
-_CAMPAIGN = """scene = "table1"
-target_error = 0.3
-keep = ["waveform", "truth"]
-receiver = "apd"
-gain = 2.0
-[fixed]
-layout = "2x2"
-bin_count = 160
-[parameters]
-bottom_depth = { low = 2.0, high = 20.0, scale = "log" }
-attenuation = [0.1, 0.2]
-scattering = "0.8 * attenuation * min(bottom_depth, 1) ** 2"
-[design]
-kind = "sobol"
-count = 16
-seed = 3
-"""
-
-
-def plan(path: Path) -> None:
-    """Read a campaign, and plan its runs."""
-    from mitransient_lidar.campaigns.design import Campaign
-    from mitransient_lidar.campaigns.runs import RunRenderer
-
-    campaign = Campaign.read(path)
-    RunRenderer.of(campaign, campaign.table())
-
-
-def table_of_runs(folder: Path) -> Path:
-    """Write the table of a campaign."""
-    (folder / "runs.csv").write_text("attenuation,bottom_depth,layout\n0.2,4.5,2x2\n0.3,5,1x1\n0.35,5.5,2x2\n")
-    return folder / "runs.csv"
-
-
-def plan_table(path: Path) -> None:
-    """Plan the runs of a table."""
-    from mitransient_lidar.campaigns.design import Campaign
-    from mitransient_lidar.campaigns.runs import RunRenderer
-
-    given = {"scene": "table1", "design": {"file": path.name}, "fixed": {"time_start_ns": 1400, "bin_count": 200}}
-    campaign = Campaign.of(given, path.parent)
-    RunRenderer.of(campaign, campaign.table())
-
-
-def store(folder: Path) -> Path:
-    """Render a small campaign."""
-    from mitransient_lidar.campaigns.sweep import sweep
-
-    fixed = {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160}
-    given = {
-        **{"scene": "table1", "target_error": 0.5, "keep": ["waveform", "echoes", "truth"], "fixed": fixed},
-        **{"parameters": {"bottom_depth": {"low": 2.0, "high": 9.0}}, "design": {"count": 6}},
-    }
-    sweep(given, folder / "store.zarr", workers=1, shard_size=3)
-    return folder / "store.zarr"
-
-
-def read_store(path: Path) -> None:
-    """Read everything that a store holds, as far as it is not damaged, and draw it."""
-    from mitransient_lidar.campaigns.store import Store, describe_campaign, open_campaign, reading
-    from mitransient_lidar.plots.campaigns import plot_campaign
-
-    def draw() -> None:
-        with reading(path):
-            plot_campaign(open_campaign(path))
-
-    _each(lambda: describe_campaign(path), draw, lambda: Store(path).renderer(), lambda: Store(path).mend())
-
-
-_HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
-
-
-def height_map(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a height map."""
-
-    def make(folder: Path) -> Path:
-        import OpenEXR
-        import xarray as xr
-
-        path = folder / f"map{suffix}"
-        positions = {"x": np.arange(20.0), "y": np.arange(24.0)}
-        if suffix == ".npy":
-            np.save(path, _HEIGHTS)
-        elif suffix == ".npz":
-            np.savez(path, heights=_HEIGHTS, **positions)
-        elif suffix == ".exr":
-            kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-            with OpenEXR.File(kind, {"Y": _HEIGHTS.astype(np.float32)}) as file:
-                file.write(str(path))
-        elif suffix == ".nc":
-            xr.Dataset({"height": (("y", "x"), _HEIGHTS)}, positions).to_netcdf(path, engine="h5netcdf")
-        else:
-            head = "ncols 20\nnrows 24\nxllcorner 0\nyllcorner 0\ncellsize 1\nnodata_value -9999\n"
-            path.write_text(head + "\n".join(" ".join(f"{one:.4f}" for one in row) for row in _HEIGHTS))
-        return path
-
-    return make
-
-
-def load_map(path: Path) -> None:
-    """Read a height map."""
-    from mitransient_lidar.physics.sea.height_maps import read_height_map
-
-    read_height_map(path, size=20.0 if path.suffix in (".npy", ".exr") else None)
-
-
-_PROFILE = """depth (m),attenuation (1/m),scattering (1/m)
-0,0.2,0.1
-2,0.25,0.12
-4.5,0.3,0.2
-8,nan,0.2
-12,0.3,0.2
-"""
-
-
-def load_plugin(**parameters: str) -> Callable[[Path], None]:
-    """Return what loads a plugin with a file."""
-
-    def read(path: Path) -> None:
-        import mitsuba as mi
-
-        from mitransient_lidar.loading import scenes, variants
-
-        variants.set_variant()
-        with scenes.as_user_error():
-            mi.load_dict({name: str(path) if value == "FILE" else value for name, value in parameters.items()})
-
-    return read
-
-
-def image(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a grey image."""
-
-    def make(folder: Path) -> Path:
-        import mitsuba as mi
-
-        path = folder / f"image{suffix}"
-        values = np.arange(1, 64, dtype=np.uint8).reshape(7, 9)
-        if suffix == ".npy":
-            np.save(path, values)
-        else:
-            mi.Bitmap(values[..., None] if suffix == ".png" else values[..., None].astype(np.float32)).write(str(path))
-        return path
-
-    return make
-
-
-def read_image(path: Path) -> None:
-    """Read a grey image."""
-    from mitransient_lidar.transport.sensor.image_sampling import read_image as read
-
-    read("pixel_map", str(path))
-
-
-_PULSE = "time_ns,power\n" + "".join(f"{0.5 * i},{np.exp(-((i - 10) ** 2) / 20):.5f}\n" for i in range(21))
-_PHASE = "angle (deg),phase function\n" + "".join(f"{i},{1 / (1 + i):.6f}\n" for i in range(0, 181, 5))
-
-KINDS = {
-    "scene": Kind(scene, load, damage_text),
-    "result_nc": Kind(saved(shot, "a.nc"), analyse),
-    "result_exr": Kind(saved(shot, "a.exr"), analyse),
-    "result_attributes": Kind(saved(shot, "a.nc"), analyse, damage_attributes),
-    "result_again": Kind(saved(shot, "a.nc"), use_again, damage_attributes),
-    "series_attributes": Kind(saved(series, "a.nc"), analyse, damage_attributes),
-    "gates_exr": Kind(gates("a_gates.exr"), draw_gates),
-    "gates_attributes": Kind(gates("a_gates.nc"), draw_gates, damage_attributes),
-    "campaign": Kind(written("a.toml", _CAMPAIGN), plan, damage_text),
-    "table_of_runs": Kind(table_of_runs, plan_table, damage_text),
-    "store": Kind(store, read_store),
-    **{f"map{suffix}": Kind(height_map(suffix), load_map) for suffix in (".npy", ".npz", ".exr", ".nc")},
-    "map.asc": Kind(height_map(".asc"), load_map, damage_text),
-    "profile": Kind(written("a.csv", _PROFILE), load_plugin(type="layered_water", profile="FILE"), damage_text),
-    "phase_function": Kind(written("a.csv", _PHASE), load_plugin(type="measured_phase", filename="FILE"), damage_text),
-    "pulse": Kind(
-        written("a.csv", _PULSE),
-        load_plugin(type="lidar_transmitter", pulse_file="FILE"),
-        damage_text,
-    ),
-    **{f"image{suffix}": Kind(image(suffix), read_image) for suffix in (".png", ".npy", ".exr")},
-}
+DAMAGE = {"bytes": damage_bytes, "text": damage_text, "attributes": damage_attributes}
 
 
 def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tuple[int, str, str]]:
@@ -471,7 +162,7 @@ def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tupl
             path = Path(folder) / original.name
             (shutil.copytree if original.is_dir() else shutil.copy)(original, path)
             try:
-                KINDS[name].damage(path, rng)
+                DAMAGE[KINDS[name].format](path, rng)
             except Exception:
                 yield number, "not damaged", ""
                 continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
@@ -210,7 +211,7 @@ class Campaign:
         path = Path(_resolved(self.design.file, self.folder))
         if free := [name for name, one in self.parameters.items() if not isinstance(one, Expression)]:
             raise UserError(f"parameters.{free[0]}: the table gives the values; only expressions may be added to it")
-        lines = read_text(path, _LARGEST_TABLE).splitlines(keepends=True)
+        lines = io.StringIO(read_text(path, _LARGEST_TABLE), newline="")
         try:
             rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(map(str.strip, row))]
         except csv.Error as error:

@@ -5,7 +5,7 @@ that has started it does, and after an error of the program, since what Dr.Jit w
 standard input holds the store, the shard, and the runs that are not to be rendered, with the reasons; it writes one
 line of JSON for each event: ``begin`` and ``end`` of a run, ``done``, ``error`` or ``bug``.
 
-A log beside the store, of its name with the suffix ``.log``, holds what such a process has told before it ended.
+A log beside the store, ``NAME.zarr.log``, holds the messages of processes that ended before their shard.
 """
 
 from __future__ import annotations
@@ -110,7 +110,8 @@ def render_in_process(path: str, shard: int, retry: bool = False, report: Report
 
 def log_path(store: str | os.PathLike[str]) -> Path:
     """Return the path of the log of a store."""
-    return Path(store).with_suffix(".log")
+    path = Path(store)
+    return path.with_name(f"{path.name}.log")
 
 
 def _log(store: str, shard: int, text: str) -> None:

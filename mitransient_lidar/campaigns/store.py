@@ -92,9 +92,10 @@ class Store:
             self.variables = [str(name) for name in self.attributes["variables"]]
         except _DAMAGE as error:
             raise UserError(f"{path} is no store of a campaign, or is damaged.") from error
-        if self.attributes.get(_SEAL) != _seal(self.attributes):
+        if self.attributes.get(_SEAL) != seal(self.attributes):
             reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
             raise UserError(f"{path} cannot be used: {reason}.")
+        self._arrays: dict[str, zarr.Array[Any]] = {}
         self._check_arrays()
 
     @classmethod
@@ -224,7 +225,7 @@ class Store:
 
     def _check_arrays(self) -> None:
         """Raise `UserError` if an array has another shape than the attributes say, or one of all runs is lost."""
-        with reading(self.path, "the list of its arrays"):
+        with _reading(self.path, "the list of its arrays"):
             names = list(self._group.array_keys())
         of_runs = ("status", "error", *self.variables)
         for name in {*names, *of_runs}:
@@ -287,19 +288,33 @@ class Store:
     def _read(self, name: str, runs: slice) -> npt.NDArray[Any]:
         """Return values of runs as they are stored; raise `UserError` where they are damaged."""
         array = self._array(name)
-        with reading(self.path, name):
+        with _reading(self.path, name):
             return np.asarray(array[runs])
 
     def _array(self, name: str) -> zarr.Array[Any]:
-        with reading(self.path, name), zarr.config.set(_WRITING):
+        # Once: a store has an array for each variable, and thousands of shards.
+        if name in self._arrays:
+            return self._arrays[name]
+        with _reading(self.path, name), zarr.config.set(_WRITING):
             found = self._group[name]
             if not isinstance(found, zarr.Array):
                 raise TypeError(name)
-            return found
+            return self._arrays.setdefault(name, found)
 
 
 @contextlib.contextmanager
-def reading(path: str | os.PathLike[str], name: str = "an array") -> Iterator[None]:
+def reporting_damage(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Convert the error of an array of `open_campaign` that is damaged to a `UserError`."""
+    try:
+        yield
+    except ValueError as error:
+        if "checksum" not in str(error):
+            raise
+        raise UserError(f"{path} is damaged: the same command of the campaign renders what cannot be read.") from error
+
+
+@contextlib.contextmanager
+def _reading(path: str | os.PathLike[str], name: str) -> Iterator[None]:
     """Convert what zarr raises for a damaged store to a `UserError`."""
     try:
         yield
@@ -333,7 +348,7 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
         If there is no store of a campaign, or its coordinates are damaged.
     """
     store = Store(path)
-    with reading(path, "a coordinate"):
+    with _reading(path, "a coordinate"):
         dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, mask_and_scale=False, decode_times=False)
     dataset["status"] = dataset["status"].copy(data=store.status())
     return dataset
@@ -418,10 +433,10 @@ def _fill(
         "coordinates": " ".join(name for name in secondary if name in group),
         **versions(),
     }
-    group.attrs.update({**about, _SEAL: _seal(about)})
+    group.attrs.update({**about, _SEAL: seal(about)})
 
 
-def _seal(attributes: Mapping[str, Any]) -> str:
+def seal(attributes: Mapping[str, Any]) -> str:
     """Return the SHA-256 of the attributes that a store is read by."""
     text = json.dumps({name: attributes.get(name) for name in _SEALED}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -160,8 +160,9 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
             first = first or error
         else:
             made = Store.create(path, renderer, columns, arrays, coordinates, shard_size)
-            # Another process may have made the store of another campaign in the meantime.
-            return made if made.campaign.text == campaign.text else _prepare(campaign, path, shard_size)
+            # Another process may have made another store in the meantime, which is then refused.
+            is_wanted = made.campaign.text == campaign.text and shard_size in (None, made.shard_size)
+            return made if is_wanted else _prepare(campaign, path, shard_size)
     raise UserError(f"the first {min(_TRIALS, count)} runs all fail, the first of them so: {first}")
 
 

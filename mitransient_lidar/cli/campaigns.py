@@ -97,12 +97,12 @@ def _render_row(campaign: Path, row: int, path: Path, quiet: bool) -> None:
 def _show(store: Path, path: Path) -> None:
     """Draw a store."""
     check_figure(path)
-    from mitransient_lidar.campaigns.store import describe_campaign, open_campaign, reading
+    from mitransient_lidar.campaigns.store import describe_campaign, open_campaign, reporting_damage
     from mitransient_lidar.plots.campaigns import plot_campaign
 
     dataset = open_campaign(store)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with reading(store):
+    with reporting_damage(store):
         plot_campaign(dataset, path)
     typer.echo(path)
     typer.echo("\n".join(describe_campaign(store)))

@@ -96,8 +96,11 @@ class DeferredInterrupt:
 
     @classmethod
     def check(cls) -> None:
-        """Raise KeyboardInterrupt if there was an interruption since the outermost context was entered."""
-        if cls._pending:
+        """Raise KeyboardInterrupt if there was an interruption since the outermost context was entered.
+
+        Outside the main thread, which handles signals, do nothing.
+        """
+        if cls._pending and threading.current_thread() is threading.main_thread():
             number, cls._pending = cls._pending, 0
             handler = cls._handlers[number]
             # The next one waits, too: what this one ends has results to keep.

@@ -139,7 +139,7 @@ def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
 
 @contextlib.contextmanager
 def _folder_of_files(folder: Path) -> Iterator[None]:
-    """Let Mitsuba look for files in a folder; neither it nor those of ``<path>`` are kept for other scenes."""
+    """Add a folder to those in which Mitsuba looks for files; remove it, and those of ``<path>``, afterwards."""
     import mitsuba as mi
 
     resolver = mi.file_resolver()

@@ -59,10 +59,9 @@ def dump(dataset: xr.Dataset, path: str | os.PathLike[str], encoding: Mapping[st
 
 
 def check_sum(path: str | os.PathLike[str]) -> None:
-    """Raise `UserError` if a file ends in another checksum than its own; HDF5 may hang in damaged files for ever.
+    """Raise `UserError` if a file ends in a checksum that is not its own, before HDF5, which may hang, reads it.
 
-    `dump` writes it behind the end of the HDF5 data, where other programs do not look, and cut it off when they change
-    the file.
+    `dump` appends it to the HDF5 data. HDF5 does not read it, and removes it when another program changes the file.
     """
     length = len(_CHECKSUM) + 2 * hashlib.sha256().digest_size
     with open(path, "rb") as file:

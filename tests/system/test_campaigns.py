@@ -78,6 +78,13 @@ def campaign(tmp_path_factory):
     return {"scene": str(few_paths("table1", tmp_path_factory.mktemp("scene"))), **QUICK}
 
 
+def planned_copy(store, path):
+    """Copy a store, without the status of its runs."""
+    shutil.copytree(store, path)
+    shutil.rmtree(path / "status" / "c")
+    return path
+
+
 @pytest.fixture(scope="module")
 def quick(campaign, tmp_path_factory):
     """Store of the quick campaign, rendered in two shards."""
@@ -265,9 +272,7 @@ def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
 @pytest.mark.slow
 def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
     process, file = scheduler
-    path = tmp_path / "lost.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "lost.zarr")
     address = json.loads(file.read_text())["address"]
     command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--scheduler", address]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as client:
@@ -283,9 +288,7 @@ def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
     """Any call may notice first that the scheduler is lost; an error with a scheduler that is there is another one."""
     from distributed import Client
 
-    path = tmp_path / "lost.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "lost.zarr")
 
     def times_out():
         raise OSError("Timed out trying to connect")
@@ -367,9 +370,7 @@ def test_scheduler_that_does_not_answer(campaign, tmp_path):
 @pytest.mark.long
 def test_disk_that_is_full(quick, tmp_path):
     """Files of a limited size stand for a full disk: chunks cannot be written, and no status says that they were."""
-    path = tmp_path / "full.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "full.zarr")
     done = subprocess.run(
         [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--workers", "1", "-q"],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
@@ -382,7 +383,7 @@ def test_disk_that_is_full(quick, tmp_path):
 
 
 def shard_code(monkeypatch, arrays, start="pass"):
-    """Let the processes of shards run a statement at their start, and an expression for the arrays of a run."""
+    """Replace what processes of shards do: a statement at their start, and an expression for the arrays of a run."""
     code = (
         f"import os, signal; from mitransient_lidar.campaigns import runs, shard\n{start}\n"
         f"arrays = runs.RunRenderer.arrays\nrender = lambda self, number, values: {arrays}\n"
@@ -397,13 +398,11 @@ def shard_code(monkeypatch, arrays, start="pass"):
 @pytest.mark.slow
 def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_path, monkeypatch):
     """It once was tried twice, and stored as a failure of the run without its traceback."""
-    path = tmp_path / "bug.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "bug.zarr")
     shard_code(monkeypatch, "{}[3] if number == 8 else arrays(self, number, values)")
     assert shards.render_in_process(str(path), 1) == (5, 0, "run 8: KeyError: 3")
     assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE, DONE, PLANNED, DONE, DONE, DONE]
-    log = (tmp_path / "bug.log").read_text()
+    log = (tmp_path / "bug.zarr.log").read_text()
     assert log.count("Traceback (most recent call last)") == 1
     assert "shard 1\n" in log
 
@@ -411,9 +410,7 @@ def test_an_error_of_the_program_is_told_and_its_run_stays_planned(quick, tmp_pa
 @pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.long)])
 def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch, deaths):
     """Twice; it once ended the campaign."""
-    path = tmp_path / "early.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "early.zarr")
     (tmp_path / "deaths").mkdir()
     place = str(tmp_path / "deaths")
     die = f"open({place!r} + f'/{{n}}', 'w').close(); os.kill(os.getpid(), 9)"
@@ -426,20 +423,18 @@ def test_a_process_that_dies_early_is_started_again(quick, tmp_path, monkeypatch
 @pytest.mark.long
 def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
     """The others are rendered, and the command says which ones to look at."""
-    path = tmp_path / "left.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
-    original = sweeping._task
+    path = planned_copy(quick, tmp_path / "left.zarr")
+    original = shards.render_in_process
 
-    def task(path, shard, *rest):
-        return (shard, shards.Outcome(0, 0, "shard 0: lost")) if shard == 0 else original(path, shard, *rest)
+    def render(path, shard, *rest):
+        return shards.Outcome(0, 0, "shard 0: lost") if shard == 0 else original(path, shard, *rest)
 
     from distributed import Client, LocalCluster
 
     with LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster, Client(cluster) as client:
-        monkeypatch.setattr(sweeping, "_task", task)
+        monkeypatch.setattr(sweeping, "render_in_process", render)
         with pytest.raises(
-            UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.log"
+            UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.zarr\.log"
         ):
             resume(path, scheduler=client)
     assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE] * 6
@@ -448,9 +443,7 @@ def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
 @pytest.mark.long
 def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
     """The campaign once waited for ever."""
-    path = tmp_path / "unreachable.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "unreachable.zarr")
     nowhere = "tcp://127.0.0.1:9"
     command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
     command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
@@ -465,9 +458,7 @@ def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
 
 @pytest.mark.long
 def test_a_run_in_which_the_process_dies_fails_alone(quick, tmp_path, monkeypatch):
-    path = tmp_path / "dying.zarr"
-    shutil.copytree(quick, path)
-    shutil.rmtree(path / "status" / "c")
+    path = planned_copy(quick, tmp_path / "dying.zarr")
     shard_code(monkeypatch, "os.abort() if number == 8 else arrays(self, number, values)")
     told = []
     assert shards.render_in_process(str(path), 1, report=lambda *counts: told.append(counts)) == (5, 1, "")

@@ -61,11 +61,8 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
             "outlines; slope_deviation does not"
         )
     if speed is None:
-        known = (
-            finite("scene.wind_speed", attributes.get("scene.wind_speed", 0))
-            if sea == ("elfouhaily", "cox_munk")
-            else 0.0
-        )
+        is_modelled = sea == ("elfouhaily", "cox_munk")
+        known = finite("scene.wind_speed", attributes.get("scene.wind_speed", 0)) if is_modelled else 0.0
         if not usable or not LEAST_WIND_SPEED <= known <= MAX_WIND_SPEED:
             return None
         speed = known

@@ -13,7 +13,16 @@ import zarr
 from mitransient_lidar.campaigns import store as campaign_store
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import Array, RunRenderer
-from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, describe_campaign, open_campaign, reading
+from mitransient_lidar.campaigns.store import (
+    DONE,
+    FAILED,
+    PLANNED,
+    Store,
+    describe_campaign,
+    open_campaign,
+    reporting_damage,
+    seal,
+)
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -192,8 +201,8 @@ def test_damaged_values_are_not_read(full, path):
     with pytest.raises(ValueError, match="checksum"):
         data["waveform"].load()
     with (
-        pytest.raises(UserError, match=r"campaign\.zarr is damaged: waveform cannot be read"),
-        reading(path, "waveform"),
+        pytest.raises(UserError, match=r"campaign\.zarr is damaged"),
+        reporting_damage(path),
     ):
         data["waveform"].load()
 
@@ -225,7 +234,7 @@ def test_edited_attributes_are_refused(full, path, change, message, sealed):
     """Those of an author who has made the checksum anew, too, where they do not fit the arrays."""
     group = zarr.open_group(str(path), mode="r+")
     attributes = {**group.attrs, **change}
-    group.attrs.update({**change, **({"sha256": campaign_store._seal(attributes)} if sealed else {})})
+    group.attrs.update({**change, **({"sha256": seal(attributes)} if sealed else {})})
     if sealed and not message:
         Store(path)
         return
