@@ -371,7 +371,11 @@ def _local(workers: int) -> Iterator[Client]:
         "dashboard_address": "127.0.0.1:0",
         "silence_logs": logging.CRITICAL,
     }
-    with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster, set_as_default=False) as client:
+    try:
+        started = LocalCluster(n_workers=workers, **options)
+    except (OSError, RuntimeError) as error:
+        raise UserError(f"{workers} worker processes could not be started; the same command tries again") from error
+    with started as cluster, Client(cluster, set_as_default=False) as client:
         if importlib.util.find_spec("bokeh") is not None:
             _LOG.info("dashboard: %s", cluster.dashboard_link)
         yield client
