@@ -6,11 +6,13 @@ bins: the stack ``bin`` with the components ``Y`` and ``stderr`` becomes the cha
 
 The attributes are written twice: OpenEXR supports only integers and floats of 32 bits and no empty list, so a JSON
 string (header attribute ``mitransientLidar``) stores them exactly; ``exrheader`` and other programs read the copies
-under their own names.
+under their own names. The attribute ``mitransientLidarSha256`` of each part is the checksum of that string and of the
+channels: OpenEXR has none for its header, nor for blocks that ZIP cannot make smaller.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -25,6 +27,7 @@ from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_
 from mitransient_lidar.core.errors import UserError
 
 _EXACT = "mitransientLidar"
+_CHECKSUM = "mitransientLidarSha256"
 _LAYER = re.compile(r"([A-Za-z]+)(\d{4,})\.(\w+)")
 _LONGEST_NAME = 255  # bytes; OpenEXR silently drops attributes with longer names
 _INT32 = np.iinfo(np.int32)
@@ -147,7 +150,10 @@ def write_parts(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
     with silence_openexr():
         try:
             with OpenEXR.File(
-                [OpenEXR.Part({**part.attributes, **kind}, part.channels, part.name) for part in parts]
+                [
+                    OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
+                    for part in parts
+                ]
             ) as file:
                 file.write(os.fspath(path))
         except RuntimeError as error:
@@ -160,7 +166,8 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
     Raises
     ------
     UserError
-        If the file is damaged, truncated, or larger than half of the memory.
+        If the file is damaged, truncated, or larger than half of the memory, or a part has another checksum than its
+        own. Files of other programs have none.
     """
     check_exr(path, _damaged(path), largest_result())
     with (
@@ -179,7 +186,23 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
         ]
     if not parts:
         raise UserError(_damaged(path))
+    for part in parts:
+        # OpenEXR returns an attribute of an unknown type as an object of its own.
+        if not isinstance(part.attributes.get(_EXACT, ""), str):
+            raise UserError(_damaged(path))
+        checksum = _checksum(part)
+        if part.attributes.get(_CHECKSUM, checksum) != checksum:
+            raise UserError(f"{path} is damaged: its SHA-256 is another one than when it was written.")
     return parts
+
+
+def _checksum(part: Part) -> str:
+    """Return the SHA-256 of the exact metadata and of the channels of a part."""
+    digest = hashlib.sha256(part.attributes.get(_EXACT, "").encode())
+    for name, pixels in sorted(part.channels.items()):
+        digest.update(f"{name} {pixels.dtype} {pixels.shape}".encode())
+        digest.update(np.ascontiguousarray(pixels))
+    return digest.hexdigest()
 
 
 def _damaged(path: str | os.PathLike[str]) -> str:

@@ -85,6 +85,28 @@ def test_every_truncation_and_a_flipped_byte_are_detected(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_flipped_bit_gives_the_same_result_or_is_refused(tmp_path):
+    values = np.random.default_rng(7).random((3, 2, 2))  # noise: ZIP leaves it as it is, without a checksum of its own
+    whole, part = tmp_path / "whole.exr", tmp_path / "part.exr"
+    exact = {"time_start_ns": 12.5, "scene": "table1"}
+    exr.write(whole, {"bin": {"Y": values, "stderr": values / 7}}, exact, {"scene": "table1"})
+    data = whole.read_bytes()
+    stacks, _ = exr.read(whole)
+    refused = 0
+    for place in range(len(data)):
+        part.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
+        try:
+            read = exr.read(part)
+        except UserError:
+            refused += 1
+            continue
+        assert read[1] == exact
+        assert read[0].keys() == stacks.keys()
+        for name, stack in stacks["bin"].items():
+            np.testing.assert_array_equal(read[0]["bin"][name], stack, strict=True)
+    assert refused > len(data) / 2
+
+
 def test_unwritable_path_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match="No such file"):
         exr.write(tmp_path / "missing" / "a.exr", {"bin": {"Y": np.zeros((1, 1, 1))}}, {}, {})
