@@ -59,8 +59,10 @@ class LayeredWater(mi.Medium):
     phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``. Default:
                                      ``fournier_forand``
     phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
-    water_scattering         string  Scattering of pure water, a part of b [1/m], of each layer or all; 0.0022 for sea
-                                     water at 532 nm. Default: 0, for phase functions that include it
+    water_scattering         string  Scattering by water molecules, a part of b [1/m], of each layer or all; 0.00196 for
+                                     sea water at 532 nm. Default: that of a water by ``jerlov``, ``chlorophyll``,
+                                     ``kd``, ``secchi`` or ``pure`` whose particles have a Fournier-Forand function;
+                                     else 0, for phase functions that include it
     (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
                                      ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
     refractive_index         string  Phase index, 1.0001 to 2, of each layer or all. Default: 1.34
@@ -109,7 +111,7 @@ class LayeredWater(mi.Medium):
     def __init__(self, props: RecordedProperties) -> None:
         props.drop_empty("layer_tops", *_DEFAULTS, "water_scattering", *WATERS, "profile")
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
-        self.column = _column(props)
+        self.column, molecules = _column(props)
         #: Whether the layers approximate a profile from a file.
         self.from_profile = _is_given(props, "profile")
         indices = []
@@ -130,10 +132,14 @@ class LayeredWater(mi.Medium):
         # Mitsuba's media accept one phase function.
         for name in list(phases)[1:]:
             del props[name]
-        all_scattering = ", ".join(map(repr, self.column.scattering.tolist())) if _is_given(props, "pure") else 0.0
-        water = _water_scattering(props.get("water_scattering", all_scattering), self.column)
+        includes_molecules = bool(phases) or kind != "fournier_forand"
+        if "water_scattering" in props:
+            molecules = _per_layer("water_scattering", props["water_scattering"], self.column.count)
+        elif includes_molecules and not _is_given(props, "pure"):
+            molecules = np.zeros(self.column.count)
+        _check_water_scattering(molecules, self.column)
         tabulated = partial(TabulatedPhaseFunction, mi.Properties())
-        of_layers = phases_of_layers(self.column, phases, kind, phase_g, water, tabulated)
+        of_layers = phases_of_layers(self.column, phases, kind, phase_g, molecules, tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
         #: Runs of layers of one refractive and one group index.
@@ -222,21 +228,24 @@ class LayeredWater(mi.Medium):
         return f"LayeredWater[{self.column}, {indices}]"
 
 
-def _column(props: RecordedProperties) -> WaterColumn:
-    """Return the layers of the parameters, of a water by name, or of a profile."""
+def _column(props: RecordedProperties) -> tuple[WaterColumn, np.ndarray]:
+    """Return the layers of the parameters, of a water by name, or of a profile, and the scattering by its molecules.
+
+    That is 0 where it is not known.
+    """
     tolerance = props.get("profile_tolerance", 0.01)
     wavelength = positive("wavelength_nm", props["wavelength_nm"]) if "wavelength_nm" in props else None
     ways = [name for name in (*WATERS, "profile") if _is_given(props, name)]
     own = [name for name in ("layer_tops", *_DEFAULTS) if name in props]
     if not ways:
         values = {name: props.get(name, default) for name, default in _DEFAULTS.items()}
-        return WaterColumn.from_text(props.get("layer_tops", "0"), **values)
+        return _of_particles(WaterColumn.from_text(props.get("layer_tops", "0"), **values))
     way = ways[0]
     excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
     if excluded:
         raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
-        return read_profile(props[way], wavelength).layers(tolerance)
+        return _of_particles(read_profile(props[way], wavelength).layers(tolerance))
     tops = number_list("layer_tops", props.get("layer_tops", "0"))
     wavelength = wavelength or props.get("wavelength_nm", 532.0)
     texts = str(props[way]).replace(",", " ").split()
@@ -246,8 +255,13 @@ def _column(props: RecordedProperties) -> WaterColumn:
         found = [water_of(way, None if way == "pure" else text, wavelength) for text in texts]
     except UserError as error:
         raise UserError(f"{way} = {props[way]!r}: {error}") from error
-    rows = np.array([[water.attenuation, water.scattering, water.backscattering] for water in found])
-    return WaterColumn(tops, *np.broadcast_to(rows.T, (3, tops.size)))
+    rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
+    *coefficients, molecules = np.broadcast_to(np.transpose(rows), (4, tops.size))
+    return WaterColumn(tops, *coefficients), molecules
+
+
+def _of_particles(column: WaterColumn) -> tuple[WaterColumn, np.ndarray]:
+    return column, np.zeros(column.count)
 
 
 def _is_given(props: RecordedProperties, name: str) -> bool:
@@ -275,15 +289,13 @@ def _per_layer(name: str, given: float | str, count: int) -> np.ndarray:
     return np.broadcast_to(values, count)
 
 
-def _water_scattering(given: float | str, column: WaterColumn) -> np.ndarray:
-    """Return the scattering of pure water [1/m], one value a layer."""
-    water = _per_layer("water_scattering", given, column.count)
-    for layer in np.flatnonzero((water < 0) | (water > column.scattering))[:1]:
+def _check_water_scattering(molecules: np.ndarray, column: WaterColumn) -> None:
+    """Raise `UserError` unless the scattering by molecules [1/m] is a part of that of each layer."""
+    for layer in np.flatnonzero((molecules < 0) | (molecules > column.scattering))[:1]:
         raise UserError(
-            f"water_scattering = {water[layer]:g} must be at least 0 and at most scattering = "
+            f"water_scattering = {molecules[layer]:g} must be at least 0 and at most scattering = "
             f"{column.scattering[layer]:g}, in layer {layer}"
         )
-    return water
 
 
 mi.register_medium("layered_water", recorded(LayeredWater))

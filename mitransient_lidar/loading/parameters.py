@@ -20,7 +20,6 @@ _COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 _ALTERNATIVES: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("divergence_mrad",), ("divergence_fwhm_mrad",), ("divergence_1e2_mrad",)),
     (_COEFFICIENTS, ("jerlov",), ("chlorophyll",), ("kd",), ("secchi",), ("petzold",), ("pure",), ("profile",)),
-    (("water_scattering",), ("pure",)),
     (("layer_tops",), ("profile",)),
 )
 

@@ -201,7 +201,7 @@ def _checksum(part: Part) -> str:
     digest = hashlib.sha256(part.attributes.get(_EXACT, "").encode())
     for name, pixels in sorted(part.channels.items()):
         digest.update(f"{name} {pixels.dtype} {pixels.shape}".encode())
-        digest.update(np.ascontiguousarray(pixels))
+        digest.update(np.ascontiguousarray(pixels).data)
     return digest.hexdigest()
 
 

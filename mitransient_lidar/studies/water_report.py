@@ -77,18 +77,20 @@ def describe_water(
     rows = {
         "absorption a (1/m)": found.absorption,
         "scattering b (1/m)": found.scattering,
+        "of it by molecules bw (1/m)": found.water_scattering,
         "backscattering bb (1/m)": found.backscattering,
         "attenuation c (1/m)": found.attenuation,
         "albedo b/c": found.albedo,
         "bb/b": found.backscatter_ratio,
+        "bb/b of the particles": found.particle_backscatter_ratio,
         "diffuse attenuation Kd (1/m)": found.kd,
         "refractive index": index,
         "group index": group,
     }
     parameters = {name: getattr(found, name) for name in ("attenuation", "scattering", "backscattering")}
     parameters |= {"refractive_index": index, "group_index": group}
-    if kind == "pure":
-        parameters["water_scattering"] = found.scattering
+    if found.water_scattering > 0:
+        parameters["water_scattering"] = found.water_scattering
     options = " ".join(f"-D {name}={number:.6g}" for name, number in parameters.items())
     return [
         *(f"{name:<30}{number:.5g}" for name, number in rows.items()),
@@ -100,7 +102,10 @@ def describe_water(
 def phase_function_of(
     kind: str, value: str | None, found: water_types.InherentProperties
 ) -> tuple[PhaseFunction, str, str]:
-    """Return the phase function of a water, its label, and a title with the properties `found` by `water_of`."""
+    """Return the phase function of a water that is rendered, or was measured, its label, and a title.
+
+    `found` are the properties of the water by `water_of`.
+    """
     ratio = f"bb/b = {found.backscatter_ratio:.3g}"
     phase: PhaseFunction
     if kind == "pure":
@@ -108,7 +113,7 @@ def phase_function_of(
     elif kind == "petzold":
         phase, label = petzold_water(_given(kind, value)), f"measured, {ratio}"
     else:
-        phase, label = fournier_forand_of(found.backscatter_ratio), f"Fournier-Forand, {ratio}"
+        phase, label = _particles_and_molecules(found), f"Fournier-Forand and molecules, {ratio}"
     properties = f"a = {found.absorption:.3g}, b = {found.scattering:.3g}, bb = {found.backscattering:.3g} 1/m"
     return phase, label, f"{_TITLES[kind].format(value)}  ·  {properties}"
 
@@ -117,6 +122,12 @@ def fournier_forand_of(backscatter_ratio: float) -> PhaseFunction:
     """Return the Fournier-Forand function of a bb/b, which maps angles [rad] to p [1/sr]; reject an impossible bb/b."""
     n, mu = fournier_forand_parameters(backscatter_ratio)
     return lambda theta: fournier_forand(theta, n, mu)
+
+
+def _particles_and_molecules(found: water_types.InherentProperties) -> PhaseFunction:
+    """Return the phase function of particles with a Fournier-Forand function and of molecules, by their scattering."""
+    particles, share = fournier_forand_of(found.particle_backscatter_ratio), found.water_scattering / found.scattering
+    return lambda theta: (1 - share) * particles(theta) + share * seawater.water_phase_function(theta)
 
 
 def profile_of(file: str | None) -> Profile:

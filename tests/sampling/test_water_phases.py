@@ -10,6 +10,7 @@ from significance import largest_z
 from mitransient_lidar.physics.water import phase as closed_form
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.seawater import water_phase_function
+from mitransient_lidar.physics.water.water_types import water_of
 from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
 
 THETA = np.radians([0.1, 1.0, 5.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0])
@@ -34,6 +35,41 @@ def test_water_and_particles_are_mixed_by_their_scattering():
     )
     expected = (0.048 * particles(0.0006 / 0.048) + 0.002 * water_phase_function(THETA)) / 0.05
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
+
+
+NAMED = [("jerlov", "I"), ("jerlov", "1C"), ("chlorophyll", "0.1"), ("kd", "0.06"), ("secchi", "25")]
+
+
+@pytest.mark.parametrize(("kind", "value"), NAMED)
+def test_waters_by_name_have_molecules_and_particles(kind, value):
+    """Zhang's molecules [1/m] at 532 nm, and particles with the rest of b and of bb."""
+    found, molecules = water_of(kind, value), 0.001962
+    scattered = found.scattering - molecules
+    ratio = (found.backscattering - molecules / 2) / scattered
+    expected = (scattered * particles(ratio) + molecules * water_phase_function(THETA)) / found.scattering
+    water = mi.load_dict({"type": "layered_water", kind: value})
+    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=3e-3)
+    assert water.phases.phases[0].backscatter_ratio == pytest.approx(found.backscatter_ratio, rel=3e-3)
+
+
+@pytest.mark.parametrize(("kind", "value"), NAMED)
+@pytest.mark.parametrize("own", [{"phase_function": "petzold"}, {"phase": {"type": "petzold"}}])
+def test_given_phase_functions_include_the_molecules_of_waters_by_name(kind, value, own):
+    water = mi.load_dict({"type": "layered_water", kind: value, **own})
+    plain = values(mi.load_dict({"type": "petzold"}))
+    np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), plain, rtol=1e-6)
+
+
+def test_molecules_of_layers_by_name_follow_their_wavelength():
+    texts = {"layer_tops": "0, 4", "chlorophyll": "0.1, 3", "wavelength_nm": 450}
+    water = mi.load_dict({"type": "layered_water", **texts})
+    for layer, concentration in enumerate(("0.1", "3")):
+        found = water_of("chlorophyll", concentration, 450)
+        part = found.water_scattering / found.scattering
+        assert found.water_scattering == pytest.approx(0.001962 * (532 / 450) ** 4.3, rel=0.03)
+        expected = (1 - part) * particles(found.particle_backscatter_ratio) + part * water_phase_function(THETA)
+        one = water.phases.at(mi.UInt32([layer] * len(THETA)))
+        np.testing.assert_allclose(values(one), expected, rtol=2e-3)
 
 
 @pytest.mark.parametrize("nested", [{"type": "hg", "g": 0.9}, {"type": "petzold"}])

@@ -58,13 +58,21 @@ class InherentProperties:
     absorption: float  #: Absorption coefficient a [1/m], at least 0.
     scattering: float  #: Scattering coefficient b [1/m], at least `backscattering`.
     backscattering: float  #: Backscattering coefficient bb [1/m], the part into the backward hemisphere, at least 0.
+    #: Scattering by water molecules [1/m], a part of `scattering`, half of which is backscattering; 0 if not known.
+    water_scattering: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("absorption", "scattering", "backscattering"):
+        for name in ("absorption", "scattering", "backscattering", "water_scattering"):
             object.__setattr__(self, name, non_negative(name, getattr(self, name)))
         if self.backscattering > self.scattering:
             raise UserError(
                 f"backscattering = {self.backscattering:g} must not exceed scattering = {self.scattering:g}"
+            )
+        # The two differ by rounding in pure water.
+        if self.water_scattering > min(self.scattering, 2 * self.backscattering) * (1 + 1e-12):
+            raise UserError(
+                f"water_scattering = {self.water_scattering:g} must not exceed scattering = {self.scattering:g} and "
+                f"twice backscattering = {self.backscattering:g}"
             )
 
     @property
@@ -81,6 +89,12 @@ class InherentProperties:
     def backscatter_ratio(self) -> float:
         """Backscattered fraction bb/b; 0 where b is 0."""
         return self.backscattering / self.scattering if self.scattering > 0 else 0.0
+
+    @property
+    def particle_backscatter_ratio(self) -> float:
+        """Backscattered fraction of the scattering by particles, (bb - bw/2) / (b - bw); 0 where there are none."""
+        particles = self.scattering - self.water_scattering
+        return (self.backscattering - self.water_scattering / 2) / particles if particles > 0 else 0.0
 
     @property
     def kd(self) -> float:
@@ -103,7 +117,7 @@ def pure_seawater(
         As in `seawater.water_scattering`: [nm], [degrees C], [per mille].
     """
     b = float(water_scattering(wavelength_nm, temperature, salinity))
-    return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2)
+    return InherentProperties(float(water_absorption(wavelength_nm)), b, b / 2, b)
 
 
 def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
@@ -142,7 +156,7 @@ def jerlov(water_type: str, wavelength_nm: float = 532.0) -> InherentProperties:
         kw, factor, exponent = _case1_terms(532.0)
         return chlorophyll(((kd - kw) / factor) ** (1 / exponent))
     a, b = measured
-    return InherentProperties(a, b, (kd - a) / _backscatter_weight(a))
+    return InherentProperties(a, b, (kd - a) / _backscatter_weight(a), pure_seawater().scattering)
 
 
 def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentProperties:
@@ -176,7 +190,7 @@ def chlorophyll(concentration: float, wavelength_nm: float = 532.0) -> InherentP
     bb = water.backscattering + b_550 * (0.002 + 0.01 * (0.5 - 0.25 * log_c) * colour)
 
     a = _absorption_for(kw + factor * c**exponent, lambda _: bb)
-    return InherentProperties(max(a, water.absorption), float(b), float(bb))
+    return InherentProperties(max(a, water.absorption), float(b), float(bb), water.scattering)
 
 
 def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | None = None) -> InherentProperties:
@@ -194,7 +208,7 @@ def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | N
     Raises
     ------
     UserError
-        If the values together give less absorption than that of pure water.
+        If the values together give less absorption or backscattering than those of pure water.
 
     Notes
     -----
@@ -218,7 +232,8 @@ def from_kd(kd: float, albedo: float | None = None, backscatter_ratio: float | N
     per_absorption = omega / (1 - omega)
     a = _absorption_for(wanted, lambda x: ratio * per_absorption * x)
     _check_absorption(a, f"kd = {wanted:g} with albedo = {omega:g} and backscatter_ratio = {ratio:g}")
-    return InherentProperties(a, a * per_absorption, ratio * per_absorption * a)
+    water = pure_seawater().scattering
+    return InherentProperties(a, a * per_absorption, ratio * per_absorption * a, water)
 
 
 def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RATIO) -> InherentProperties:
@@ -229,7 +244,7 @@ def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RAT
     depth : float
         Secchi depth z [m], 0.5 to 25.
     backscatter_ratio : float
-        bb/b, 0.001 to 0.04.
+        bb/b of the particles, 0.001 to 0.04.
 
     Raises
     ------
@@ -248,9 +263,14 @@ def from_secchi(depth: float, backscatter_ratio: float = PETZOLD_BACKSCATTER_RAT
     ratio = in_range("backscatter_ratio", backscatter_ratio, 0.001, 0.04)
     kd = 1.7 / z
     c = 8.7 / z - kd
-    a = _absorption_for(kd, lambda x: ratio * (c - x))
+    water = pure_seawater()
+
+    def backscattering(a: float) -> float:
+        return water.backscattering + ratio * (c - a - water.scattering)
+
+    a = _absorption_for(kd, backscattering)
     _check_absorption(a, f"depth = {z:g} with backscatter_ratio = {ratio:g}")
-    return InherentProperties(a, c - a, ratio * (c - a))
+    return InherentProperties(a, c - a, backscattering(a), water.scattering)
 
 
 def water_of(

@@ -180,8 +180,9 @@ def test_pure_sea_water_renders():
         ("pure", None, "pure sea water, bb/b = 0.5", 0.5, 0.1171, 1e-3),
         # Petzold's 16.623 over his 0.219 at 1 degree.
         ("petzold", "coastal", "measured, bb/b = 0.0134", 0.0134, 75.9, 0.02),
-        # Mobley, Sundman and Boss (2002): n = 1.10 and mu = 3.5835 for this bb/b, whose function is 72.78 at 1 degree.
-        ("secchi", "6", "Fournier-Forand, bb/b = 0.0183", 0.0183, 72.78, 2e-3),
+        # Mobley, Sundman and Boss (2002): n = 1.10 and mu = 3.5835 for particles of 0.0183, whose function is 72.78 at
+        # 1 degree; of b = 0.936 molecules scatter 0.00196, a half of it backwards.
+        ("secchi", "6", "Fournier-Forand and molecules, bb/b = 0.0193", 0.01931, 72.63, 2e-3),
     ],
 )
 def test_every_kind_draws_its_function(monkeypatch, kind, value, label, share, at_1_degree, tolerance):

@@ -159,7 +159,7 @@ def test_water_from_secchi_depth_satisfies_both_rules(depth):
     water = from_secchi(depth, 0.02)
     assert water.kd * depth == pytest.approx(1.7, rel=1e-9)
     assert (water.attenuation + water.kd) * depth == pytest.approx(8.7, rel=1e-9)
-    assert water.backscatter_ratio == pytest.approx(0.02, rel=1e-9)
+    assert water.particle_backscatter_ratio == pytest.approx(0.02, rel=1e-9)
 
 
 @pytest.mark.parametrize("water_type", ["III", "1C", "3C", "5C"])
@@ -176,6 +176,8 @@ def test_secchi_depth_fits_jerlovs_waters(water_type):
     [
         (lambda: InherentProperties(-0.1, 0.1, 0), r"absorption = -0\.1 must not be negative"),
         (lambda: InherentProperties(0.1, 0.1, 0.2), r"backscattering = 0\.2 must not exceed scattering = 0\.1"),
+        (lambda: InherentProperties(0.1, 0.1, 0.01, 0.03), r"water_scattering = 0\.03 must not exceed .* twice back"),
+        (lambda: from_kd(0.05, backscatter_ratio=0.001), "water_scattering = 0.00196.* must not exceed scattering"),
         (lambda: InherentProperties(0.1, np.nan, 0), "scattering = nan must be finite"),
         (lambda: jerlov("IV"), "water_type = 'IV' must be one of I, IA, IB, II, III, 1C, 3C, 5C, 7C, 9C"),
         (lambda: jerlov("II", 450), "wavelength_nm = 450 must lie between 531 and 533: .* at 532 nm only"),
