@@ -59,10 +59,13 @@ class LayeredWater(mi.Medium):
     phase_function           string  ``fournier_forand`` (each layer's from its bb/b), ``petzold`` or ``hg``. Default:
                                      ``fournier_forand``
     phase_g                  float   hg: mean cosine, -0.999 to 0.999. Default: 0.924
-    water_scattering         string  Scattering by water molecules, a part of b [1/m], of each layer or all; 0.00196 for
-                                     sea water at 532 nm. Default: that of a water by ``jerlov``, ``chlorophyll``,
-                                     ``kd``, ``secchi`` or ``pure`` whose particles have a Fournier-Forand function;
-                                     else 0, for phase functions that include it
+    water_scattering         string  Scattering by water molecules, a part of b [1/m], of each layer or all. Default: 0,
+                                     for phase functions that include it; 0.00196 at 532 nm in a water by ``jerlov``,
+                                     ``chlorophyll``, ``kd`` or ``secchi`` whose particles have Fournier-Forand
+                                     functions; all of b in ``pure``
+    chi_p                    string  bb/(2 pi p(180 deg) b) of the particles, 0.1 to 10, of each layer or all: less is
+                                     a brighter echo of the water. Default: empty, that of the phase function, 0.94 to
+                                     1.09 of ``fournier_forand``, 0.90 of ``petzold``
     (nested)                 phase   Any phase function, used in all layers instead; or one a layer, named ``phase_0``,
                                      ``phase_1``, ... from the top; ``plume_phase`` is that of the bubbles
     refractive_index         string  Phase index, 1.0001 to 2, of each layer or all. Default: 1.34
@@ -109,7 +112,7 @@ class LayeredWater(mi.Medium):
     """
 
     def __init__(self, props: RecordedProperties) -> None:
-        props.drop_empty("layer_tops", *_DEFAULTS, "water_scattering", *WATERS, "profile")
+        props.drop_empty("layer_tops", *_DEFAULTS, "water_scattering", "chi_p", *WATERS, "profile")
         phases = {name: child for name, child in props.objects() if isinstance(child, mi.PhaseFunction)}
         self.column, molecules = _column(props)
         #: Whether the layers approximate a profile from a file.
@@ -132,14 +135,16 @@ class LayeredWater(mi.Medium):
         # Mitsuba's media accept one phase function.
         for name in list(phases)[1:]:
             del props[name]
-        includes_molecules = bool(phases) or kind != "fournier_forand"
-        if "water_scattering" in props:
-            molecules = _per_layer("water_scattering", props["water_scattering"], self.column.count)
-        elif includes_molecules and not _is_given(props, "pure"):
-            molecules = np.zeros(self.column.count)
+        if not _is_given(props, "pure") and (phases or kind != "fournier_forand"):
+            molecules = np.zeros(1)
+        own = ", ".join(map(repr, molecules.tolist()))
+        molecules = _per_layer("water_scattering", props.get("water_scattering", own), self.column.count)
         _check_water_scattering(molecules, self.column)
+        chi_p = _per_layer("chi_p", props["chi_p"], self.column.count) if "chi_p" in props else None
+        for value in () if chi_p is None else chi_p:
+            in_range("chi_p", value, 0.1, 10)
         tabulated = partial(TabulatedPhaseFunction, mi.Properties())
-        of_layers = phases_of_layers(self.column, phases, kind, phase_g, molecules, tabulated)
+        of_layers = phases_of_layers(self.column, phases, kind, phase_g, molecules, chi_p, tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
         #: Runs of layers of one refractive and one group index.
@@ -229,9 +234,9 @@ class LayeredWater(mi.Medium):
 
 
 def _column(props: RecordedProperties) -> tuple[WaterColumn, np.ndarray]:
-    """Return the layers of the parameters, of a water by name, or of a profile, and the scattering by its molecules.
+    """Return the layers of the parameters, of a water by name, or of a profile, and scattering by molecules [1/m].
 
-    That is 0 where it is not known.
+    That is one value a layer, or one for all; 0 where it is not known.
     """
     tolerance = props.get("profile_tolerance", 0.01)
     wavelength = positive("wavelength_nm", props["wavelength_nm"]) if "wavelength_nm" in props else None
@@ -239,13 +244,13 @@ def _column(props: RecordedProperties) -> tuple[WaterColumn, np.ndarray]:
     own = [name for name in ("layer_tops", *_DEFAULTS) if name in props]
     if not ways:
         values = {name: props.get(name, default) for name, default in _DEFAULTS.items()}
-        return _of_particles(WaterColumn.from_text(props.get("layer_tops", "0"), **values))
+        return WaterColumn.from_text(props.get("layer_tops", "0"), **values), np.zeros(1)
     way = ways[0]
     excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
     if excluded:
         raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
-        return _of_particles(read_profile(props[way], wavelength).layers(tolerance))
+        return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1)
     tops = number_list("layer_tops", props.get("layer_tops", "0"))
     wavelength = wavelength or props.get("wavelength_nm", 532.0)
     texts = str(props[way]).replace(",", " ").split()
@@ -256,12 +261,8 @@ def _column(props: RecordedProperties) -> tuple[WaterColumn, np.ndarray]:
     except UserError as error:
         raise UserError(f"{way} = {props[way]!r}: {error}") from error
     rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
-    *coefficients, molecules = np.broadcast_to(np.transpose(rows), (4, tops.size))
-    return WaterColumn(tops, *coefficients), molecules
-
-
-def _of_particles(column: WaterColumn) -> tuple[WaterColumn, np.ndarray]:
-    return column, np.zeros(column.count)
+    *coefficients, molecules = np.transpose(rows)
+    return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules
 
 
 def _is_given(props: RecordedProperties, name: str) -> bool:

@@ -124,7 +124,10 @@ def _lines(found: Any) -> list[str]:
         return [*lines, "water: no column that can be fitted"]
     lines.append("water (1/m): " + ", ".join(f"{name} {value[key]:.4g}" for name, key in _WATER.items()))
     low, high = value["attenuation_low"], value["attenuation_high"]
-    return [*lines, f"c is uncertain: {low:.2g} to {high:.2g} 1/m for bb/b from 0.044 to 0.01"]
+    from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIOS
+
+    least, most = BACKSCATTER_RATIOS
+    return [*lines, f"c is uncertain: {low:.2g} to {high:.2g} 1/m for particles of bb/b from {most:g} to {least:g}"]
 
 
 def _bottom_lines(found: Any) -> list[str]:

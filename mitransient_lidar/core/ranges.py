@@ -34,6 +34,7 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("layer_tops", "depth", "water_depth"), (0.0, 1e5)),
     **dict.fromkeys(("attenuation", "scattering", "backscattering"), _PER_METRE),
     **dict.fromkeys(("water_scattering", "plume_scattering"), _PER_METRE),
+    "chi_p": (0.1, 10.0),
     **dict.fromkeys(("size", "refined_size", "map_size", "plume_length", "plume_width"), _LENGTH),
     "irradiance": (0.0, 1e6),
     "time": (-1e9, 1e9),

@@ -26,7 +26,7 @@ DEFAULT_TOLERANCE = 0.01
 
 #: Uncertainty of the properties of each kind.
 _CAUTION = {
-    "jerlov": "bb is estimated from Kd and uncertain by half",
+    "jerlov": "bb is that of typical particles and uncertain by a third in the ocean, by half at the coast",
     "chlorophyll": "the scattering of individual waters differs by a factor of 2",
     "kd": "Kd determines the scattering within a factor of 2 only",
     "secchi": "the Secchi depth determines the properties within a factor of 2 only",

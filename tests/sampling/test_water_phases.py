@@ -72,6 +72,56 @@ def test_molecules_of_layers_by_name_follow_their_wavelength():
         np.testing.assert_allclose(values(one), expected, rtol=2e-3)
 
 
+@pytest.mark.parametrize(
+    "own", [{}, {"phase_function": "petzold"}, {"phase_function": "hg"}, {"phase": {"type": "rayleigh"}}]
+)
+def test_chi_changes_what_is_near_180_degrees(own):
+    plain, changed = (mi.load_dict({"type": "layered_water", **own, **chi}) for chi in ({}, {"chi_p": 0.5}))
+    before, after = (values(water.phases.at(mi.UInt32(0))) for water in (plain, changed))
+    # Up to 150 degrees all but unchanged; at 180 degrees bb/(2 pi chi).
+    np.testing.assert_allclose(after[:6], before[:6], rtol=3e-3)
+    np.testing.assert_allclose(after[6:8], before[6:8], rtol=1e-2)
+    ratio = changed.phases.phases[0].backscatter_ratio
+    assert after[-1] == pytest.approx(ratio / (2 * np.pi * 0.5), rel=2e-3)
+    theta = np.linspace(np.pi / 2, np.pi, 4001)
+    area = (
+        2 * np.pi * np.trapezoid(values(one.phases.at(mi.UInt32(0)), theta) * np.sin(theta), theta)
+        for one in (plain, changed)
+    )
+    assert ratio == pytest.approx(next(area), rel=3e-3)
+    assert ratio == pytest.approx(next(area), rel=3e-3)
+
+
+def test_chi_is_that_of_particles_in_each_layer():
+    parts = {"layer_tops": "0, 2", "chi_p": "0.4, 2", "water_scattering": 0.002}
+    water = mi.load_dict({"type": "layered_water", **parts})
+    for layer, chi in enumerate((0.4, 2.0)):
+        one = water.phases.at(mi.UInt32([layer] * len(THETA)))
+        # bb = 0.006 and b = 0.15 1/m, of which molecules have 0.001 and 0.002.
+        expected = (0.005 / (2 * np.pi * chi) + 0.002 * water_phase_function(np.pi)) / 0.15
+        assert values(one)[-1] == pytest.approx(expected, rel=2e-3)
+
+
+def test_samples_follow_chi():
+    """Those beyond 170 degrees, by z-test: their share, and the mean of 1 / density over their solid angle."""
+    count, edge = 2**21, np.radians(170)
+    phase = mi.load_dict({"type": "layered_water", "chi_p": 0.2, "backscattering": 0.03}).phases.at(mi.UInt32(0))
+    rng = mi.PCG32(count, initstate=11 + significance.seed_shift)
+    mei = dr.zeros(mi.MediumInteraction3f, count)
+    mei.wi = mi.Vector3f(0, 0, -1)
+    pair = mi.Point2f(rng.next_float32(), rng.next_float32())
+    wo, _, pdf = phase.sample(mi.PhaseFunctionContext(), mei, rng.next_float32(), pair)
+    is_near = np.array(wo.z) < np.cos(edge)
+    theta = np.linspace(edge, np.pi, 4001)
+    expected = 2 * np.pi * np.trapezoid(values(phase, theta) * np.sin(theta), theta)
+    assert expected > 1.8 * 0.2 * (1 + np.cos(edge))  # an even distribution of bb/b = 0.2, and a peak
+    error = np.sqrt(expected / count)
+    assert abs(is_near.mean() - expected) < largest_z(count, 2) * error + 1e-3 * expected
+    inverse = np.where(is_near, 1 / np.array(pdf), 0)
+    solid_angle = 2 * np.pi * (1 + np.cos(edge))
+    assert abs(inverse.mean() - solid_angle) < largest_z(count, 2) * inverse.std() / np.sqrt(count)
+
+
 @pytest.mark.parametrize("nested", [{"type": "hg", "g": 0.9}, {"type": "petzold"}])
 def test_any_phase_function_is_mixed_with_the_water(nested):
     plain = values(mi.load_dict(nested))
@@ -152,6 +202,8 @@ def test_layers_with_many_ratios_share_functions_within_two_percent():
         ({"water_scattering": 0.2}, "water_scattering = 0.2 must be at least 0 and at most scattering = 0.15"),
         ({"water_scattering": "0.1, 0.1"}, "water_scattering has 2 values but must have 1 or 1"),
         ({"water_scattering": 0.0022, "backscattering": 0.001}, "backscattering = 0.001 must be at least half of"),
+        ({"chi_p": 0.05}, "chi_p = 0.05 must lie between 0.1 and 10"),
+        ({"chi_p": "1, 1"}, "chi_p has 2 values but must have 1 or 1"),
         ({"backscattering": 0.0}, "backscatter_ratio = 0 must lie between"),
         ({"refractive_index": "1.3, 1.4"}, "refractive_index has 2 values but must have 1 or 1"),
         ({"refractive_index": 2.5}, "refractive_index = 2.5 must lie between 1.0001 and 2"),

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
-from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.physics.water.seawater import water_scattering
+from mitransient_lidar.physics.water.water_types import PETZOLD_BACKSCATTER_RATIO
 
 #: Diameters [m] of the field of view on the sea at which a column decays with Kd, and from which on with a + bb.
 SPOT_OF_KD, SPOT_OF_A_PLUS_BB = 6.4, 10.6
@@ -25,8 +26,8 @@ SMALLEST_SPOT = 6.0
 #: Level of a column by multiple scattering over that by bb alone.
 MULTIPLE_SCATTERING = 1.13
 
-#: bb/b of natural waters: the typical one, and a range that includes most.
-BACKSCATTER_RATIO, BACKSCATTER_RATIOS = 0.0183, (0.01, 0.044)
+#: bb/b of particles: the typical one, and a range that includes those of most natural waters.
+BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.03)
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class WaterEstimate:
     """Water of a column's signal [1/m]; arrays of one shape, NaN where no water fits.
 
     They are a, bb, and Kd of downwelling irradiance with the sun at the zenith, and the beam attenuation c for the
-    typical bb/b, and for the largest and the smallest.
+    typical bb/b of particles, and for the largest and the smallest.
     """
 
     absorption: FloatArray
@@ -94,8 +95,9 @@ def water_of_column(
     package, for one geometry: seven waters (c 0.18 to 1.4), a beam of 10 mrad, 200 m high, 2 to 5 m deep; their levels
     scattered by 8 %. The beam must be narrower than the field of view, and the column homogeneous.
 
-    c is ill-posed: the signal hardly depends on forward scattering. The estimate is a + bb/r for r = 0.0183 (Petzold's
-    average particle), 0.044 and 0.01, a range that includes most natural waters.
+    c is ill-posed: the signal hardly depends on forward scattering. The estimate is a + bw + (bb - bw/2)/r, with the
+    scattering bw of sea water at 532 nm, for particles of r = 0.0183 (Petzold's average particle), 0.03 and 0.003. The
+    waters of `water_types` have 0.0033 (chlorophyll 30 mg/m^3) to 0.0198 (Petzold's turbid water).
     """
     diameter = in_range("spot_diameter", spot_diameter, SMALLEST_SPOT, np.inf)
     factor = positive("phase_factor", phase_factor)
@@ -112,14 +114,17 @@ def water_of_column(
         a = 0.5 * (a + k - bb - excess)
     known &= a > 0
     kd = _kd(np.maximum(a, 0), bb)
-    usual, high, low = (a + bb / ratio for ratio in (BACKSCATTER_RATIO, *BACKSCATTER_RATIOS))
+    molecules = float(water_scattering(532.0))
+    particles = np.maximum(bb - molecules / 2, 0)
+    usual, low, high = (
+        a + molecules + particles / ratio for ratio in (BACKSCATTER_RATIO, *reversed(BACKSCATTER_RATIOS))
+    )
     return WaterEstimate(*(np.where(known, value, np.nan) for value in (a, bb, kd, usual, low, high)))
 
 
 def _kd(absorption: FloatArray, backscattering: FloatArray) -> FloatArray:
-    """Return the diffuse attenuation [1/m], which depends on the scattering only through bb."""
-    pairs = zip(absorption.ravel(), backscattering.ravel(), strict=True)
-    return np.array([InherentProperties(a, bb, bb).kd for a, bb in pairs]).reshape(absorption.shape)
+    """Return the diffuse attenuation [1/m] by Lee, Du and Arnone (2005), which depends on the scattering by bb only."""
+    return np.asarray(absorption + 4.18 * (1 - 0.52 * np.exp(-10.8 * absorption)) * backscattering)
 
 
 def bottom_reflectance(

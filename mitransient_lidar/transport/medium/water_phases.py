@@ -72,6 +72,7 @@ def phases_of_layers(
     kind: str,
     phase_g: float,
     water_scattering: np.ndarray,
+    chi_p: np.ndarray | None,
     tabulated: Callable[[PowerLawTable], mi.PhaseFunction],
 ) -> list[mi.PhaseFunction]:
     """Return one phase function a layer, the same object where layers share it.
@@ -88,13 +89,15 @@ def phases_of_layers(
         Mean cosine for ``hg``.
     water_scattering
         Scattering of pure water [1/m], shape (layers,), a part of the column's scattering.
+    chi_p
+        bb/(2 pi p(pi) b) of the particles of each layer, shape (layers,), or None for that of their function.
     tabulated
         Constructor of a phase function from a table.
 
     Raises
     ------
     UserError
-        When nested functions are neither one nor one a layer.
+        When nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
     """
     count = column.count
     share = np.divide(water_scattering, column.scattering, out=np.zeros(count), where=column.scattering > 0)
@@ -113,8 +116,8 @@ def phases_of_layers(
     elif kind == "hg":
         particles = [create_object("hg", g=phase_g)] * count
     else:
-        return _mixed(*_fournier_forand(column, water_scattering, share), tabulated)
-    return _mixed(particles, share, tabulated)
+        particles, share = _fournier_forand(column, water_scattering, share)
+    return _mixed(particles, share, [None] * count if chi_p is None else chi_p.tolist(), tabulated)
 
 
 def _fournier_forand(
@@ -143,20 +146,24 @@ def _rounded(value: float) -> float:
 
 
 def _mixed(
-    particles: list[mi.PhaseFunction], share: np.ndarray, tabulated: Callable[[PowerLawTable], mi.PhaseFunction]
+    particles: list[mi.PhaseFunction],
+    share: np.ndarray,
+    chi_p: list[float | None],
+    tabulated: Callable[[PowerLawTable], mi.PhaseFunction],
 ) -> list[mi.PhaseFunction]:
     """Return phase functions of particles mixed with that of pure water, by its share of the scattering."""
 
     @cache
-    def mixed(number: int, part: float) -> mi.PhaseFunction:
+    def mixed(number: int, part: float, chi: float | None) -> mi.PhaseFunction:
         phase = different[number]
-        if part <= _SMALLEST_SHARE:
+        if part <= _SMALLEST_SHARE and chi is None:
             return phase
+        table = table_of(phase) if chi is None else table_of(phase).with_chi(chi)
         water = PowerLawTable.from_function(water_phase_function)
-        return tabulated(PowerLawTable.mixture([table_of(phase), water], [1 - part, part]))
+        return tabulated(PowerLawTable.mixture([table, water], [1 - part, part]))
 
     different = {id(phase): phase for phase in particles}
-    return [mixed(id(phase), part) for phase, part in zip(particles, share.tolist(), strict=True)]
+    return [mixed(id(phase), part, chi) for phase, part, chi in zip(particles, share.tolist(), chi_p, strict=True)]
 
 
 def table_of(phase: mi.PhaseFunction) -> PowerLawTable:

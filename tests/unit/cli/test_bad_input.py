@@ -37,12 +37,13 @@ POSE = "altitude off_nadir_deg aim_x aim_y"
 RECORD = "time_start_ns bin_width_ns"
 SEA = "wind_speed wind_direction_deg surface_time surface_size phase_g"
 NUMBERS = f"{LASER} {RECEIVER} {POSE} {RECORD} {SEA} bottom_depth bottom_reflectance"
-LISTS = "layer_tops attenuation scattering backscattering water_scattering refractive_index group_index"
+LISTS = "layer_tops attenuation scattering backscattering water_scattering chi_p refractive_index group_index"
 
 TABLE1 = {
     ("inf", "must be finite"): NUMBERS,
     # All numbers are read alike: each of these mistakes for a third of them.
-    ("", "is empty: it must have a value"): f"{' '.join(NUMBERS.split()[::3])} {LISTS} bin_count surface_seed layout",
+    ("", "is empty: it must have a value"): f"{' '.join(NUMBERS.split()[::3])} layer_tops attenuation scattering "
+    "backscattering refractive_index group_index bin_count surface_seed layout",
     ("deep", "must be a number"): NUMBERS.split()[1::3],
     ("1 2", "must be one number"): "pulse_energy_mj pulse_fwhm_ns wavelength_nm optical_efficiency altitude",
     ("1 2", "must be a number"): "divergence_mrad",
@@ -86,6 +87,7 @@ TABLE1 = {
     ("0.2", "must not exceed scattering = 0.15"): "backscattering",
     ("0.1", "scattering = 0.15 must not exceed"): "attenuation",
     ("0.2", "must be at least 0 and at most scattering"): "water_scattering",
+    ("20", "must lie between 0.1 and 10"): "chi_p",
     ("3, 0", "must start at 0 m"): "layer_tops",
 }
 TARGET = {

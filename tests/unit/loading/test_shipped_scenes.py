@@ -21,7 +21,7 @@ TABLE = {
     **{"surface_refined_size": "auto", "surface_cell_size": "auto"},
     **{"surface_shortest_wave": "auto", "surface_size": "auto"},
     **{"refractive_index": "1.34", "group_index": "1.364", "layer_tops": "0"},
-    **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": ""},
+    **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "", "chi_p": ""},
     **dict.fromkeys(("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure", "profile"), ""),
     **{"phase": "fournier_forand", "phase_g": "0.924"},
     **{"bottom_depth": "8", "bottom_reflectance": "0.1"},

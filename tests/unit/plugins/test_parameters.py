@@ -13,7 +13,7 @@ from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 #: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
 WITHOUT_VALUE = {
-    "layered_water": {"jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile"},
+    "layered_water": {"jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"},
     "ocean_surface": {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
         *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),

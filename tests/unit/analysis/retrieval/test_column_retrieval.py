@@ -15,6 +15,7 @@ from mitransient_lidar.analysis.retrieval.column_retrieval import (
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.water_types import water_of
 
 THETA = math.radians(20)
 SYSTEM = LidarSystem(200, THETA, 3.645e-3, 0.025, 1.34, 1.364)
@@ -37,9 +38,17 @@ def test_water_of_its_own_model(spot, decay):
     np.testing.assert_allclose(found.absorption, A, rtol=1e-6)
     np.testing.assert_allclose(found.backscattering, BB, rtol=1e-6)
     np.testing.assert_allclose(found.kd, KD, rtol=1e-6)
-    np.testing.assert_allclose(found.attenuation, A + BB / 0.0183, rtol=1e-6)
-    np.testing.assert_allclose(found.attenuation_low, A + BB / 0.044, rtol=1e-6)
-    np.testing.assert_allclose(found.attenuation_high, A + BB / 0.01, rtol=1e-6)
+    # Molecules scatter 0.0019623 1/m (Zhang, Hu and He 2009), a half of it backwards; the rest is by particles.
+    for values, ratio in ((found.attenuation, 0.0183), (found.attenuation_low, 0.03), (found.attenuation_high, 0.003)):
+        np.testing.assert_allclose(values, A + 0.0019623 + (BB - 0.0019623 / 2) / ratio, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["jerlov I", "jerlov 9C", "chlorophyll 0.01", "chlorophyll 30", "petzold turbid"])
+def test_bounds_of_attenuation_include_waters_by_name(name):
+    water = water_of(*name.split())
+    level = 1.13 * water.backscattering / (2 * np.pi)
+    found = water_of_column(water.absorption + water.backscattering, level, 11.0)
+    assert found.attenuation_low < water.attenuation < found.attenuation_high
 
 
 def test_columns_that_no_water_makes_are_nan():

@@ -187,6 +187,24 @@ def test_table_follows_a_backward_lobe(g_backward, count):
     np.testing.assert_allclose(PowerLawTable.from_function(p, count).eval(theta), p(theta), rtol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["fournier_forand", "petzold", "isotropic"])
+@pytest.mark.parametrize("chi", [0.1, 0.5, 2.0, 10.0])
+def test_value_at_180_degrees_by_its_ratio_to_the_backscattering(name, chi):
+    before = tables()[name]
+    after, ratio = before.with_chi(chi), before.backscatter_ratio
+    assert after.backscatter_ratio == pytest.approx(ratio, rel=5e-4)
+    assert after.eval_s(1.0) == pytest.approx(ratio / (2 * np.pi * chi), rel=1e-3)
+    # The shape up to 160 degrees stays, and forward scattering.
+    theta = np.radians([0.1, 10.0, 60.0, 89.0])
+    np.testing.assert_allclose(after.eval(theta), before.eval(theta), rtol=1e-3)
+    change = after.eval(np.radians([95.0, 130.0, 160.0])) / before.eval(np.radians([95.0, 130.0, 160.0]))
+    assert np.ptp(change) < 1e-3 + 2e-4 / chi
+    assert abs(change[0] - 1) < 1e-3 + 6e-3 * abs(1 / chi - 1)
+    # Half of the change is reached 5 degrees from the back: exp(-(5 / 6)^2).
+    changes = after.eval(np.radians([175.0, 180.0])) / before.eval(np.radians([175.0, 180.0])) - change[1]
+    assert changes[0] / changes[1] == pytest.approx(np.exp(-((5 / 6) ** 2)), abs=0.03)
+
+
 def test_isotropic_table_is_exact():
     table = tables()["isotropic"]
     np.testing.assert_allclose(table.value, 1 / (4 * np.pi), rtol=1e-12)
@@ -205,6 +223,11 @@ def test_isotropic_table_is_exact():
         (lambda: henyey_greenstein(1.0, 1.0), "g = 1 must lie between -1 and 1"),
         (lambda: two_term_henyey_greenstein(1.0, 1.5, 0.9, 0.3), "weight = 1.5"),
         (lambda: two_term_henyey_greenstein(1.0, 0.5, 0.9, -0.3), "g_backward = -0.3"),
+        (lambda: tables()["isotropic"].with_chi(0.0), "chi = 0 must be greater than 0"),
+        (
+            lambda: tables()["isotropic"].with_chi(0.001),
+            "chi_p = 0.001 makes the phase function negative: .* than 0.00",
+        ),
         (lambda: PowerLawTable.from_values([1.0, 0.0, 1.0]), "greater than 0 at every node"),
         (lambda: PowerLawTable.from_values([1.0, np.nan]), "nan"),
         (lambda: PowerLawTable.from_values([1e30, 1.0], -20.0), "exponent must be below 1"),
