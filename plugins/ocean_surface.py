@@ -30,7 +30,8 @@ class OceanSurface(mi.Mesh):
     fetch, inverse_wave_age   float    Distance over which the wind has blown over water [m], or inverse wave age, 0.84
                                        (fully developed) to 5. Default: 0.84
     peak_enhancement          float    JONSWAP's gamma. Default: 3.3
-    swell_height              float    Significant height of an added swell [m], 0 for none. Default: 0
+    swell_height              float    Significant height of an added swell [m], at most a fifteenth of its length; 0
+                                       for none. Default: 0
     swell_wavelength          float    Its wavelength [m]. Default: 60
     swell_direction_deg       float    Direction it travels towards [deg]. Default: 0
     slope_variance            string   Total slope variance of waves and ripples: ``cox_munk`` (measured, clean sea,

@@ -155,7 +155,8 @@ def saturation_advice(recorded: xr.Dataset) -> str:
     if "fitting_optical_density" in recorded.attrs:
         density = recorded.attrs["fitting_optical_density"]
         text += f": a filter of optical density {density:.1f} (factor {10**density:.3g})"
-        text += f" or a gain of {recorded.attrs['fitting_gain']:.3g} would fit"
+        gain = recorded.attrs["fitting_gain"]
+        text += f" or a gain of {gain:.3g} would fit" if gain > 0 else " would fit"
     return text
 
 
@@ -204,6 +205,8 @@ def _in_range(
     fitting = math.ceil(10 * math.log10(attenuation) - 1e-6) / 10 if math.isfinite(attenuation) else math.inf
     chosen = fitting if density == "auto" else wanted
     largest = chain.fitting_gain(10**-chosen * light, width, 10**-chosen * background)
+    if gain == "auto" and largest == 0:
+        raise UserError("gain = 'auto' finds no gain of the photomultiplier: use optical_density = 'auto'")
     factor = largest if gain == "auto" else float(gain)
     automatic = "gain" if gain == "auto" else "optical_density" if density == "auto" else ""
     attributes: dict[str, float | str] = {
@@ -258,9 +261,9 @@ def _background(dataset: xr.Dataset, power: npt.ArrayLike | xr.DataArray, dims: 
     return values
 
 
-def _described(name: str, part: Any) -> Mapping[str, int | float | str]:
-    """Return the parameters of a stage and of its nested stages as attributes."""
-    found: dict[str, int | float | str] = {}
+def _described(name: str, part: Any) -> Mapping[str, int | float | str | list[float]]:
+    """Return the parameters of a stage and of its nested stages as attributes; None and () are left out."""
+    found: dict[str, int | float | str | list[float]] = {}
     if is_dataclass(part):
         if name != "receiver":
             found[name] = type(part).__name__
@@ -268,6 +271,8 @@ def _described(name: str, part: Any) -> Mapping[str, int | float | str]:
             found |= _described(f"{name}.{field.name}", getattr(part, field.name))
     elif isinstance(part, bool):
         found[name] = int(part)
+    elif isinstance(part, tuple):
+        found |= {name: list(part)} if part else {}
     elif part is not None:
         found[name] = part
     return found

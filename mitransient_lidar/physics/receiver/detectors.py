@@ -94,9 +94,16 @@ class LinearDetector:
         Multiplied dark current, before the multiplication [nA]: the anode's dark current over the gain.
     leakage_current_na : float
         Unmultiplied dark current [nA], such as the surface current of an avalanche photodiode.
+    dynode_gains : tuple of float
+        Gains of the dynodes of a photomultiplier, whose voltage can be lowered; empty for other detectors.
+    largest_current_ma : float
+        Largest output current in pulses [mA]: behind an amplifier, more saturates.
 
     Notes
     -----
+    Afterpulses, jitter, recovery from overload and signal-induced noise (a tail of 1e-4 to 1e-3 of a strong surface
+    echo for up to a microsecond, in photomultipliers) are neglected: real receivers see false echoes there.
+
     The charge of n events is drawn from a gamma distribution of mean n gain and variance n gain^2 (excess_noise - 1),
     the shot noise of the leakage from a normal one: mean and variance are exact, the shape of the tails is not.
     """
@@ -106,11 +113,15 @@ class LinearDetector:
     excess_noise: float = 1.0
     dark_current_na: float = 0.0
     leakage_current_na: float = 0.0
+    dynode_gains: tuple[float, ...] = ()
+    largest_current_ma: float = np.inf
 
     def __post_init__(self) -> None:
         _check_efficiency(self.quantum_efficiency)
         for name in ("gain", "excess_noise"):
             in_range(name, getattr(self, name), 1, np.inf)
+        if not self.largest_current_ma > 0:
+            raise UserError(f"largest_current_ma = {self.largest_current_ma:g} must be greater than 0")
         for name in ("dark_current_na", "leakage_current_na"):
             non_negative(name, getattr(self, name))
 
@@ -129,11 +140,31 @@ class LinearDetector:
 
     @classmethod
     def photomultiplier(
-        cls, quantum_efficiency: float, dynode_gains: Sequence[float], dark_current_na: float = 0.0
+        cls,
+        quantum_efficiency: float,
+        dynode_gains: Sequence[float],
+        dark_current_na: float = 0.0,
+        largest_current_ma: float = np.inf,
     ) -> LinearDetector:
         """Photomultiplier tube, its gain and excess noise from the gains of its dynodes (`dynode_excess_noise`)."""
-        noise = dynode_excess_noise(dynode_gains)
-        return cls(quantum_efficiency, float(np.prod(dynode_gains)), noise, dark_current_na)
+        gains, noise = tuple(float(gain) for gain in dynode_gains), dynode_excess_noise(dynode_gains)
+        gain = float(np.prod(gains))
+        return cls(quantum_efficiency, gain, noise, dark_current_na, 0.0, gains, largest_current_ma)
+
+    def with_gain(self, factor: float) -> LinearDetector:
+        """Return a photomultiplier at another voltage: its gain times a factor, the same for each dynode.
+
+        Raises
+        ------
+        UserError
+            If a dynode's gain would not be above 1.
+        """
+        each = positive("gain", factor) ** (1 / len(self.dynode_gains))
+        gains = [each * gain for gain in self.dynode_gains]
+        if min(gains) <= 1:
+            least = min(self.dynode_gains) ** -len(self.dynode_gains)
+            raise UserError(f"gain = {factor:g} must be above {least:.3g}, for gains of all dynodes above 1")
+        return self.photomultiplier(self.quantum_efficiency, gains, self.dark_current_na, self.largest_current_ma)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin for a mean number of photons per bin, of the same shape."""

@@ -41,6 +41,7 @@ _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
 _HEADROOM = 6.0  # standard deviations of noise below the upper limit of samples in range
 _STRONGEST = 16  # records that an attenuation is fitted to
 _DARKEST = math.log(1e12)  # largest attenuation that is tried
+_MOST_STEPS, _IN_RANGE = 20, 1e-9  # steps of fitting a gain, and the relative excess at which they end
 
 
 class Record(NamedTuple):
@@ -151,9 +152,17 @@ class ReceiverChain:
         return self._readout().expected(mean, variance)
 
     def with_gain(self, factor: float) -> ReceiverChain:
-        """Return the chain with the transimpedance of its amplifier times a factor, above 0."""
+        """Return the chain with another gain: of a photomultiplier's dynodes, or of the amplifier behind others.
+
+        Raises
+        ------
+        UserError
+            If the factor is not positive, there is no amplifier, or dynodes would no longer amplify.
+        """
         if self.amplifier is None:
             raise UserError(f"gain = {factor:g} needs an amplifier, which this receiver lacks")
+        if isinstance(self.detector, LinearDetector) and self.detector.dynode_gains:
+            return replace(self, detector=self.detector.with_gain(factor))
         ohm = self.amplifier.transimpedance_ohm * positive("gain", factor)
         return replace(self, amplifier=replace(self.amplifier, transimpedance_ohm=ohm))
 
@@ -164,16 +173,26 @@ class ReceiverChain:
         background: npt.ArrayLike = 0.0,
         samples: slice = slice(None),
     ) -> float:
-        """Return the largest factor of the transimpedance, at most 1, that keeps samples in range.
+        """Return the largest factor of the gain, at most 1, that keeps samples in range; see `with_gain`.
 
-        Samples are in range with 6 standard deviations of noise below the upper limit of amplifier and digitiser; all
-        voltages and noises are proportional to the transimpedance. Only `samples` count. Other arguments are those of
-        `apply`. The factor is 1 without an amplifier or a limit.
+        Samples are in range with 6 standard deviations of noise below the upper limit of tube, amplifier and digitiser.
+        Only `samples` count. Other arguments are those of `apply`. The factor is 1 without an amplifier or a limit, and
+        0 where the dynodes of a photomultiplier would have to attenuate.
         """
-        if self.amplifier is None or not math.isfinite(top := self._readout().top_v):
-            return 1.0
-        highest = float(self._highest(power, bin_width_ns, background, samples).max())
-        return 1.0 if highest <= top else top / highest
+        factor, chain = 1.0, self
+        # Behind a photomultiplier, the noise of the amplifier stays and the excess noise grows.
+        for _ in range(_MOST_STEPS):
+            if chain.amplifier is None or not math.isfinite(top := chain._readout().top_v):
+                break
+            highest = float(chain._highest(power, bin_width_ns, background, samples).max())
+            if highest <= top * (1 + _IN_RANGE):
+                break
+            factor *= top / highest
+            try:
+                chain = self.with_gain(factor)
+            except UserError:
+                return 0.0
+        return factor
 
     def fitting_attenuation(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> float:
         """Return the least factor, at least 1, by which light must be attenuated for samples in range.
@@ -287,7 +306,10 @@ class ReceiverChain:
     def _readout(self) -> Readout:
         """Return the stages behind the low-pass."""
         assert self.amplifier is not None
-        return Readout(self.amplifier.limit_v, self.logarithm, self.digitiser)
+        limits = [] if self.amplifier.limit_v is None else [self.amplifier.limit_v]
+        if math.isfinite(largest := getattr(self.detector, "largest_current_ma", math.inf)):
+            limits.append(1e-3 * largest * self.amplifier.transimpedance_ohm)
+        return Readout(min(limits, default=None), self.logarithm, self.digitiser)
 
     def _process(
         self, charge: FloatArray, bin_width_ns: float, random: np.random.Generator
@@ -306,8 +328,11 @@ class ReceiverChain:
 
 
 # A gain of 5 and six of 4 give an excess noise of 1.27; photomultipliers have 1.2 to 1.3 (Hamamatsu, questions and
-# answers on avalanche photodiodes). Quantum efficiency of a multialkali cathode at 532 nm and dark current are typical.
-_TUBE = LinearDetector.photomultiplier(0.15, (5.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0), dark_current_na=1e-5)
+# answers on avalanche photodiodes). Quantum efficiency of a multialkali cathode at 532 nm, dark current and the largest
+# linear current in pulses are typical.
+_TUBE = LinearDetector.photomultiplier(
+    0.15, (5.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0), dark_current_na=1e-5, largest_current_ma=50.0
+)
 _LOAD = Amplifier(500.0, noise_pa_per_rthz=40.0, load_ohm=50.0, bandwidth_mhz=350.0)
 
 #: Typical chains for 532 nm. Numbers that the `source` does not cover are typical values.
@@ -335,10 +360,12 @@ RECEIVERS = MappingProxyType(
             "architecture, 2010)",
         ),
         "apd": ReceiverChain(
-            LinearDetector.avalanche(0.6, 150.0, 0.02, dark_current_na=0.1, leakage_current_na=10.0),
+            # 15 nA in all, and a noise of 0.23 pA per root Hz, as in the data sheet.
+            LinearDetector.avalanche(0.6, 150.0, 0.02, dark_current_na=1.35e-3, leakage_current_na=14.8),
             Amplifier(10e3, noise_pa_per_rthz=3.0, bandwidth_mhz=200.0),
             digitiser=Digitiser(12, 1.0, -0.1),
-            source="typical silicon reach-through avalanche photodiode at the gain of 150 of Excelitas C30902EH",
+            source="Excelitas C30902EH at its gain of 150: dark current and noise of the data sheet; typical quantum "
+            "efficiency and amplifier",
         ),
         "sipm": ReceiverChain(
             SiliconPhotomultiplier(0.33, 3600, 50.0, 0.087, 5.07e5, 1.7e6, 0.05),

@@ -22,7 +22,8 @@ class SwellSpectrum(AxialSpectrum):
     Parameters
     ----------
     height : float
-        Significant wave height [m], 0 to a seventh of the wavelength, the limit of breaking.
+        Significant wave height [m], 0 to a fifteenth of the wavelength: steeper seas break (DNV-RP-C205; a single wave
+        breaks at a seventh).
     wavelength : float
         Mean wavelength [m], positive. In a realisation it is rounded to a fraction of the period, and swell more than
         twice as long as the period is missing.
@@ -43,9 +44,9 @@ class SwellSpectrum(AxialSpectrum):
     def __post_init__(self) -> None:
         wavelength = positive("wavelength", self.wavelength)
         height = non_negative("height", self.height)
-        if height > wavelength / 7:
+        if height > wavelength / 15:
             raise UserError(
-                f"height = {height:g} must not exceed {wavelength / 7:.3g} m, a seventh of the wavelength (breaking)"
+                f"height = {height:g} must not exceed {wavelength / 15:.3g} m, a fifteenth of the wavelength (breaking)"
             )
         finite("direction", self.direction)
         in_range("relative_bandwidth", positive("relative_bandwidth", self.relative_bandwidth), 0, 0.3)

@@ -8,7 +8,12 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
+from mitransient_lidar.physics.receiver.detectors import (
+    LinearDetector,
+    SiliconPhotomultiplier,
+    SinglePhotonDetector,
+    photons_per_joule,
+)
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 
@@ -249,6 +254,41 @@ def test_fitting_gain_and_attenuation_in_closed_form():
     more = chain.fitting_attenuation(power, bins, background=power[0, 1])
     assert more == pytest.approx(2 * most / root**2, rel=1e-5)
     assert chain.fitting_attenuation(0.1 * power, bins) == chain.fitting_gain(0.1 * power, bins) == 1
+
+
+def test_gain_of_a_photomultiplier_is_that_of_its_dynodes():
+    """The excess noise of the tube grows, and the amplifier's noise stays: the largest gain is a root of both."""
+    limit, noise = 0.5, Amplifier(1e3, noise_pa_per_rthz=30.0, bandwidth_mhz=100.0)
+    tube = LinearDetector.photomultiplier(0.2, (5.0, 4.0, 4.0), largest_current_ma=1e3 * limit / 1e3)
+    chain = ReceiverChain(tube, noise)
+    lower = chain.with_gain(0.125)
+    assert lower.amplifier == chain.amplifier
+    np.testing.assert_allclose(lower.detector.dynode_gains, (2.5, 2.0, 2.0))
+    assert lower.detector.gain == pytest.approx(10.0)
+    # 1 + 1/2.5 + 1/5 + 1/10
+    assert lower.detector.excess_noise == pytest.approx(1.7)
+    # The largest current saturates, 0.5 mA or 0.5 V here, ten times exceeded.
+    light = np.full(400, 10 * limit / 1e3 / (tube.gain * 0.2 * 1.602176634e-19 * photons_per_joule(532.0)))
+    assert chain.expected(light, 1.0).saturation[200] == pytest.approx(1)
+    factor = chain.fitting_gain(light, 1.0)
+    fitted = chain.with_gain(factor)
+    assert fitted.expected(light, 1.0).saturation.max() < 1e-8
+    unlimited = replace(fitted, detector=replace(fitted.detector, largest_current_ma=np.inf))
+    mean, variance = (float(each[200]) for each in unlimited.expected(light, 1.0)[:2])
+    assert mean + 6 * np.sqrt(variance) == pytest.approx(limit, rel=1e-6)
+    with pytest.raises(UserError, match=r"gain = 0.001 must be above 0.0156, for gains of all dynodes above 1"):
+        chain.with_gain(1e-3)
+    assert chain.fitting_gain(1e4 * light, 1.0) == 0
+    with pytest.raises(ValueError, match="largest_current_ma = 0 must be greater than 0"):
+        LinearDetector.photomultiplier(0.2, (5.0,), largest_current_ma=0.0)
+
+
+def test_noise_of_the_avalanche_photodiode():
+    """Data sheet of C30902EH: 15 nA, and 0.23 pA per root Hz, whose square is 2 e (I + i M^2 F), at a gain of 150."""
+    diode = RECEIVERS["apd"].detector
+    assert diode.leakage_current_na + diode.gain * diode.dark_current_na == pytest.approx(15, rel=0.01)
+    current = 1e-9 * (diode.leakage_current_na + diode.dark_current_na * diode.gain**2 * diode.excess_noise)
+    assert np.sqrt(2 * 1.602176634e-19 * current) == pytest.approx(0.23e-12, rel=0.01)
 
 
 def test_chains_without_limits_need_no_attenuation():

@@ -449,7 +449,7 @@ def test_matched_totals_of_too_large_a_ratio_miss_the_larger():
         (lambda: JonswapSpectrum(10, 1e4, 0.9), "peak_enhancement = 0.9 must lie between 1 and 7"),
         (lambda: JonswapSpectrum(10, 1e4, direction="x"), "direction = 'x' must be a number"),
         (lambda: SwellSpectrum(-1, 10), "height = -1 must not be negative"),
-        (lambda: SwellSpectrum(2, 10), "height = 2 must not exceed 1.43 m, a seventh of the wavelength"),
+        (lambda: SwellSpectrum(2, 20), "height = 2 must not exceed 1.33 m, a fifteenth of the wavelength"),
         (lambda: SwellSpectrum(1, 0), "wavelength = 0 must be greater than 0"),
         (lambda: SwellSpectrum(1, 20, np.nan), "direction = nan"),
         (lambda: SwellSpectrum(1, 20, 0, 0), "relative_bandwidth = 0 must be greater than 0"),
