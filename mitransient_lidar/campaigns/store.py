@@ -228,6 +228,8 @@ class Store:
         with _reading(self.path, "the list of its arrays"):
             names = list(self._group.array_keys())
         of_runs = ("status", "error", *self.variables)
+        for name in sorted({*self.attributes.get("arrays", ()), "run"} - {*names, *of_runs}):
+            raise UserError(f"{self.path} is damaged: it has lost {name}.")
         for name in {*names, *of_runs}:
             array = self._array(name)
             if name not in of_runs:
@@ -430,6 +432,7 @@ def _fill(
         "shard_size": size,
         "inputs": inputs,
         "variables": list(arrays),
+        "arrays": sorted(group.array_keys()),
         "coordinates": " ".join(name for name in secondary if name in group),
         **versions(),
     }

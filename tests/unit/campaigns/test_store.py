@@ -1,6 +1,7 @@
 import errno
 import os
 import re
+import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -214,6 +215,13 @@ def test_damaged_coordinates_are_refused(full, path, name, damage):
     damage(path / name / "c" / "0")
     with pytest.raises(ValueError, match=r"campaign\.zarr is damaged|checksum"):
         open_campaign(path).load()
+
+
+@pytest.mark.parametrize("name", ["time", "time_input", "pixel", "run", "shot", "layout", "waveform"])
+def test_a_store_that_has_lost_an_array_is_refused(full, path, name):
+    shutil.rmtree(path / name)
+    with pytest.raises(UserError, match=rf"campaign\.zarr is damaged: (it has lost {name}|{name} cannot be read)\."):
+        open_campaign(path)
 
 
 @pytest.mark.parametrize(
