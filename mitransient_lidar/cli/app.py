@@ -28,6 +28,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.shot_statistics,
         studies.target_signal,
         studies.detect,
+        studies.estimate,
         studies.beam_spread,
         studies.fov_sweep,
         studies.scattering_orders,

@@ -10,6 +10,9 @@ import typer
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, number_list
 
+Instrument = Annotated[
+    str | None, typer.Option(help="Instrument instead of the scene's lidar, from the list of instruments.")
+]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a shipped scene, or path of a Mitsuba XML file.")]
 SceneOrResult = Annotated[
     str,

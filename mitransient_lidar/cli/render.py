@@ -10,7 +10,7 @@ import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import Define, OptionalSeed, Quiet, SceneOrResult, parameters
+from mitransient_lidar.cli.options import Define, Instrument, OptionalSeed, Quiet, SceneOrResult, parameters
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
@@ -37,9 +37,7 @@ def render(
     scene: SceneOrResult,
     define: Define = None,
     output: Folder = Path("."),
-    instrument: Annotated[
-        str | None, typer.Option(help="Instrument instead of the scene's lidar, from the list of instruments.")
-    ] = None,
+    instrument: Instrument = None,
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     target_error: TargetError = None,
     target_quantile: TargetQuantile = None,

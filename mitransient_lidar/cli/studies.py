@@ -14,6 +14,7 @@ from mitransient_lidar.cli.options import (
     RECEIVERS,
     Define,
     DrawingOnly,
+    Instrument,
     Quiet,
     Scene,
     SceneOrResult,
@@ -254,6 +255,27 @@ def beam_spread(
     write_figure(found, output, plot_beam_spread)
     if not quiet:
         _print(study.describe_spread(found))
+
+
+def estimate(
+    scene: Scene,
+    define: Define = None,
+    instrument: Instrument = None,
+    paths: Annotated[int, typer.Option(help="Number of paths of the light.")] = 2**13,
+    seed: Seed = 0,
+    output: OptionalFigure = None,
+) -> None:
+    """Estimate the waveforms in a second, over a level sea and without targets.
+
+    Lidar equation with sampled forward scattering: a first look, and a second opinion on a render.
+    """
+    check_figure(output)
+    from mitransient_lidar.plots.waveforms import plot_components
+    from mitransient_lidar.studies import estimate as study
+
+    found = study.estimate(scene, parameters(define), instrument=instrument, paths=paths, seed=seed)
+    write_figure(found, output, plot_components)
+    _print(study.describe_estimate(found))
 
 
 def fov_sweep(

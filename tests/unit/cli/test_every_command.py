@@ -22,6 +22,7 @@ SCENE_COMMANDS = {
     "shot-statistics": ["--count", 2],
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
+    "estimate": [],
     "beam-spread": ["--depths", "2,5", "--passes", 2],
     "fov-sweep": ["--fov-mrad", "20,35", "--passes", 8],
     "scattering-orders": ["--passes", 2, "--orders", 2],

@@ -1,0 +1,202 @@
+"""Fast estimate of the echoes of sea surface, water and a level bottom, without tracing rays.
+
+Light is the lidar equation's, on the lines of sight of a level sea. Scattering moves and delays it: paths scatter
+forwards a random number of times at random depths, and each event shifts all that follows by the tangent of its angle
+times the remaining distance. One scattering by 180 degrees, or the bottom, turns the path. Shifts on the way down move
+the point that is lit, and with it the time; those on the way up move only the direction from which its light is seen.
+Two-way use of the beam spread function in this way follows Katsev et al. (1997), J. Opt. Soc. Am. A 14, 1338,
+doi:10.1364/JOSAA.14.001338, and Walker and McLean (1999), Appl. Opt. 38, 2384, doi:10.1364/AO.38.002384; angles are
+drawn from the phase function here, since its moments describe sea water badly (`small_angle.BeamSpread`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
+
+#: Scattering by more is loss: the light has left the beam [rad].
+_LARGEST_ANGLE = np.radians(80.0)
+
+#: Nodes of the inverse of a phase function's distribution.
+_NODES = 8192
+
+
+class Arrivals(NamedTuple):
+    """Light that comes back; arrays of one shape."""
+
+    angle_x: FloatArray  #: Direction in the tangent plane of the receiver, away from nadir [rad].
+    angle_y: FloatArray  #: And to the left [rad].
+    time_ns: FloatArray  #: Time since the light left the transmitter [ns].
+    energy: FloatArray  #: Energy received [J].
+
+
+@dataclass(frozen=True)
+class EchoEstimate:
+    """Lidar over a level sea and a level Lambertian bottom, transmitter and receiver at one place with one axis."""
+
+    system: LidarSystem  #: The lidar; its energy and its indices.
+    column: WaterColumn  #: Layers of the water.
+    phases: Sequence[PowerLawTable]  #: Phase function of each layer.
+    slope_covariance: FloatArray  #: Of waves and ripples together, away from nadir and to the left, shape (2, 2).
+    bottom_depth: float  #: Depth of the bottom, or of the last light from the water without one [m].
+    reflectance: float  #: Lambertian reflectance of the bottom, 0 to 1.
+
+    def surface(self, beam: FloatArray) -> Arrivals:
+        """Return the glint of points of the beam in the tangent plane [rad], shape (n, 2), each of 1/n of the energy.
+
+        Glint of Gaussian slopes by Cox and Munk (1954), doi:10.1364/JOSA.44.000838, without shadows.
+        """
+        theta, azimuth = self._rays(*beam.T)
+        slopes = np.tan(theta)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        exponent = np.einsum("ni,ij,nj->n", slopes, np.linalg.inv(self.slope_covariance), slopes)
+        density = np.exp(-0.5 * exponent) / (2 * np.pi * np.sqrt(np.linalg.det(self.slope_covariance)))
+        reflectance, _ = fresnel(0.0, self.system.refractive_index)
+        geometry = self.system.aperture_area / (4 * np.cos(theta) ** 3 * self.system.height**2)
+        energy = self.system.energy * reflectance * density * geometry / len(beam)
+        return Arrivals(beam[:, 0], beam[:, 1], 2e9 / C0 * self.system.height / np.cos(theta), energy)
+
+    def water_and_bottom(self, beam: FloatArray, steps: int, rng: np.random.Generator) -> tuple[Arrivals, Arrivals]:
+        """Return the light of the water, in `steps` of equal depth, and of the bottom, of points of the beam.
+
+        The points are those of `surface`. Arrays are of shape (n, steps) and (n, 1).
+        """
+        spread = self._scattered(len(beam), steps, rng)
+        thickness = self.bottom_depth / steps
+        # One offset for all paths: the sum over the steps is a rectangle rule with a random start.
+        depths = np.asarray(thickness * (np.arange(steps) + rng.random()), dtype=np.float64)
+        theta, _ = self._rays(*beam.T)
+        cosine = np.cos(snell(theta, self.system.refractive_index))[:, None]
+        phases = np.array([float(phase.eval_s(1.0)) for phase in self.phases])
+        backscatter = (self.column.scattering * phases)[self.column.layer_at(depths)]
+        ripples = [self._ripples(len(beam), rng)[:, None] for _ in range(2)]
+
+        def arrivals(depth: FloatArray, returned: FloatArray) -> Arrivals:
+            in_water = depth / self._cosine
+            *shifts, delay, kept = spread.at(in_water)
+            distance = self.system.height / np.cos(self.system.off_nadir) + in_water / self.system.refractive_index
+            down, up = ((shift + tilt * in_water) / distance for shift, tilt in zip(shifts, ripples, strict=True))
+            lit = beam[:, :1] + 1j * beam[:, 1:] + down
+            to_lit, _ = self._rays(lit.real, lit.imag)
+            slant = depth / np.cos(snell(to_lit, self.system.refractive_index))
+            time = 2e9 / C0 * (self.system.height / np.cos(to_lit) + self.system.group_index * slant) + delay
+            gain = self.system.water_gain(depth, theta[:, None])
+            lost = np.exp(-2 * self._absorbed(depth) / cosine)
+            seen = lit + up
+            return Arrivals(seen.real, seen.imag, time, gain * returned * lost * kept / len(beam))
+
+        water = arrivals(depths, np.asarray(backscatter * thickness / cosine))
+        return water, arrivals(np.array([self.bottom_depth]), self.reflectance / np.pi * cosine)
+
+    @property
+    def _cosine(self) -> float:
+        """Cosine of the refracted angle of the axis."""
+        return float(np.cos(snell(self.system.off_nadir, self.system.refractive_index)))
+
+    def _rays(self, angle_x: FloatArray, angle_y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return angle from the vertical and azimuth [rad] of points in the tangent plane."""
+        sin, cos = np.sin(self.system.off_nadir), np.cos(self.system.off_nadir)
+        down, forward = cos - angle_x * sin, sin + angle_x * cos
+        return np.arctan2(np.hypot(forward, angle_y), down), np.arctan2(angle_y, forward)
+
+    def _absorbed(self, depth: FloatArray) -> FloatArray:
+        """Return the optical depth of absorption along the vertical."""
+        none = np.zeros(self.column.count)
+        absorbing = WaterColumn(self.column.layer_tops, self.column.absorption, none, none)
+        return np.asarray(absorbing.cumulative(depth))
+
+    def _ripples(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Return deflections by slopes where light enters or leaves the water [rad], as complex numbers.
+
+        A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)).
+        """
+        root = np.linalg.cholesky(self.slope_covariance)
+        slopes = rng.standard_normal((count, 2)) @ root.T
+        factor = 1 - np.cos(self.system.off_nadir) / (self.system.refractive_index * self._cosine)
+        return np.asarray(factor * (slopes[:, 0] + 1j * slopes[:, 1]))
+
+    def _scattered(self, count: int, steps: int, rng: np.random.Generator) -> _Spread:
+        """Draw the forward scattering of paths, at slant distances to the bottom, on the way down and up."""
+        tops = np.append(self.column.layer_tops, np.inf)
+        edges = np.append(tops[tops < self.bottom_depth], self.bottom_depth) / self._cosine
+        b = self.column.scattering[: edges.size - 1]
+        optical = np.append(0.0, np.cumsum(b * np.diff(edges)))
+        number = rng.poisson(2 * optical[-1], count)
+        path = np.repeat(np.arange(count), number)
+        place = optical[-1] * rng.random(path.size)
+        # Where nothing scatters, optical depths repeat: the last of equal ones is that of the layer below.
+        layer = np.clip(np.searchsorted(optical, place, side="right") - 1, 0, b.size - 1)
+        distance = edges[layer] + (place - optical[layer]) / np.where(b > 0, b, 1.0)[layer]
+        u, theta = rng.random(path.size), np.zeros(path.size)
+        for one in np.unique(layer):
+            theta[layer == one] = _angles(self.phases[one], u[layer == one])
+        is_lost = theta > _LARGEST_ANGLE
+        end = np.full(count, np.inf)
+        np.minimum.at(end, path[is_lost], distance[is_lost])
+        path, distance, theta, layer = (each[~is_lost] for each in (path, distance, theta, layer))
+        turn = np.tan(theta) * np.exp(2j * np.pi * rng.random(path.size))
+        grid = np.linspace(0, edges[-1], steps + 1)
+        cell = path * steps + np.minimum(np.searchsorted(grid, distance, side="right") - 1, steps - 1)
+        detour = 1 / np.cos(theta) - 1
+        speed = 1e-9 * C0 / self.system.group_index
+        is_down = rng.random(path.size) < 0.5
+        turns = [part * leg for leg in (is_down, ~is_down) for part in (turn.real, turn.imag)]
+        weights = *turns, detour / speed, detour * self.column.absorption[layer]
+        return _Spread(cell, distance, weights, end, grid, count)
+
+
+class _Spread:
+    """Sums over scattering events, which are linear in the distance beyond each event."""
+
+    def __init__(
+        self,
+        cell: FloatArray,
+        distance: FloatArray,
+        weights: Sequence[FloatArray],
+        end: FloatArray,
+        grid: FloatArray,
+        count: int,
+    ) -> None:
+        self._end, self._grid = end, grid
+        shape = count, grid.size - 1
+
+        def summed(values: FloatArray) -> FloatArray:
+            """Return sums over the events of each path before each node of the grid."""
+            found = np.bincount(cell, values, shape[0] * shape[1]).reshape(shape)
+            return np.pad(np.cumsum(found, axis=1), ((0, 0), (1, 0)))
+
+        self._sums = [(summed(weight), summed(weight * distance)) for weight in weights]
+
+    def at(self, distance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return shifts on the way down and up [m], delay [ns] and share of the energy that is kept at distances [m].
+
+        Shifts are complex numbers, away from nadir and to the left. Sums are linear between the nodes of the grid, as
+        if events within a cell were spread along it.
+        """
+        last = self._grid.size - 1
+        place = np.clip(distance / self._grid[-1] * last, 0, last)
+        low = np.minimum(place.astype(np.intp), last - 1)
+        part = place - low
+
+        def beyond(sums: tuple[FloatArray, FloatArray]) -> FloatArray:
+            nodes = [self._grid[node] * sums[0][:, node] - sums[1][:, node] for node in (low, low + 1)]
+            return np.asarray((1 - part) * nodes[0] + part * nodes[1])
+
+        down_x, down_y, up_x, up_y, delay, absorbed = map(beyond, self._sums)
+        kept = np.where(self._end[:, None] > distance, np.exp(-absorbed), 0.0)
+        return down_x + 1j * down_y, up_x + 1j * up_y, delay, kept
+
+
+def _angles(phase: PowerLawTable, u: FloatArray) -> FloatArray:
+    """Return scattering angles [rad] of a phase function for uniform numbers."""
+    theta = np.concatenate([[0.0], np.geomspace(1e-6, np.pi, _NODES)])
+    return np.asarray(np.interp(u, phase.cdf_s(np.sin(theta / 2) ** 2), theta))

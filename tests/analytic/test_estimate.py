@@ -1,0 +1,78 @@
+"""The fast estimate against renders: an independent model of echoes, shared in nothing but the scene."""
+
+import numpy as np
+import pytest
+import significance
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.studies.estimate import describe_estimate, estimate
+
+LEVEL = {"spectrum": "flat"}
+
+
+def by_origin(dataset, origin):
+    """Return energies of an origin by pixel, their standard errors, and mean times [ns]."""
+    energy = dataset["impulse_response_by_origin"].sel(origin=origin)
+    error = np.sqrt((dataset["impulse_response_by_origin_stderr"].sel(origin=origin) ** 2).sum("time"))
+    total = energy.sum("time")
+    return total.values, error.values, ((energy * energy["time"]).sum("time") / total).values
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("params", "water"),
+    [
+        ({"layout": "2x2"}, 0.05),
+        ({"layout": "1x1", "field_of_view_mrad": 5, "divergence_mrad": 0.5}, 0.05),
+        ({"layout": "1x4", "off_nadir_deg": 5, "wind_speed": 10, "wind_direction_deg": 60}, 0.11),
+    ],
+    ids=["four", "narrow", "strips"],
+)
+def test_estimate_agrees_with_renders(params, water):
+    """Levels and times of each pixel; the water lacks light that turned twice."""
+    params = {**LEVEL, **params}
+    rendered = mitransient_lidar.render("table1", params=params, passes=12, components=True, seed=3)
+    found = estimate("table1", params, paths=2**15, seed=significance.seed_shift)
+    for origin, bias, shift in (("surface", 0.012, 0.05), ("water", water, 1.5), ("bottom", 0.03, 0.2)):
+        energy, error, time = by_origin(found, origin)
+        wanted, spread, arrival = by_origin(rendered, origin)
+        # Eight parts and twelve passes, the largest of four pixels.
+        limit = significance.largest_z(8, 4) * np.hypot(error, spread)
+        assert np.all(abs(energy - wanted) < limit + bias * wanted), origin
+        assert np.all(abs(time - arrival) < shift + 8 * limit / wanted), origin
+
+
+def test_estimate_is_a_result_with_components():
+    found = estimate("table1", {**LEVEL, "jerlov": "1C"}, paths=2**11)
+    assert found["waveform_by_origin"].dims == ("origin", "pixel", "time")
+    np.testing.assert_allclose(found["waveform_by_origin"].sum("origin"), found["waveform"], rtol=1e-12)
+    assert found.attrs["model"] == "estimate"
+    lines = describe_estimate(found)
+    assert [line.split()[0] for line in lines] == ["all", "surface", "water", "bottom"]
+    again = estimate("table1", {**LEVEL, "jerlov": "1C"}, paths=2**11)
+    np.testing.assert_array_equal(again["waveform"], found["waveform"])
+
+
+def test_targets_are_left_out_with_a_word(caplog):
+    estimate("fig13_2x2", LEVEL, paths=2**9)
+    assert "the estimate leaves out 'target'" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("scene", "params", "message"),
+    [
+        ("table1", {"altitude": -3}, "altitude = -3 is under water"),
+        ("table1", {"layout": "64x64"}, "the receiver has 4096 pixels: an estimate takes at most 1024"),
+        ("ship_wake", {}, "the scene has bubbles"),
+        ("fresh_water_lens", {}, "different indices"),
+    ],
+)
+def test_scenes_that_the_model_is_not_for(scene, params, message):
+    with pytest.raises(UserError, match=message):
+        estimate(scene, params)
+
+
+def test_numbers_out_of_range():
+    with pytest.raises(UserError, match="paths = 10 must"):
+        estimate("table1", LEVEL, paths=10)
