@@ -29,6 +29,9 @@ _NUMBERS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("gain", "optical_density", "noise_bandwidth_hz", "background_power_w"), _NOT_NEGATIVE),
 }
 
+#: Those that count something, which is known.
+_COUNTS = ("passes", "pulses", "shots")
+
 #: Number of values of attributes that are lists of finite numbers, None for any.
 _LISTS: dict[str, int | None] = {
     "transmitter_pose": 12,
@@ -62,7 +65,7 @@ def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
     for name, (low, high) in _NUMBERS.items():
         high = min(high, RANGES[name][1]) if name in RANGES else high
         value = attributes.get(name, low)
-        if not _is_number(value) or value < low or value > high:
+        if not _is_number(value) or value < low or value > high or (name in _COUNTS and math.isnan(value)):
             raise _refusal(place, name, value, f"a number between {low:g} and {high:g}")
     for name, length in _LISTS.items():
         value = attributes.get(name, ())
@@ -70,9 +73,9 @@ def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
             continue
         if name in attributes and not (_are_numbers(value) and length in (None, np.size(value))):
             raise _refusal(place, name, value, f"{length or 'one or more'} finite numbers")
-    pairs = [np.size(attributes[name]) for name in ("error_inflation_bins", "error_inflation") if name in attributes]
-    if len(set(pairs)) > 1:
-        raise _refusal(place, "error_inflation", attributes["error_inflation"], f"{pairs[0]} numbers")
+    bins, inflation = (attributes.get(name, ()) for name in ("error_inflation_bins", "error_inflation"))
+    if np.size(bins) != np.size(inflation):
+        raise _refusal(place, "error_inflation", inflation, f"{np.size(bins)} numbers, as error_inflation_bins")
     for name in _TEXTS:
         if not isinstance(attributes.get(name, ""), str):
             raise _refusal(place, name, attributes[name], "a text")
