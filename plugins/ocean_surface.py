@@ -40,7 +40,8 @@ class OceanSurface(mi.Mesh):
     surface_seed              integer  Seed of the waves, 0 to 2^53: the same sea at any resolution and position of the
                                        patch. Default: 1
     time                      float    Time at which the waves are taken [s]. Default: 0
-    water_depth               float    Water depth for the dispersion of the waves [m]. Default: deep
+    water_depth               float    Water depth for dispersion and heights of the wind waves (TMA spectrum, Bouws et
+                                       al. 1985) [m]. Default: deep
     current_speed             float    Current that carries the waves [m/s], 0 to 10. Default: 0
     current_direction_deg     float    Direction the current flows towards [deg]. Default: 0
     wake_speed                float    Speed of a ship whose Kelvin wake is added [m/s], 0 for none. Default: 0

@@ -29,6 +29,7 @@ from mitransient_lidar.physics.sea.wind_spectra import (
     ElfouhailySpectrum,
     JonswapSpectrum,
     PiersonMoskowitzSpectrum,
+    ShallowSpectrum,
     inverse_wave_age,
 )
 
@@ -40,6 +41,9 @@ _SMALLEST_RIPPLE_VARIANCE = 1e-5
 #: Unit of the period of the sea [m], its least length in peak wavelengths, and its largest length [m]. The period does
 #: not depend on the resolution, so that a seed defines one sea.
 _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
+
+#: Water depth [m] from which no wave notices the bottom.
+DEEP = 1e4
 
 #: Wind speed [m/s] below which there are no waves.
 _CALM = 1e-6
@@ -104,7 +108,7 @@ class SeaSurface:
         resolution = Resolution.read(get, instruments)
         period = read_length(get, "period")
         time = finite("time", get("time", 0.0))
-        depth = positive("water_depth", get("water_depth", 1e4))
+        depth = positive("water_depth", get("water_depth", DEEP))
         current = in_range("current_speed", get("current_speed", 0.0), 0.0, 10.0)
         current_direction = _read_angle(get, "current_direction_deg")
         map_size = read_length(get, "map_size")
@@ -227,16 +231,20 @@ def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: floa
     elif spectrum in ("elfouhaily", "jonswap", "pierson_moskowitz"):
         if wind_speed == 0:
             logger.info("wind_speed = 0: the sea has no wind waves, only ripples")
-        elif spectrum == "elfouhaily":
-            omega = 0.84 if age is None else float(age)
-            omega = omega if fetch is None else inverse_wave_age(wind_speed, fetch)
-            components.append(ElfouhailySpectrum(wind_speed, omega, wind_direction))
-        elif spectrum == "jonswap":
-            if fetch is None:
-                raise UserError("fetch is missing: the spectrum 'jonswap' needs it, in metres")
-            components.append(JonswapSpectrum(wind_speed, fetch, peak_enhancement, wind_direction))
         else:
-            components.append(PiersonMoskowitzSpectrum(wind_speed, wind_direction))
+            deep: CosineSpectrum
+            if spectrum == "elfouhaily":
+                omega = 0.84 if age is None else float(age)
+                omega = omega if fetch is None else inverse_wave_age(wind_speed, fetch)
+                deep = ElfouhailySpectrum(wind_speed, omega, wind_direction)
+            elif spectrum == "jonswap":
+                if fetch is None:
+                    raise UserError("fetch is missing: the spectrum 'jonswap' needs it, in metres")
+                deep = JonswapSpectrum(wind_speed, fetch, peak_enhancement, wind_direction)
+            else:
+                deep = PiersonMoskowitzSpectrum(wind_speed, wind_direction)
+            depth = positive("water_depth", get("water_depth", DEEP))
+            components.append(deep if depth >= DEEP else ShallowSpectrum(deep, depth))
     if swell_height > 0:
         if spectrum in ("flat", "height_map"):
             raise UserError(f"swell_height = {swell_height:g} needs a spectrum of waves, not {spectrum!r}")

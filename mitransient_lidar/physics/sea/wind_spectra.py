@@ -1,4 +1,4 @@
-"""Spectra of wind waves: Elfouhaily, Pierson-Moskowitz and JONSWAP.
+"""Spectra of wind waves: Elfouhaily, Pierson-Moskowitz and JONSWAP, and TMA in shallow water.
 
 Wind speeds are at 10 m height. All share the directional spreading of Elfouhaily et al. (1997).
 """
@@ -6,7 +6,7 @@ Wind speeds are at 10 m height. All share the directional spreading of Elfouhail
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -260,3 +260,62 @@ class JonswapSpectrum(SaturatedSpectrum):
     def _relative_fetch(self) -> float:
         """Fetch over U^2/g [1]."""
         return GRAVITY * self.fetch / self.wind_speed**2
+
+
+@dataclass(frozen=True)
+class ShallowSpectrum(CosineSpectrum):
+    """Wind waves in water of finite depth, which limits the long ones.
+
+    Parameters
+    ----------
+    deep : CosineSpectrum
+        Spectrum of the same wind over deep water.
+    depth : float
+        Water depth [m], positive.
+
+    Notes
+    -----
+    TMA spectrum of Bouws, Guenther, Rosenthal and Vincent (1985), J. Geophys. Res. 90, 975,
+    doi:10.1029/JC090iC01p00975: k^3 S(k) is that of deep water at the same frequency, thus at the wavenumber
+    k tanh(k depth), and so is the spreading. In frequencies it is the deep spectrum times Kitaigorodskii's factor, from
+    (depth omega^2/g)/2 for long waves to 1.
+    """
+
+    deep: CosineSpectrum
+    depth: float
+    direction: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        positive("depth", self.depth)
+        object.__setattr__(self, "direction", self.deep.direction)
+
+    @property
+    def peak_wavenumber(self) -> float:
+        """Wavenumber [rad/m] of the frequency of the deep peak."""
+        return self._shallow(self.deep.peak_wavenumber)
+
+    @property
+    def smooth_ranges(self) -> tuple[float, ...]:
+        """See `AxialSpectrum.smooth_ranges`."""
+        return tuple(self._shallow(edge) for edge in self.deep.smooth_ranges)
+
+    def omnidirectional(self, k: npt.ArrayLike) -> FloatArray:
+        """Omnidirectional elevation spectrum S(k) [m^3]; see `WaveSpectrum.omnidirectional`."""
+        wavenumber = np.asarray(k, dtype=np.float64)
+        ratio = np.tanh(np.maximum(wavenumber, 0) * self.depth)
+        return np.asarray(ratio**3 * self.deep.omnidirectional(wavenumber * ratio))
+
+    def spreading(self, k: npt.ArrayLike) -> FloatArray:
+        """Anisotropy Delta(k) [1]; see `AxialSpectrum.spreading`."""
+        wavenumber = np.asarray(k, dtype=np.float64)
+        return self.deep.spreading(wavenumber * np.tanh(wavenumber * self.depth))
+
+    def _shallow(self, deep: float) -> float:
+        """Return the wavenumber of the frequency of a wave over deep water [rad/m]: a root of k tanh(k depth)."""
+        from scipy.optimize import brentq
+
+        if not math.isfinite(deep):
+            return deep
+        # tanh(x) is at least x/(1 + x).
+        highest = 0.5 * (deep + math.sqrt(deep**2 + 4 * deep / self.depth))
+        return float(brentq(lambda k: k * math.tanh(k * self.depth) - deep, deep, highest * (1 + 1e-9), xtol=1e-12))
