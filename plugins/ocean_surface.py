@@ -73,7 +73,8 @@ class OceanSurface(mi.Mesh):
     limited to the beam, and then the cells grow, within the footprint. A scene without a lidar has 32 m in cells of
     0.125 m, with waves from 1 m. The choice is made when the scene is rendered, or loaded by ``mitransient_lidar``.
 
-    The mesh represents the waves from the shortest one up. The rest of the total slope variance, along and across the
+    Waves are linear: independent, with Gaussian heights and slopes, without the sharper crests and the skewed slopes of
+    real ones. The mesh represents the waves from the shortest one up. The rest of the total slope variance, along and across the
     wind, is an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of Gaussian
     slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With
     ``cox_munk`` and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The variance of the

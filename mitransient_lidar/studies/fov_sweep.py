@@ -84,11 +84,11 @@ def fov_sweep(
     with the mean-square radius of the correlation; R_b is twice the root-mean-square angle of the beam per axis times
     the slant range. The diameter in the fit is 2 R. K approaches c only if c R_b is also far below 1.
 
-    ``kd`` is the depth-averaged Kd of daylight by Lee (`water_types`), bb that of the phase function in use.
+    ``kd`` is the depth-averaged Kd of daylight (`water_types`), bb that of the phase function in use.
 
     For the default water and a narrow beam on a level sea, K falls as Gordon's until c R_s = 3, but to the absorption
-    coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 14 % below
-    Lee's Kd. Because of the forward peak, K stays below c in any practical view: 0.91 c at c R_s = 0.015. The fit,
+    coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 13 % below
+    Kd. Because of the forward peak, K stays below c in any practical view: 0.91 c at c R_s = 0.015. The fit,
     which is independent of the phase function, is up to 0.06 1/m too high between the limits.
 
     Rings between neighbouring circles are rendered and added up, since rare paths near the middle would cause most of
