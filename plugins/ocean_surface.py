@@ -74,11 +74,11 @@ class OceanSurface(mi.Mesh):
     0.125 m, with waves from 1 m. The choice is made when the scene is rendered, or loaded by ``mitransient_lidar``.
 
     Waves are linear: independent, with Gaussian heights and slopes, without the sharper crests and the skewed slopes of
-    real ones. The mesh represents the waves from the shortest one up. The rest of the total slope variance, along and across the
-    wind, is an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of Gaussian
-    slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across the wind. With
-    ``cox_munk`` and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The variance of the
-    ripples is at least 1e-5, so that a point laser can be connected; `slope_variance` of the loaded object is the
+    real ones. The mesh represents the waves from the shortest one up. The rest of the total slope variance, along and
+    across the wind, is an anisotropic Beckmann ``roughdielectric`` with :math:`\alpha = \sqrt{2}\,\sigma`, the model of
+    Gaussian slopes; the index is the water's ``refractive_index``. Texture coordinates run along and across the wind.
+    With ``cox_munk`` and ``spectrum`` the total depends neither on the cells nor on the shortest wave. The variance of
+    the ripples is at least 1e-5, so that a point laser can be connected; `slope_variance` of the loaded object is the
     total. Waves shorter than a sixteenth of the period are needed for a mesh: where automatic cells are longer, all
     slopes are ripples.
 

@@ -31,7 +31,7 @@ DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, P
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
 
 #: Help of an option for the receiver.
-RECEIVERS = "Receiver of every pixel: ideal, photodiode, pmt, pmt_log, apd, sipm or spad."
+RECEIVERS = "Receiver of every pixel: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array."
 
 
 def parameters(definitions: list[str] | None) -> dict[str, str]:

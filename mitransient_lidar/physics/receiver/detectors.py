@@ -274,7 +274,7 @@ class SiliconPhotomultiplier:
 
 @dataclass(frozen=True)
 class SinglePhotonDetector:
-    """Single-photon avalanche diode with a counter in time bins.
+    """Single-photon avalanche diode, or several channels that share the light evenly, with a counter in time bins.
 
     Parameters
     ----------
@@ -287,6 +287,8 @@ class SinglePhotonDetector:
         Dark counts [1/s], at least 0.
     paralyzable : bool
         Whether an event in the dead time prolongs it.
+    channels : int
+        Number of channels, each with its own dead time, whose counts are summed; 1 to 10^4. Dark counts are of all.
 
     Notes
     -----
@@ -297,11 +299,13 @@ class SinglePhotonDetector:
     dead_time_ns: float
     dark_count_rate_hz: float = 0.0
     paralyzable: bool = False
+    channels: int = 1
 
     def __post_init__(self) -> None:
         _check_efficiency(self.quantum_efficiency)
         positive("dead_time_ns", self.dead_time_ns)
         non_negative("dark_count_rate_hz", self.dark_count_rate_hz)
+        integer("channels", self.channels, 1, 10_000)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin without dead time for a mean number of photons per bin, of the same shape."""
@@ -309,17 +313,21 @@ class SinglePhotonDetector:
 
     def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
         """Mean and covariances of the counts for mean events per bin, shape (..., time)."""
-        dead = dead_time.dead_bins(self.dead_time_ns, bin_width_ns)
+        dead, own = dead_time.dead_bins(self.dead_time_ns, bin_width_ns), events / self.channels
         if self.paralyzable:
-            fired = dead_time.firing_probability_paralyzable(events, dead)
+            fired = dead_time.firing_probability_paralyzable(own, dead)
         else:
-            fired, _ = dead_time.firing_probability(events, dead)
-        return fired, dead_time.pair_covariances(events, fired, dead, lags, self.paralyzable)
+            fired, _ = dead_time.firing_probability(own, dead)
+        covariances = dead_time.pair_covariances(own, fired, dead, lags, self.paralyzable)
+        return self.channels * fired, [self.channels * one for one in covariances]
 
     def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
-        """Draw counts per bin, 0 or 1, shape (shots, *events.shape)."""
-        dead = dead_time.dead_bins(self.dead_time_ns, bin_width_ns)
-        return dead_time.sample_counter(events, dead, self.paralyzable, shots, random).astype(np.float64)
+        """Draw counts per bin, 0 to the number of channels, shape (shots, *events.shape)."""
+        dead, own = dead_time.dead_bins(self.dead_time_ns, bin_width_ns), events / self.channels
+        count = np.zeros((shots, *events.shape))
+        for _ in range(self.channels):
+            count += dead_time.sample_counter(own, dead, self.paralyzable, shots, random)
+        return count
 
 
 Detector = LinearDetector | SiliconPhotomultiplier | SinglePhotonDetector

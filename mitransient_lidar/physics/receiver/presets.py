@@ -377,5 +377,10 @@ RECEIVERS = MappingProxyType(
             SinglePhotonDetector(0.5, 30.0, 100.0),
             source="typical counting module with the dead time of 30 ns of EG&G SPCM-AQ",
         ),
+        "spad_array": ReceiverChain(
+            SinglePhotonDetector(0.15, 3.2, 1600.0, channels=16),
+            source="typical photomultiplier that counts photons in 16 channels, each dead for 3.2 ns, as behind a "
+            "strong beam of ATLAS",
+        ),
     }
 )

@@ -57,6 +57,7 @@ STAGES = {
     "cells": (ReceiverChain(SiliconPhotomultiplier(0.3, 200, 10.0, 0.1, 1e6, 1e6, 0.1)), 3e-8),
     "counter": (ReceiverChain(SinglePhotonDetector(0.5, 10.0, 1e6)), 3e-10),
     "paralysed counter": (ReceiverChain(SinglePhotonDetector(0.5, 10.0, paralyzable=True)), 1e-10),
+    "four counters": (ReceiverChain(SinglePhotonDetector(0.5, 10.0, 1e6, channels=4)), 1e-9),
     "amplifier": (ReceiverChain(DIODE, Amplifier(1e4, 5.0, load_ohm=1e3)), 0.0),
     "amplifier and pole": (ReceiverChain(DIODE, Amplifier(1e4, 5.0, bandwidth_mhz=80.0)), 0.0),
     "photons and Gaussian": (ReceiverChain(DIODE, Amplifier(1e4, bandwidth_mhz=80.0, response="gaussian")), 1e-8),
@@ -93,8 +94,8 @@ def test_stages_alone_and_together(name):
 @pytest.mark.parametrize("name", sorted(set(RECEIVERS) - {"pmt_log"}))
 def test_receivers_in_use(name):
     chain = RECEIVERS[name]
-    light = power(scale={"ideal": 1e-9, "sipm": 2e-8, "spad": 1e-10}.get(name, 3e-7))
-    fewest = 100 if name == "spad" else -np.inf
+    light = power(scale={"ideal": 1e-9, "sipm": 2e-8, "spad": 1e-10, "spad_array": 1e-9}.get(name, 3e-7))
+    fewest = 100 if name.startswith("spad") else -np.inf
     assert_expected(chain.apply(light, 1.0, SHOTS, 12, 1e-10), chain.expected(light, 1.0, 1e-10), fewest=fewest)
     assert chain.source
 
