@@ -28,11 +28,11 @@ logger = logging.getLogger(__name__)
 #: Independent parts of the paths, for standard errors.
 _PARTS = 8
 
-#: Largest number of pixels, and of paths.
-_MOST_PIXELS, _MOST_PATHS = 1024, 2**22
+#: Largest number of pixels, of paths, and of their points at once.
+_MOST_PIXELS, _MOST_PATHS, _MOST_POINTS = 1024, 2**22, 2**21
 
-#: Steps of depth: shorter than a bin, within these limits.
-_FEWEST_STEPS, _MOST_STEPS = 64, 1024
+#: Steps of depth: a bin or this share of the pulse, within these limits.
+_STEPS_OF_PULSE, _FEWEST_STEPS, _MOST_STEPS = 0.3, 64, 1024
 
 #: Optical depth of absorption and backscattering, one way, from which the water is dark.
 _DARK = 8.0
@@ -200,7 +200,7 @@ def _slopes(lidar: LidarScene) -> FloatArray:
 class _Histogram(NamedTuple):
     """Energy of a part of the paths."""
 
-    values: FloatArray  # pixels and origins, in the order of the accumulator, by time bin [J]
+    values: FloatArray  # [J], shape (pixels, origins, bins)
 
     def energy(self) -> FloatArray:
         return self.values
@@ -208,21 +208,28 @@ class _Histogram(NamedTuple):
 
 def _record(lidar: LidarScene, model: EchoEstimate, paths: int, rng: np.random.Generator) -> Any:
     """Return the histogram of paths."""
+    span_ns = 2e9 / C0 * model.system.group_index * model.bottom_depth
+    step_ns = max(lidar.axis.bin_width_ns, _STEPS_OF_PULSE * lidar.transmitter.pulse.fwhm_ns)
+    steps = int(np.clip(math.ceil(span_ns / step_ns), _FEWEST_STEPS, _MOST_STEPS))
+    total = np.zeros((lidar.receiver.pixels.count, len(_ORIGINS), lidar.axis.bin_count))
+    size = _MOST_POINTS // steps
+    for first in range(0, paths, size):
+        count = min(size, paths - first)
+        beam = _beam(lidar, count, rng)
+        found = model.surface(beam), *model.water_and_bottom(beam, steps, rng)
+        total += count / paths * np.stack([_binned(lidar, each, rng) for each in found], axis=1)
+    return _Histogram(total)
+
+
+def _beam(lidar: LidarScene, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return points of the beam in the tangent plane [rad], shape (count, 2): a lattice, shifted at random."""
     import mitsuba as mi
 
-    points = (_lattice(paths) + rng.random(2)) % 1
-    x, y = lidar.transmitter.sample_tangent(mi.Point2f(points.T.astype(np.float32)))
-    beam = np.stack([np.array(x, dtype=np.float64), np.array(y, dtype=np.float64)], axis=1)
-    per_bin = 2 * model.system.group_index * model.bottom_depth / (1e-9 * C0 * lidar.axis.bin_width_ns)
-    steps = int(np.clip(math.ceil(per_bin), _FEWEST_STEPS, _MOST_STEPS))
-    found = [_binned(lidar, each, rng) for each in (model.surface(beam), *model.water_and_bottom(beam, steps, rng))]
-    return _Histogram(np.stack(found, axis=1).reshape(-1, lidar.axis.bin_count))
-
-
-def _lattice(count: int) -> FloatArray:
-    """Return points of a rank-1 lattice in the unit square, shape (count, 2)."""
     number = np.arange(count)
-    return np.stack([(number + 0.5) / count, number * 0.6180339887498949 % 1], axis=1)
+    lattice = np.stack([(number + 0.5) / count, number * 0.6180339887498949 % 1], axis=1)
+    points = (lattice + rng.random(2)) % 1
+    x, y = lidar.transmitter.sample_tangent(mi.Point2f(points.T.astype(np.float32)))
+    return np.stack([np.array(x, dtype=np.float64), np.array(y, dtype=np.float64)], axis=1)
 
 
 def _binned(lidar: LidarScene, light: Arrivals, rng: np.random.Generator) -> FloatArray:

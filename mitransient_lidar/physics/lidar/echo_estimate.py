@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
 from mitransient_lidar.physics.water.layers import WaterColumn
@@ -159,7 +159,7 @@ class _Spread:
 
     def __init__(
         self,
-        cell: FloatArray,
+        cell: IntArray,
         distance: FloatArray,
         weights: Sequence[FloatArray],
         end: FloatArray,

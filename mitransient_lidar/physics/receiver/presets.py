@@ -307,8 +307,8 @@ class ReceiverChain:
         """Return the stages behind the low-pass."""
         assert self.amplifier is not None
         limits = [] if self.amplifier.limit_v is None else [self.amplifier.limit_v]
-        if math.isfinite(largest := getattr(self.detector, "largest_current_ma", math.inf)):
-            limits.append(1e-3 * largest * self.amplifier.transimpedance_ohm)
+        if isinstance(self.detector, LinearDetector) and math.isfinite(self.detector.largest_current_ma):
+            limits.append(1e-3 * self.detector.largest_current_ma * self.amplifier.transimpedance_ohm)
         return Readout(min(limits, default=None), self.logarithm, self.digitiser)
 
     def _process(
