@@ -54,7 +54,7 @@ def estimate(
     paths: int = 2**13,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Estimate the waveforms of a scene in a fraction of a second, as a first look and a second opinion.
+    """Estimate the waveforms of a scene in about a second, as a first look and a second opinion.
 
     Parameters
     ----------
