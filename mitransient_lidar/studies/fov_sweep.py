@@ -87,7 +87,7 @@ def fov_sweep(
     ``kd`` is the depth-averaged Kd of daylight (`water_types`), bb that of the phase function in use.
 
     For the default water and a narrow beam on a level sea, K falls as Gordon's until c R_s = 3, but to the absorption
-    coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 13 % below
+    coefficient (0.149 for a = 0.150 1/m), as found by Phillips and Koerber (1984), Aust. J. Phys. 37, 75, 12 % below
     Kd. Because of the forward peak, K stays below c in any practical view: 0.91 c at c R_s = 0.015. The fit,
     which is independent of the phase function, is up to 0.06 1/m too high between the limits.
 

@@ -179,7 +179,7 @@ def test_command_writes_table_plot_and_file(tmp_path):
     # 5 mrad from 200 m: a radius of 0.5 m, 0.15 attenuation lengths.
     assert lines[4].split()[:3] == ["5", "0.5", "0.150"]
     assert lines[5].split()[:3] == ["20", "2", "0.600"]
-    assert lines[6].startswith("c = 0.3000, Kd = 0.17")
+    assert lines[6].startswith("c = 0.3000, Kd = 0.1688")
     import xarray as xr
 
     with xr.open_dataset(target.with_suffix(".nc"), engine="h5netcdf") as found:
