@@ -43,6 +43,9 @@ _APART = 0.01
 #: Largest height of a level bottom over its depth.
 _LEVEL = 0.01
 
+#: Largest number of 32 bits below 1.
+_BELOW_ONE = np.float32(1 - 2**-24)
+
 _ORIGINS = ("surface", "water", "bottom")
 
 
@@ -227,8 +230,9 @@ def _beam(lidar: LidarScene, count: int, rng: np.random.Generator) -> FloatArray
 
     number = np.arange(count)
     lattice = np.stack([(number + 0.5) / count, number * 0.6180339887498949 % 1], axis=1)
-    points = (lattice + rng.random(2)) % 1
-    x, y = lidar.transmitter.sample_tangent(mi.Point2f(points.T.astype(np.float32)))
+    points = ((lattice + rng.random(2)) % 1).T.astype(np.float32)
+    # Numbers next to 1 are rounded to it in 32 bits.
+    x, y = lidar.transmitter.sample_tangent(mi.Point2f(np.minimum(points, _BELOW_ONE)))
     return np.stack([np.array(x, dtype=np.float64), np.array(y, dtype=np.float64)], axis=1)
 
 
@@ -241,9 +245,9 @@ def _binned(lidar: LidarScene, light: Arrivals, rng: np.random.Generator) -> Flo
     light = Arrivals(*(np.ascontiguousarray(each).ravel() for each in np.broadcast_arrays(*light)))
     angle_x, angle_y = mi.Float(light.angle_x), mi.Float(light.angle_y)
     if lidar.receiver.blur is not None:
-        dx, dy = lidar.receiver.blur.sample(mi.Point2f(rng.random((2, light.energy.size)).astype(np.float32)))
+        dx, dy = lidar.receiver.blur.sample(mi.Point2f(rng.random((2, light.energy.size), dtype=np.float32)))
         angle_x, angle_y = angle_x + dx, angle_y + dy
-    pixel, number = pixels.pixel_at(angle_x, angle_y, mi.Float(rng.random(light.energy.size)))
+    pixel, number = pixels.pixel_at(angle_x, angle_y, mi.Float(rng.random(light.energy.size, dtype=np.float32)))
     dr.eval(pixel, number)
     time = np.floor((light.time_ns - axis.start_ns) / axis.bin_width_ns)
     seen = (np.array(number) > 0) & (time >= 0) & (time < axis.bin_count)
