@@ -30,6 +30,7 @@ PLUGIN_MODULES = (
     "phase.measured_phase",
     "phase.two_term_henyey_greenstein",
     "layered_water",
+    "gram_charlier_dielectric",
     "ocean_surface",
     "seabed",
     "retroreflector",

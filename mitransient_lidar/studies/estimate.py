@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -154,7 +154,8 @@ def _model(lidar: LidarScene) -> EchoEstimate:
     system = LidarSystem(float(pose.origin[2]), angle, energy, 1.0, lidar.refractive_index, lidar.group_index)
     depth, reflectance = _bottom(lidar)
     phases = [table_of(phase) for phase in water.phases.phases[: water.column.count]]
-    return EchoEstimate(system, water.column, phases, _slopes(lidar), depth, reflectance)
+    covariance, ratio = _slopes(lidar)
+    return EchoEstimate(system, water.column, phases, covariance, depth, reflectance, ratio)
 
 
 def _bottom(lidar: LidarScene) -> tuple[float, float]:
@@ -188,16 +189,25 @@ def _below(lidar: LidarScene, point: mi.Point3f) -> mi.SurfaceInteraction3f:
     raise UserError("the axis of the receiver must meet water above the bottom for an estimate")
 
 
-def _slopes(lidar: LidarScene) -> FloatArray:
-    """Return the covariance of the slopes of the sea, away from nadir and to the left, shape (2, 2)."""
+def _slopes(lidar: LidarScene) -> tuple[FloatArray, Callable[[FloatArray], FloatArray] | None]:
+    """Return the covariance of the sea's slopes away from nadir and to the left, shape (2, 2), and their series."""
     sea = getattr(lidar.surfaces[0], "sea", None)
     if sea is None:
-        return np.diag([0.5 * lidar.slope_variance] * 2)
+        return np.diag([0.5 * lidar.slope_variance] * 2), None
     variances = np.add(sea.resolved_variance, sea.ripple_variance)
     far = lidar.receiver.pose.far
     turn = sea.wind_direction - math.atan2(far[1], far[0])
     axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    return np.asarray(axes @ np.diag(variances) @ axes.T)
+    covariance = np.asarray(axes @ np.diag(variances) @ axes.T)
+    if sea.slope_series is None:
+        return covariance, None
+    series = sea.slope_series.of_part(sea.ripple_variance, tuple(variances))
+
+    def ratio(slopes: FloatArray) -> FloatArray:
+        downwind, crosswind = (slopes @ axes / np.sqrt(variances)).T
+        return np.asarray(series.ratio(crosswind, -downwind))
+
+    return covariance, ratio
 
 
 class _Histogram(NamedTuple):

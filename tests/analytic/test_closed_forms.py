@@ -12,7 +12,7 @@ import pytest
 import significance
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin
 from oracles.echo_times import bottom_time_ns
-from oracles.lidar_equation import column_energy
+from oracles.lidar_equation import column_energy, surface_energy
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
@@ -156,6 +156,36 @@ def test_surface_of_gaussian_slopes(lidar_scene, passes, case, integrator):
     strong = expected > 0.05 * expected.max()
     samples = passes(scene, 6)[:, strong]
     significance.assert_equal(samples, expected[strong], error=1e-3, bias=3e-3)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(("angle", "wind_from_deg"), [(20.0, 0.0), (20.0, 180.0), (12.0, 120.0)])
+def test_surface_of_measured_slopes(lidar_scene, passes, integrator, angle, wind_from_deg):
+    """Cox and Munk's series at 6 m/s, looking upwind, downwind and aside: 1.19, 0.74 and 0.93 times the Gaussian."""
+    pose = {"altitude": 200.0, "off_nadir_deg": angle}
+    scene = lidar_scene(
+        tx={**pose, "divergence_mrad": 0.2, "pulse_energy_mj": 4.0},
+        rx={**pose, "layout": "1x1", "field_of_view_mrad": 4.0, "obscuration": 0.0},
+        film={"time_start_ns": 1340.0},
+        integrator={"type": integrator, "paths_per_pass": 2**12},
+        sea={
+            **{"slope_variance": "cox_munk", "wind_speed": 6.0, "wind_direction_deg": wind_from_deg + 180},
+            **{"slope_distribution": "gram_charlier"},
+        },
+        water={"attenuation": 50.0, "scattering": 0.0, "backscattering": 0.0},
+        bottom=None,
+    )
+    collection, energy = scene.sensors()[0].receiver.optics.collection, scene.emitters()[0].energy
+    system = LidarSystem(200.0, np.radians(angle), energy * collection, 1.0, 1.34, GROUP_INDEX)
+    along, across = 3.16e-3 * 6.0, 0.003 + 1.92e-3 * 6.0
+    bearing = np.radians(wind_from_deg)
+    y, x = np.tan(np.radians(angle)) * np.array([np.cos(bearing), np.sin(bearing)]) / np.sqrt([along, across])
+    skewed = 0.0416 * (x * x - 1) * y / 2 + 0.158 * (y**3 - 3 * y) / 6
+    peaked = 0.4 * (x**4 - 6 * x * x + 3) / 24 + 0.12 * (x * x - 1) * (y * y - 1) / 4
+    ratio = 1 + skewed + peaked + 0.23 * (y**4 - 6 * y * y + 3) / 24
+    expected = ratio * surface_energy(system, (along, across), np.radians(angle), bearing)
+    samples = passes(scene, 6).sum(axis=(1, 2))
+    significance.assert_equal(samples, expected, error=1e-3, bias=3e-3)
 
 
 @BOTH_IN_ALL_CASES

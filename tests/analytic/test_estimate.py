@@ -26,8 +26,9 @@ def by_origin(dataset, origin):
         ({"layout": "2x2"}, 0.05),
         ({"layout": "1x1", "field_of_view_mrad": 5, "divergence_mrad": 0.5}, 0.05),
         ({"layout": "1x4", "off_nadir_deg": 5, "wind_speed": 10, "wind_direction_deg": 60}, 0.11),
+        ({"layout": "2x2", "wind_speed": 6, "wind_direction_deg": 150, "slope_distribution": "gram_charlier"}, 0.05),
     ],
-    ids=["four", "narrow", "strips"],
+    ids=["four", "narrow", "strips", "skewed slopes"],
 )
 def test_estimate_agrees_with_renders(params, water):
     """Levels and times of each pixel; the water lacks light that turned twice."""

@@ -46,6 +46,7 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
     """Return wind speed [m/s] and direction from the lidar's azimuth [rad], None if a sea cannot be modelled."""
     attributes = dataset.attrs
     sea = attributes.get("scene.spectrum"), attributes.get("scene.slope_variance")
+    is_gaussian = attributes.get("scene.slope_distribution", "gaussian") == "gaussian"
     pixels = len(outlines(dataset))
     beam = attributes.get("beam_profile", "gaussian"), attributes.get("divergence_across_mrad")
     usable = (
@@ -61,7 +62,7 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
             "outlines; slope_deviation does not"
         )
     if speed is None:
-        is_modelled = sea == ("elfouhaily", "cox_munk")
+        is_modelled = is_gaussian and sea == ("elfouhaily", "cox_munk")
         known = finite("scene.wind_speed", attributes.get("scene.wind_speed", 0)) if is_modelled else 0.0
         if not usable or not LEAST_WIND_SPEED <= known <= MAX_WIND_SPEED:
             return None

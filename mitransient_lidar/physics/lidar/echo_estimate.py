@@ -11,7 +11,7 @@ drawn from the phase function here, since its moments describe sea water badly (
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -50,16 +50,20 @@ class EchoEstimate:
     slope_covariance: FloatArray  #: Of waves and ripples together, away from nadir and to the left, shape (2, 2).
     bottom_depth: float  #: Depth of the bottom, or of the last light from the water without one [m].
     reflectance: float  #: Lambertian reflectance of the bottom, 0 to 1.
+    #: Density of the surface's slopes, shape (n, 2), over the Gaussian one [1]; None for Gaussian slopes.
+    slope_ratio: Callable[[FloatArray], FloatArray] | None = None
 
     def surface(self, beam: FloatArray) -> Arrivals:
         """Return the glint of points of the beam in the tangent plane [rad], shape (n, 2), each of 1/n of the energy.
 
-        Glint of Gaussian slopes by Cox and Munk (1954), doi:10.1364/JOSA.44.000838, without shadows.
+        Glint by Cox and Munk (1954), doi:10.1364/JOSA.44.000838, without shadows.
         """
         theta, azimuth = self._rays(*beam.T)
         slopes = np.tan(theta)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
         exponent = np.einsum("ni,ij,nj->n", slopes, np.linalg.inv(self.slope_covariance), slopes)
         density = np.exp(-0.5 * exponent) / (2 * np.pi * np.sqrt(np.linalg.det(self.slope_covariance)))
+        if self.slope_ratio is not None:
+            density = density * np.maximum(self.slope_ratio(slopes), 0.0)
         reflectance, _ = fresnel(0.0, self.system.refractive_index)
         geometry = self.system.aperture_area / (4 * np.cos(theta) ** 3 * self.system.height**2)
         energy = self.system.energy * reflectance * density * geometry / len(beam)
@@ -117,7 +121,7 @@ class EchoEstimate:
     def _ripples(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return deflections by slopes where light enters or leaves the water [rad], as complex numbers.
 
-        A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)).
+        Slopes are Gaussian here. A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)).
         """
         root = np.linalg.cholesky(self.slope_covariance)
         slopes = rng.standard_normal((count, 2)) @ root.T

@@ -1,11 +1,23 @@
-"""Measured slope variances of the sea."""
+"""Measured distribution of the slopes of the sea."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range
 
 #: Largest wind speed of all models of the sea [m/s].
 MAX_WIND_SPEED = 30.0
+
+#: Wind speeds at which Cox and Munk measured [m/s].
+MEASURED_WIND = 1.0, 14.0
+
+#: Largest share of slopes, by the Gaussian part, for which a series may have a negative density.
+LARGEST_NEGATIVE_SHARE = 0.005
 
 
 def cox_munk(wind_speed: float) -> tuple[float, float]:
@@ -28,3 +40,104 @@ def cox_munk(wind_speed: float) -> tuple[float, float]:
     """
     wind = in_range("wind_speed", wind_speed, 0, MAX_WIND_SPEED)
     return 3.16e-3 * wind, 0.003 + 1.92e-3 * wind
+
+
+@dataclass(frozen=True)
+class GramCharlierSeries:
+    """Ratio of a density of slopes to the Gaussian one of the same variances.
+
+    For slopes over their standard deviations, crosswind x and upwind y, positive where the surface rises towards the
+    wind, the ratio is
+
+        1 - c21 (x^2 - 1) y / 2 - c03 (y^3 - 3 y) / 6
+          + c40 (x^4 - 6 x^2 + 3) / 24 + c22 (x^2 - 1) (y^2 - 1) / 4 + c04 (y^4 - 6 y^2 + 3) / 24.
+
+    Cox and Munk (1954), J. Opt. Soc. Am. 44, 838, doi:10.1364/JOSA.44.000838, equation for the probability of slopes.
+    """
+
+    c21: float  #: Skewness of the upwind slope with the square of the crosswind one, negated.
+    c03: float  #: Skewness of the upwind slope, negated.
+    c40: float  #: Excess kurtosis of the crosswind slope.
+    c22: float  #: Excess of the mean product of the squares over 1.
+    c04: float  #: Excess kurtosis of the upwind slope.
+
+    @classmethod
+    def of_clean_sea(cls, wind_speed: float) -> GramCharlierSeries:
+        """Return the series of a clean sea.
+
+        Parameters
+        ----------
+        wind_speed
+            Wind speed [m/s], 1 to 14.
+
+        Raises
+        ------
+        UserError
+            If the wind speed is out of range.
+
+        Notes
+        -----
+        Cox and Munk (1954): 0.01 - 0.0086 W (+- 0.03), 0.04 - 0.033 W (+- 0.12), 0.40 (+- 0.23), 0.12 (+- 0.06) and
+        0.23 (+- 0.41), from slopes of up to 2.5 standard deviations.
+        """
+        wind = in_range("wind_speed of a slope_distribution 'gram_charlier'", wind_speed, *MEASURED_WIND)
+        return cls(0.01 - 0.0086 * wind, 0.04 - 0.033 * wind, 0.40, 0.12, 0.23)
+
+    def of_part(self, total: tuple[float, float], part: tuple[float, float]) -> GramCharlierSeries:
+        """Return the series of one of two independent parts of the slopes, the other of which is Gaussian.
+
+        Third and fourth cumulants are those of the part alone; the series of the sum is this one exactly.
+
+        Parameters
+        ----------
+        total, part
+            Slope variances upwind and crosswind of both and of the part [1], positive; in reverse order for the series
+            of the sum from that of the part.
+        """
+        y, x = (np.sqrt(both / one) for both, one in zip(total, part, strict=True))
+        factors = x**2 * y, y**3, x**4, x**2 * y**2, y**4
+        terms = self.c21, self.c03, self.c40, self.c22, self.c04
+        return GramCharlierSeries(*(float(c * factor) for c, factor in zip(terms, factors, strict=True)))
+
+    def ratio(self, x: Any, y: Any) -> Any:
+        """Return the ratio at crosswind and upwind slopes over their standard deviations, arrays of any library."""
+        x2, y2 = x * x, y * y
+        odd = -0.5 * self.c21 * (x2 - 1) - self.c03 / 6 * (y2 - 3)
+        even = self.c40 / 24 * ((x2 - 6) * x2 + 3) + self.c04 / 24 * ((y2 - 6) * y2 + 3)
+        return 1 + odd * y + even + 0.25 * self.c22 * (x2 - 1) * (y2 - 1)
+
+    def along(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return skewness and excess kurtosis of the slope in a direction.
+
+        Parameters
+        ----------
+        x, y
+            Cosines of the direction to crosswind and to upwind, each times the standard deviation of the slope in that
+            axis over the one in the direction: the sum of the squares is 1.
+        """
+        x2, y2 = x * x, y * y
+        skewness = -(self.c03 * y2 + 3 * self.c21 * x2) * y
+        return skewness, self.c40 * x2 * x2 + 6 * self.c22 * x2 * y2 + self.c04 * y2 * y2
+
+    @property
+    def negative_share(self) -> float:
+        """Integral of the density where it is negative, with its sign reversed [1]."""
+        nodes = np.linspace(-8, 8, 321)
+        x, y = np.meshgrid(nodes, nodes)
+        gaussian = np.exp(-0.5 * (x**2 + y**2)) / (2 * np.pi) * (nodes[1] - nodes[0]) ** 2
+        return float(np.sum(gaussian * np.maximum(-self.ratio(x, y), 0)))
+
+    def require_positive(self, advice: str) -> None:
+        """Refuse a series whose density is negative for more than half a percent of the slopes.
+
+        Raises
+        ------
+        UserError
+            With `advice` at the end.
+        """
+        share = self.negative_share
+        if share > LARGEST_NEGATIVE_SHARE:
+            raise UserError(
+                f"slope_distribution = 'gram_charlier' has a negative density for {100 * share:.2g} % of the slopes of "
+                f"the ripples, of at most {100 * LARGEST_NEGATIVE_SHARE:g} %; {advice}"
+            )

@@ -15,7 +15,7 @@ import numpy as np
 from mitransient_lidar.core.array_files import read_npz, readable_suffix
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, non_negative, positive
-from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
+from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
@@ -76,6 +76,7 @@ class SeaSurface:
     wake: Wake | None  #: Heights of a ship's wake [m] on grid lines x and y [m], None without a ship.
     shortest_wave: float  #: Wavelength of the shortest waves [m], that of two cells in coarse ones.
     beam_wave: float  #: Wavelength of the shortest waves that the beam alone needs [m], that of the sea or more.
+    slope_series: GramCharlierSeries | None = None  #: Series of the ripples' slopes, None for Gaussian ones.
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
@@ -113,6 +114,7 @@ class SeaSurface:
         current_direction = _read_angle(get, "current_direction_deg")
         map_size = read_length(get, "map_size")
         path = get("filename", "")
+        series = _read_series(get, slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
         waves: PeriodicHeights | NestedHeights | HeightMap | None = None
@@ -150,9 +152,17 @@ class SeaSurface:
         lengths = (0.0, 0.0) if spectrum == "height_map" else (resolution.shortest_wave, resolution.beam_wave)
         shortest, beam_wave = (max(wave, 2 * cell) for wave in lengths)
         ripples = along, across
+        if series is not None:
+            series = series.of_part(cox_munk(wind_speed), ripples)
+        if series is not None and not is_placeholder:
+            shares = (f"{100 * one / both:.0f}" for one, both in zip(ripples, total, strict=True))
+            series.require_positive(
+                f"they have {' and '.join(shares)} % of the slope variances along and across the wind: give a longer "
+                f"shortest_wave than {shortest:.3g} m"
+            )
         return cls(
             *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
-            *(resolved, ripples, wake, shortest, beam_wave),
+            *(resolved, ripples, wake, shortest, beam_wave, series),
         )
 
     @property
@@ -250,6 +260,20 @@ def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: floa
             raise UserError(f"swell_height = {swell_height:g} needs a spectrum of waves, not {spectrum!r}")
         components.append(SwellSpectrum(swell_height, swell_wavelength, swell_direction))
     return SeaState(tuple(components)) if components else None
+
+
+def _read_series(get: Get, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:
+    """Return the series of all slopes of the sea, None for Gaussian ones."""
+    distribution = get("slope_distribution", "gaussian")
+    if distribution == "gaussian":
+        return None
+    if distribution != "gram_charlier":
+        raise UserError(f"slope_distribution = {distribution!r} must be 'gaussian' or 'gram_charlier'")
+    if slope_variance != "cox_munk":
+        raise UserError(
+            f"slope_distribution = 'gram_charlier' needs the slope_variance 'cox_munk', not {slope_variance!r}"
+        )
+    return GramCharlierSeries.of_clean_sea(wind_speed)
 
 
 def _with_total_variance(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mitransient_lidar.physics.sea.cox_munk import cox_munk
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.physics.sea.realization import mesh_slope_variance
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
 from mitransient_lidar.physics.sea.wind_spectra import ElfouhailySpectrum, PiersonMoskowitzSpectrum
@@ -33,11 +34,74 @@ def test_matched_waves_leave_ripples_to_every_mesh(kind, wind):
         before = ripples
 
 
+def normal_grid(reach=9.0, count=721):
+    """Return crosswind and upwind slopes over their standard deviations, and the Gaussian's integral of each node."""
+    nodes = np.linspace(-reach, reach, count)
+    x, y = np.meshgrid(nodes, nodes)
+    return x, y, np.exp(-0.5 * (x**2 + y**2)) / (2 * np.pi) * (nodes[1] - nodes[0]) ** 2
+
+
+@pytest.mark.parametrize(
+    ("wind", "nadir", "looking_upwind", "looking_downwind"), [(6, 1.109, 1.188, 0.743), (10, 1.109, 0.95, 0.87)]
+)
+def test_series_at_20_degrees(wind, nadir, looking_upwind, looking_downwind):
+    """By hand from the published terms. Who looks upwind sees lee faces, which rise towards the wind."""
+    series = GramCharlierSeries.of_clean_sea(wind)
+    slope = np.tan(np.radians(20)) / np.sqrt(3.16e-3 * wind)
+    assert series.ratio(0.0, 0.0) == pytest.approx(nadir, abs=5e-4)
+    assert series.ratio(0.0, slope) == pytest.approx(looking_upwind, abs=5e-3)
+    assert series.ratio(0.0, -slope) == pytest.approx(looking_downwind, abs=5e-3)
+
+
+def test_series_has_the_moments_of_its_terms():
+    series = GramCharlierSeries(-0.05, -0.16, 0.4, 0.12, 0.23)
+    x, y, gaussian = normal_grid()
+    density = gaussian * series.ratio(x, y)
+
+    def mean(values):
+        return float(np.sum(density * values))
+
+    found = [mean(one) for one in (np.ones_like(x), x, y, x * x, y * y, x * y, x * x * y, y**3, x**3)]
+    assert found == pytest.approx([1, 0, 0, 1, 1, 0, 0.05, 0.16, 0], abs=1e-9)
+    assert [mean(x**4) - 3, mean(x * x * y * y) - 1, mean(y**4) - 3] == pytest.approx([0.4, 0.12, 0.23], abs=1e-9)
+    for angle in (0.3, 2.0, 4.5):
+        across, up = np.sin(angle), np.cos(angle)
+        slope = across * x + up * y
+        wanted = mean(slope**3), mean(slope**4) - 3
+        assert series.along(across, up) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_waves_and_ripples_together_have_the_series():
+    """The ripples' density, averaged over Gaussian slopes of waves, is the whole series."""
+    total, part = cox_munk(6.0), (0.6 * cox_munk(6.0)[0], 0.7 * cox_munk(6.0)[1])
+    series = GramCharlierSeries.of_clean_sea(6.0)
+    ripples = series.of_part(total, part)
+    x, y, gaussian = normal_grid(reach=7.0, count=281)
+    sigma = np.sqrt(np.array([total, part, np.subtract(total, part)]))
+    for up, across in ((0.0, 0.0), (0.3, 0.1), (-0.25, 0.2)):
+        u, c = ((slope - sigma[2, i] * node) / sigma[1, i] for slope, node, i in ((up, y, 0), (across, x, 1)))
+        density = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[1].prod()) * ripples.ratio(c, u)
+        u, c = up / sigma[0, 0], across / sigma[0, 1]
+        wanted = np.exp(-0.5 * (u * u + c * c)) / (2 * np.pi * sigma[0].prod()) * series.ratio(c, u)
+        assert np.sum(gaussian * density) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_series_of_a_small_part_is_refused():
+    series, total = GramCharlierSeries.of_clean_sea(6.0), cox_munk(6.0)
+    halves, fifths = (series.of_part(total, (share * total[0], share * total[1])) for share in (0.5, 0.2))
+    halves.require_positive("")
+    assert halves.negative_share < 1e-5
+    assert fifths.negative_share == pytest.approx(0.444, abs=2e-3)
+    with pytest.raises(UserError, match=r"negative density for 44 % of the slopes .* at most 0.5 %; smooth them"):
+        fifths.require_positive("smooth them")
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: cox_munk(-1), "wind_speed = -1 must lie between 0 and 30"),
         (lambda: cox_munk(np.inf), "wind_speed = inf must be finite"),
+        (lambda: GramCharlierSeries.of_clean_sea(15), "slope_distribution 'gram_charlier' = 15 must lie"),
         (lambda: mesh_slope_variance(ElfouhailySpectrum(5), 10, 15), "cells = 15 must be an even"),
     ],
 )
