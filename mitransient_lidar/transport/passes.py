@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
@@ -27,8 +29,10 @@ class PassRecord:
         Number of rays traced.
     """
 
-    def __init__(self, histogram: TransientHistogram, classes: PathClasses) -> None:
-        self.histogram, self.classes = histogram, classes
+    def __init__(
+        self, histogram: TransientHistogram, classes: PathClasses, focusing: RippleFocusing | None = None
+    ) -> None:
+        self.histogram, self.classes, self.focusing = histogram, classes, focusing
         self.clear()
 
     def clear(self) -> None:
@@ -46,12 +50,15 @@ class PassRecord:
         length: mi.Float,
         energy: mi.Float,
         active: mi.Bool,
+        echo: Echo | None = None,
     ) -> None:
         """Add the energy [J] of paths by relative optical length [m] and by what their class depends on.
 
         That is the order of scattering, the number of reversals, and the number of the last solid that the light has
-        met, from 1 on, or 0 (`PathClasses`).
+        met, from 1 on, or 0 (`PathClasses`). An `echo` from under water is enhanced by ripples.
         """
+        if self.focusing is not None and echo is not None:
+            energy = energy * self.focusing.of(echo, order, length)
         self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active)
 
     def lose(self, energy: mi.Float, active: mi.Bool) -> None:
@@ -71,7 +78,10 @@ class PassRenderer(ABC):
     """
 
     def __init__(self, scene: LidarScene, classes: PathClasses, paths: int) -> None:
-        self.scene, self.classes, self.paths = scene, classes, paths
+        self.scene, self.paths = scene, paths
+        #: Enhancement by ripples, or None.
+        self.focusing = RippleFocusing.of_scene(scene)
+        self.classes = replace(classes, counted=self.focusing is not None)
         self.sampler = SensorSampler(scene.receiver, scene.transmitter)
 
     @property
@@ -93,7 +103,7 @@ class PassRenderer(ABC):
     def by_origin(self) -> PassRenderer:
         """Return a renderer that separates light by its origin; raise UserError for too many solids."""
         separate = copy.copy(self)
-        separate.classes = PathClasses.by_origin(self.scene.solids)
+        separate.classes = replace(PathClasses.by_origin(self.scene.solids), counted=self.classes.counted)
         return separate
 
     def of_shots(self, scene: LidarScene, shots: int, copies: int) -> PassRenderer:
@@ -121,7 +131,7 @@ class PassRenderer(ABC):
         scene = self.scene
         emitted = scene.transmitter.energy
         histogram = TransientHistogram(scene.axis, shape, emitted, gates, scene.reference_length)
-        record = PassRecord(histogram, self.classes)
+        record = PassRecord(histogram, self.classes, self.focusing)
         with dr.suspend_grad():
             self.trace(record, shots, self.paths if paths is None else paths)
         record.evaluate()

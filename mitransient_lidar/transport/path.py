@@ -12,6 +12,9 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import WaterScene
 
+#: Surface length of paths that have not met the sea first [m].
+NO_SURFACE = 1e9
+
 
 @dataclass
 class Path:
@@ -36,6 +39,9 @@ class Path:
         Number of changes between going down and going up so far.
     index_layer
         Index layer of the next segment, if it lies in water.
+    surface_length
+        Optical length from the start by the point where the path first met the sea to the other end [m], as `length`;
+        far beyond any record if its first segment has ended elsewhere.
     before_first_solid
         Whether the path has met no solid (bottom or target) yet.
     rays
@@ -53,6 +59,7 @@ class Path:
     scatterings: mi.UInt32
     reversals: mi.UInt32
     index_layer: mi.UInt32
+    surface_length: mi.Float
     before_first_solid: mi.Bool
     rays: mi.UInt32
     active: mi.Bool
@@ -88,6 +95,7 @@ class Path:
             "scatterings": mi.UInt32(0),
             "reversals": mi.UInt32(0),
             "index_layer": mi.UInt32(0),
+            "surface_length": mi.Float(NO_SURFACE),
             "before_first_solid": mi.Bool(True),
             "rays": mi.UInt32(0),
             "active": active,

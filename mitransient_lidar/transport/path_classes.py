@@ -12,6 +12,9 @@ from mitransient_lidar.core.errors import UserError
 #: Bits of a label for the pixel, and for the number of scattering events; the others are for reversals.
 _PIXEL_BITS, _ORDER_BITS = 20, 6
 
+#: Bits of a label for the pixel where only scattering events are counted, and the largest number of these.
+_MANY_PIXEL_BITS, _MOST_COUNTED = 28, 15
+
 _MOST = (1 << _ORDER_BITS) - 1
 
 #: Largest number of orders that can be separated.
@@ -30,11 +33,13 @@ class PathClasses:
 
     Either orders of scattering below `orders`, and all higher ones together; or the origin of the light, that is the
     last of the `solids` that it has met, else the water if that has scattered it, else the surface. With `orders` = 0
-    and without `solids` each pixel is one class.
+    and without `solids` each pixel is one class. Labels have the number of scattering events, up to 15, if they are
+    `counted`.
     """
 
     orders: int = 0
     solids: tuple[mi.Shape, ...] | None = None
+    counted: bool = False
 
     @classmethod
     def by_origin(cls, solids: list[mi.Shape]) -> PathClasses:
@@ -47,6 +52,11 @@ class PathClasses:
     def by_order(self) -> bool:
         """Whether there are classes by order of scattering."""
         return self.orders > 0
+
+    @property
+    def labels_orders(self) -> bool:
+        """Whether labels have the numbers of scattering events."""
+        return self.by_order or self.counted
 
     @property
     def separate(self) -> bool:
@@ -67,14 +77,18 @@ class PathClasses:
 
     def pack(self, label: mi.UInt32, scatterings: mi.UInt32, reversals: mi.UInt32) -> mi.UInt32:
         """Return a label packed with numbers of scattering events and reversals."""
-        if not self.by_order:
+        if not self.labels_orders:
             return label
+        if not self.by_order:
+            return label | (dr.minimum(scatterings, _MOST_COUNTED) << _MANY_PIXEL_BITS)
         return label | _packed(scatterings, _PIXEL_BITS) | _packed(reversals, _PIXEL_BITS + _ORDER_BITS)
 
     def unpack(self, label: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return a label without the numbers of scattering events and reversals, and these (0 without orders)."""
-        if not self.by_order:
+        """Return a label without the numbers of scattering events and reversals, and these (0 where not counted)."""
+        if not self.labels_orders:
             return label, mi.UInt32(0), mi.UInt32(0)
+        if not self.by_order:
+            return label & ((1 << _MANY_PIXEL_BITS) - 1), label >> _MANY_PIXEL_BITS, mi.UInt32(0)
         return (label & ((1 << _PIXEL_BITS) - 1), (label >> _PIXEL_BITS) & _MOST, label >> (_PIXEL_BITS + _ORDER_BITS))
 
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:

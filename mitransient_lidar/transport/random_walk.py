@@ -163,6 +163,8 @@ class RandomWalk:
             depth = self._water.scattering_flight.optical_depth(path.depth, path.downward, vertex.length)
             edge = dr.select(path.inverse > 0, path.inverse * dr.square(vertex.length) * dr.exp(depth), 0)
             step.arrive(path, vertex)
+            by_surface = path.length + self._to_go.distance(path.point)
+            path.surface_length = dr.select(first & vertex.at_sea, by_surface, path.surface_length)
             if on_first_hit is not None:
                 on_first_hit(path, vertex.si, first & (vertex.at_sea | (vertex.on_solid & ~wet)))
             hit = vertex.on_solid & wet

@@ -27,6 +27,7 @@ from mitransient_lidar.transport.refracted_connection import (
     connect_laser,
     trace_to_top_layer,
 )
+from mitransient_lidar.transport.ripple_focusing import Echo
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
@@ -103,8 +104,10 @@ class PathLight:
         raise NotImplementedError
 
     @abstractmethod
-    def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
-        """Record light that arrives along connected paths of an optical length [m]."""
+    def receive(
+        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool
+    ) -> None:
+        """Record light that arrives along paths of an optical length [m], connected from solids or elsewhere."""
 
     @abstractmethod
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
@@ -112,6 +115,10 @@ class PathLight:
 
         `share` is the received energy per radiance above the surface at `crossing`.
         """
+
+    def length_by(self, path: ConnectedPath) -> mi.Float:
+        """Return the optical length from the receiver by the last vertex straight to the emitter [m]; 0 if far away."""
+        return mi.Float(0)
 
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
         """Return the numbers of solids as `PathClasses.solid`; 0 where the record has no such classes."""
@@ -148,16 +155,23 @@ class LaserLight(PathLight):
         """Connect scattering events to a laser under water."""
         return connect_event_to_laser(self.scene, point, active)
 
+    def length_by(self, path: ConnectedPath) -> mi.Float:
+        """Return the optical length from the receiver by the last vertex straight to the laser [m]."""
+        return path.length + self._to_laser.distance(path.point)
+
     def solid(self, shape: mi.ShapePtr) -> mi.UInt32:
         """Return the numbers of solids among the classes of the record."""
         return self.record.classes.solid(shape)
 
-    def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
+    def receive(
+        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool
+    ) -> None:
         """Add energy to the histogram."""
         # The connection to a laser above goes up: from a vertex that was reached downwards it is one more reversal.
         upward = opaque(self.scene.transmitter.pose.origin[2]) - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
-        self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active)
+        echo = Echo(path.surface_length, on_solid | ~path.before_first_solid)
+        self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add energy to the losses."""
@@ -220,6 +234,8 @@ class PathTracer:
             absorbed = self._absorption.optical_depth(path.depth, path.downward, vertex.length)
             path.throughput *= dr.select(path.active & path.in_water, dr.exp(-absorbed), 1)
         self._step.arrive(path, vertex)
+        by_surface = self.light.length_by(path)
+        path.surface_length = dr.select(first & vertex.at_sea, by_surface, path.surface_length)
         event = self._step.scattering_event(path, vertex.scattered, rng)
         if self.scene.water is not None and self._absorption is None:
             path.throughput *= dr.select(vertex.scattered, self.scene.water.albedo(event.scatterer), 1)
@@ -281,7 +297,7 @@ class PathTracer:
         # One ray along the path, one up to the surface, one to the emitter.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(sampled, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
-        light.receive(path, path.length + water_length + air_length, energy, radiance > 0)
+        light.receive(path, path.length + water_length + air_length, energy, radiance > 0, vertex.on_solid)
         light.reflect(path, si, rng, vertex.at_sea & ~vertex.in_water)
         # For the loss, the density of the sampled direction replaces that of the surface's BSDF.
         share = light.weight * path.throughput * connected * density
@@ -301,7 +317,7 @@ class PathTracer:
         if self.options.complement_only:
             energy = dr.select(self._merged(path, vertex, first), 0, energy)
         path.rays += dr.select(path.active, mi.UInt32(2), 0)
-        light.receive(path, path.length + length, energy, radiance > 0)
+        light.receive(path, path.length + length, energy, radiance > 0, vertex.on_solid)
 
     @staticmethod
     def _submerged(vertex: Vertex) -> mi.Bool:

@@ -21,14 +21,9 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
-
-#: Scattering by more is loss: the light has left the beam [rad].
-_LARGEST_ANGLE = np.radians(80.0)
-
-#: Nodes of the inverse of a phase function's distribution.
-_NODES = 8192
 
 
 class Arrivals(NamedTuple):
@@ -50,6 +45,8 @@ class EchoEstimate:
     slope_covariance: FloatArray  #: Of waves and ripples together, away from nadir and to the left, shape (2, 2).
     bottom_depth: float  #: Depth of the bottom, or of the last light from the water without one [m].
     reflectance: float  #: Lambertian reflectance of the bottom, 0 to 1.
+    #: Enhancement by waves that light crosses twice [1], of depths and displacements [m]; None for independent slopes.
+    enhancement: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     #: Density of the surface's slopes, shape (n, 2), over the Gaussian one [1]; None for Gaussian slopes.
     slope_ratio: Callable[[FloatArray], FloatArray] | None = None
 
@@ -96,6 +93,8 @@ class EchoEstimate:
             gain = self.system.water_gain(depth, theta[:, None])
             lost = np.exp(-2 * self._absorbed(depth) / cosine)
             seen = lit + up
+            if self.enhancement is not None:
+                kept = kept * self.enhancement(depth, np.abs(shifts[0] + shifts[1]))
             return Arrivals(seen.real, seen.imag, time, gain * returned * lost * kept / len(beam))
 
         water = arrivals(depths, np.asarray(backscatter * thickness / cosine))
@@ -142,8 +141,8 @@ class EchoEstimate:
         distance = edges[layer] + (place - optical[layer]) / np.where(b > 0, b, 1.0)[layer]
         u, theta = rng.random(path.size), np.zeros(path.size)
         for one in np.unique(layer):
-            theta[layer == one] = _angles(self.phases[one], u[layer == one])
-        is_lost = theta > _LARGEST_ANGLE
+            theta[layer == one] = scattering_angles(self.phases[one], u[layer == one])
+        is_lost = theta > LARGEST_ANGLE
         end = np.full(count, np.inf)
         np.minimum.at(end, path[is_lost], distance[is_lost])
         path, distance, theta, layer = (each[~is_lost] for each in (path, distance, theta, layer))
@@ -198,9 +197,3 @@ class _Spread:
         down_x, down_y, up_x, up_y, delay, absorbed = map(beyond, self._sums)
         kept = np.where(self._end[:, None] > distance, np.exp(-absorbed), 0.0)
         return down_x + 1j * down_y, up_x + 1j * up_y, delay, kept
-
-
-def _angles(phase: PowerLawTable, u: FloatArray) -> FloatArray:
-    """Return scattering angles [rad] of a phase function for uniform numbers."""
-    theta = np.concatenate([[0.0], np.geomspace(1e-6, np.pi, _NODES)])
-    return np.asarray(np.interp(u, phase.cdf_s(np.sin(theta / 2) ** 2), theta))

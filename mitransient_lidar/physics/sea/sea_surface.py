@@ -77,6 +77,8 @@ class SeaSurface:
     shortest_wave: float  #: Wavelength of the shortest waves [m], that of two cells in coarse ones.
     beam_wave: float  #: Wavelength of the shortest waves that the beam alone needs [m], that of the sea or more.
     slope_series: GramCharlierSeries | None = None  #: Series of the ripples' slopes, None for Gaussian ones.
+    #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
+    focusing_spectrum: SeaState | None = None
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
@@ -114,6 +116,7 @@ class SeaSurface:
         current_direction = _read_angle(get, "current_direction_deg")
         map_size = read_length(get, "map_size")
         path = get("filename", "")
+        focuses = _read_switch(get, "ripple_focusing")
         series = _read_series(get, slope_variance, wind_speed)
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
@@ -152,6 +155,8 @@ class SeaSurface:
         lengths = (0.0, 0.0) if spectrum == "height_map" else (resolution.shortest_wave, resolution.beam_wave)
         shortest, beam_wave = (max(wave, 2 * cell) for wave in lengths)
         ripples = along, across
+        # Tables and swell have no ripples of their own.
+        is_whole = state is not None and isinstance(state.components[0], CosineSpectrum)
         if series is not None:
             series = series.of_part(cox_munk(wind_speed), ripples)
         if series is not None and not is_placeholder:
@@ -162,7 +167,7 @@ class SeaSurface:
             )
         return cls(
             *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
-            *(resolved, ripples, wake, shortest, beam_wave, series),
+            *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
         )
 
     @property
@@ -345,6 +350,14 @@ def _read_wake(get: Get) -> Wake | None:
     if speed == 0:
         return None
     return partial(kelvin_wake, speed=speed, bearing=bearing, length=length, ship_x=x, ship_y=y)
+
+
+def _read_switch(get: Get, name: str) -> bool:
+    """Return a parameter that is true or false, true by default."""
+    value = get(name, True)
+    if str(value).lower() not in ("true", "false"):
+        raise UserError(f"{name} = {value!r} must be true or false")
+    return str(value).lower() == "true"
 
 
 def _read_angle(get: Get, name: str) -> float:

@@ -73,7 +73,9 @@ class DaylightLight(PathLight):
             return mi.Float(0), mi.Float(0)
         return connect_sun(self.scene, si, emitter.in_air, sun.sampled_irradiance, active), mi.Float(0)
 
-    def receive(self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
+    def receive(
+        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool
+    ) -> None:
         """Add light of the sun."""
         self.add(self.pixel, energy, active)
 

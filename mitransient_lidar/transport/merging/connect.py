@@ -172,7 +172,7 @@ class WaterConnections:
         energy = scale * point.weight * photon.weight * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length
-        self._receive(point, photon, solid, direction, 1, length, distance, energy, active)
+        self._receive(point, photon, solid, direction, 1, length, distance, energy, active, on_solid=True)
 
     def _segment(self, point: SegmentPoints, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Return direction, length [m] and absorption of segments, and their length^2 / transmittance of scattering."""
@@ -205,8 +205,10 @@ class WaterConnections:
         distance: mi.Float,
         energy: mi.Float,
         active: mi.Bool,
+        on_solid: bool = False,
     ) -> None:
         """Add the energy of connected paths to the record."""
-        subpath = SensorSubpath(*self.record.classes.unpack(point.label), solid, point.direction, point.weight)
+        subpath = SensorSubpath.at(self.record, point, solid)
         group: Any = self._water.index_layers.group(mi.UInt32(0))
-        subpath.add(self.record, light, events, length + distance * group, energy, active, [direction])
+        length = length + distance * group
+        subpath.add(self.record, light, events, length, energy, active, [direction], on_solid)

@@ -17,6 +17,7 @@ from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
+from mitransient_lidar.transport.ripple_focusing import Echo
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -32,7 +33,7 @@ def store_points(
     points = segments.points(index)
     bucket, _, _ = cells.locate(points.point, points.direction)
     u = segments.random(index, shots)
-    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, classes.by_order)
+    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, classes.labels_orders)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     _, tag, _ = cells.locate(points.point, points.direction)
@@ -75,7 +76,7 @@ def merge_in_water(
         scatterers.append((water.plume_phase, water.plume.scattering_at(points.point)))
     absorption = water.absorption_flight.attenuation(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
-    subpath = SensorSubpath(*record.classes.unpack(points.label), mi.UInt32(0), points.direction, points.weight)
+    subpath = SensorSubpath.at(record, points, mi.UInt32(0))
     first, end = photons.find(bucket, mi.Bool(True))
     typical = cells.typical_volume(points.point)
     weight = points.weight / volume * typical
@@ -119,7 +120,8 @@ def merge_on_solids(
         patch, random = patches.locate(si), mi.PCG32(rng)
         first, end = photons.find(patch.bucket, active)
         solid = record.classes.solid(si.shape)
-        subpath = SensorSubpath(pixel, path.scatterings, path.reversals, solid, path.direction, path.weight)
+        events = path.scatterings, path.reversals
+        subpath = SensorSubpath(pixel, *events, solid, path.direction, path.weight, path.surface_length)
         weight = path.weight * patches.inverse_share(patch, si.shape, random, active & (first < end)) / patch.area
         typical = patches.typical_area(si)
         connection = connections * edge / dr.abs(dr.dot(si.n, path.direction))
@@ -135,7 +137,8 @@ def merge_on_solids(
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
             share = typical / dr.fma(connection, photon.edge, typical)
             energy = weight * photon.weight * bsdf * share
-            subpath.add(record, photon, 0, path.length + photon.length, energy, within & (bsdf > 0))
+            lit = within & (bsdf > 0)
+            subpath.add(record, photon, 0, path.length + photon.length, energy, lit, on_solid=True)
             return (index + 1,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge on solids")
@@ -153,6 +156,13 @@ class SensorSubpath:
     solid: mi.UInt32
     direction: mi.Vector3f
     weight: mi.Float
+    surface_length: mi.Float
+
+    @classmethod
+    def at(cls, record: PassRecord, point: SegmentPoints, solid: mi.UInt32) -> SensorSubpath:
+        """Return the parts up to points of the receiver's paths."""
+        events = record.classes.unpack(point.label)
+        return cls(*events, solid, point.direction, point.weight, point.surface_length)
 
     def add(
         self,
@@ -163,21 +173,23 @@ class SensorSubpath:
         energy: mi.Float,
         active: mi.Bool,
         between: Sequence[mi.Vector3f] = (),
+        on_solid: bool = False,
     ) -> None:
         """Add complete paths to a record, with a number of scattering `events` where the parts meet.
 
-        `between` are the directions of segments between the receiver's part and the light's. Paths of which one part
-        lies outside the surface mesh count as lost.
+        `on_solid` is whether they have met a solid, `between` are the directions of segments between the receiver's
+        part and the light's. Paths of which one part lies outside the surface mesh count as lost.
         """
         outside = (self.weight < 0) | (light.weight < 0)
         order, reversals = self.scatterings + events, self.reversals
+        _, before, reversed_before = record.classes.unpack(light.label)
+        order = order + before
         if record.classes.by_order:
-            _, before, reversed_before = record.classes.unpack(light.label)
             # Light continues against the directions of the receiver's part.
             course = [self.direction.z, *(direction.z for direction in between), -light.direction.z]
             for here, following in pairwise(course):
                 reversals = reversals + dr.select(here * following < 0, mi.UInt32(1), 0)
             reversals = reversals + reversed_before
-            order = order + before
-        record.receive(self.pixel, order, reversals, self.solid, length, dr.abs(energy), active & ~outside)
+        echo = Echo(self.surface_length, on_solid)
+        record.receive(self.pixel, order, reversals, self.solid, length, dr.abs(energy), active & ~outside, echo)
         record.lose(dr.abs(energy), active & outside)

@@ -143,12 +143,12 @@ class PhotonBuffer:
         self._stored = dr.zeros(mi.UInt32, 1)
         self._patch = dr.empty(mi.UInt32, 2 * capacity)
         self._lane = dr.empty(mi.UInt32, capacity)
-        self._label = dr.empty(mi.UInt32, capacity if classes.by_order else 1)
+        self._label = dr.empty(mi.UInt32, capacity if classes.labels_orders else 1)
         self._record = dr.empty(mi.Float, 4 * capacity)
         self._weight = dr.empty(mi.Float, 2 * capacity)
         self._place = dr.zeros(mi.Float, 4 * photons)
         self._connectable = dr.zeros(mi.Float, 4 * photons)
-        self._connectable_label = dr.zeros(mi.UInt32, photons if classes.by_order else 1)
+        self._connectable_label = dr.zeros(mi.UInt32, photons if classes.labels_orders else 1)
 
     def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool, connectable: mi.Bool) -> None:
         """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
@@ -161,7 +161,7 @@ class PhotonBuffer:
         dr.scatter(self._weight, mi.Vector2f(path.weight, dr.select(connectable, mi.Float(1), 0)), slot, keep)
         dr.scatter(self._connectable, where, path.lane, connectable)
         dr.scatter(self._place, mi.Vector4f(path.weight, place.x, place.y, place.z), path.lane, connectable)
-        if self._classes.by_order:
+        if self._classes.labels_orders:
             label = self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals)
             dr.scatter(self._label, label, slot, keep)
             dr.scatter(self._connectable_label, label, path.lane, connectable)
@@ -180,8 +180,8 @@ class PhotonBuffer:
         key = dr.reinterpret_array(mi.UInt32, x) ^ dr.reinterpret_array(mi.UInt32, length)
         lanes = Lanes.of_paths(dr.gather(mi.UInt32, self._lane, index), self._shots, self.photons)
         u = mi.sample_tea_float32(lanes.number, key)
-        photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.by_order)
-        label = dr.gather(mi.UInt32, self._label, index) if self._classes.by_order else mi.UInt32(0)
+        photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.labels_orders)
+        label = dr.gather(mi.UInt32, self._label, index) if self._classes.labels_orders else mi.UInt32(0)
         weight, first = dr.gather(mi.Vector2f, self._weight, index)
         photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, mi.Float(0), mi.Float(0), first, label), tag)
         return photons, wanted
@@ -190,6 +190,6 @@ class PhotonBuffer:
         """Return the hits of paths by number that can be connected [m], and their photons, of weight 0 for none."""
         x, y, z, length = dr.gather(mi.Vector4f, self._connectable, index)
         weight, px, py, pz = dr.gather(mi.Vector4f, self._place, index)
-        label = dr.gather(mi.UInt32, self._connectable_label, index) if self._classes.by_order else mi.UInt32(0)
+        label = dr.gather(mi.UInt32, self._connectable_label, index) if self._classes.labels_orders else mi.UInt32(0)
         zero = mi.Float(0)
         return mi.Point3f(px, py, pz), Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, mi.Float(1), label)

@@ -40,6 +40,8 @@ class SegmentPoints:
         on the way; 0 if the segment starts elsewhere.
     label
         Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
+    surface_length
+        As of the path [m].
     """
 
     point: mi.Point3f
@@ -49,6 +51,7 @@ class SegmentPoints:
     mis_partial_sum: mi.Float
     edge: mi.Float
     label: mi.UInt32
+    surface_length: mi.Float
 
 
 class SegmentBuffer:
@@ -87,7 +90,8 @@ class SegmentBuffer:
         dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.offset), slot, keep)
         direction = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._direction, direction, slot, keep)
-        dr.scatter(self._weight, mi.Vector4f(path.weight, path.mis_partial_sum, path.inverse, 0), slot, keep)
+        weight = mi.Vector4f(path.weight, path.mis_partial_sum, path.inverse, path.surface_length)
+        dr.scatter(self._weight, weight, slot, keep)
         path.points += number
         dr.scatter(self._of_path, path.points, path.lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
@@ -131,7 +135,7 @@ class SegmentBuffer:
         segment = dr.gather(mi.UInt32, self._slot, first)
         x, y, z, offset = dr.gather(mi.Vector4f, self._start, segment)
         dx, dy, dz, length = dr.gather(mi.Vector4f, self._direction, segment)
-        throughput, mis_partial_sum, inverse, _ = dr.gather(mi.Vector4f, self._weight, segment)
+        throughput, mis_partial_sum, inverse, surface_length = dr.gather(mi.Vector4f, self._weight, segment)
         along = dr.fma(mi.Float(index - first), self.spacing, offset)
         direction = mi.Vector3f(dx, dy, dz)
         absorption = self._water.absorption_flight.optical_depth(-z, -dz, along)
@@ -148,4 +152,5 @@ class SegmentBuffer:
             mis_partial_sum,
             edge,
             dr.gather(mi.UInt32, self._label, segment),
+            surface_length,
         )

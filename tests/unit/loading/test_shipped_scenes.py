@@ -17,7 +17,7 @@ TABLE = {
     **{"altitude": "200", "off_nadir_deg": "20", "aim_x": "0", "aim_y": "0"},
     **{"time_start_ns": "auto", "bin_width_ns": "1", "bin_count": "auto"},
     **{"wind_speed": "3", "wind_direction_deg": "0", "spectrum": "elfouhaily", "slope_variance": "cox_munk"},
-    **{"slope_distribution": "gaussian"},
+    **{"slope_distribution": "gaussian", "ripple_focusing": "true"},
     **{"surface_seed": "1", "surface_time": "0"},
     **{"surface_refined_size": "auto", "surface_cell_size": "auto"},
     **{"surface_shortest_wave": "auto", "surface_size": "auto"},

@@ -1,0 +1,168 @@
+"""Enhancement of echoes from the water by waves that light crosses twice.
+
+Waves focus light under water, and light returns best to where it came from: through the same slopes. Of all pairs of
+ways down and up between lidar and a point, those through nearby points of the sea have alike slopes. The mean over seas
+of the irradiance times the visibility of the point, over the product of their means, is
+
+    g = integral of N(d - o; (a z)^2 D(d)) over the distance d of the two points on the sea,
+
+with the normal density N, the structure function of slopes D(d), 2x2, the displacement of a ray at the depth z by a
+slope, a z, and the displacement o of one way against the other by scattering, or between laser and receiver. It is
+exact for small Gaussian slopes. Slopes that are drawn anew on each way, as ripples are, have the constant D = 2 v.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.wave_spectrum import WaveSpectrum
+
+#: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].
+_SHORTEST_WAVE, _FARTHEST = 8.5e-4, 300.0
+
+#: Least depth of tables [m]: above it little is known of the waves that count, and depths are within them.
+LEAST_DEPTH = 0.5
+
+#: Nodes of wavenumber, of distance, and of the angle between distance and displacement.
+_WAVENUMBERS, _DISTANCES, _ANGLES = 400, 120, 16
+
+#: Displacements of a table [m], besides 0.
+_DISPLACEMENTS = np.geomspace(3e-4, 3.0, 17)
+
+#: Ways whose displacement is so many times what slopes do are independent.
+_FAR_APART = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeStructure:
+    """Structure functions of the slopes of an isotropic sea, by distance.
+
+    Attributes
+    ----------
+    distance
+        Distances of points [m], equally spaced in their logarithm.
+    along, across
+        Mean square difference of the slopes along the distance and across it [1].
+    """
+
+    distance: FloatArray
+    along: FloatArray
+    across: FloatArray
+
+    def enhancement(self, spread: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
+        """Return the enhancement g [1].
+
+        Parameters
+        ----------
+        spread
+            Displacement of a ray over the slope that causes it [m], a depth times a factor below 1; any shape.
+        displacement
+            Displacement of the two ways against each other [m]; broadcast with `spread`.
+        """
+        spread, apart = (np.asarray(one, dtype=np.float64)[..., None, None] for one in (spread, displacement))
+        nodes, weights = np.polynomial.legendre.leggauss(_ANGLES)
+        # Denser about the direction of the displacement.
+        angle = np.pi * (0.5 * (nodes + 1)) ** 2
+        weight = weights * 0.5 * (nodes + 1) * np.pi
+        d = self.distance[:, None]
+        along, across = (spread**2 * one[:, None] for one in (self.along, self.across))
+        exponent = -0.5 * ((d - apart * np.cos(angle)) ** 2 / along + (apart * np.sin(angle)) ** 2 / across)
+        density = np.exp(exponent) / (np.pi * np.sqrt(along * across))
+        # At both ends of the distances nothing is left.
+        step = np.log(self.distance[1] / self.distance[0])
+        found = step * np.sum(np.sum(density * weight, axis=-1) * self.distance**2, axis=-1)
+        moved = spread[..., 0, 0] ** 2 * np.interp(apart[..., 0, 0], self.distance, self.across)
+        return np.asarray(np.where(moved * _FAR_APART**2 < apart[..., 0, 0] ** 2, 1.0, found))
+
+
+@dataclass(frozen=True, eq=False)
+class EnhancementTable:
+    """Enhancement by depth and displacement.
+
+    Attributes
+    ----------
+    depths
+        Depths [m], ascending, shape (depths,).
+    values
+        Enhancements [1], shape (depths, displacements).
+    """
+
+    depths: FloatArray
+    values: FloatArray
+
+    @classmethod
+    def of(cls, structure: SlopeStructure, depths: FloatArray, spread_per_depth: float) -> EnhancementTable:
+        """Return the table of a sea; `spread_per_depth` is the displacement of a ray over depth and slope [1]."""
+        spreads = spread_per_depth * depths[:, None]
+        return cls(depths, structure.enhancement(spreads, np.append(0.0, _DISPLACEMENTS)))
+
+    def at(self, depth: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
+        """Return enhancements at depths and displacements [m], arrays that broadcast.
+
+        They are linear in the logarithm of the depth and in the displacement, and those of the ends beyond the table.
+        Above its first depth they fall to 1 at the surface.
+        """
+        z, apart = np.broadcast_arrays(np.asarray(depth, np.float64), np.asarray(displacement, np.float64))
+        place = np.interp(np.log(np.maximum(z, self.depths[0])), np.log(self.depths), np.arange(self.depths.size))
+        nodes = np.append(0.0, _DISPLACEMENTS)
+        other = np.interp(apart, nodes, np.arange(nodes.size))
+        low, left = (
+            np.minimum(one.astype(np.intp), size - 2)
+            for one, size in zip((place, other), self.values.shape, strict=True)
+        )
+        down, right = place - low, other - left
+        first, second = (
+            (1 - right) * self.values[row, left] + right * self.values[row, left + 1] for row in (low, low + 1)
+        )
+        found = (1 - down) * first + down * second
+        return np.asarray(1 + (found - 1) * np.clip(z / self.depths[0], 0, 1))
+
+
+def slope_spread(off_nadir: float, refractive_index: float) -> float:
+    """Return the displacement of a ray over depth and slope [1], at an angle from the vertical in air [rad].
+
+    A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)), with the refracted angle phi. The point at
+    a depth moves by this factor across the plane of incidence, and by 1/cos^2(phi) of it in the plane: this is the
+    geometric mean.
+    """
+    cos_water = np.sqrt(1 - (np.sin(off_nadir) / refractive_index) ** 2)
+    return float((1 - np.cos(off_nadir) / (refractive_index * cos_water)) / cos_water)
+
+
+def slope_structures(
+    spectrum: WaveSpectrum, resolved_variance: float, ripple_variance: float
+) -> tuple[SlopeStructure, SlopeStructure]:
+    """Return the structure functions of a sea, and of the same sea with ripples drawn anew for each way.
+
+    Parameters
+    ----------
+    spectrum
+        Spectrum of all waves.
+    resolved_variance, ripple_variance
+        Slope variances of longer waves and of ripples, both axes [1]: ripples are the waves above the wavenumber at
+        which the spectrum has the first one, scaled to the second one.
+    """
+    from scipy.special import j0, j1
+
+    k = np.geomspace(0.1 * spectrum.peak_wavenumber, 2 * np.pi / _SHORTEST_WAVE, _WAVENUMBERS)
+    slopes = np.asarray(spectrum.omnidirectional(k) * k**3)
+    steps = np.gradient(np.log(k))
+    variance = slopes * steps
+    is_ripple = np.cumsum(variance) > resolved_variance
+    ripples = np.where(is_ripple, variance, 0.0)
+    ripples *= ripple_variance / max(float(ripples.sum()), 1e-30)
+    distance = np.geomspace(1e-5, _FARTHEST, _DISTANCES)
+    x = np.outer(distance, k)
+    across = j1(x) / x
+    along = j0(x) - across
+
+    def structure(waves: FloatArray, independent: float) -> SlopeStructure:
+        total = 0.5 * waves.sum() + independent
+        return SlopeStructure(distance, *(2 * (total - kernel @ waves) for kernel in (along, across)))
+
+    waves = np.where(is_ripple, 0.0, variance)
+    return structure(waves + ripples, 0.0), structure(waves, 0.5 * ripple_variance)

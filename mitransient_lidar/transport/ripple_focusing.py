@@ -1,0 +1,113 @@
+"""Mean enhancement of echoes by ripples that the mesh of the sea does not have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.sea.double_passage import (
+    LEAST_DEPTH,
+    EnhancementTable,
+    slope_spread,
+    slope_structures,
+)
+from mitransient_lidar.physics.water.forward_scattering import displacements
+from mitransient_lidar.transport.medium.water_phases import table_of
+from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.scene import LidarScene
+
+#: Largest depth of the table [m], and its number of depths.
+_DEEPEST, _DEPTHS = 60.0, 20
+
+#: Largest number of forward scattering events that is told apart.
+_MOST_EVENTS = 7
+
+#: Samples of displacements.
+_SAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Echo:
+    """Where paths have turned.
+
+    Attributes
+    ----------
+    surface_length
+        Relative optical length by the point of the sea that the path has crossed [m], `Path.surface_length`.
+    on_solid
+        Whether they have met a solid.
+    """
+
+    surface_length: mi.Float
+    on_solid: mi.Bool | bool
+
+
+class RippleFocusing:
+    """Factors of the energy of paths that cross a sea with ripples twice.
+
+    Ripples are drawn anew on each way, so that they neither focus light nor return it through themselves. The factor is
+    the enhancement with correlated ripples over that without them, by the depth of the echo and the number of forward
+    scattering events, which move one way against the other (`physics.sea.double_passage`).
+
+    Parameters
+    ----------
+    factors
+        Shape (`_MOST_EVENTS` + 1, `_DEPTHS`).
+    depth_per_length
+        Depth of an echo over the optical length of its path beyond that by the surface.
+    """
+
+    def __init__(self, factors: FloatArray, depth_per_length: float) -> None:
+        self.factors = factors
+        self._table, self._depth_per_length = aligned(mi.Float, factors.astype(np.float32)), opaque(depth_per_length)
+
+    @classmethod
+    def of_scene(cls, scene: LidarScene) -> RippleFocusing | None:
+        """Return the factors of a lidar above a sea whose spectrum is known; None for others."""
+        seas = [sea for surface in scene.surfaces if (sea := getattr(surface, "sea", None)) is not None]
+        transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
+        if scene.water is None or scene.submerged or len(seas) != 1 or receiver.axis[2] >= 0:
+            return None
+        sea = seas[0]
+        if sea.focusing_spectrum is None:
+            return None
+        structures = slope_structures(sea.focusing_spectrum, sum(sea.resolved_variance), sum(sea.ripple_variance))
+        theta = np.radians(receiver.off_nadir_deg)
+        cos_water = float(np.cos(snell(theta, scene.refractive_index)))
+        depths = np.geomspace(LEAST_DEPTH, _DEEPEST, _DEPTHS)
+        spread = slope_spread(theta, scene.refractive_index)
+        tables = [EnhancementTable.of(structure, depths, spread) for structure in structures]
+        distance = float(np.linalg.norm(receiver.ground_point() - receiver.origin))
+        offset = transmitter.origin - receiver.origin
+        apart = complex(*(float(offset @ side) for side in (receiver.far, receiver.left)))
+        radius = np.sqrt(scene.receiver.optics.aperture_area / np.pi)
+        phases = [table_of(phase) for phase in scene.water.phases.phases[: scene.water.column.count]]
+        rng = np.random.default_rng(0)
+        disc = radius * np.sqrt(rng.random(_SAMPLES)) * np.exp(2j * np.pi * rng.random(_SAMPLES))
+        between = (apart + disc) / (scene.refractive_index * distance) * depths[:, None, None]
+        moves = displacements(scene.water.column, phases, depths, _MOST_EVENTS, _SAMPLES, rng)
+        moved = np.abs(between + moves) / cos_water
+        true, drawn = (table.at(depths[:, None, None], moved).mean(axis=-1) for table in tables)
+        return cls((true / drawn).T, 0.5 * cos_water / scene.group_index)
+
+    def of(self, echo: Echo, order: mi.UInt32, length: mi.Float) -> mi.Float:
+        """Return the factors of paths by number of scattering events and relative length [m].
+
+        One event turns light in the water. Light that the surface alone has reflected has the factor 1.
+        """
+        turned = dr.select(mi.Bool(echo.on_solid), mi.UInt32(0), 1)
+        events = dr.minimum(dr.select(order > turned, order - turned, 0), _MOST_EVENTS)
+        depth = (length - echo.surface_length) * self._depth_per_length
+        step = np.log(_DEEPEST / LEAST_DEPTH) / (_DEPTHS - 1)
+        place = dr.clip(dr.log(dr.maximum(depth, 1e-6) / LEAST_DEPTH) / step, 0, _DEPTHS - 1)
+        low = dr.minimum(mi.UInt32(place), _DEPTHS - 2)
+        first, second = (dr.gather(mi.Float, self._table, events * _DEPTHS + low + more) for more in (0, 1))
+        factor = dr.lerp(first, second, place - mi.Float(low))
+        # From 1 at the surface.
+        factor = dr.lerp(1, factor, dr.clip(depth / LEAST_DEPTH, 0, 1))
+        return dr.select(order >= turned, factor, 1)
