@@ -109,8 +109,7 @@ def test_labels_keep_pixel_and_events():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("water", [{}, {"jerlov": "II"}], ids=["table1", "II"])
-def test_echoes_do_not_depend_on_the_shortest_wave(water):
+def test_echoes_do_not_depend_on_the_shortest_wave():
     """Waves of 1 m and ripples, or waves from 0.15 m: gates of the column, and the bottom, mean over seas."""
     gates = (0.6, 1.4, 2.5, 4.0, 7.0)
     found = {}
@@ -118,7 +117,7 @@ def test_echoes_do_not_depend_on_the_shortest_wave(water):
         for focuses in (True, False):
             rows = []
             for seed in range(4):
-                params = {"surface_seed": seed, "surface_shortest_wave": wave, "surface_cell_size": cell, **water}
+                params = {"surface_seed": seed, "surface_shortest_wave": wave, "surface_cell_size": cell}
                 params |= {"ripple_focusing": str(focuses).lower(), "layout": "1x1"}
                 got = mitransient_lidar.render("table1", params=params, passes=2, components=True, seed=seed)
                 energy = got["impulse_response_by_origin"].isel(pixel=0)
