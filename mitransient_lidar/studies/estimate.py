@@ -97,9 +97,9 @@ def estimate(
     Compared with renders of ``table1`` over a level sea, with views of 10 to 100 mrad, bottoms at 4 to 15 m and
     Jerlov's types II, 1C and 5C, and with a beam of 0.5 mrad in 5 mrad, the surface agrees within 0.1 %, the bottom
     within 2 % of its energy, 4 % of its peak and 0.3 ns of its mean time. The water has 1 to 8 % too little energy,
-    15 % in 5C, mostly late. Over waves of 3 m/s, means of six seas, gates of the column from 0.5 m to the bottom at 8 m
-    agree within 2 %, over those of 6 m/s they have 3 to 7 % too little. In the turbid layers of ``fig15_2x2``, c of 0.9
-    and 0.5, the bottom has 3 to 13 % too little.
+    15 % in 5C, mostly late. Over waves of 3 and 6 m/s, means of six seas, the column has 7 and 2 % too much at 0.5 to
+    1.5 m, and less with depth, down to 5 % too little at 6 to 8 m; the bottom has 2 and 3 % too much. In the turbid
+    layers of ``fig15_2x2``, c of 0.9 and 0.5, the bottom has 3 to 13 % too little.
     """
     paths, seed = integer("paths", paths, 8 * _PARTS, _MOST_PATHS), integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params, instrument=instrument)
