@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,10 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range
-from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.electronics import Digitiser
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver, Setting
+from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,13 +29,13 @@ _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 def detect_waveforms(
     dataset: xr.Dataset,
-    chain: ReceiverChain | str,
+    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
     shots: int = 1,
     seed: int = 0,
     background_power: npt.ArrayLike | xr.DataArray = 0.0,
     *,
-    gain: float | Literal["auto"] = 1.0,
-    optical_density: float | Literal["auto"] = 0.0,
+    gain: Setting | None = None,
+    optical_density: Setting | None = None,
 ) -> xr.Dataset:
     """Record shots of a result, or of each shot of a series, with a receiver chain.
 
@@ -39,18 +43,21 @@ def detect_waveforms(
     ----------
     dataset : xarray.Dataset
         A result with ``waveform`` [W] over (pixel, time) or (row, column, time), optionally after ``shot``.
-    chain : ReceiverChain or str
-        The receiver chain, or its name in `physics.receiver.presets.RECEIVERS`.
+    chain : Receiver, ReceiverChain, str or path-like, optional
+        The receiver of every channel, or one chain for all; a name in `physics.receiver.presets.RECEIVERS` or of an
+        instrument, or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
+        of the result, and the preset ``apd`` without one.
     shots, seed : int
         Number of records of each waveform with independent noise, at least 1, and seed of the noise, at least 0.
     background_power : array-like or xarray.DataArray
         Steady power in addition to the waveform [W], not negative: a number, or one per pixel; see
         `physics.lidar.clear_sky.background_power`.
-    gain : float or 'auto'
-        Factor of the amplifier's transimpedance, above 0; 'auto' for the largest up to 1 without saturation.
-    optical_density : float or 'auto'
+    gain : float or 'auto', optional
+        Factor of the amplifier's transimpedance, above 0; 'auto' for the largest up to 1 without saturation. By default
+        that of the receiver's channels, 1 where they have none.
+    optical_density : float or 'auto', optional
         Optical density of a filter before the detector, 0 to 12, which also attenuates the background; 'auto' for the
-        least multiple of 0.1 without saturation.
+        least multiple of 0.1 without saturation. By default that of the channels, 0 where they have none.
 
     Returns
     -------
@@ -64,7 +71,10 @@ def detect_waveforms(
         attributes are those of the result, with the parameters of the chain as ``receiver.*``, ``gain`` and
         ``optical_density`` as used (``chosen`` names the one that was 'auto'), and ``fitting_gain`` and
         ``fitting_optical_density``, each of which avoids saturation while the other one is kept
-        (`ReceiverChain.fitting_gain`).
+        (`ReceiverChain.fitting_gain`). Where channels differ, attributes of the chain are
+        ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels is that of
+        `ReceiverChain.event_height`. ``impulse_response`` over ``lag`` [ns] is
+        the weight of the light of a bin in later samples.
 
     Raises
     ------
@@ -78,15 +88,69 @@ def detect_waveforms(
     shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     Dead times of counters and cells lose light without being marked as saturated.
     """
-    given = receiver_chain("chain", chain)
+    own = chain if chain is not None else str(dataset.attrs.get("instrument", "apd"))
+    receiver = receiver_of("chain", own)
+    if gain is not None or optical_density is not None:
+        receiver = receiver.with_settings(gain, optical_density)
+    names = [str(name) for name in np.atleast_1d(dataset["pixel"].values)] if "pixel" in dataset.dims else []
+    groups: dict[int, list[int]] = {}
+    for number, name in enumerate(names):
+        groups.setdefault(id(receiver.of(name)), []).append(number)
+    sky = _background(dataset, background_power, tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot"))
+    if len(groups) < 2:
+        channel = receiver.of(names[0]) if names else receiver.default
+        recorded = _record_channel(dataset, channel, shots, seed, sky)
+    else:
+        parts = []
+        for number, pixels in enumerate(groups.values()):
+            part, light = dataset.isel(pixel=pixels), sky if np.ndim(sky) == 0 else sky[pixels]
+            parts.append(_record_channel(part, receiver.of(names[pixels[0]]), shots, seed + number, light))
+        recorded = _joined(parts, list(groups.values()))
+    recorded.attrs |= {"noise_seed": int(seed)} | ({} if receiver.name == "custom" else {"receiver": receiver.name})
+    if receiver.pulse_repetition_khz is not None:
+        recorded.attrs["pulse_repetition_khz"] = receiver.pulse_repetition_khz
+    if recorded["saturated"].any():
+        _LOG.warning("%s", saturation_advice(recorded))
+    return recorded
+
+
+def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
+    """Return the records of groups of pixels as one, with the attributes in which they differ by pixel."""
+    order = np.argsort(np.concatenate(places))
+    joined = xr.concat(parts, "pixel", data_vars="minimal", coords="minimal", compat="override", join="override")
+    joined = joined.isel(pixel=order)
+    attributes: dict[str, Any] = {}
+    for name in dict.fromkeys(name for part in parts for name in part.attrs):
+        values = [part.attrs.get(name) for part in parts]
+        if all(_same(value, values[0]) for value in values):
+            attributes[name] = values[0]
+        elif name.startswith("receiver.") or None in values:
+            for part in parts:
+                for pixel in part["pixel"].values:
+                    if name in part.attrs:
+                        attributes[name.replace("receiver.", f"receiver.channels.{pixel}.", 1)] = part.attrs[name]
+        else:
+            each = [value for value, pixels in zip(values, places, strict=True) for _ in pixels]
+            attributes[name] = [each[place] for place in order]
+    joined.attrs = attributes
+    return joined
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Return whether two attributes are the same."""
+    return type(first) is type(second) and bool(np.array_equal(first, second))
+
+
+def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int, sky: FloatArray) -> xr.Dataset:
+    """Return the record of pixels that share a channel; the arguments are those of `detect_waveforms`."""
+    given = channel.chain
     dims, light = _waveform(dataset)
     pixels, series = tuple(dim for dim in dims[:-1] if dim != "shot"), dims[0] == "shot"
     width = results.time_axis(dataset).bin_width_ns
-    sky = _background(dataset, background_power, pixels)
     smoothed = given.amplifier is not None and given.amplifier.bandwidth_mhz is not None
     if smoothed and float(dataset.attrs.get("response_time_ns", 0)) > 0:
         _LOG.warning("the waveform includes a response time already, and the amplifier's bandwidth smooths it again")
-    receiver, density, fitting = _in_range(given, gain, optical_density, light, width, sky)
+    receiver, density, fitting = _in_range(given, channel.gain, channel.optical_density, light, width, sky)
     power, background = 10**-density * light, np.broadcast_to(10**-density * sky, light.shape[:-1])
     signal, saturated = receiver.apply(power, width, shots, seed, background)
     number = len(signal)
@@ -126,23 +190,31 @@ def detect_waveforms(
             {**share, "long_name": "share of saturated samples"},
         ),
     }
+    first, weights = receiver.low_pass(width).by_bin()
+    lag = ("lag", (first + np.arange(weights.size)) * width, {"units": "ns", "long_name": "delay of the sample"})
+    values["impulse_response"] = (
+        ("lag",),
+        weights,
+        {**share, "long_name": "weight of the light of a bin in a sample"},
+    )
+    heights = receiver.event_height(power, width, background)
+    values["event_height"] = (
+        pixels,
+        heights.max(axis=0) if series else heights,
+        {**sampled, "long_name": "height that a single event exceeds in one of a thousand records"},
+    )
     labels = dataset["shot"].values if series and number == 1 else np.arange(len(signal))
     attributes = {
         **dataset.attrs,
         "time_start_ns": float(time[0]) - 0.5 * width * stride,
         "bin_width_ns": width * stride,
         "shots": len(signal),
-        "noise_seed": int(seed),
         "background_power_w": np.ravel(sky).tolist() if np.ndim(sky) else float(sky),
-        **({"receiver": chain} if isinstance(chain, str) else {}),
         **dict(_described("receiver", receiver)),
         **fitting,
     }
     shot = ("shot", labels, {"long_name": "number of the shot"})
-    recorded = xr.Dataset(values, {**coords, "time": time, "shot": shot}, attributes)
-    if saturated.any():
-        _LOG.warning("%s", saturation_advice(recorded))
-    return recorded
+    return xr.Dataset(values, {**coords, "time": time, "shot": shot, "lag": lag}, attributes)
 
 
 def saturation_advice(recorded: xr.Dataset) -> str:
@@ -153,9 +225,9 @@ def saturation_advice(recorded: xr.Dataset) -> str:
         return "no sample is saturated"
     text = f"{_percent(share)} of the shots have saturated samples"
     if "fitting_optical_density" in recorded.attrs:
-        density = recorded.attrs["fitting_optical_density"]
+        density = float(np.max(recorded.attrs["fitting_optical_density"]))
         text += f": a filter of optical density {density:.1f} (factor {10**density:.3g})"
-        gain = recorded.attrs["fitting_gain"]
+        gain = float(np.min(recorded.attrs["fitting_gain"]))
         text += f" or a gain of {gain:.3g} would fit" if gain > 0 else " would fit"
     return text
 
@@ -164,7 +236,7 @@ def describe_recording(recorded: xr.Dataset) -> list[str]:
     """Return lines on a record of `detect_waveforms`: gain and filter as used, and saturation in total and by pixel."""
     attributes = recorded.attrs
     used = ", ".join(
-        f"{name.replace('_', ' ')} {attributes[name]:.4g}{' (auto)' if attributes['chosen'] == name else ''}"
+        f"{name.replace('_', ' ')} {_span(attributes[name])}{' (auto)' if name in attributes['chosen'] else ''}"
         for name in ("gain", "optical_density")
     )
     lines = [
@@ -180,6 +252,12 @@ def describe_recording(recorded: xr.Dataset) -> list[str]:
     for name, of_shots, of_samples in zip(recorded["pixel"].values, shots.values, samples.values, strict=True):
         lines.append(f"saturated in {name}: {_percent(of_shots)} of the shots, {_percent(of_samples)} of the samples")
     return lines
+
+
+def _span(values: float | list[float]) -> str:
+    """Return a number, or the least and the largest one of a list."""
+    low, high = np.min(values), np.max(values)
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
 def _percent(share: float) -> str:
@@ -220,13 +298,30 @@ def _in_range(
     return (chain.with_gain(factor) if gain == "auto" and factor < 1 else used), chosen, attributes
 
 
-def receiver_chain(name: str, chain: ReceiverChain | str) -> ReceiverChain:
-    """Return a receiver chain, which may be given by its name in `RECEIVERS`, as the parameter `name`."""
-    if isinstance(chain, ReceiverChain):
-        return chain
-    if chain not in RECEIVERS:
-        raise UserError(f"{name} = {chain!r} must be a ReceiverChain or one of {', '.join(RECEIVERS)}")
-    return RECEIVERS[chain]
+def receiver_of(parameter: str, given: Receiver | ReceiverChain | str | os.PathLike[str]) -> Receiver:
+    """Return a receiver from itself, its chain, a name, or a TOML file, as the named parameter."""
+    try:
+        return receiver_named(given)
+    except UserError as error:
+        text = str(error)
+        raise UserError(
+            f"{parameter}{text.removeprefix('receiver')}" if text.startswith("receiver =") else text
+        ) from None
+
+
+def encoding(recorded: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Return the encoding of a record in a file: signals behind a converter as its integer codes.
+
+    ``scale_factor`` and ``add_offset`` turn them into volts.
+    """
+    names = ("receiver.digitiser.bits", "receiver.digitiser.full_scale_v", "receiver.digitiser.low_v")
+    if not set(names) <= set(recorded.attrs):
+        return {}
+    bits, full_scale, low = (recorded.attrs[name] for name in names)
+    digitiser = Digitiser(int(bits), float(full_scale), float(low))
+    kind = "uint8" if digitiser.bits <= 8 else "uint16" if digitiser.bits <= 16 else "uint32"
+    codes = {"dtype": kind, "scale_factor": digitiser.step_v, "add_offset": digitiser.low_v, "_FillValue": None}
+    return {"signal": codes}
 
 
 def _waveform(dataset: xr.Dataset) -> tuple[tuple[str, ...], FloatArray]:

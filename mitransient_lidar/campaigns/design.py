@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import tomllib
 
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.toml_files import parse_toml
 from mitransient_lidar.core.validation import (
     FloatArray,
     finite,
@@ -137,11 +137,7 @@ class Campaign:
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Campaign:
         """Read a TOML file; raise `UserError` if it cannot be read, is not TOML, or describes no campaign."""
-        try:
-            given = tomllib.loads(read_text(path))
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise UserError(f"{path} is not a TOML file: {' '.join(str(error).split())}") from error
-        return cls.of(given, Path(path).resolve().parent)
+        return cls.of(parse_toml(read_text(path), path), Path(path).resolve().parent)
 
     @classmethod
     def of(cls, given: Mapping[str, Any], folder: Path | None = None) -> Campaign:

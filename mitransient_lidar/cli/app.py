@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli import campaigns, gates, render, results, retrieve, scenes, studies, waveforms
+from mitransient_lidar.cli import campaigns, depth_bias, gates, render, results, retrieve, scenes, studies, waveforms
 from mitransient_lidar.cli.messages import exit_on_error
 from mitransient_lidar.core.errors import UserError
 
@@ -29,6 +29,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.target_signal,
         studies.detect,
         studies.estimate,
+        depth_bias.depth_bias,
         studies.beam_spread,
         studies.fov_sweep,
         studies.scattering_orders,

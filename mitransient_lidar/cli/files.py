@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,13 +84,13 @@ def announced() -> Iterator[None]:
         typer.echo(path)
 
 
-def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
-    """Write a dataset to a NetCDF file and print its path."""
+def write_netcdf(dataset: xr.Dataset, path: Path, encoding: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Write a dataset to a NetCDF file, with the encoding of some variables, and print its path."""
     from mitransient_lidar.results import netcdf
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with announced(), replacing(path) as temporary:
-        netcdf.dump(dataset, temporary, {})
+        netcdf.dump(dataset, temporary, encoding or {})
 
 
 def write_figure(dataset: xr.Dataset, path: Path | None, plot: Callable[[xr.Dataset, Path], Any]) -> None:

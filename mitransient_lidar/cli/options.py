@@ -31,7 +31,10 @@ DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, P
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
 
 #: Help of an option for the receiver.
-RECEIVERS = "Receiver of every pixel: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array."
+RECEIVERS = (
+    "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
+    "file."
+)
 
 
 def parameters(definitions: list[str] | None) -> dict[str, str]:

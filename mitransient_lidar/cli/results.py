@@ -74,11 +74,22 @@ def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
 
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An EXR or NetCDF result: one shot or a series.")],
-    receiver: Annotated[str, typer.Option(help=RECEIVERS)] = "apd",
-    gain: Annotated[str, typer.Option(metavar="FACTOR", help="Factor of the amplifier's gain, or auto.")] = "1",
+    receiver: Annotated[
+        str | None, typer.Option(help=f"{RECEIVERS} By default that of the result's instrument, or apd.")
+    ] = None,
+    gain: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FACTOR", help="Factor of the amplifier's gain, or auto; by default the receiver's, or 1."
+        ),
+    ] = None,
     optical_density: Annotated[
-        str, typer.Option(metavar="DENSITY", help="Optical density of a filter before the detector, or auto.")
-    ] = "0",
+        str | None,
+        typer.Option(
+            metavar="DENSITY",
+            help="Optical density of a filter before the detector, or auto; by default the receiver's, or 0.",
+        ),
+    ] = None,
     shots: Annotated[int, typer.Option(help="Number of records of each waveform, with independent noise.")] = 1,
     background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
     seed: Seed = 0,
@@ -90,18 +101,20 @@ def record(
     """Record the waveforms of a result with a receiver.
 
     Writes the signals with the noise of detector and electronics, which waveforms and plot read, and prints how much is
-    saturated. With auto, the gain or the filter is chosen so that nothing is.
+    saturated. Behind a converter they are its codes, with scale_factor and add_offset for volts. With auto, the gain or
+    the filter is chosen so that nothing is saturated.
     """
     target = output or file.with_name(f"{file.stem}_recorded.nc")
     check_suffix("--output", target, ".nc")
-    chosen: dict[str, Any] = {"gain": number_or_auto("--gain", gain)}
-    chosen["optical_density"] = number_or_auto("--optical-density", optical_density)
+    chosen: dict[str, Any] = {}
+    for option, text in (("gain", gain), ("optical_density", optical_density)):
+        chosen[option] = None if text is None else number_or_auto(f"--{option.replace('_', '-')}", text)
     from mitransient_lidar import results
     from mitransient_lidar.analysis import receiver as analysis
 
     with reporting(quiet):
         recorded = analysis.detect_waveforms(results.open(file), receiver, shots, seed, background_power_w, **chosen)
-    write_netcdf(recorded, target)
+    write_netcdf(recorded, target, analysis.encoding(recorded))
     for line in analysis.describe_recording(recorded):
         typer.echo(line)
 

@@ -40,6 +40,17 @@ def waveforms(
     mean_surface: Annotated[
         bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
     ] = False,
+    correct: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="Subtract the mean errors of a table of depth-bias from the depths; auto for the shipped one of the "
+            "result's instrument.",
+        ),
+    ] = None,
+    wind_speed: Annotated[
+        float | None, typer.Option(help="Wind speed of the corrections [m/s]; that of the scene by default.")
+    ] = None,
 ) -> None:
     """Measure the echoes in the waveforms of a result.
 
@@ -50,17 +61,25 @@ def waveforms(
         check_suffix("--csv", output, ".csv")
     elif not table:
         raise UserError("--no-table leaves nothing to do: give --csv OUT as well.")
-    from mitransient_lidar.analysis.waveforms import csv_tables, records
+    if correct is not None and mean_surface:
+        raise UserError("--correct and --mean-surface are alternatives: corrections are of depths from surface echoes.")
+    if wind_speed is not None and correct is None:
+        raise UserError(f"--wind-speed {wind_speed:g} needs --correct.")
+    from mitransient_lidar.analysis.waveforms import csv_tables, depth_correction, records
     from mitransient_lidar.analysis.waveforms import echo_table as measuring
 
+    dataset = records.open_waveforms(file)
+    corrections = None if correct is None else depth_correction.corrections_for(dataset, correct)
     found = measuring.extract(
-        records.open_waveforms(file),
+        dataset,
         estimator or ["gaussian"],
         threshold=threshold,
         contrast=contrast,
         layers=layers,
         depth_from="mean" if mean_surface else "echo",
     )
+    if corrections is not None:
+        found = depth_correction.correct_depths(found, corrections, wind_speed)
     if table:
         _print(found)
     if output is not None:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import xarray
 
     from mitransient_lidar.rendering.echo_window import EchoProbe
+    from mitransient_lidar.transport.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ def render(
     probe = probe_echoes(lidar, renderer.sampler)
     window = error_window(lidar, probe)
     check_scene(lidar, renderer.sampler, probe)
-    described = describe_scene(lidar, probe, window)
+    described = describe_scene(lidar, probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
     accumulator = choose_accumulator(lidar, window, described.get("surface_time_ns"), max_memory, origins)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
@@ -200,7 +201,9 @@ def with_lines_of_sight(dataset: xarray.Dataset, lidar: LidarScene) -> xarray.Da
     return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
 
 
-def describe_scene(lidar: LidarScene, probe: EchoProbe, window: ErrorWindow) -> dict[str, Any]:
+def describe_scene(
+    lidar: LidarScene, probe: EchoProbe, window: ErrorWindow, focusing: RippleFocusing | None
+) -> dict[str, Any]:
     """Return the attributes of a result that describe lidar, sea and expected echoes."""
     from mitransient_lidar.rendering.describe import describe_lidar
 
@@ -212,6 +215,7 @@ def describe_scene(lidar: LidarScene, probe: EchoProbe, window: ErrorWindow) -> 
         **describe_lidar(lidar),
         **surface,
         **_surface_heights(lidar),
+        **({} if focusing is None else focusing.describe()),
         "window_start_ns": float(window.start_ns.min()),
         "window_end_ns": float(window.end_ns.max()),
     }

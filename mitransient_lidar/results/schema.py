@@ -32,6 +32,9 @@ _NUMBERS: dict[str, tuple[float, float]] = {
 #: Those that count something, which is known.
 _COUNTS = ("passes", "pulses", "shots")
 
+#: Those that are a list over the pixels where they differ.
+_PER_PIXEL = ("gain", "optical_density", "background_power_w")
+
 #: Number of values of attributes that are lists of finite numbers, None for any.
 _LISTS: dict[str, int | None] = {
     "transmitter_pose": 12,
@@ -42,6 +45,8 @@ _LISTS: dict[str, int | None] = {
     "slope_deviation": 2,
     "error_inflation_bins": None,
     "error_inflation": None,
+    "wave_focusing_depths": None,
+    "wave_focusing": None,
 }
 
 #: Those that are empty where there are none: views of hexagons and of separate pixels have no sides.
@@ -65,6 +70,8 @@ def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
     for name, (low, high) in _NUMBERS.items():
         high = min(high, RANGES[name][1]) if name in RANGES else high
         value = attributes.get(name, low)
+        if name in _PER_PIXEL and _are_numbers(value) and min(value) >= low and max(value) <= high:
+            continue
         if not _is_number(value) or value < low or value > high or (name in _COUNTS and math.isnan(value)):
             raise _refusal(place, name, value, f"a number between {low:g} and {high:g}")
     for name, length in _LISTS.items():

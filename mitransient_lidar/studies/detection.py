@@ -12,7 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.detection import trials
 from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
-from mitransient_lidar.analysis.receiver import receiver_chain
+from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
@@ -107,7 +107,7 @@ def detect(
     seas, and the statistic is taken as normally distributed. Intervals are Student's from a jackknife over at most 10
     groups of renders or seas, and exact binomial ones for rates of random shots, given the rendered light and seas.
     """
-    chain = receiver_chain("receiver", receiver)
+    chain = receiver_of("receiver", receiver).default.chain
     in_range("pfa", pfa, 1e-12, 0.5)
     in_range("pd", pd, 1.01 * pfa, 1 - 1e-9)
     shots = integer("shots", shots, 100, 100_000)

@@ -105,6 +105,7 @@ def estimate(
     session = open_scene(scene, params, instrument=instrument)
     from mitransient_lidar.rendering.echo_window import probe_echoes
     from mitransient_lidar.rendering.render import describe_scene, error_window, with_lines_of_sight
+    from mitransient_lidar.transport.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.scene import LidarScene
     from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
@@ -118,7 +119,8 @@ def estimate(
     for generator in np.random.SeedSequence(seed).spawn(_PARTS):
         accumulator.add(_record(lidar, model, paths // _PARTS, np.random.default_rng(generator)))
     accumulator.require_light(_PARTS)
-    attributes = session.attributes(model="estimate", paths=paths, seed=seed, **describe_scene(lidar, probe, window))
+    described = describe_scene(lidar, probe, window, RippleFocusing.of_scene(lidar))
+    attributes = session.attributes(model="estimate", paths=paths, seed=seed, **described)
     return with_lines_of_sight(accumulator.dataset(attributes), lidar)
 
 

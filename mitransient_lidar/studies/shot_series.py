@@ -266,7 +266,7 @@ class _Series:
         probe = probe_echoes(self.lidar, self._renderer.sampler)
         self.window = error_window(self.lidar, probe)
         check_scene(self.lidar, self._renderer.sampler, probe)
-        self._described = describe_scene(self.lidar, probe, self.window)
+        self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
 
     def _open(self, params: Mapping[str, Any]) -> Session:
         """Load the scene with parameters."""

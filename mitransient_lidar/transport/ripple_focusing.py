@@ -56,14 +56,25 @@ class RippleFocusing:
 
     Parameters
     ----------
-    factors
-        Shape (`_MOST_EVENTS` + 1, `_DEPTHS`).
+    depths, factors
+        Depths [m], and factors, of shape (`_MOST_EVENTS` + 1, `_DEPTHS`).
     depth_per_length
         Depth of an echo over the optical length of its path beyond that by the surface.
+    enhancement
+        Enhancement by all waves, of the shape of `factors`.
+    events
+        Mean number of scattering events on both ways to each depth.
     """
 
-    def __init__(self, factors: FloatArray, depth_per_length: float) -> None:
-        self.factors = factors
+    def __init__(
+        self,
+        depths: FloatArray,
+        factors: FloatArray,
+        depth_per_length: float,
+        enhancement: FloatArray,
+        events: FloatArray,
+    ) -> None:
+        self.depths, self.factors, self.enhancement, self.events = depths, factors, enhancement, events
         self._table, self._depth_per_length = aligned(mi.Float, factors.astype(np.float32)), opaque(depth_per_length)
 
     @classmethod
@@ -93,7 +104,19 @@ class RippleFocusing:
         moves = displacements(scene.water.column, phases, depths, _MOST_EVENTS, _SAMPLES, rng)
         moved = np.abs(between + moves) / cos_water
         true, drawn = (table.at(depths[:, None, None], moved).mean(axis=-1) for table in tables)
-        return cls((true / drawn).T, 0.5 * cos_water / scene.group_index)
+        events = 2 * scene.water.column.optical_depth_of_scattering(depths) / cos_water
+        return cls(depths, (true / drawn).T, 0.5 * cos_water / scene.group_index, true.T, events)
+
+    def describe(self) -> dict[str, list[float]]:
+        """Return attributes of a result: mean enhancement by all waves by depth [m], linear and to 1 at 0 m.
+
+        The numbers of scattering events are Poisson-distributed, as those of light of which none is lost.
+        """
+        number = np.arange(_MOST_EVENTS)
+        log = number[:, None] * np.log(np.maximum(self.events, 1e-30)) - self.events
+        share = np.exp(log - np.cumsum(np.log(np.maximum(number, 1)))[:, None])
+        mean = (share * self.enhancement[:-1]).sum(axis=0) + (1 - share.sum(axis=0)) * self.enhancement[-1]
+        return {"wave_focusing_depths": self.depths.tolist(), "wave_focusing": mean.tolist()}
 
     def of(self, echo: Echo, order: mi.UInt32, length: mi.Float) -> mi.Float:
         """Return the factors of paths by number of scattering events and relative length [m].

@@ -13,11 +13,11 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     EchoFlag,
     IntArray,
     Records,
-    Template,
     has_echo,
     smooth,
 )
 from mitransient_lidar.analysis.waveforms.echo_estimators import Window, centroid, ideal_echo, summit
+from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 

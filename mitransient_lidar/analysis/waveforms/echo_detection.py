@@ -1,8 +1,4 @@
-"""Waveform records, the shape of an ideal echo, and detection of the echoes in records.
-
-All estimators give the same time for an echo with the shape of the pulse: their bias for it is subtracted. Samples are
-means over their bins.
-"""
+"""Waveform records, and detection of the echoes in them."""
 
 from __future__ import annotations
 
@@ -15,16 +11,16 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, positive
-from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 
 IntArray = npt.NDArray[np.intp]
 BoolArray = npt.NDArray[np.bool_]
 
-_FINE = 15  # points of a template per bin; odd, so that one of them is the centre of the bin
 _NOISE_FLOOR = 1e-6  # smallest noise, relative to the largest sample of a record
 _SMOOTHING = 0.5  # width of the detection filter in echo widths
 _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
+_EVENT = 0.8  # height of a single event after the detection filter
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
 GAUSSIAN_AREA = float(np.sqrt(np.pi / np.log(16)))  # area of a Gaussian of unit height and unit width at half maximum
 
@@ -37,6 +33,8 @@ class EchoFlag(IntFlag):
     MERGED = 4  # less than an echo width from another echo
     CUT = 8  # extends beyond an end of the record
     POOR_FIT = 16  # too few usable samples, or a fit that has not converged
+    SCATTERED_LIGHT = 64  # the beam does not light the pixel: the light has been scattered, and the depth is too large
+    FEW_EVENTS = 128  # no higher than single events of the detector, such as dark counts: may be noise
     NO_SURFACE_LIGHT = 32  # the beam does not light the surface in the pixel, or the first echo is not the surface's
 
 
@@ -111,38 +109,6 @@ class Records:
 
 
 @dataclass(frozen=True)
-class Template:
-    """Shape of an ideal echo that arrives at 0: times [ns], 15 per bin, height, 1 at the peak, and full width [ns]."""
-
-    time_ns: FloatArray
-    power: FloatArray
-    fwhm_ns: float
-
-    @classmethod
-    def of(cls, pulse: Pulse, bin_width_ns: float, response_time_ns: float = 0.0) -> Template:
-        """Return the shape of a pulse after the response, a single pole, averaged over bins."""
-        step = bin_width_ns / _FINE
-        first, weights = pulse.kernel(step, response_time_ns)
-        shares = np.convolve(weights, np.full(_FINE, 1.0))
-        time = np.asarray((first - (_FINE - 1) / 2 + np.arange(shares.size)) * step, dtype=np.float64)
-        power = shares / shares.max()
-        above = np.flatnonzero(power >= 0.5)
-        left, right = above[0], above[-1]
-        rise = np.interp(0.5, power[left - 1 : left + 1], time[left - 1 : left + 1]) if left > 0 else time[0]
-        fall = np.interp(-0.5, -power[right : right + 2], time[right : right + 2])
-        return cls(time, power, float(fall - rise))
-
-    def rise(self, level: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the time [ns] at which the edge crosses a level (0 to 1, of the peak), and its derivative."""
-        edge = slice(0, int(np.argmax(self.power)) + 1)
-        heights, kept = np.unique(self.power[edge], return_index=True)
-        wanted = np.clip(level, 1e-6, 0.999)
-        time = np.interp(wanted, heights, self.time_ns[edge][kept])
-        ahead = np.interp(np.minimum(wanted * 1.001, 1.0), heights, self.time_ns[edge][kept])
-        return time, (ahead - time) / (0.001 * wanted)
-
-
-@dataclass(frozen=True)
 class DetectedEchoes:
     """Surface, target and bottom of each record: bins of their peaks, -1 without an echo, and sums of `EchoFlag`."""
 
@@ -206,6 +172,8 @@ def find_echoes(
     threshold: float = 5.0,
     contrast: float = 0.05,
     earliest_ns: float = -np.inf,
+    latest_ns: npt.ArrayLike = np.inf,
+    event_height: npt.ArrayLike = 0.0,
 ) -> DetectedEchoes:
     """Find surface, target and bottom.
 
@@ -227,6 +195,11 @@ def find_echoes(
         Smallest excess of a peak behind the surface over the column, relative to the signal, 0 to 1.
     earliest_ns : float
         Earliest time of the surface echo [ns].
+    latest_ns : array_like, shape () or (n,)
+        Latest time of the surface echo [ns]. Where the first peak is later, there is none, and the peak is a target or
+        the bottom.
+    event_height : array_like, shape () or (n,)
+        Height that single events of the detector reach. Lower peaks count only where there is no higher one.
 
     Raises
     ------
@@ -241,17 +214,21 @@ def find_echoes(
     count = power.shape[1]
     bins = np.arange(count)
     surface = _first_peak(power, noise, threshold, records.time_ns >= earliest_ns)
+    # Without a surface echo, the others are behind its latest time.
+    latest = np.searchsorted(records.time_ns, np.broadcast_to(np.asarray(latest_ns), surface.shape), side="right") - 1
+    late = surface > latest
+    origin, surface = np.where(late, latest, surface), np.where(late, -1, surface)
 
     reach = max(round(_REACH * width / records.bin_ns), 1)
-    behind = bins > surface[:, np.newaxis]
+    behind = bins > origin[:, np.newaxis]
     stands_out = _above_column(np.maximum(power, 0), reach)
     # Near the surface there is no column to extrapolate from: the excess is the rise after a dip.
     lowest = np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
     apart = width / records.bin_ns
-    near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart)
+    near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart) & (surface >= 0)[:, np.newaxis]
     stands_out = np.where(near, power - lowest, stands_out)
     dip = np.minimum.accumulate(np.where(behind, np.maximum(stands_out, 0), np.inf), axis=1)
-    excess = np.where(behind & (surface >= 0)[:, np.newaxis], stands_out, -np.inf)
+    excess = np.where(behind & ((surface >= 0) | late)[:, np.newaxis], stands_out, -np.inf)
     excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
     peaks = np.zeros(power.shape, dtype=bool)
     peaks[:, 1:-1] = (stands_out[:, 1:-1] > stands_out[:, :-2]) & (stands_out[:, 1:-1] >= stands_out[:, 2:])
@@ -260,11 +237,16 @@ def find_echoes(
     # Much weaker peaks are in the tail of a strong echo.
     peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
 
+    # A single event is as narrow as the response, which smoothing lowers.
+    few = np.broadcast_to(np.asarray(event_height, dtype=np.float64), surface.shape)[:, np.newaxis] * _EVENT
+    strong = peaks & (excess >= few)
+    peaks = np.where(strong.any(axis=1, keepdims=True), strong, peaks)
     bottom = np.where(peaks.any(axis=1), count - 1 - np.argmax(peaks[:, ::-1], axis=1), -1)
     before = peaks & (bins < (bottom - apart)[:, np.newaxis])
     target = np.where(before.any(axis=1), np.argmax(np.where(before, excess, -np.inf), axis=1), -1)
     places = np.stack([surface, target, bottom])
     flags = np.where(places < 0, int(EchoFlag.NO_ECHO), 0)
+    flags[1:] |= np.where((places[1:] >= 0) & ~strong.any(axis=1), int(EchoFlag.FEW_EVENTS), 0)
     for first, second in combinations(range(3), 2):
         near = (places[first] >= 0) & (places[second] >= 0) & (places[second] - places[first] < apart)
         flags[[first, second]] |= np.where(near, int(EchoFlag.MERGED), 0)

@@ -15,9 +15,9 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     EchoFlag,
     IntArray,
     Records,
-    Template,
     has_echo,
 )
+from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.core.validation import FloatArray
 
 _SUMMIT = 0.5  # lower limit of the summit of an echo, relative to its peak

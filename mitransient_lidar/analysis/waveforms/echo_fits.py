@@ -8,24 +8,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, Echoes, EchoFlag, IntArray, Records, has_echo
+from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 
 Model = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
-_ITERATIONS = 30
+_ITERATIONS = 60
 _SIGNIFICANT = 9.0  # decrease of the squared residuals by which a surface height is distinct from the column's onset
 _CLEAR = 10.0  # standard errors of a height above which it is not tested
+_OF_WAVES = 0.1  # deviation of a column's onset from the mean over waves, relative
+_FAINT = 0.1  # first guess of the height of a surface whose column is brighter, over the peak
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
 
 
-def gaussian_surface(records: Records, bins: IntArray, width: float, decay: npt.ArrayLike, flags: IntArray) -> Echoes:
+def gaussian_surface(
+    records: Records,
+    bins: IntArray,
+    width: float,
+    decay: npt.ArrayLike,
+    flags: IntArray,
+    shape: EchoShape,
+    column: ColumnOnset | None = None,
+    level: tuple[FloatArray, FloatArray] | None = None,
+) -> Echoes:
     """Fit a surface echo together with the water column that begins at it.
 
-    The model is A exp(-u^2/(2 s^2)) plus a column C exp(-k u) from u = 0 on, blurred by the same Gaussian, where u is
-    the time since the surface. It is fitted from two echo widths before the peak to two after it, and determines the
-    surface even where the peak is that of the column. Amplitude, energy and width are those of A.
+    The model is A E(u) plus a column C F(u) exp(-k u) from u = 0 on, blurred by E, where u is the time since the
+    surface, E the shape of an ideal echo, blurred by a Gaussian of free width, and F the focusing of light by waves.
+    It is fitted from two echo widths before the peak to two after it, and determines the surface even where the peak is
+    that of the column. Amplitude, energy and width are those of A E.
 
     A surface echo that is weak relative to the column is fitted nearly as well without A, one or two nanoseconds
     earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to
@@ -40,39 +53,67 @@ def gaussian_surface(records: Records, bins: IntArray, width: float, decay: npt.
         Expected full width of the echo at half maximum [ns].
     decay : array_like, shape () or (n,)
         Rate k of decay of the column [1/ns], at least 0.
+    shape : EchoShape
+        Shape of an ideal echo.
+    column : ColumnOnset, optional
+        Blurred form of F; by default that of F = 1.
+    level : (ndarray, ndarray), shape (n,) each, optional
+        C from the column behind the echo, and its standard error; NaN where it is not known.
     """
-    data = _Data.of(records, bins, width, decay, (-2, 2))
+    begin = column or ColumnOnset()
+    # The brightest depth may be the peak, later than the surface.
+    early = begin.brightest_ns
+    data = _Data.of(records, bins, width, decay, (-2 - early / width, 2), shape)
+    data = replace(data, earliest=-1.2 * width - early)
+    if level is not None:
+        data = replace(data, known=(3, *level))
+    if early > 0:
+        data = replace(data, noise=np.hypot(data.noise, _OF_WAVES * np.maximum(data.power, 0)))
     peak = data.peak()
-    sigma = np.full(peak.shape, width / FWHM_PER_SIGMA)
+    sigma = np.full(peak.shape, shape.sigma_of(width))
     start = np.stack([np.full(peak.shape, -0.3 * width), sigma, 0.5 * peak, 0.7 * peak], axis=1)
+    faint = start if early == 0 else np.stack([start[:, 0] - early, sigma, 0 * peak, 0.7 * peak], axis=1)
 
     def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-        from scipy.special import ndtr
-
         time, s, height, level = (p[:, i : i + 1] for i in range(4))
-        v = u - time
-        z = v / s
-        gauss = np.exp(-0.5 * z**2)
-        onset = np.exp(0.5 * (k * s) ** 2 - k * v) * ndtr(z - k * s)
-        # d/dv of the blurred column is its Gaussian edge less k of itself.
-        edge = gauss / (np.sqrt(2 * np.pi) * s)
-        by_time = height * gauss * z / s + level * (k * onset - edge)
-        by_s = height * gauss * z**2 / s + level * (k**2 * s * onset - edge * (z + k * s))
-        return height * gauss + level * onset, np.stack([by_time, by_s, gauss, onset], axis=1)
+        jacobian = np.zeros((4, len(p), u.size))
+        for delay, share, weight in shape.terms:
+            v = u - time - delay
+            z = v / s
+            gauss = share * np.exp(-0.5 * z**2)
+            # A Gaussian times an exponential is a later Gaussian.
+            value, first, second = begin.at(v - k * s**2, s)
+            fall = weight * np.exp(np.clip(0.5 * (k * s) ** 2 - k * v, -700, 700))
+            jacobian[0] += height * gauss * z / s + level * fall * (k * value - first)
+            jacobian[1] += height * gauss * z**2 / s + level * fall * s * (k**2 * value - 2 * k * first + second)
+            jacobian[2] += gauss
+            jacobian[3] += fall * value
+        return height * jacobian[2] + level * jacobian[3], jacobian.transpose(1, 0, 2)
 
     exists = has_echo(flags)
     fit = _fit(model, start, data, peak, exists)
+    tried: list[_Fit] = []
+    if early > 0:
+        # A column that is brightest below the surface has the shape of a late echo.
+        tried.append(_fit(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan)))
+        faint = np.where(tried[0].good[:, np.newaxis], tried[0].values, faint)
+        second = faint.copy()
+        second[:, 2] = _FAINT * peak
+        other = _fit(model, second, data, peak, exists)
+        fit = fit.replaced(other.good & ~(fit.good & (fit.cost <= other.cost)), other)
     error = np.sqrt(fit.covariance[:, 2, 2])
     weak = exists & ~(fit.good & (fit.values[:, 2] > _CLEAR * error))
     some = fit.good & (fit.values[:, 2] > error)
-    tried: list[_Fit] = []
     for share in _HEIGHTS:
+        if tried and share == 0:
+            weak = exists & tried[0].good & (tried[0].cost <= fit.cost + _SIGNIFICANT)
+            continue
         if not weak.any():
-            return _echoes(records, bins, fit, flags)
-        tried.append(_fit(model, start, data, peak, weak, np.where(weak, share * peak, np.nan)))
-        start = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, start)
+            return _echoes(records, bins, fit, flags, shape)
+        tried.append(_fit(model, faint, data, peak, weak, np.where(weak, share * peak, np.nan)))
+        faint = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, faint)
         weak &= ~some | (tried[0].cost <= fit.cost + _SIGNIFICANT)
-    return _echoes(records, bins, fit.replaced(weak, _mean(tried)), flags)
+    return _echoes(records, bins, fit.replaced(weak, _mean(tried)), flags, shape)
 
 
 def gaussian_echo(
@@ -81,46 +122,56 @@ def gaussian_echo(
     width: float,
     decay: npt.ArrayLike,
     flags: IntArray,
+    shape: EchoShape,
     *,
     after: IntArray | None = None,
 ) -> Echoes:
     """Fit an echo at which the column ends.
 
-    The model is A exp(-u^2/(2 s^2)) plus a column exp(-k u) with one level before and another one behind the echo and a
-    step between them that is blurred like the echo. It is fitted from two echo widths before the peak to one and a half
-    after it, without samples less than an echo width behind the surface peaks in the bins `after`, shape (n,). The
-    other arguments are those of `gaussian_surface`.
+    The model is A E(u) plus a column exp(-k u) with one level before and another one behind the echo and a step between
+    them that is blurred like the echo. It is fitted from two echo widths before the peak to one and a half after it,
+    without samples less than an echo width behind the surface peaks in the bins `after`, shape (n,). The other
+    arguments are those of `gaussian_surface`.
     """
-    data = _Data.of(records, bins, width, decay, (-2, 1.5))
+    data = _Data.of(records, bins, width, decay, (-2, 1.5), shape)
     if after is not None:
         first = (np.minimum(after + width / records.bin_ns, 0.5 * (after + bins)) - bins) * records.bin_ns
-        data = replace(data, usable=data.usable & (data.u >= first[:, np.newaxis]))
+        data = replace(data, usable=data.usable & (data.u - shape.peak_ns >= first[:, np.newaxis]))
     peak = data.peak()
     early = np.argmax(data.usable, axis=1)
     before = np.maximum(np.take_along_axis(data.power, early[:, np.newaxis], axis=1)[:, 0], 0)
     before = np.minimum(before, 0.5 * peak)
-    start = np.stack([0 * peak, np.full(peak.shape, width / FWHM_PER_SIGMA), peak, before, 0 * peak], axis=1)
+    start = np.stack([0 * peak, np.full(peak.shape, shape.sigma_of(width)), peak, before, 0 * peak], axis=1)
 
     def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
         from scipy.special import ndtr
 
         time, s, height, level, behind = (p[:, i : i + 1] for i in range(5))
-        v = u - time
-        z = v / s
-        gauss, passed, fall = np.exp(-0.5 * z**2), ndtr(z), np.exp(-k * v)
-        column = fall * (level + (behind - level) * passed)
-        edge = fall * (behind - level) * gauss / (np.sqrt(2 * np.pi) * s)
-        by_time = height * gauss * z / s + k * column - edge
-        by_s = height * gauss * z**2 / s - edge * z
-        jacobian = np.stack([by_time, by_s, gauss, fall * (1 - passed), fall * passed], axis=1)
-        return height * gauss + column, jacobian
+        fall = np.exp(-k * (u - time))
+        step = fall * (behind - level)
+        by_time, by_s, echo, passed = (np.zeros((len(p), u.size)) for _ in range(4))
+        for delay, share, weight in shape.terms:
+            z = (u - time - delay) / s
+            gauss = np.exp(-0.5 * z**2)
+            edge = weight * step * gauss / (np.sqrt(2 * np.pi) * s)
+            by_time += height * share * gauss * z / s - edge
+            by_s += height * share * gauss * z**2 / s - edge * z
+            echo += share * gauss
+            passed += weight * ndtr(z)
+        column = fall * level + step * passed
+        jacobian = np.stack([by_time + k * column, by_s, echo, fall * (1 - passed), fall * passed], axis=1)
+        return height * echo + column, jacobian
 
-    return _echoes(records, bins, _fit(model, start, data, peak, has_echo(flags)), flags)
+    return _echoes(records, bins, _fit(model, start, data, peak, has_echo(flags)), flags, shape)
 
 
 @dataclass(frozen=True)
 class _Data:
-    """Samples about the peaks: times from them (bins,), samples and noise (n, bins), and decay rates (n, 1)."""
+    """Samples about the peaks: times from them (bins,), samples and noise (n, bins), and decay rates (n, 1).
+
+    Times count from the arrival of an ideal echo whose peak is in the bin of the peak; `earliest` is the first one that
+    a fit may find. A parameter may be `known`, with its standard error, shape (n,); NaN where it is not.
+    """
 
     u: FloatArray
     power: FloatArray
@@ -128,21 +179,32 @@ class _Data:
     usable: BoolArray
     rate: FloatArray
     width: float
+    shape: EchoShape
+    earliest: float
+    known: tuple[int, FloatArray, FloatArray] | None = None
 
     @classmethod
     def of(
-        cls, records: Records, bins: IntArray, width: float, decay: npt.ArrayLike, span: tuple[float, float]
+        cls,
+        records: Records,
+        bins: IntArray,
+        width: float,
+        decay: npt.ArrayLike,
+        span: tuple[float, float],
+        shape: EchoShape,
     ) -> _Data:
         """Return the samples in a span of echo widths about the peaks."""
         rate = np.broadcast_to(np.asarray(decay, dtype=np.float64), bins.shape)[:, np.newaxis]
         low, high = (end * width / records.bin_ns for end in span)
         lags = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
         power, noise, inside = records.around(bins, lags)
-        return cls(np.asarray(lags * records.bin_ns, dtype=np.float64), power, noise, inside, rate, width)
+        u = np.asarray(lags * records.bin_ns + shape.peak_ns, dtype=np.float64)
+        return cls(u, power, noise, inside, rate, width, shape, -1.2 * width)
 
     def peak(self) -> FloatArray:
         """Return the largest sample within half an echo width, shape (n,)."""
-        return np.asarray(np.max(np.where(self.usable & (np.abs(self.u) < 0.5 * self.width), self.power, 0), axis=1))
+        near = np.abs(self.u - self.shape.peak_ns) < 0.5 * self.width
+        return np.asarray(np.max(np.where(self.usable & near, self.power, 0), axis=1))
 
 
 @dataclass(frozen=True)
@@ -203,15 +265,20 @@ def _fit(
     good = np.zeros(count, dtype=bool)
     damping = np.full(count, 1e-3)
     # Fits with fixed heights, which are only compared, need less accuracy.
-    enough = np.where(fixed, 1e-3, 1e-9)
+    enough = np.where(fixed, 1e-3, 1e-4)
     weights = np.where(usable, 1 / data.noise, 0.0)
     unit = np.ones((count, size))
     unit[:, :2] = width
     unit[:, 2:] = scale[:, np.newaxis]
+    lowest, highest = np.full(size, -np.inf), np.full(size, np.inf)
+    lowest[:3] = data.earliest, data.shape.least_sigma, 0
+    highest[:2] = 1.2 * width, data.shape.sigma_of(3 * width)
+    values[:, :2] = np.clip(values[:, :2], lowest[:2], highest[:2])
     active = np.flatnonzero(wanted)
     cost = np.full(count, np.inf)
     found, jacobian = model(values[active], u, rate[active])
-    cost[active] = np.sum((weights[active] * (power[active] - found)) ** 2, axis=1)
+    prior = _Prior.of(data.known, count)
+    cost[active] = np.sum((weights[active] * (power[active] - found)) ** 2, axis=1) + prior.cost(values, active)
     for _ in range(_ITERATIONS):
         if not active.size:
             break
@@ -220,17 +287,26 @@ def _fit(
         weighted[fixed[active], 2] = 0
         normal = weighted @ weighted.transpose(0, 2, 1)
         right = (weighted @ (w * (y - found))[..., np.newaxis])[..., 0]
+        normal[:, prior.index, prior.index] += (prior.weight * unit[:, prior.index])[active] ** 2
+        right[:, prior.index] += (prior.weight**2 * unit[:, prior.index] * (prior.mean - values[:, prior.index]))[
+            active
+        ]
+        # A parameter at a limit stays there while the residuals push it outwards.
+        stuck = ((x <= lowest) & (right < 0)) | ((x >= highest) & (right > 0))
+        right[stuck] = 0
+        normal = np.where(stuck[:, :, np.newaxis] | stuck[:, np.newaxis, :], 0, normal)
         diagonal = np.einsum("nii->ni", normal)
         # The ridge keeps a parameter that the samples do not constrain.
         ridge = damping[active][:, np.newaxis] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
         damped = normal + ridge[:, :, np.newaxis] * np.eye(size)
         step = np.linalg.solve(damped, right[..., np.newaxis])[..., 0]
         trial = x + np.clip(step, -1, 1) * unit[active]
-        trial[:, 0] = np.clip(trial[:, 0], -1.2 * width, 1.2 * width)
-        trial[:, 1] = np.clip(trial[:, 1], 0.1 * width / FWHM_PER_SIGMA, 3 * width / FWHM_PER_SIGMA)
-        trial[:, 2] = np.where(fixed[active], held[active], np.maximum(trial[:, 2], 0))
+        trial = np.clip(trial, lowest, highest)
+        trial[:, 2] = np.where(fixed[active], held[active], trial[:, 2])
         tried, changed = model(trial, u, k)
-        new = np.sum((w * (y - tried)) ** 2, axis=1)
+        after = values.copy()
+        after[active] = trial
+        new = np.sum((w * (y - tried)) ** 2, axis=1) + prior.cost(after, active)
         better = new <= cost[active]
         settled = better & (cost[active] - new <= 1e-7 * new + enough[active])
         small = np.max(np.abs(trial - x) / unit[active], axis=1) < 1e-7
@@ -245,6 +321,7 @@ def _fit(
         _, jacobian = model(values[good], u, rate[good])
         weighted = jacobian * (weights[good][:, np.newaxis, :] * unit[good][..., np.newaxis])
         normal = weighted @ weighted.transpose(0, 2, 1)
+        normal[:, prior.index, prior.index] += (prior.weight * unit[:, prior.index])[good] ** 2
         # A fixed height has no correlation; its error is that of a fit of the height alone.
         still = fixed[good]
         normal[still, 2, :2] = normal[still, :2, 2] = 0
@@ -256,27 +333,50 @@ def _fit(
     return _Fit(values, covariance, cost, good)
 
 
-def _echoes(records: Records, bins: IntArray, fit: _Fit, flags: IntArray) -> Echoes:
+@dataclass(frozen=True)
+class _Prior:
+    """Known value of one parameter of the fits, and the inverse of its standard error, 0 where it is not known."""
+
+    index: int
+    mean: FloatArray
+    weight: FloatArray
+
+    @classmethod
+    def of(cls, known: tuple[int, FloatArray, FloatArray] | None, count: int) -> _Prior:
+        """Return the prior of some parameter, or one without weight."""
+        if known is None:
+            return cls(0, np.zeros(count), np.zeros(count))
+        index, mean, error = known
+        usable = np.isfinite(mean) & (error > 0)
+        return cls(index, np.where(usable, mean, 0), np.where(usable, 1 / np.where(usable, error, 1), 0))
+
+    def cost(self, values: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the squared residuals of some of the fits."""
+        return np.asarray((self.weight[rows] * (values[rows, self.index] - self.mean[rows])) ** 2)
+
+
+def _echoes(records: Records, bins: IntArray, fit: _Fit, flags: IntArray, shape: EchoShape) -> Echoes:
     """Return the echoes of fits whose first parameters are time, sigma and height."""
     time, s, height = fit.values[:, 0], fit.values[:, 1], fit.values[:, 2]
     variance = np.einsum("nii->ni", fit.covariance)
-    area = np.sqrt(2 * np.pi) * 1e-9
+    area = np.sqrt(2 * np.pi) * 1e-9 * shape.heights.sum()
     mixed = s**2 * variance[:, 2] + height**2 * variance[:, 1] + 2 * s * height * fit.covariance[:, 1, 2]
-    middle = records.time_of(bins)
-    half = 0.5 * FWHM_PER_SIGMA * s
-    cut = (middle + time - half < records.time_ns[0]) | (middle + time + half > records.time_ns[-1])
+    middle, top = records.time_of(bins) - shape.peak_ns, shape.top_of(s)
+    width, by_sigma = shape.width_of(s)
+    peak = middle + time + shape.peak_ns
+    cut = (peak - 0.5 * width < records.time_ns[0]) | (peak + 0.5 * width > records.time_ns[-1])
     exists = has_echo(flags)
     flags = flags | np.where(exists & ~fit.good, int(EchoFlag.POOR_FIT), 0)
     flags = flags | np.where(exists & cut, int(EchoFlag.CUT), 0)
     found = Echoes(
         middle + time,
-        height,
+        height * top,
         area * height * s,
-        FWHM_PER_SIGMA * s,
+        width,
         np.sqrt(variance[:, 0]),
-        np.sqrt(variance[:, 2]),
+        np.sqrt(variance[:, 2]) * top,
         area * np.sqrt(np.maximum(mixed, 0)),
-        FWHM_PER_SIGMA * np.sqrt(variance[:, 1]),
+        by_sigma * np.sqrt(variance[:, 1]),
         flags,
     )
     return found.known_only(exists & fit.good)

@@ -22,7 +22,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     find_echoes,
 )
 from mitransient_lidar.analysis.waveforms.records import Waveforms
-from mitransient_lidar.analysis.waveforms.surface_times import surface_times
+from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, surface_times
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
@@ -33,6 +33,8 @@ ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
 _SIGNIFICANT = 3.0  # standard errors of the amplitude of a surface echo that is distinct from the column
+_TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
+_LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
     "time_ns": "arrival of the echo",
@@ -211,11 +213,19 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
     """Return the quantities of some of the waveforms by name, shape (waveforms, ...)."""
     records, width = waveforms.records(rows), waveforms.echo_fwhm_ns
     found = find_echoes(
-        records, width, threshold=settings.threshold, contrast=settings.contrast, earliest_ns=waveforms.quiet_until_ns
+        records,
+        width,
+        threshold=settings.threshold,
+        contrast=settings.contrast,
+        earliest_ns=waveforms.quiet_until_ns,
+        latest_ns=waveforms.latest_surface(rows),
+        event_height=waveforms.events(rows),
     )
     time = records.time_ns
     surface, target, bottom = found.bins
-    start = np.where(surface >= 0, time[surface] + 1.75 * width, np.nan)
+    # The column begins where the tail of the surface echo has ended.
+    tail = max(1.75 * width, waveforms.template.tail_ns(_TAIL) + width - waveforms.template.fwhm_ns)
+    start = np.where(surface >= 0, time[surface] + tail, np.nan)
     following = np.where(target >= 0, target, bottom)
     # The last bins lack the rising edges of pulses after the end of the record.
     end = np.where(following >= 0, time[following] - 1.5 * width, time[-1] - 1.2 * waveforms.template.fwhm_ns)
@@ -297,6 +307,8 @@ def _with_depths(
     time, error, peak = table["time_ns"], table["time_ns_stderr"], table.pop("peak_ns")
     errors = DepthErrors.of(dataset.attrs, lines, shots, waveforms.geometry, waveforms.template.fwhm_ns)
     zero, zero_error, by_light = (np.empty(time.shape[:2]) for _ in range(3))
+    dark = lines.beam_share < LEAST_SHARE * waveforms.brightest
+    table["flags"][..., 2:] |= np.where(dark, int(EchoFlag.SCATTERED_LIGHT), 0)[:, np.newaxis, np.newaxis]
     for number, estimator in enumerate(settings.estimators):
         measured = time[:, number, 0]
         found = surface_times(
@@ -309,7 +321,7 @@ def _with_depths(
         )
         own = found.own.ravel()
         flags = table["flags"][:, number, 0]
-        flags |= np.where(own | np.isnan(measured), 0, int(EchoFlag.NO_SURFACE_LIGHT))
+        flags |= np.where((own | np.isnan(measured)) & ~dark, 0, int(EchoFlag.NO_SURFACE_LIGHT))
         # Without a distinct echo, the onset of the column gives the time.
         absent = np.isnan(measured) | ~own
         faint = absent.copy()
@@ -445,14 +457,19 @@ def _estimate(
             return echo_estimators.crossing(window, top, level, np.zeros_like(level), template)
         return top.time_ns, top.time_stderr
 
-    bias = 0.0
-    if estimator in ("peak", "centroid", "gaussian"):
-        bias = echo_estimators.calibrate(time_of, template, records.bin_ns, width)
     if estimator == "gaussian":
-        echoes = [echo_fits.gaussian_surface(records, found.surface, width, decay, found.flags[0])]
+        shape = waveforms.echo_shape
+        level = column.level, np.hypot(column.level_stderr, _LEVEL * column.level)
+        surface = echo_fits.gaussian_surface(
+            records, found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
+        )
+        fits = [surface]
         for place, flag in places[1:]:
-            echoes.append(echo_fits.gaussian_echo(records, place, width, decay, flag, after=found.surface))
-        return [one.delayed(-bias) for one in echoes]
+            fits.append(echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface))
+        return fits
+    bias = 0.0
+    if estimator in ("peak", "centroid"):
+        bias = echo_estimators.calibrate(time_of, template, records.bin_ns, width)
     echoes = []
     for number, (place, flag) in enumerate(places):
         after = found.surface if number else None

@@ -12,7 +12,10 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.waveforms.echo_detection import Records, Template
+from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
+from mitransient_lidar.analysis.waveforms.echo_detection import Records
+from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response, Template
+from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
@@ -25,6 +28,8 @@ from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, requ
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
+_LATEST = 3.0  # widths of an echo by which the surface may be late
+_LOWEST = -3.0  # point of a sea without the attribute surface_heights_m [m]
 _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 
@@ -69,14 +74,20 @@ class Waveforms:
         or (pixels, 1), or of each waveform where it differs between shots, shape (count, time).
     saturated, saturation_level
         Samples at a limit, of the shape of `samples`, and the least such sample.
-    kernel, template
-        Pulse and response in bins, and the shape of an ideal echo.
+    kernel, template, echo_shape
+        Pulse and response in bins, and the shape of an ideal echo, also as a sum of Gaussians.
+    focusing, onset
+        Mean focusing of the column's light by waves, None where it is not known, and the onset of the column.
     echo_fwhm_ns, quiet_until_ns
         Expected width of an echo, and end of the part of the record without echoes [ns].
     geometry
         Lidar geometry on the axis.
     lines
         Lines of sight, of the pixels of every shot or of one for all shots, shape (pixels,).
+    event_height
+        Height that single events of the detector reach, shape (pixels,).
+    lowest_m
+        Lowest point of the sea [m], negative; that of a rough sea where it is not known.
     """
 
     dims: tuple[str, ...]
@@ -90,10 +101,15 @@ class Waveforms:
     saturation_level: float
     kernel: tuple[int, FloatArray]
     template: Template
+    echo_shape: EchoShape
+    focusing: Focusing | None
+    onset: ColumnOnset
     echo_fwhm_ns: float
     quiet_until_ns: float
     geometry: LidarGeometry
     lines: LinesOfSight
+    event_height: FloatArray
+    lowest_m: float
 
     @property
     def count(self) -> int:
@@ -126,11 +142,14 @@ class Waveforms:
         shape = pulse or Pulse.gaussian(required_number(dataset.attrs, "pulse_fwhm_ns"))
         step = results.time_axis(dataset).bin_width_ns
         response = float(dataset.attrs.get("response_time_ns", 0.0))
-        template = Template.of(shape, step, response)
+        receiver = _receiver_response(dataset, step) if name == "signal" else None
+        template = Template.of(shape, step if receiver is None else receiver.bin_ns, response, receiver)
+        kernel = shape.kernel(step, response) if receiver is None else template.kernel(step)
         # Two-way time per angle from the axis, in the plane of incidence.
         ns_per_mrad = 2e6 * geometry.height * math.sin(geometry.off_nadir) / (C0 * math.cos(geometry.off_nadir) ** 2)
         given = None if echo_fwhm_ns is None else positive("echo_fwhm_ns", echo_fwhm_ns)
         width = given or _echo_width(dataset, template, ns_per_mrad)
+        echo_shape, focusing = EchoShape.of(template), Focusing.from_attributes(dataset.attrs)
         half_view = 0.5 * float(dataset.attrs.get("field_of_view_mrad", 0.0))
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
@@ -152,27 +171,79 @@ class Waveforms:
             _noise(dataset, name, samples, baseline, quiet, noise, max(int(template.fwhm_ns / step), 1)),
             dataset["saturated"].values.reshape(-1, time.size).astype(bool) if "saturated" in dataset else None,
             math.inf if saturation_level is None else float(saturation_level),
-            shape.kernel(step, response),
+            kernel,
             template,
+            echo_shape,
+            focusing,
+            ColumnOnset.of(focusing, geometry.depth_per_ns, echo_shape.sigma_of(3 * width)),
             width,
             quiet_until,
             geometry,
             _lines_of_sight(dataset, dims[:-1]),
+            _event_height(dataset, pixels) if name == "signal" else np.zeros(pixels),
+            float(np.atleast_1d(dataset.attrs.get("surface_heights_m", _LOWEST))[0]),
         )
+
+    @property
+    def brightest(self) -> float:
+        """Largest share of the beam in a pixel, 0 where it is not known."""
+        return float(np.nan_to_num(self.lines.beam_share).max(initial=0.0))
 
     def lines_of(self, rows: slice) -> LinesOfSight:
         """Return the lines of sight of some of the waveforms."""
         return self.lines.at(np.arange(rows.start, rows.stop) % self.lines.off_nadir.size)
 
+    def latest_surface(self, rows: slice) -> FloatArray:
+        """Return the latest times of the surface echo [ns], of the lowest point of the sea, shape (waveforms,).
+
+        Pixels without direct light have none.
+        """
+        lines = self.lines_of(rows)
+        trough = -self.lowest_m / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+        margin = _LATEST * (self.echo_fwhm_ns + lines.surface_spread) + self.template.peak_ns + self.onset.brightest_ns
+        dark = lines.beam_share < LEAST_SHARE * self.brightest
+        return np.asarray(lines.surface_time + np.where(dark, 0, trough + margin))
+
+    def events(self, rows: slice) -> FloatArray:
+        """Return the heights that single events of the detector reach, shape (waveforms,)."""
+        return np.asarray(self.event_height[np.arange(rows.start, rows.stop) % self.event_height.size])
+
     def gain(self, rows: slice) -> FloatArray:
-        """Return the signal over that at the surface by distance and refraction, shape (waveforms, time)."""
-        return self.lines_of(rows).spreading(self.geometry, self.time_ns)
+        """Return the signal over that at the surface by distance, refraction and waves, shape (waveforms, time)."""
+        lines = self.lines_of(rows)
+        spreading = lines.spreading(self.geometry, self.time_ns)
+        if self.focusing is None:
+            return spreading
+        return spreading * self.focusing.at(lines.depth_of_time(np.broadcast_to(self.time_ns, spreading.shape)))
 
     def records(self, rows: slice) -> Records:
         """Return some of the waveforms less their baseline."""
         pixel = np.arange(rows.start, rows.stop) % self.baseline.size
         noise = self.noise[rows] if len(self.noise) == self.count else self.noise[pixel]
         return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
+
+
+def _event_height(dataset: xr.Dataset, pixels: int) -> FloatArray:
+    """Return the height that single events of the detector reach, shape (pixels,); 0 where it is not known."""
+    if "event_height" not in dataset or dataset["event_height"].size != pixels:
+        return np.zeros(pixels)
+    return np.nan_to_num(dataset["event_height"].values.reshape(-1).astype(np.float64))
+
+
+def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
+    """Return the response of the receiver that recorded a signal; None where it is not known."""
+    if "impulse_response" not in dataset:
+        return None
+    response = dataset["impulse_response"]
+    if response.dims != ("lag",) or response.size == 0 or "lag" not in response.coords:
+        raise UserError(f"impulse_response of the dimensions {response.dims} must have the dimension lag")
+    weights, lag = (np.asarray(one.values, dtype=np.float64) for one in (response, response["lag"]))
+    if not (np.isfinite(weights).all() and np.isfinite(lag).all() and weights.sum() > 0):
+        raise UserError("impulse_response must be finite, of a positive sum")
+    width = step if lag.size == 1 else float(lag[-1] - lag[0]) / (lag.size - 1)
+    if width <= 0 or np.any(np.abs(lag - lag[0] - width * np.arange(lag.size)) > 1e-3 * width):
+        raise UserError("lag of impulse_response must increase in equal steps")
+    return Response(round(lag[0] / width), weights / weights.sum(), width)
 
 
 def _lines_of_sight(dataset: xr.Dataset, dims: tuple[str, ...]) -> LinesOfSight:
@@ -193,6 +264,8 @@ def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
     """Return a dataset with the signal before the logarithm, and its standard deviation to first order."""
     signal = dataset["signal"]
     replaced = {"signal": signal.copy(data=logarithm.expand(signal.values))}
+    if "event_height" in dataset:
+        replaced["event_height"] = dataset["event_height"].copy(data=logarithm.expand(dataset["event_height"].values))
     if "signal_deviation" in dataset:
         deviation = dataset["signal_deviation"]
         mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean({"shot"} & set(signal.dims))

@@ -11,8 +11,10 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.results.geometry import LinesOfSight
 
-_LEAST_SHARE = 1e-3  # of the beam in a pixel with direct light, relative to the brightest pixel
+#: Least share of the beam in a pixel with direct light, relative to the brightest pixel.
+LEAST_SHARE = 1e-3
 _LIMIT = 4.0  # standard deviations by which an echo may deviate from the other pixels' surface
+_LEVEL = 0.15  # error of the mean sea level [m]
 _SHAPE = 0.1  # error of an echo's time by its unknown shape, in echo widths
 
 
@@ -53,8 +55,10 @@ def surface_times(
     SurfaceTimes
         A pixel's own time where it has at least a thousandth of the light of the brightest pixel, and where its
         deviation from the level sea agrees, within 4 standard deviations, with the heights of the sea and with the
-        median of the pixels, weighted with their light. Otherwise, that of the level sea plus the mean deviation of the
-        former pixels; NaN without any of them. Where the shares of the beam are unknown, all times are own.
+        median of the pixels, weighted with their light; a noisy one is drawn towards the level sea. Otherwise, that of
+        the level sea plus the mean deviation of the former pixels; without any of them, that of the mean sea level,
+        with the standard deviation of the heights as error, or NaN where the heights are unknown. Where the shares of
+        the beam are unknown, all times are own.
 
     Notes
     -----
@@ -67,7 +71,7 @@ def surface_times(
     share = lines.beam_share
     if np.isnan(share).any():
         return SurfaceTimes(time_ns, stderr_ns, known)
-    light = share >= _LEAST_SHARE * share.max(axis=1, keepdims=True)
+    light = share >= LEAST_SHARE * share.max(axis=1, keepdims=True)
     tilt = _tilt_ns(lines, np.sqrt(0.5 * slope_variance))
     own_error = np.hypot(np.hypot(np.nan_to_num(stderr_ns), lines.surface_spread), _SHAPE * echo_fwhm_ns)
     deviation = np.where(known, time_ns, 0) - lines.surface_time
@@ -82,9 +86,19 @@ def surface_times(
     some = total > 0
     total = np.where(some, total, 1.0)
     mean = np.sum(weight * deviation, axis=1, keepdims=True) / total
-    inferred = np.where(some, lines.surface_time + mean, np.nan)
-    error = np.where(some, np.hypot(1 / np.sqrt(total), tilt), np.nan)
-    return SurfaceTimes(np.where(lit, time_ns, inferred), np.where(lit, stderr_ns, error), lit)
+    # An eighth of the heights' range is their standard deviation.
+    spread = 0.125 * (heights_m[1] - heights_m[0]) / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+    level = np.where(np.isfinite(spread), 0.0, np.nan)
+    inferred = lines.surface_time + np.where(some, mean, level)
+    error = np.where(some, np.hypot(1 / np.sqrt(total), tilt), np.where(np.isfinite(spread), spread, np.nan))
+    # A noisy time is drawn towards that of the mean sea level, by its own error and the heights of the sea.
+    level_error = np.hypot(
+        np.where(np.isfinite(spread), spread, np.inf), _LEVEL / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+    )
+    noise = np.nan_to_num(stderr_ns)
+    drawn = np.where(np.isfinite(level_error), noise**2 / (noise**2 + level_error**2), 0)
+    own_time, own_noise = time_ns - drawn * deviation, noise * np.sqrt(1 - drawn)
+    return SurfaceTimes(np.where(lit, own_time, inferred), np.where(lit, own_noise, error), lit)
 
 
 def _tilt_ns(lines: LinesOfSight, slope: float) -> FloatArray:

@@ -151,6 +151,11 @@ class LinearDetector:
         gain = float(np.prod(gains))
         return cls(quantum_efficiency, gain, noise, dark_current_na, 0.0, gains, largest_current_ma)
 
+    @property
+    def charge_spread(self) -> float:
+        """Variance of the charge of an event over the square of its mean [1]."""
+        return self.excess_noise - 1
+
     def with_gain(self, factor: float) -> LinearDetector:
         """Return a photomultiplier at another voltage: its gain times a factor, the same for each dynode.
 
@@ -231,6 +236,12 @@ class SiliconPhotomultiplier:
         in_range("gain", self.gain, 1, np.inf)
         for name in ("dark_count_rate_hz", "gain_spread"):
             non_negative(name, getattr(self, name))
+
+    @property
+    def charge_spread(self) -> float:
+        """Variance of the charge of an event, with those that it triggers, over the square of its mean [1]."""
+        offspring = -np.log1p(-self.crosstalk)
+        return float(offspring / (1 - offspring) + self.gain_spread**2 * (1 - offspring))
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin, with all cells live, for a mean number of photons per bin, of the same shape."""

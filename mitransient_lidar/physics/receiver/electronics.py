@@ -11,11 +11,14 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import BOLTZMANN
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite, integer, non_negative, positive
+from mitransient_lidar.core.validation import FloatArray, finite, finite_array, integer, non_negative, positive
+from mitransient_lidar.physics.piecewise_linear import integral
 
 _TAIL = 1e-10  # fraction of a filter's response left out at its ends
 #: Longest part of a bin, in time constants of the responses, for which steady light has its shot noise to 0.5 %.
 _PART = {"single_pole": 0.25, "gaussian": 1 / 3}
+_ENDS = 0.02  # largest value at the ends of a measured impulse response, relative to its peak
+_MOST_SAMPLES = 2**16  # of a measured impulse response
 _NODES = 48  # of the quadrature over a normal distribution within 8 standard deviations
 
 
@@ -49,6 +52,12 @@ class LowPass:
     def start(self) -> int:
         """Part of a record, with `before` bins before it, that is the first on which sample 0 depends."""
         return self.before * self.parts + self.parts // 2 - self.first - self.weights.size
+
+    def by_bin(self) -> tuple[int, FloatArray]:
+        """Return the response to the light of whole bins: bins before the sample of the first weight, and weights."""
+        part = self.parts // 2 - 1 - self.first - np.arange(self.weights.size) if self.parts > 1 else np.zeros(1, int)
+        lag = -(part // self.parts)
+        return int(lag[0]), np.asarray(np.bincount(lag - lag[0], self.weights), dtype=np.float64)
 
     def divided(self, record: FloatArray) -> FloatArray:
         """Return a record, shape (..., time), that holds in each part of a bin an equal part of its value."""
@@ -86,6 +95,9 @@ class Amplifier:
         Shape of the low-pass: exp(-t/tau)/tau with tau = 1/(2 pi f), or a Gaussian without delay.
     limit_v : float or None
         Largest output of either sign [V], positive; None for no limit.
+    impulse_response : (tuple of float, tuple of float) or None
+        Measured response instead of a bandwidth: times after the light [ns], ascending, with 0 among them, and values
+        in any unit, linear between the times, of positive area, and at either end within 2 % of their peak about 0.
 
     Notes
     -----
@@ -99,6 +111,7 @@ class Amplifier:
     bandwidth_mhz: float | None = None
     response: Literal["single_pole", "gaussian"] = "single_pole"
     limit_v: float | None = None
+    impulse_response: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
         positive("transimpedance_ohm", self.transimpedance_ohm)
@@ -109,9 +122,15 @@ class Amplifier:
                 positive(name, getattr(self, name))
         if self.response not in ("single_pole", "gaussian"):
             raise UserError(f"response = {self.response!r} must be 'single_pole' or 'gaussian'")
+        if self.impulse_response is not None:
+            if self.bandwidth_mhz is not None:
+                raise UserError(f"bandwidth_mhz = {self.bandwidth_mhz:g} and an impulse_response are alternatives")
+            _check_response(*self.impulse_response)
 
     def low_pass(self, bin_width_ns: float) -> LowPass:
         """Return the response to charges in parts of bins, short enough for the noise of steady light to 0.5 %."""
+        if self.impulse_response is not None:
+            return _measured(*self.impulse_response, bin_width_ns)
         if self.bandwidth_mhz is None:
             return MEAN_OF_BINS
         from scipy.special import ndtr
@@ -141,18 +160,17 @@ class Amplifier:
         if self.load_ohm is not None:
             density += 4 * BOLTZMANN * self.temperature_k / self.load_ohm
         volts = self.transimpedance_ohm * math.sqrt(density)
+        if self.impulse_response is not None:
+            return _noise_of_measured(*self.impulse_response, volts, stride * bin_width_ns)
         if self.bandwidth_mhz is None:
             return volts * math.sqrt(0.5e9 / bin_width_ns), np.ones(1)
         step = stride * bin_width_ns / self._time_constant_ns()
         if self.response == "single_pole":
             powers = np.exp(-step * np.arange(math.ceil(-math.log(_TAIL) / step) + 1))
             return volts * math.sqrt(0.5e6 * math.pi * self.bandwidth_mhz), _normal(powers)
-        # A filter whose spectrum is the root of that of the correlation exp(-t^2/(4 sigma^2)).
         lags = np.arange(math.ceil(12 / step) + 1)
-        correlation = np.exp(-0.25 * (lags * step) ** 2)
-        spectrum = np.fft.rfft(np.concatenate([correlation, correlation[:0:-1]]))
-        weights = np.fft.fftshift(np.fft.irfft(np.sqrt(np.maximum(spectrum.real, 0)), 2 * lags.size - 1))
-        return volts * math.sqrt(1e6 * math.sqrt(math.pi / math.log(16)) * self.bandwidth_mhz), _normal(weights)
+        weights = _weights_of_correlation(np.exp(-0.25 * (lags * step) ** 2))
+        return volts * math.sqrt(1e6 * math.sqrt(math.pi / math.log(16)) * self.bandwidth_mhz), weights
 
     def _time_constant_ns(self) -> float:
         """Time constant of the single pole, or standard deviation of the Gaussian response."""
@@ -321,6 +339,61 @@ class Readout:
                 codes, beyond = self.logarithm.expand(codes), self.logarithm.expand(beyond)
             clip, over = np.clip(codes, -rail, rail), np.clip(beyond, -rail, rail)
         return (float(clip[0]), float(clip[1])), (float(over[0]), float(over[1]))
+
+
+def _check_response(times: tuple[float, ...], values: tuple[float, ...]) -> None:
+    """Refuse an impulse response that is not one."""
+    t, h = finite_array("impulse_response", times), finite_array("impulse_response", values)
+    if t.shape != h.shape or t.ndim != 1 or t.size < 3 or np.any(np.diff(t) <= 0):
+        raise UserError("impulse_response must have at least 3 samples at ascending times")
+    if t[0] > 0 or t[-1] <= 0:
+        raise UserError(
+            f"impulse_response is from {t[0]:g} to {t[-1]:g} ns: its times must hold 0, the arrival of the light"
+        )
+    ends = max(abs(h[0]), abs(h[-1])) / max(float(np.abs(h).max()), 1e-300)
+    if ends > _ENDS:
+        raise UserError(f"impulse_response is {100 * ends:.2g} % of its peak at an end, where it must be 0 within 2 %")
+    if _area(t, h) <= 0:
+        raise UserError("impulse_response must have a positive area")
+
+
+def _area(t: FloatArray, h: FloatArray) -> float:
+    """Return the area below samples."""
+    return float(np.sum(0.5 * (h[1:] + h[:-1]) * np.diff(t)))
+
+
+def _measured(times: tuple[float, ...], values: tuple[float, ...], bin_width_ns: float) -> LowPass:
+    """Return the low-pass of a measured response: its integrals over parts of bins."""
+    t, h = np.asarray(times), np.asarray(values)
+    width = _area(t, h) / float(np.abs(h).max())
+    parts = 2 * math.ceil(bin_width_ns / (2 * _PART["gaussian"] * width))
+    part = bin_width_ns / parts
+    first, last = math.floor(t[0] / part), math.ceil(t[-1] / part)
+    edges = np.arange(first, last + 1) * part
+    return LowPass(parts, first, _unit(np.diff(integral(t, h, edges))))
+
+
+def _noise_of_measured(
+    times: tuple[float, ...], values: tuple[float, ...], volts: float, step_ns: float
+) -> tuple[float, FloatArray]:
+    """Return the deviation [V], for a density [V/sqrt(Hz)], and the weights of noise behind a measured response."""
+    t, h = np.asarray(times), np.asarray(values)
+    h = h / _area(t, h)
+    fine = min(float(np.diff(t).min()), step_ns) / 4
+    fine = max(fine, (t[-1] - t[0]) / _MOST_SAMPLES)
+    even = np.interp(np.arange(t[0], t[-1] + fine, fine), t, h)
+    shifts = np.arange(math.ceil((t[-1] - t[0]) / step_ns) + 1) * step_ns / fine
+    size = even.size
+    powers = np.abs(np.fft.rfft(even, 2 * size)) ** 2
+    correlation = np.interp(shifts, np.arange(size), np.fft.irfft(powers)[:size], right=0.0)
+    # Half of the one-sided density over both signs of the frequency, and 1e9 ns in a second.
+    return volts * math.sqrt(0.5e9 * correlation[0] * fine), _weights_of_correlation(correlation)
+
+
+def _weights_of_correlation(correlation: FloatArray) -> FloatArray:
+    """Return weights whose correlation is given at lags from 0: their spectrum is the root of its spectrum."""
+    spectrum = np.fft.rfft(np.concatenate([correlation, correlation[:0:-1]]))
+    return _normal(np.fft.fftshift(np.fft.irfft(np.sqrt(np.maximum(spectrum.real, 0)), 2 * correlation.size - 1)))
 
 
 def filtered(record: FloatArray, weights: FloatArray) -> FloatArray:

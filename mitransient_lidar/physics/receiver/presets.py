@@ -38,6 +38,8 @@ from mitransient_lidar.physics.receiver.electronics import (
 )
 
 _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
+_RARE = 1e-3  # share of records in which a single event is higher than stated
+_OVERLAPPING = 3.0  # events in a bin above which they are no longer single
 _HEADROOM = 6.0  # standard deviations of noise below the upper limit of samples in range
 _STRONGEST = 16  # records that an attenuation is fitted to
 _DARKEST = math.log(1e12)  # largest attenuation that is tried
@@ -240,6 +242,27 @@ class ReceiverChain:
         shape = *np.shape(power)[:-1], -1
         mean, variance = (np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True))
         return mean, variance if self.amplifier is None else variance + self.amplifier.noise(bin_width_ns)[0] ** 2
+
+    def event_height(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
+        """Return the height in the samples that a single event exceeds in one of a thousand records, shape (...).
+
+        Events are those of light and dark counts; where many overlap, only a few of each bin count. Their charges are
+        gamma-distributed, as those of `LinearDetector`. 0 without an amplifier, or where events are rarer.
+        """
+        from scipy.stats import gamma
+
+        light, sky = self._light(power, bin_width_ns, background)
+        if self.amplifier is None or isinstance(self.detector, SinglePhotonDetector):
+            return np.zeros(np.shape(power)[:-1])
+        low_pass = self.low_pass(bin_width_ns)
+        events = self.events(light, bin_width_ns, sky)
+        number = np.minimum(events, _OVERLAPPING / low_pass.parts).sum(axis=-1)
+        spread = self.detector.charge_spread
+        shape = 1 / max(spread, 1e-6)
+        rare = np.clip(_RARE / np.maximum(number, 1e-12), 0, 1)
+        charge = np.where(rare < 1, gamma.isf(rare, shape, scale=spread), 0.0) * self.detector.gain
+        peak = float(low_pass.weights.max()) * self._volts_per_electron(bin_width_ns)
+        return (charge * peak).reshape(np.shape(power)[:-1])
 
     def snr(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
         """Return the signal-to-noise ratio of the samples of one shot, shape (..., sample).

@@ -116,6 +116,16 @@ class WaterColumn:
         layer = self.layer_at(z)
         return np.asarray(self.edge_optical_depth[layer] + self.attenuation[layer] * (z - self.layer_tops[layer]))
 
+    def optical_depth_of_scattering(self, depth: npt.ArrayLike) -> FloatArray:
+        """Vertical optical depth of scattering from z = 0 to `depth` [m], not negative."""
+        ends = np.clip(np.asarray(depth, dtype=np.float64)[..., np.newaxis], self.layer_tops, self._layer_ends)
+        return np.asarray((ends - self.layer_tops) @ self.scattering)
+
+    @property
+    def _layer_ends(self) -> FloatArray:
+        """Lower edges of the layers [m]."""
+        return np.append(self.layer_tops[1:], np.inf)
+
     def optical_depth(self, depth0: npt.ArrayLike, depth1: npt.ArrayLike, distance: npt.ArrayLike) -> FloatArray:
         """Optical depth of straight segments.
 

@@ -5,7 +5,8 @@ import pytest
 from significance import largest_z
 
 from mitransient_lidar.analysis.waveforms.deconvolution import deconvolution_offset, deconvolved_echo, richardson_lucy
-from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, find_echoes
+from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 
 DT = 0.5

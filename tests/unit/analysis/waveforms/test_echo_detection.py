@@ -6,7 +6,8 @@ from scipy.stats import exponnorm, norm
 from significance import largest_count, largest_z
 
 from mitransient_lidar.analysis.waveforms import echo_estimators
-from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, Template, find_echoes
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records, find_echoes
+from mitransient_lidar.analysis.waveforms.echo_shape import Template
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
 
 DT = 0.5

@@ -6,8 +6,11 @@ from scipy.stats import exponnorm
 from significance import largest_count, largest_z
 
 from mitransient_lidar.analysis.waveforms.column_fits import change_points, column_fit
+from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, Records
 from mitransient_lidar.analysis.waveforms.echo_fits import gaussian_echo, gaussian_surface
+from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Template
+from mitransient_lidar.physics.lidar.pulse import Pulse
 
 TIME = (np.arange(400) + 0.5) * 0.5
 SIGMA = 3.3
@@ -15,6 +18,7 @@ WIDTH = SIGMA * np.sqrt(8 * np.log(2))
 DECAY = 0.035
 SURFACE, BOTTOM = 60.1, 134.3
 COUNT = 800
+SHAPE = EchoShape.gaussian(WIDTH)
 
 
 def onset(at, level=1.0, decay=DECAY):
@@ -50,7 +54,7 @@ def test_surface_and_column_are_separated():
     peak = int(np.argmax(signal[:200]))
     assert TIME[peak] - SURFACE > 2
     bins, flags = np.full(COUNT, peak), np.zeros(COUNT, int)
-    found = gaussian_surface(noisy(signal, 0.01), bins, WIDTH, DECAY, flags)
+    found = gaussian_surface(noisy(signal, 0.01), bins, WIDTH, DECAY, flags, SHAPE)
     assert not found.flags.any()
     assert_true(found.time_ns, found.time_stderr, SURFACE, bias=0.01)
     assert_true(found.amplitude, found.amplitude_stderr, 0.4, bias=0.002)
@@ -67,7 +71,7 @@ def test_a_surface_low_beside_its_column_has_one_time_with_a_true_error(height, 
     """
     signal = onset(SURFACE) + gauss(SURFACE, height)
     bins, flags = np.full(300, int(np.argmax(signal))), np.zeros(300, int)
-    found = gaussian_surface(noisy(signal, noise, 300), bins, WIDTH, DECAY, flags)
+    found = gaussian_surface(noisy(signal, noise, 300), bins, WIDTH, DECAY, flags, SHAPE)
     error = found.time_ns - SURFACE
     assert 0.5 < np.sqrt(np.mean((error / found.time_stderr) ** 2)) < 2.7
     assert np.median(found.time_stderr) < 1.0
@@ -80,7 +84,7 @@ def test_a_surface_low_beside_its_column_has_one_time_with_a_true_error(height, 
 def test_the_onset_of_a_column_without_noise_is_the_surface():
     signal = onset(SURFACE)
     clean = gaussian_surface(
-        Records.of(signal[np.newaxis], TIME), np.array([np.argmax(signal)]), WIDTH, DECAY, np.zeros(1, int)
+        Records.of(signal[np.newaxis], TIME), np.array([np.argmax(signal)]), WIDTH, DECAY, np.zeros(1, int), SHAPE
     )
     assert clean.time_ns[0] == pytest.approx(SURFACE, abs=0.02)
     assert clean.amplitude[0] == pytest.approx(0, abs=0.005)
@@ -89,7 +93,7 @@ def test_the_onset_of_a_column_without_noise_is_the_surface():
 def test_bottom_on_the_column_that_it_ends():
     signal = waveform()
     bins, flags = np.full(COUNT, int(np.argmin(np.abs(TIME - BOTTOM)))), np.zeros(COUNT, int)
-    found = gaussian_echo(noisy(signal, 0.02), bins, WIDTH, DECAY, flags, after=bins - 150)
+    found = gaussian_echo(noisy(signal, 0.02), bins, WIDTH, DECAY, flags, SHAPE, after=bins - 150)
     assert not found.flags.any()
     # The step in the column of the model lacks the factor exp((k s)^2/2) = 1.007 of a blurred exponential.
     assert_true(found.time_ns, found.time_stderr, BOTTOM, bias=0.005)
@@ -101,17 +105,56 @@ def test_times_without_noise_have_no_bias_at_any_position_in_a_bin():
     arrivals = 100 + np.linspace(0, 0.5, 11)
     records = Records.of(np.stack([gauss(at, 1.0) for at in arrivals]), TIME)
     bins = np.argmin(np.abs(TIME - arrivals[:, np.newaxis]), axis=1)
-    found = gaussian_echo(records, bins, WIDTH, 0.0, np.zeros(11, int))
+    found = gaussian_echo(records, bins, WIDTH, 0.0, np.zeros(11, int), SHAPE)
     np.testing.assert_allclose(found.time_ns, arrivals, atol=0.002)
     np.testing.assert_allclose(found.width_ns, WIDTH, rtol=1e-3)
+
+
+def test_echoes_with_the_tail_of_a_receiver_have_true_times_heights_and_energies():
+    """A single Gaussian would be 2 ns late."""
+    template = Template.of(Pulse.gaussian(WIDTH), 0.5, 4.0)
+    shape = EchoShape.of(template)
+    at = 100.2
+    signal = 3.0 * np.interp(TIME, at + template.time_ns, template.power, left=0, right=0)
+    bins, flags = np.full(COUNT, int(np.argmax(signal))), np.zeros(COUNT, int)
+    records, width = noisy(signal, 0.03), template.fwhm_ns
+    for found in (
+        gaussian_echo(records, bins, width, 0.02, flags, shape),
+        gaussian_surface(records, bins, width, 0.02, flags, shape),
+    ):
+        # A sum of Gaussians is within 1 % of the template.
+        assert_true(found.time_ns, found.time_stderr, at, bias=0.03)
+        assert found.amplitude.mean() == pytest.approx(3.0, rel=0.02)
+        assert found.energy.mean() == pytest.approx(np.trapezoid(signal, TIME) * 1e-9, rel=0.03)
+        assert found.width_ns.mean() == pytest.approx(width, rel=0.03)
+
+
+def test_a_column_that_waves_focus_does_not_delay_the_surface():
+    """The signal is brightest 7 ns after the surface; without the focusing in the model, the surface is 4 ns late."""
+    fine = np.arange(-40, 240, 0.01)
+    focusing = Focusing(np.array([0.0, 0.5, 1.0, 2.0, 30.0]), np.array([1.0, 3.7, 2.1, 1.5, 1.0]))
+    shape = np.where(fine >= 0, focusing.at(0.106 * fine) * np.exp(-DECAY * fine), 0)
+    blur = np.exp(-0.5 * (np.arange(-20, 20, 0.01) / SIGMA) ** 2)
+    column = np.convolve(shape, blur / blur.sum(), "same")
+    signal = np.interp(TIME, fine + SURFACE, column)
+    bins, flags = np.full(300, int(np.argmax(signal))), np.zeros(300, int)
+    level = np.ones(300), np.full(300, 0.2)
+    onset = ColumnOnset.of(focusing, 0.106, SHAPE.sigma_of(3 * WIDTH))
+    for glint in (0.0, 1.0):
+        records = noisy(signal + gauss(SURFACE, glint), 0.05, 300)
+        found = gaussian_surface(records, bins, WIDTH, DECAY, flags, SHAPE, onset, level)
+        assert abs(np.mean(found.time_ns) - SURFACE) < 0.8
+        assert np.sqrt(np.mean(((found.time_ns - SURFACE) / found.time_stderr) ** 2)) < 1.5
+    plain = gaussian_surface(records, bins, WIDTH, DECAY, flags, SHAPE)
+    assert np.mean(plain.time_ns) - SURFACE > 2
 
 
 def test_missing_echoes_are_nan_and_poor_fits_are_flagged():
     flags = np.array([int(EchoFlag.NO_ECHO), 0])
     records = Records.of(np.stack([gauss(60, 1.0), np.full(TIME.size, -1.0)]), TIME, 0.1)
     for found in (
-        gaussian_echo(records, np.array([-1, 120]), WIDTH, 0.0, flags),
-        gaussian_surface(records, np.array([-1, 120]), WIDTH, 0.03, flags),
+        gaussian_echo(records, np.array([-1, 120]), WIDTH, 0.0, flags, SHAPE),
+        gaussian_surface(records, np.array([-1, 120]), WIDTH, 0.03, flags, SHAPE),
     ):
         assert np.isnan(found.time_ns).all()
         assert found.flags.tolist() == [EchoFlag.NO_ECHO, EchoFlag.POOR_FIT]

@@ -1,0 +1,171 @@
+"""Shape of an ideal echo in a record: the pulse after bins and receiver, and its sum of Gaussians for fits.
+
+All estimators give the same time for an echo with this shape: their bias for it is subtracted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+
+_FINE = 15  # points of a template per bin of light; odd, so that one of them is the centre of the bin
+_CLOSE = 0.01  # largest deviation of Gaussians from a template, relative to its peak
+_WIDTHS = (0.9, 0.75, 0.6, 0.45, 0.35, 0.25, 0.18, 0.12)  # tried widths of the Gaussians of a sum, over the template's
+_APART = 0.8  # distance of the Gaussians of a sum, in their standard deviations
+_LEAST_HEIGHT = 1e-4  # of the Gaussians of a sum, relative to the peak
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response of a receiver to the light of one bin: weights of the bins of light in a sample, of unit sum."""
+
+    first: int  #: Bins from the light of the first weight to the sample; negative for later light.
+    weights: FloatArray
+    bin_ns: float  #: Width of the bins of light [ns].
+
+
+@dataclass(frozen=True)
+class Template:
+    """Shape of an ideal echo that arrives at 0: times [ns], 15 per bin, height, 1 at the peak, and full width [ns]."""
+
+    time_ns: FloatArray
+    power: FloatArray
+    fwhm_ns: float
+
+    @classmethod
+    def of(
+        cls, pulse: Pulse, bin_width_ns: float, response_time_ns: float = 0.0, receiver: Response | None = None
+    ) -> Template:
+        """Return the shape of a pulse after a response, a single pole, averaged over bins, then after a receiver.
+
+        A receiver has bins of the same width.
+        """
+        step = bin_width_ns / _FINE
+        first, weights = pulse.kernel(step, response_time_ns)
+        shares = np.convolve(weights, np.full(_FINE, 1.0))
+        start = first - (_FINE - 1) / 2
+        if receiver is not None:
+            spread = np.zeros((receiver.weights.size - 1) * _FINE + 1)
+            spread[::_FINE] = receiver.weights
+            shares = np.convolve(shares, spread)
+            start += receiver.first * _FINE
+        time = np.asarray((start + np.arange(shares.size)) * step, dtype=np.float64)
+        power = shares / shares.max()
+        above = np.flatnonzero(power >= 0.5)
+        left, right = above[0], above[-1]
+        rise = np.interp(0.5, power[left - 1 : left + 1], time[left - 1 : left + 1]) if left > 0 else time[0]
+        fall = np.interp(-0.5, -power[right : right + 2], time[right : right + 2])
+        return cls(time, power, float(fall - rise))
+
+    def kernel(self, bin_width_ns: float) -> tuple[int, FloatArray]:
+        """Return the first lag and the weights, of unit sum, of an echo in samples at a distance [ns]."""
+        first = int(np.ceil(self.time_ns[0] / bin_width_ns))
+        lags = np.arange(first, int(np.floor(self.time_ns[-1] / bin_width_ns)) + 1)
+        weights = np.interp(lags * bin_width_ns, self.time_ns, self.power)
+        return first, weights / weights.sum()
+
+    @property
+    def peak_ns(self) -> float:
+        """Time of the peak [ns], the middle of equal samples."""
+        top = np.flatnonzero(self.power >= self.power.max() * (1 - 1e-9))
+        return float(0.5 * (self.time_ns[top[0]] + self.time_ns[top[-1]]))
+
+    def rise(self, level: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the time [ns] at which the edge crosses a level (0 to 1, of the peak), and its derivative."""
+        edge = slice(0, int(np.argmax(self.power)) + 1)
+        heights, kept = np.unique(self.power[edge], return_index=True)
+        wanted = np.clip(level, 1e-6, 0.999)
+        time = np.interp(wanted, heights, self.time_ns[edge][kept])
+        ahead = np.interp(np.minimum(wanted * 1.001, 1.0), heights, self.time_ns[edge][kept])
+        return time, (ahead - time) / (0.001 * wanted)
+
+    def tail_ns(self, level: float) -> float:
+        """Return the time from the peak to where the echo falls below a level (0 to 1, of the peak) for good [ns]."""
+        return float(self.time_ns[np.flatnonzero(self.power >= level)[-1]] - self.peak_ns)
+
+
+@dataclass(frozen=True)
+class EchoShape:
+    """A template as a sum of Gaussians of one width, whose blurred form is of the same kind.
+
+    Attributes
+    ----------
+    delays, heights
+        Times of the Gaussians from the arrival [ns], and their heights, shape (terms,); the sum is 1 at the peak.
+    sigma, fwhm_ns, peak_ns
+        Standard deviation of the Gaussians, full width at half maximum of the sum, and time of its peak [ns].
+    """
+
+    delays: FloatArray
+    heights: FloatArray
+    sigma: float
+    fwhm_ns: float
+    peak_ns: float
+
+    @classmethod
+    def gaussian(cls, fwhm_ns: float) -> EchoShape:
+        """Return a Gaussian that arrives at its peak."""
+        return cls(np.zeros(1), np.ones(1), fwhm_ns / FWHM_PER_SIGMA, fwhm_ns, 0.0)
+
+    @classmethod
+    def of(cls, template: Template) -> EchoShape:
+        """Return a Gaussian of the width of a template, or a sum of narrower ones, that is within 1 % of its peak.
+
+        The heights are fitted with least squares and not negative, for the largest width that is close enough.
+        """
+        from scipy.optimize import nnls
+
+        time, power, peak = template.time_ns, template.power, template.peak_ns
+        sigma = template.fwhm_ns / FWHM_PER_SIGMA
+        # The middle of the upper half is the peak of a symmetric template that two bins share.
+        middle = float(np.average(time, weights=np.where(power >= 0.5, power, 0)))
+        if np.max(np.abs(power - np.exp(-0.5 * ((time - middle) / sigma) ** 2))) < _CLOSE:
+            return cls(np.array([middle]), np.ones(1), sigma, template.fwhm_ns, middle)
+        for share in _WIDTHS:
+            width = share * sigma
+            centres = np.arange(time[0], time[-1] + width, _APART * width)
+            heights, _ = nnls(np.exp(-0.5 * ((time[:, np.newaxis] - centres) / width) ** 2), power)
+            kept = heights > _LEAST_HEIGHT
+            centres, heights = centres[kept], heights[kept]
+            model = np.exp(-0.5 * ((time[:, np.newaxis] - centres) / width) ** 2) @ heights
+            if np.max(np.abs(model - power)) < _CLOSE:
+                break
+        return cls(centres, heights / model.max(), width, template.fwhm_ns, peak)
+
+    @property
+    def terms(self) -> list[tuple[float, float, float]]:
+        """Delay [ns], height, and share of the area of each Gaussian."""
+        shares = self.heights / self.heights.sum()
+        return list(zip(self.delays.tolist(), self.heights.tolist(), shares.tolist(), strict=True))
+
+    @property
+    def least_sigma(self) -> float:
+        """Smallest standard deviation of its Gaussians in fits [ns]: a sum must not fall apart."""
+        return 0.1 * self.sigma if self.delays.size == 1 else 0.9 * self.sigma
+
+    def sigma_of(self, fwhm_ns: float) -> float:
+        """Return the standard deviation [ns] of the Gaussians of an echo of a full width at half maximum [ns]."""
+        return float(np.sqrt(max(self._extra(fwhm_ns, self.fwhm_ns) + self.sigma**2, self.least_sigma**2)))
+
+    def width_of(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the full width at half maximum [ns] for standard deviations of the Gaussians, and its derivative."""
+        square = self.fwhm_ns**2 + FWHM_PER_SIGMA**2 * (sigma**2 - self.sigma**2)
+        width = np.sqrt(np.maximum(square, (0.1 * self.fwhm_ns) ** 2))
+        return width, FWHM_PER_SIGMA**2 * sigma / width
+
+    def top_of(self, sigma: FloatArray) -> FloatArray:
+        """Return the height of the peak for standard deviations of the Gaussians, shape (n,)."""
+        if self.delays.size == 1:
+            return np.ones_like(sigma)
+        time = np.linspace(self.delays[0], self.delays[-1], max(8 * self.delays.size, 32))
+        z = (time[:, np.newaxis] - self.delays) / sigma[:, np.newaxis, np.newaxis]
+        return np.asarray((np.exp(-0.5 * z**2) @ self.heights).max(axis=1))
+
+    @staticmethod
+    def _extra(fwhm_ns: float, own: float) -> float:
+        """Return the variance [ns^2] by which an echo is wider than another one."""
+        return (fwhm_ns**2 - own**2) / FWHM_PER_SIGMA**2

@@ -1,0 +1,274 @@
+"""Receivers from TOML files: a chain for each channel, with its gain and filter."""
+
+from __future__ import annotations
+
+import importlib.resources
+import inspect
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.text_tables import read_time_samples
+from mitransient_lidar.core.toml_files import parse_toml
+from mitransient_lidar.core.validation import positive, shown
+from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
+from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+
+Setting = float | Literal["auto"]
+
+#: Detectors by their names in files.
+_DETECTORS: dict[str, Callable[..., Any]] = {
+    "photodiode": LinearDetector,
+    "avalanche_photodiode": LinearDetector.avalanche,
+    "photomultiplier": LinearDetector.photomultiplier,
+    "silicon_photomultiplier": SiliconPhotomultiplier,
+    "photon_counter": SinglePhotonDetector,
+}
+_STAGES: dict[str, Callable[..., Any]] = {"amplifier": Amplifier, "logarithm": LogAmplifier, "digitiser": Digitiser}
+_OF_CHANNEL = ("detector", *_STAGES, "gain", "optical_density")
+_OF_FILE = ("preset", *_OF_CHANNEL, "wavelength_nm", "pulse_repetition_khz", "source", "channels")
+#: Names of the samples of an impulse response.
+_RESPONSE = Column(
+    "impulse_response", ("response", "signal", "amplitude", "power", "v", "mv", "volt", "voltage", "counts")
+)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Receiver of one channel: its chain, factor of the gain, and optical density of a filter; see `presets`."""
+
+    chain: ReceiverChain
+    gain: Setting = 1.0
+    optical_density: Setting = 0.0
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """Receiver of all channels.
+
+    Attributes
+    ----------
+    default
+        The channel that counts where `channels` has no other one.
+    channels
+        Channels by the name of their pixel.
+    pulse_repetition_khz
+        Pulse repetition rate [kHz], or None.
+    name
+        Name of the preset, instrument, or file.
+
+    Raises
+    ------
+    UserError
+        If the channels differ in the response of the amplifier, in the logarithm or in the converter, which are those
+        of the record.
+    """
+
+    default: Channel
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+    pulse_repetition_khz: float | None = None
+    name: str = "custom"
+
+    def __post_init__(self) -> None:
+        for name, channel in self.channels.items():
+            for stage in ("logarithm", "digitiser", "wavelength_nm"):
+                if getattr(channel.chain, stage) != getattr(self.default.chain, stage):
+                    raise UserError(f"{stage} of channel {name!r} must be that of all channels")
+            if _shape(channel.chain.amplifier) != _shape(self.default.chain.amplifier):
+                raise UserError(f"amplifier of channel {name!r} must have the response of all channels")
+
+    def with_settings(self, gain: Setting | None, optical_density: Setting | None) -> Receiver:
+        """Return the receiver with another gain or filter in all channels; None keeps them."""
+        changed = {"gain": gain, "optical_density": optical_density}
+        given: dict[str, Any] = {key: value for key, value in changed.items() if value is not None}
+        # A gain that is chosen goes with a filter that is given, and the reverse.
+        for setting, other, usual in (("gain", "optical_density", 0.0), ("optical_density", "gain", 1.0)):
+            if given.get(setting) == "auto" and other not in given:
+                automatic = [one for one in (self.default, *self.channels.values()) if getattr(one, other) == "auto"]
+                given |= {other: usual} if automatic else {}
+        channels = {name: replace(one, **given) for name, one in self.channels.items()}
+        return replace(self, default=replace(self.default, **given), channels=channels)
+
+    def of(self, pixel: str) -> Channel:
+        """Return the channel of a pixel."""
+        return self.channels.get(pixel, self.default)
+
+
+def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
+    """Return what the response of an amplifier depends on."""
+    if amplifier is None:
+        return None
+    return amplifier.bandwidth_mhz, amplifier.response, amplifier.impulse_response
+
+
+def receiver(name: str | os.PathLike[str] | ReceiverChain | Receiver) -> Receiver:
+    """Return a receiver: a preset by name, that of an instrument by name, or one from a TOML file.
+
+    Raises
+    ------
+    UserError
+        If there is none of that name, or the file is invalid.
+    """
+    if isinstance(name, Receiver):
+        return name
+    if isinstance(name, ReceiverChain):
+        return Receiver(Channel(name))
+    if isinstance(name, str) and name in RECEIVERS:
+        return Receiver(Channel(RECEIVERS[name]), name=name)
+    if isinstance(name, str) and (own := instrument_receiver(name)) is not None:
+        return own
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise UserError(
+            f"receiver = {shown(str(name))} must be one of {', '.join(RECEIVERS)}, an instrument, or a .toml file"
+        )
+    return parse_receiver(read_text(path), str(path), path.parent)
+
+
+def instrument_receiver(instrument: str) -> Receiver | None:
+    """Return the receiver of an instrument by its name; None for an unknown one."""
+    folder = Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments"
+    path = folder / f"{instrument}.toml"
+    if Path(instrument).name != instrument or not path.is_file():
+        return None
+    return replace(parse_receiver(read_text(path), path.name, folder), name=instrument)
+
+
+def parse_receiver(text: str, name: str, folder: Path) -> Receiver:
+    """Return the receiver that the text of a TOML file describes.
+
+    Keys of the file: ``preset`` (a receiver of `presets.RECEIVERS` whose stages count where the file has no others),
+    ``wavelength_nm``, ``pulse_repetition_khz``, ``source``, ``gain`` and ``optical_density`` (numbers or "auto"), the
+    tables ``detector`` (with ``type``: photodiode, avalanche_photodiode, photomultiplier, silicon_photomultiplier or
+    photon_counter), ``amplifier`` (its ``impulse_response`` may name a file in `folder`), ``logarithm`` and
+    ``digitiser``, and ``channels.NAME`` with those among them that differ. Keys of tables are the parameters of
+    `detectors` and `electronics`.
+
+    Raises
+    ------
+    UserError
+        If a key is unknown, a parameter is out of range, or the stages do not fit together.
+    """
+    values = parse_toml(text, name)
+    _check_keys(name, values, _OF_FILE)
+    chain = None
+    if "preset" in values:
+        if values["preset"] not in RECEIVERS:
+            raise UserError(f"{name}: preset = {shown(values['preset'])} must be one of {', '.join(RECEIVERS)}")
+        chain = RECEIVERS[values["preset"]]
+    others: dict[str, Any] = {key: values[key] for key in ("wavelength_nm", "source") if key in values}
+    default = _channel(name, values, None if chain is None else Channel(chain), folder, others)
+    channels = {}
+    for channel, own in _table(name, values, "channels").items():
+        label = f"{name}: channels.{channel}"
+        if not isinstance(own, dict):
+            raise UserError(f"{label} = {shown(own)} must be a table")
+        _check_keys(label, own, _OF_CHANNEL)
+        channels[channel] = _channel(label, own, default, folder, {})
+    rate = values.get("pulse_repetition_khz")
+    rate = None if rate is None else positive("pulse_repetition_khz", rate)
+    return Receiver(default, channels, rate, name)
+
+
+def _channel(
+    name: str, values: Mapping[str, Any], base: Channel | None, folder: Path, others: Mapping[str, Any]
+) -> Channel:
+    """Return a channel from the tables of a file, with the stages of another one where they are missing."""
+    stages: dict[str, Any] = dict(others)
+    own = _table(name, values, "detector")
+    if own:
+        kind = own.pop("type", None)
+        if kind is None and base is not None:
+            stages["detector"] = _changed(f"{name}: detector", base.chain.detector, own)
+        elif kind not in _DETECTORS:
+            raise UserError(f"{name}: detector.type = {shown(kind)} must be one of {', '.join(_DETECTORS)}")
+        else:
+            stages["detector"] = _built(f"{name}: detector", _DETECTORS[kind], own)
+    elif base is None:
+        raise UserError(f"{name} has neither a preset nor a detector")
+    for stage, build in _STAGES.items():
+        own = _table(name, values, stage)
+        if not own:
+            continue
+        label = f"{name}: {stage}"
+        if "impulse_response" in own:
+            own["impulse_response"] = _impulse_response(folder, own["impulse_response"])
+            own.setdefault("bandwidth_mhz", None)
+        former = None if base is None else getattr(base.chain, stage)
+        stages[stage] = _built(label, build, own) if former is None else _changed(label, former, own)
+    try:
+        chain = ReceiverChain(**stages) if base is None else replace(base.chain, **stages)
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from None
+    settings = {}
+    for setting in ("gain", "optical_density"):
+        given = values.get(setting, (1.0, 0.0)[setting != "gain"] if base is None else getattr(base, setting))
+        if given != "auto" and (isinstance(given, bool) or not isinstance(given, int | float)):
+            raise UserError(f"{name}: {setting} = {shown(given)} must be a number or auto")
+        settings[setting] = given
+    return Channel(chain, settings["gain"], settings["optical_density"])
+
+
+def _impulse_response(folder: Path, given: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return times [ns] and values of a measured response from a file."""
+    if not isinstance(given, str):
+        raise UserError(f"impulse_response = {shown(given)} must be the name of a file")
+    times, values = read_time_samples(folder / given, _RESPONSE)
+    return tuple(times.tolist()), tuple(values.tolist())
+
+
+def _table(name: str, values: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return a copy of a table of a file, empty without it."""
+    given = values.get(key, {})
+    if not isinstance(given, dict):
+        raise UserError(f"{name}: {key} = {shown(given)} must be a table")
+    return dict(given)
+
+
+def _check_keys(name: str, values: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    """Refuse unknown keys."""
+    for key in values:
+        if key not in known:
+            raise UserError(f"{name}: {key} is not known; it must be one of {', '.join(known)}")
+
+
+def _built(name: str, build: Callable[..., Any], values: Mapping[str, Any]) -> Any:
+    """Return a stage from its parameters."""
+    parameters = inspect.signature(build).parameters
+    _check_keys(name, values, tuple(parameters))
+    missing = [key for key, one in parameters.items() if one.default is one.empty and key not in values]
+    if missing:
+        raise UserError(f"{name} lacks {', '.join(missing)}")
+    return _tried(name, lambda: build(**_checked(name, values)))
+
+
+def _changed(name: str, stage: Any, values: Mapping[str, Any]) -> Any:
+    """Return a stage with other parameters."""
+    assert is_dataclass(stage)
+    assert not isinstance(stage, type)
+    _check_keys(name, values, tuple(one.name for one in fields(stage)))
+    return _tried(name, lambda: replace(stage, **_checked(name, values)))
+
+
+def _checked(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters with lists as tuples; refuse tables."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            raise UserError(f"{name}.{key} must be a value, not a table")
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+
+
+def _tried(name: str, build: Callable[[], Any]) -> Any:
+    """Return what a function builds, with the place in the file in the message of an error."""
+    try:
+        return build()
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from None
+    except (TypeError, ValueError):
+        raise UserError(f"{name} has a parameter of another type than its number or text") from None

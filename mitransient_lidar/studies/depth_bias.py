@@ -1,0 +1,240 @@
+"""Errors of the depths that an instrument finds in its noisy records, from renders over known bottoms."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar._version import __version__
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, summarize_depths
+from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite_array, integer
+from mitransient_lidar.loading.instruments import read_instrument
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.studies.shot_series import render_shots
+
+#: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
+WATERS = ("IB", "1C", "5C")
+
+#: Relative standard error of renders, over a level sea and over waves.
+_ERRORS = (0.01, 0.03)
+
+#: Speed of the wind whose ripples a level sea has [m/s].
+_RIPPLES = 5.0
+
+#: Difference of the second angle [degree], and angle from which it is less.
+_FURTHER, _GRAZING = 5.0, 60.0
+
+#: Distance from the bottom within which its signal is the largest [m].
+_NEAR = 0.5
+
+_NUMBERS = {
+    "bias": ("m", "mean error of the depth below the local surface"),
+    "spread": ("m", "standard deviation of that error"),
+    "found": ("1", "share of shots with a depth"),
+    "noise_error": ("m", "median of the stated error by noise"),
+    "error": ("m", "median of the stated error"),
+    "z": ("1", "root mean square of error over stated error"),
+    "wrong": ("1", "share of shots with an error above 0.5 m and no flag"),
+    "corrected_bias": ("m", "bias after correction"),
+    "corrected_spread": ("m", "standard deviation after correction"),
+    "corrected_z": ("1", "root mean square of error over stated error after correction"),
+    "snr": ("1", "median over shots of the largest signal-to-noise ratio within 0.5 m of the bottom"),
+}
+
+
+def depth_bias(
+    instrument: str,
+    params: Mapping[str, Any] | None = None,
+    *,
+    scene: str = "table1",
+    angles_deg: Sequence[float] | None = None,
+    winds: Sequence[float] = (0.0, 3.0, 6.0),
+    waters: Sequence[str] = WATERS,
+    depths: Sequence[float] = (3.0, 6.0, 10.0),
+    estimators: Sequence[str] = ESTIMATORS,
+    receiver: str | None = None,
+    shots: int = 12,
+    records: int = 5,
+    seed: int = 1,
+    corrections: xr.Dataset | None = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Measure the errors of depths in an instrument's records, by angle, wind, water and depth.
+
+    Parameters
+    ----------
+    instrument
+        Name of the instrument.
+    params, scene
+        A scene with the parameters ``aim_x``, ``aim_y``, ``off_nadir_deg``, ``wind_speed``, ``spectrum``, ``jerlov``
+        and ``bottom_depth``, and further parameters.
+    angles_deg
+        Angles from nadir [degree], ascending; by default that of the instrument, and 5 degrees more,
+        or less near grazing.
+    winds
+        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
+    waters
+        Jerlov types, from clear to turbid.
+    depths
+        Depths of the bottom [m], ascending.
+    estimators
+        Estimators of `echo_table.extract`.
+    receiver
+        A receiver as of `receiver_files.receiver`; by default that of the instrument.
+    shots, records
+        Random places of a sea with waves, 2 to 10 000, and records with noise of each, 1 to 10 000; a level sea has as
+        many records in all.
+    seed
+        Seed of places, seas and noise, at least 0.
+    corrections
+        A former table, to correct the depths by.
+    progress
+        Called with a `passes.Progress` after every sea.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``off_nadir_deg``, ``wind_speed``, ``water``, ``depth``, ``estimator`` and ``pixel``: ``bias``, ``spread``,
+        ``found``, ``noise_error``, ``error``, ``z`` and ``wrong`` of `summarize_depths`; with `corrections` also
+        ``corrected_bias``, ``corrected_spread`` and ``corrected_z``. Without estimator: ``snr``; and over
+        ``off_nadir_deg``, ``wind_speed`` and ``water``, the ``attenuation`` [1/m] that is measured. The truth is the
+        depth of the bottom below the mean surface in the beam.
+
+    Raises
+    ------
+    UserError
+        If the instrument is unknown, or a number or parameter is out of range.
+    """
+    own = read_instrument(instrument)
+    usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
+    other = usual + (_FURTHER if usual < _GRAZING else -_FURTHER)
+    axes = {
+        "off_nadir_deg": finite_array("angles_deg", sorted((usual, other)) if angles_deg is None else angles_deg),
+        "wind_speed": finite_array("winds", winds),
+        "water": np.asarray(waters, dtype=str),
+        "depth": finite_array("depths", depths),
+    }
+    for name in ("off_nadir_deg", "wind_speed", "depth"):
+        if axes[name].size == 0 or np.any(np.diff(axes[name]) <= 0) or axes[name][0] < 0:
+            raise UserError(f"{name} = {axes[name].tolist()} must be numbers of at least 0 that ascend")
+    shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
+    seed = integer("seed", seed, 0, 2**31)
+    cells: dict[tuple[int, ...], dict[str, Any]] = {}
+    began, total = time.perf_counter(), math.prod(values.size for values in axes.values())
+    pixels: list[str] = []
+    for number, place in enumerate(np.ndindex(*(values.size for values in axes.values()))):
+        angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
+        given = {
+            **(params or {}),
+            "off_nadir_deg": float(angle),
+            "wind_speed": float(wind) or _RIPPLES,
+            "jerlov": str(water),
+            "bottom_depth": float(depth),
+            "surface_seed": seed + number,
+            **({} if wind else {"spectrum": "flat"}),
+        }
+        options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)]}
+        rendered = render_shots(
+            scene, given, instrument=instrument, target_error=_ERRORS[bool(wind)], seed=seed, first_seed=seed, **options
+        )
+        recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
+        cells[place] = _cell(recorded, estimators, corrections)
+        pixels = [str(name) for name in recorded["pixel"].values]
+        if progress is not None:
+            elapsed = time.perf_counter() - began
+            left = elapsed / (number + 1) * (total - number - 1)
+            progress(Progress(number + 1, total, "render", elapsed, left))
+    attributes = {
+        "title": f"Errors of the depths of {instrument}",
+        "source": f"mitransient-lidar {__version__}",
+        "instrument": instrument,
+        "receiver": receiver or instrument,
+        "scene": scene,
+        "parameters": json.dumps({name: str(value) for name, value in (params or {}).items()}),
+        "shots": shots,
+        "records": records,
+        "seed": seed,
+    }
+    return _labelled(axes, cells, pixels, list(estimators), attributes)
+
+
+def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[str]:
+    """Return the lines of a table of a result of `depth_bias`, in centimetres, of one estimator."""
+    corrected = "corrected_bias" in found
+    head = f"{'angle':>6}{'wind':>6} {'water':<6}{'depth':>6} {'channel':<10}{'SNR':>7}{'found':>7}"
+    head += f"{'bias':>8}{'spread':>8}"
+    lines = [head + f"{'error':>8}{'z':>6}{'wrong':>7}" + (f"{'bias':>10}{'spread':>8}{'z':>6}" if corrected else "")]
+    one = found.sel(estimator=estimator)
+    for place in np.ndindex(*(found.sizes[axis] for axis in AXES)):
+        at = one.isel(dict(zip(AXES, place, strict=True)))
+        label = f"{float(at['off_nadir_deg']):>6.1f}{float(at['wind_speed']):>6g} {at['water'].item():<6}"
+        for pixel in found["pixel"].values:
+            cell = at.sel(pixel=pixel)
+            number = {name: float(cell[name]) for name in cell.data_vars if cell[name].ndim == 0}
+            text = f"{label}{float(at['depth']):>6g} {pixel!s:<10}{number['snr']:>7.1f}{100 * number['found']:>5.0f} %"
+            text += "".join(f"{100 * number[name]:>8.1f}" for name in ("bias", "spread", "error"))
+            text += f"{number['z']:>6.2f}{100 * number['wrong']:>5.1f} %"
+            if corrected:
+                text += f"{100 * number['corrected_bias']:>10.1f}{100 * number['corrected_spread']:>8.1f}"
+                text += f"{number['corrected_z']:>6.2f}"
+            lines.append(text)
+    return lines
+
+
+def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:
+    """Return the numbers of one sea, over estimator and pixel, or pixel, or without dimensions."""
+    truth = (recorded["true_bottom_depth"] + recorded["true_surface_height"]).values
+    found = extract(recorded, list(estimators))
+    numbers: dict[str, Any] = dict(summarize_depths(found, truth))
+    if corrections is not None:
+        after = summarize_depths(correct_depths(found, corrections), truth)
+        numbers |= {f"corrected_{name}": after[name] for name in ("bias", "spread", "z")}
+    attenuation = found["attenuation"].values
+    numbers["attenuation"] = float(np.nanmedian(attenuation)) if np.isfinite(attenuation).any() else np.nan
+    depth = (recorded["time"] - recorded["surface_time"]) * recorded["depth_per_ns"]
+    near = np.abs(depth - float(np.mean(truth))) < _NEAR
+    largest = recorded["snr"].where(near).max("time")
+    numbers["snr"] = largest.median("shot").transpose("pixel").values
+    return numbers
+
+
+def _labelled(
+    axes: Mapping[str, Any],
+    cells: Mapping[tuple[int, ...], Mapping[str, Any]],
+    pixels: Sequence[str],
+    estimators: Sequence[str],
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Return the table of all seas."""
+    shape = tuple(values.size for values in axes.values())
+
+    def table(name: str) -> Any:
+        first = np.asarray(next(iter(cells.values()))[name])
+        values = np.full((*shape, *first.shape), np.nan)
+        for place, cell in cells.items():
+            values[place] = cell[name]
+        return values
+
+    data: dict[str, Any] = {}
+    for name, (unit, text) in _NUMBERS.items():
+        if name in next(iter(cells.values())):
+            dims = (*AXES, "pixel") if name == "snr" else (*AXES, "estimator", "pixel")
+            data[name] = (dims, table(name), {"units": unit, "long_name": text})
+    measured = np.nanmedian(np.where(np.isnan(table("attenuation")), np.inf, table("attenuation")), axis=-1)
+    described = {"units": "1/m", "long_name": "median attenuation of the column along the path"}
+    data["attenuation"] = (AXES[:3], np.where(np.isfinite(measured), measured, np.nan), described)
+    units = {"off_nadir_deg": "degree", "wind_speed": "m s-1", "depth": "m"}
+    coords: dict[str, Any] = {
+        name: (name, values, {"units": units[name]} if name in units else {}) for name, values in axes.items()
+    }
+    coords |= {"estimator": list(estimators), "pixel": list(pixels)}
+    return xr.Dataset(data, coords, dict(attributes))
