@@ -319,8 +319,10 @@ def encoding(recorded: xr.Dataset) -> dict[str, dict[str, Any]]:
         return {}
     bits, full_scale, low = (recorded.attrs[name] for name in names)
     digitiser = Digitiser(int(bits), float(full_scale), float(low))
-    kind = "uint8" if digitiser.bits <= 8 else "uint16" if digitiser.bits <= 16 else "uint32"
-    codes = {"dtype": kind, "scale_factor": digitiser.step_v, "add_offset": digitiser.low_v, "_FillValue": None}
+    # The highest number of the type, which no code has, is the one for missing values.
+    kind = np.dtype("uint16" if digitiser.bits < 16 else "uint32")
+    codes = {"dtype": kind, "scale_factor": digitiser.step_v, "add_offset": digitiser.low_v}
+    codes["_FillValue"] = int(np.iinfo(kind).max)
     return {"signal": codes}
 
 

@@ -25,7 +25,7 @@ from mitransient_lidar.studies.shot_series import render_shots
 WATERS = ("IB", "1C", "5C")
 
 #: Relative standard error of renders, over a level sea and over waves.
-_ERRORS = (0.01, 0.03)
+_ERRORS = (0.02, 0.06)
 
 #: Speed of the wind whose ripples a level sea has [m/s].
 _RIPPLES = 5.0

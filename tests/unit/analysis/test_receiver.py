@@ -8,12 +8,15 @@ import xarray as xr
 from significance import largest_z
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms
+from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms, encoding
+from mitransient_lidar.analysis.waveforms.records import open_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver
+from mitransient_lidar.results.netcdf import dump
 
 PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # J
 CHAIN = ReceiverChain(
@@ -281,3 +284,57 @@ def changed(value):
 def test_invalid_input(call, message):
     with pytest.raises(UserError, match=message):
         call()
+
+
+def two_channels(**of_blue):
+    own = Channel(CHAIN, 0.5)
+    return Receiver(own, {"blue": Channel(CHAIN, **of_blue)}, pulse_repetition_khz=10.0, name="two")
+
+
+def test_channels_have_their_own_gain_and_filter():
+    recorded = detect_waveforms(make(), two_channels(gain=1.0, optical_density=1.0), shots=3, seed=4)
+    assert recorded["pixel"].values.tolist() == ["red", "green", "blue", "black"]
+    assert recorded.attrs["gain"] == [0.5, 0.5, 1.0, 0.5]
+    assert recorded.attrs["optical_density"] == [0.0, 0.0, 1.0, 0.0]
+    assert recorded.attrs["receiver.channels.blue.amplifier.transimpedance_ohm"] == 1e4
+    assert recorded.attrs["receiver.channels.red.amplifier.transimpedance_ohm"] == 5e3
+    assert recorded.attrs["receiver.detector.gain"] == 50.0
+    assert (recorded.attrs["receiver"], recorded.attrs["pulse_repetition_khz"]) == ("two", 10.0)
+    whole = detect_waveforms(make(), CHAIN)
+    dark = whole["signal_mean"].min("time")
+    above = (recorded["signal_mean"] - dark).sum("time") / (whole["signal_mean"] - dark).sum("time")
+    np.testing.assert_allclose(above, [0.5, 0.5, 0.1, 0.5], rtol=0.02)
+    # The same light and noise as without channels, but for the gain.
+    assert "gain 0.5 to 1, optical density 0 to 1" in describe_recording(recorded)[0]
+
+
+def test_a_channel_that_is_named_has_an_automatic_gain_of_its_own():
+    strong = make().assign(waveform=make()["waveform"] * 300)
+    both = detect_waveforms(strong, Receiver(Channel(CHAIN, "auto")))
+    apart = detect_waveforms(strong, Receiver(Channel(CHAIN, "auto"), {"red": Channel(CHAIN, "auto")}))
+    assert not apart["saturated"].any()
+    assert apart.attrs["gain"][0] > 2 * both.attrs["gain"]
+    assert apart.attrs["gain"][1:] == [both.attrs["gain"]] * 3
+
+
+def test_the_receiver_of_the_instrument_is_the_default():
+    own = detect_waveforms(make(instrument="riegl_vq840g"))
+    assert own.attrs["receiver"] == "riegl_vq840g"
+    assert own.attrs["receiver.amplifier.bandwidth_mhz"] == 300
+    assert detect_waveforms(make()).attrs["receiver"] == "apd"
+    with pytest.raises(UserError, match="chain = 'eye' must be one of ideal"):
+        detect_waveforms(make(), "eye")
+
+
+def test_codes_in_a_file_are_volts_by_their_attributes(tmp_path):
+    recorded = detect_waveforms(make(), CHAIN, shots=5)
+    path = tmp_path / "codes.nc"
+    dump(recorded, path, encoding(recorded))
+    with xr.open_dataset(path, mask_and_scale=False) as raw:
+        codes = raw["signal"]
+        assert codes.dtype == np.uint16
+        assert codes.values.max() < 4096
+        volts = codes.values * codes.attrs["scale_factor"] + codes.attrs["add_offset"]
+    np.testing.assert_allclose(volts, recorded["signal"].values, atol=1e-6)
+    np.testing.assert_allclose(open_waveforms(path)["signal"].values, recorded["signal"].values, atol=1e-6)
+    assert encoding(detect_waveforms(make(), "ideal")) == {}

@@ -1,0 +1,199 @@
+"""Receivers from TOML files: channels, measured responses, and refusals."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from significance import largest_chi2, largest_z
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier
+from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import instrument_receiver, parse_receiver, receiver
+
+WHOLE = """
+wavelength_nm = 515
+pulse_repetition_khz = 35
+gain = "auto"
+[detector]
+type = "photomultiplier"
+quantum_efficiency = 0.2
+dynode_gains = [5, 4, 4]
+[amplifier]
+transimpedance_ohm = 500
+bandwidth_mhz = 250
+[digitiser]
+bits = 12
+full_scale_v = 2
+[channels.deep]
+optical_density = 0.5
+gain = 1
+[channels.deep.detector]
+type = "avalanche_photodiode"
+quantum_efficiency = 0.6
+gain = 100
+ionisation_ratio = 0.02
+"""
+
+
+def parse(text):
+    return parse_receiver(text, "own.toml", Path())
+
+
+def test_every_key_reaches_its_stage():
+    own = parse(WHOLE)
+    assert own.pulse_repetition_khz == 35
+    chain = own.of("shallow").chain
+    assert chain.detector == LinearDetector.photomultiplier(0.2, (5, 4, 4))
+    assert (chain.amplifier.transimpedance_ohm, chain.amplifier.bandwidth_mhz, chain.wavelength_nm) == (500, 250, 515)
+    assert (chain.digitiser.bits, chain.digitiser.full_scale_v) == (12, 2)
+    deep = own.of("deep")
+    assert deep.chain.detector == LinearDetector.avalanche(0.6, 100, 0.02)
+    assert deep.chain.amplifier == chain.amplifier
+    assert (own.of("shallow").gain, own.of("shallow").optical_density) == ("auto", 0.0)
+    assert (deep.gain, deep.optical_density) == (1, 0.5)
+
+
+def test_a_preset_keeps_what_a_file_leaves_out():
+    own = parse('preset = "apd"\n[amplifier]\nbandwidth_mhz = 100\n').default.chain
+    preset = RECEIVERS["apd"]
+    assert own.detector == preset.detector
+    assert own.digitiser == preset.digitiser
+    assert own.amplifier == Amplifier(10e3, noise_pa_per_rthz=3.0, bandwidth_mhz=100)
+
+
+def test_settings_replace_those_of_all_channels():
+    own = parse(WHOLE).with_settings(0.5, None)
+    assert (own.default.gain, own.of("deep").gain, own.of("deep").optical_density) == (0.5, 0.5, 0.5)
+    # One of both is chosen, not both.
+    other = parse(WHOLE).with_settings(None, "auto")
+    assert (other.default.gain, other.default.optical_density) == (1.0, "auto")
+
+
+def test_every_instrument_has_a_receiver_with_sources():
+    """Each number has a source or is marked as assumed, as in the file of the optics."""
+    for name in instrument_names():
+        own = instrument_receiver(name)
+        assert own is not None
+        assert own.name == name
+        assert set(own.channels) <= set(read_instrument(name).channels)
+    assert instrument_receiver("../table1") is None
+    assert isinstance(receiver("icesat2_atlas").default.chain.detector, SinglePhotonDetector)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gain = ", "not a TOML file"),
+        ('preset = "tube"', "preset = 'tube' must be one of"),
+        ("gain = 1", "neither a preset nor a detector"),
+        ('preset = "apd"\ncolour = 3', "colour is not known; it must be one of"),
+        ('preset = "apd"\n[amplifier]\nohms = 3', "amplifier: ohms is not known"),
+        ('preset = "apd"\n[detector]\ntype = "eye"', "detector.type = 'eye' must be one of"),
+        ('[detector]\ntype = "photodiode"', "detector lacks quantum_efficiency"),
+        ('preset = "apd"\n[amplifier]\nbandwidth_mhz = -1', "amplifier: bandwidth_mhz = -1"),
+        ('preset = "apd"\n[amplifier]\nbandwidth_mhz = "wide"', "amplifier"),
+        ('preset = "apd"\ngain = true', "gain = True must be a number or auto"),
+        ('preset = "apd"\n[channels]\ndeep = 3', "channels.deep = 3 must be a table"),
+        ('preset = "apd"\n[channels.deep]\npreset = "pmt"', "channels.deep: preset is not known"),
+        ('preset = "apd"\n[channels.deep.digitiser]\nbits = 8', "digitiser of channel 'deep' must be that of all"),
+        (
+            'preset = "apd"\n[channels.deep.amplifier]\nbandwidth_mhz = 8',
+            "amplifier of channel 'deep' must have the resp",
+        ),
+        ('preset = "spad"\n[amplifier]\ntransimpedance_ohm = 8', "amplifier must be None behind"),
+        ('preset = "apd"\npulse_repetition_khz = 0', "pulse_repetition_khz = 0"),
+        ('preset = "apd"\namplifier = 3', "amplifier = 3 must be a table"),
+        ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
+        ('preset = "apd"\n[amplifier.limit_v]\nhigh = 3', "limit_v must be a value, not a table"),
+    ],
+)
+def test_invalid_files_are_refused_in_one_sentence(text, message):
+    with pytest.raises(UserError, match=message.replace("(", r"\(")) as error:
+        parse(text)
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(UserError, match="receiver = 'tube' must be one of ideal"):
+        receiver("tube")
+    with pytest.raises(UserError, match="own"):
+        receiver("own.toml")
+
+
+def write_response(folder, times, values):
+    rows = "\n".join(f"{t},{v}" for t, v in zip(times, values, strict=True))
+    (folder / "response.csv").write_text(f"time_ns,response\n{rows}\n")
+
+
+@pytest.mark.parametrize(
+    ("times", "values", "message"),
+    [
+        (np.arange(5.0) + 1, [0, 1, 2, 1, 0], "must hold 0, the arrival of the light"),
+        (np.arange(5.0), [0, 1, 2, 1, 1], "where it must be 0 within 2 %"),
+        (np.arange(5.0), [0, -1, -2, -1, 0], "must have a positive area"),
+    ],
+)
+def test_responses_without_zero_are_refused(tmp_path, times, values, message):
+    write_response(tmp_path, times, values)
+    with pytest.raises(UserError, match=message):
+        parse_receiver('preset = "apd"\n[amplifier]\nimpulse_response = "response.csv"', "own.toml", tmp_path)
+
+
+def test_a_measured_single_pole_is_the_single_pole(tmp_path):
+    """Mean, variance and correlation of samples are those of the closed form with the same time constant."""
+    bandwidth = 100.0
+    tau = 1e3 / (2 * math.pi * bandwidth)
+    times = np.concatenate([[-1e-3], np.linspace(0, 12 * tau, 4000)])
+    write_response(tmp_path, times, np.where(times >= 0, np.exp(-times / tau), 0))
+    text = 'preset = "apd"\n[amplifier]\nimpulse_response = "response.csv"'
+    own = parse_receiver(text, "own.toml", tmp_path).default.chain
+    pole = parse(f'preset = "apd"\n[amplifier]\nbandwidth_mhz = {bandwidth}').default.chain
+    own, pole = (ReceiverChain(one.detector, one.amplifier) for one in (own, pole))
+    power = np.zeros(60)
+    power[20:23] = 1e-7
+    for first, second in zip(own.expected(power, 1.0)[:2], pole.expected(power, 1.0)[:2], strict=True):
+        np.testing.assert_allclose(first, second, rtol=0.01, atol=0.002 * second.max())
+    noise, weights = own.amplifier.noise(1.0)
+    expected, _ = pole.amplifier.noise(1.0)
+    assert noise == pytest.approx(expected, rel=0.005)
+    correlation = np.correlate(weights, weights, "full")[weights.size - 1 :]
+    np.testing.assert_allclose(correlation[:4], np.exp(-np.arange(4) / tau), atol=0.01)
+
+
+def test_samples_behind_a_measured_response_have_the_stated_moments(tmp_path):
+    """A response with an undershoot, whose noise is anticorrelated."""
+    times = np.linspace(-1, 12, 200)
+    write_response(
+        tmp_path, times, np.exp(-0.5 * ((times - 2) / 0.7) ** 2) - 0.2 * np.exp(-0.5 * ((times - 5) / 1) ** 2)
+    )
+    text = 'preset = "photodiode"\n[amplifier]\nimpulse_response = "response.csv"'
+    chain = parse_receiver(text, "own.toml", tmp_path).default.chain
+    chain = ReceiverChain(chain.detector, chain.amplifier)
+    power = np.zeros(40)
+    power[10:15] = 3e-7
+    count = 4000
+    drawn = chain.apply(power, 1.0, count, 3).signal.astype(float)
+    expected = chain.expected(power, 1.0)
+    z = (drawn.mean(axis=0) - expected.mean) / np.sqrt(expected.variance / count)
+    assert np.abs(z).max() < largest_z(40)
+    ratio = drawn.var(axis=0, ddof=1) / expected.variance
+    assert ratio.max() < 1 + 6 * np.sqrt(2 / count)
+    assert ratio.min() > 1 - 6 * np.sqrt(2 / count)
+    # The mean is the light after the response, negative in the undershoot.
+    assert expected.mean[16:22].min() < 0
+    assert largest_chi2(40) > 0
+
+
+def test_single_events_exceed_the_stated_height_in_one_of_a_thousand_records():
+    """Dark counts alone, without the noise of the amplifier; the closed form is for one event in a bin."""
+    detector = LinearDetector.avalanche(0.6, 150.0, 0.02, dark_current_na=2e-3)
+    chain = ReceiverChain(detector, Amplifier(10e3, bandwidth_mhz=200.0))
+    records, bins, width = 30_000, 160, 0.2
+    height = float(chain.event_height(np.zeros(bins), width))
+    highest = chain.apply(np.zeros(bins), width, records, 5).signal.max(axis=-1)
+    # Two events in a response are higher; those between two samples, and before the record, lower.
+    assert 0.2e-3 < np.mean(highest > height) < 2e-3
