@@ -24,6 +24,7 @@ AXES = ("off_nadir_deg", "wind_speed", "water", "depth")
 
 _TABLE = ("bias", "spread", "found", "attenuation")
 _LEAST_ERROR = 0.01  # of a corrected depth [m]
+_NEAR = 2.0  # largest error of a depth that counts [m]
 
 
 def read_corrections(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -154,7 +155,7 @@ def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, Float
     -------
     dict
         ``found``, the share of shots with a depth; ``bias`` and ``spread``, median error and its standard deviation,
-        of depths within 1 m; ``noise_error`` and ``error``, the medians of the stated error by noise, and of all;
+        of depths within 2 m; ``noise_error`` and ``error``, the medians of the stated error by noise, and of all;
         ``z``, the root mean square of error over stated error; ``wrong``, the share of shots that err by more than
         0.5 m without a flag.
     """
@@ -164,7 +165,7 @@ def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, Float
     usual = np.isfinite(depth) & has_echo(flags)
     error = depth - np.asarray(truth, dtype=np.float64)[:, np.newaxis, np.newaxis]
     stated = np.hypot(noise, method)
-    near = usual & (np.abs(error) < 1)
+    near = usual & (np.abs(error) < _NEAR)
     masked, known = np.where(near, error, np.nan), np.where(near, stated, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         empty = ~near.any(axis=0)

@@ -152,6 +152,11 @@ class Waveforms:
         echo_shape, focusing = EchoShape.of(template), Focusing.from_attributes(dataset.attrs)
         half_view = 0.5 * float(dataset.attrs.get("field_of_view_mrad", 0.0))
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
+        # Crests are earlier than the mean sea level.
+        heights = np.atleast_1d(dataset.attrs.get("surface_heights_m", 0.0))
+        of_crest = quiet_until - float(heights[-1]) / (0.5e-9 * C0 * math.cos(geometry.off_nadir))
+        if np.count_nonzero(time < of_crest) >= _FEWEST_QUIET:
+            quiet_until = of_crest
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
         quiet = time < quiet_until
         baseline = np.zeros(pixels)
