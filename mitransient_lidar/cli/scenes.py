@@ -45,7 +45,8 @@ def instruments(
 ) -> None:
     """List the instruments, or print the parameters of one with their sources.
 
-    Parameters that are not published are assumed, and listed as such. Use with render SCENE --instrument NAME.
+    Parameters that are not published are assumed, and listed as such; those of the receiver follow, as the TOML file
+    that record takes. Use with render SCENE --instrument NAME.
     """
     from mitransient_lidar.loading import instruments as shipped
 
@@ -67,6 +68,7 @@ def instruments(
     widths = [max(len(getattr(parameter, field)) for parameter in parameters) for field in ("name", "value")]
     for parameter in parameters:
         typer.echo(f"{parameter.name:{widths[0]}}  {parameter.value:>{widths[1]}}  {parameter.source}")
+    typer.echo(f"\n{shipped.receiver_text(name)}", nl=False)
 
 
 def info(

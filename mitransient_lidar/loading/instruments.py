@@ -88,6 +88,11 @@ def instrument_text(name: str) -> str:
     return text_of(document.root)
 
 
+def receiver_text(name: str) -> str:
+    """Return the TOML file of an instrument's receiver; raise UserError if there is no such instrument."""
+    return read_text(_path(name).with_suffix(".toml"))
+
+
 def mount(name: str, scene: SceneDocument) -> SceneDocument:
     """Replace laser and receiver of a scene by those of an instrument.
 

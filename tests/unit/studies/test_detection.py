@@ -337,7 +337,7 @@ def test_echo_outside_the_record_is_reported(monkeypatch):
         (("fig13_2x2", "-o", "a.txt"), "must end in .png"),
         (
             ("fig13_2x2", "-q", "--receiver", "eye"),
-            "receiver = 'eye' must be a ReceiverChain or one of ideal, photodiode",
+            "receiver = 'eye' must be one of ideal, photodiode",
         ),
     ],
 )

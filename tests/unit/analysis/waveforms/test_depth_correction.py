@@ -1,0 +1,141 @@
+"""Corrections of depths: interpolation, what they change, and refusals."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitransient_lidar.analysis.waveforms.depth_correction import (
+    AXES,
+    correct_depths,
+    corrections_for,
+    read_corrections,
+    summarize_depths,
+)
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
+from mitransient_lidar.core.errors import UserError
+
+ECHO = ["surface", "column", "target", "bottom"]
+
+
+def table(instrument="riegl_vq840g"):
+    """A bias that is linear in angle, wind, attenuation and depth, so that interpolation is exact."""
+    axes = {"off_nadir_deg": [10.0, 20.0], "wind_speed": [0.0, 6.0], "water": ["IB", "5C"], "depth": [2.0, 6.0, 10.0]}
+    names = {"estimator": ["gaussian", "peak"], "pixel": ["red", "green"]}
+    grid = xr.Dataset(coords={**axes, **names})
+    attenuation = xr.DataArray([0.1, 0.5], dims="water", coords={"water": axes["water"]})
+    estimator = xr.DataArray([1.0, 2.0], dims="estimator", coords={"estimator": names["estimator"]})
+    pixel = xr.DataArray([0.0, 1.0], dims="pixel", coords={"pixel": names["pixel"]})
+    angle, wind, depth = grid["off_nadir_deg"], grid["wind_speed"], grid["depth"]
+    bias = estimator * (0.01 * angle + 0.02 * wind + 0.3 * attenuation + 0.005 * depth) + pixel
+    spread = xr.zeros_like(bias) + 0.01 * depth
+    level = attenuation + xr.zeros_like(angle) + xr.zeros_like(wind)
+    data = {"bias": bias, "spread": spread, "found": xr.ones_like(bias), "attenuation": level}
+    made = xr.Dataset(data).transpose(..., "estimator", "pixel")
+    return made.transpose(*AXES, "estimator", "pixel").assign_attrs(instrument=instrument)
+
+
+def echoes(depth, attenuation=0.3, pixels=("red", "green"), several=True, **attributes):
+    """Echoes of shots over pixels, with one depth of the bottom for all pixels of a shot."""
+    depth = np.asarray(depth, dtype=float)
+    shape = (depth.size, len(pixels), 2 if several else 1, 4)
+    values = np.full(shape, np.nan)
+    values[..., 0], values[..., 3] = 0.0, depth[:, None, None]
+    if not several:
+        values = values[:, :, 0]
+    dims = ("shot", "pixel", *(["estimator"] if several else []), "echo")
+    zeros = np.zeros(values.shape)
+    data = {
+        "depth_m": (dims, values),
+        "depth_m_stderr": (dims, zeros + 0.02),
+        "depth_m_method_error": (dims, zeros + 0.05),
+        "flags": (dims, zeros.astype(int)),
+        "attenuation": (("shot", "pixel"), np.full(shape[:2], attenuation)),
+    }
+    names = ["gaussian", "peak"] if several else ["gaussian"]
+    coords = {"echo": ECHO, "pixel": list(pixels), **({"estimator": names} if several else {})}
+    usual = {"instrument": "riegl_vq840g", "off_nadir_deg": 15.0, "scene.wind_speed": "3", "estimators": names}
+    usual["surface_heights_m"] = [-0.5, 0.5]
+    return xr.Dataset(data, coords, {**usual, **attributes})
+
+
+def test_the_bias_of_the_place_between_nodes_is_subtracted():
+    corrected = correct_depths(echoes([4.0, 8.0, np.nan]), table())
+    bottom = corrected.sel(echo="bottom")
+    for e, factor in enumerate((1.0, 2.0)):
+        for p in (0, 1):
+            bias = factor * (0.15 + 0.06 + 0.09 + 0.005 * np.array([4.0, 8.0])) + p
+            np.testing.assert_allclose(bottom["depth_m"].values[:2, p, e], np.array([4.0, 8.0]) - bias)
+            np.testing.assert_allclose(bottom["depth_correction_m"].values[:2, p, e], bias)
+            np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], [0.04, 0.08])
+    assert np.isnan(bottom["depth_m"].values[2]).all()
+    surface = corrected.sel(echo="surface")
+    np.testing.assert_allclose(surface["depth_m"], 0)
+    np.testing.assert_allclose(surface["depth_m_method_error"], 0.05)
+    assert corrected.attrs["depth_corrections"] == "riegl_vq840g"
+
+
+def test_one_estimator_has_no_dimension_and_ends_hold_beyond():
+    corrected = correct_depths(echoes([40.0], 2.0, several=False, off_nadir_deg=35.0), table(), wind_speed=20.0)
+    np.testing.assert_allclose(corrected["depth_m"].values[0, 0, 3], 40 - (0.2 + 0.12 + 0.15 + 0.05))
+    level = correct_depths(echoes([6.0], several=False, surface_heights_m=[0.0, 0.0]), table())
+    np.testing.assert_allclose(level["depth_m"].values[0, 0, 3], 6 - (0.15 + 0.09 + 0.03))
+
+
+def test_unknown_cells_take_the_nearest_known_one():
+    made = table()
+    made["bias"][{"depth": 2}] = np.nan
+    corrected = correct_depths(echoes([10.0], several=False), made)
+    np.testing.assert_allclose(corrected["depth_m"].values[0, 0, 3], 10 - (0.15 + 0.06 + 0.09 + 0.03))
+    made["bias"][:] = np.nan
+    np.testing.assert_allclose(correct_depths(echoes([10.0]), made).sel(echo="bottom")["depth_m"], 10)
+
+
+def test_summary_of_depths():
+    """Three of four found, one of them 0.7 m off; flagged errors are not wrong ones."""
+    found = echoes([5.1, 4.9, 5.7, np.nan])
+    found["flags"][{"shot": 3, "echo": 3}] = int(EchoFlag.NO_ECHO)
+    numbers = summarize_depths(found, np.full(4, 5.0))
+    assert numbers["found"].shape == (2, 2)
+    np.testing.assert_allclose(numbers["found"], 0.75)
+    np.testing.assert_allclose(numbers["bias"], 0.7 / 3)
+    np.testing.assert_allclose(numbers["spread"], np.std([0.1, -0.1, 0.7]))
+    np.testing.assert_allclose(numbers["wrong"], 0.25)
+    np.testing.assert_allclose(numbers["error"], np.hypot(0.02, 0.05))
+    np.testing.assert_allclose(numbers["z"], np.sqrt(np.mean(np.square([0.1, 0.1, 0.7]))) / np.hypot(0.02, 0.05))
+    found["flags"][{"shot": 2, "echo": 3}] = int(EchoFlag.FEW_EVENTS)
+    np.testing.assert_allclose(summarize_depths(found, np.full(4, 5.0))["wrong"], 0)
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        (
+            echoes([5.0], instrument="teledyne_czmil"),
+            "of the instrument riegl_vq840g, but the result has instrument tele",
+        ),
+        (echoes([5.0], instrument=""), "but the result has no instrument"),
+        (echoes([5.0], pixels=("red", "blue")), "lack the pixel 'blue'"),
+        (echoes([5.0], **{"scene.wind_speed": "strong"}), "wind speed of the result is not known"),
+        (echoes([5.0]).assign_coords(estimator=["gaussian", "centroid"]), "lack the estimator 'centroid'"),
+    ],
+)
+def test_tables_of_something_else_are_refused(found, message):
+    with pytest.raises(UserError, match=message):
+        correct_depths(found, table())
+
+
+def test_files_without_corrections_are_refused(tmp_path):
+    with pytest.raises(UserError, match="needs a result of an instrument"):
+        corrections_for(echoes([5.0], instrument=""), "auto")
+    with pytest.raises(UserError, match="no shipped corrections of the instrument mine"):
+        corrections_for(echoes([5.0], instrument="mine"), "auto")
+    echoes([5.0]).to_netcdf(tmp_path / "echoes.nc")
+    with pytest.raises(UserError, match="holds no corrections of depths"):
+        read_corrections(tmp_path / "echoes.nc")
+    with pytest.raises(UserError, match="No such file"):
+        read_corrections(tmp_path / "other.nc")
+    table().isel(depth=[2, 0, 1]).to_netcdf(tmp_path / "mixed.nc")
+    with pytest.raises(UserError, match="depth that does not ascend"):
+        read_corrections(tmp_path / "mixed.nc")
+    table().to_netcdf(tmp_path / "good.nc")
+    xr.testing.assert_allclose(read_corrections(tmp_path / "good.nc")["bias"], table()["bias"])
