@@ -54,9 +54,12 @@ def gates(
     from mitransient_lidar.analysis.gates import cut as gating
     from mitransient_lidar.results import gate_stack
 
+    given = {"--width-ns": width_ns, "--step-ns": step_ns, "--count": None if count == 1 else count}
     with reporting(quiet):
         result = _open(stack)
         if "gate_energy" in result and start_ns is None and start_depth is None:
+            if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
+                raise UserError(f"{named[0]} needs --start-ns or --start-depth, where the first gate begins.")
             files.write(result, result, quiet)
             return
         train = gate_stack.train_from_options(

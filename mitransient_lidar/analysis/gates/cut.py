@@ -64,7 +64,9 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
             quadrature = np.sqrt(error[..., inside] ** 2 @ weights**2)
             stderr[..., gate] = np.minimum(quadrature * _inflation_at(inflation, equivalent), bound)
     joules = train.pulses * time.bin_width_ns * 1e-9
-    return build_gates(joules * energy, joules * stderr, train, coords=dataset.coords, attributes=dataset.attrs)
+    # Gates of the result itself are replaced.
+    coords = {name: one for name, one in dataset.coords.items() if "gate" not in one.dims}
+    return build_gates(joules * energy, joules * stderr, train, coords=coords, attributes=dataset.attrs)
 
 
 def _inflation(attributes: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
