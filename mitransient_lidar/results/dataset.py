@@ -299,8 +299,10 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
             netcdf.write_netcdf(dataset, temporary, large)
 
 
-def open(path: str | os.PathLike[str]) -> xr.Dataset:
+def open(path: str | os.PathLike[str], *, signals: bool = False) -> xr.Dataset:
     """Read a result from an EXR or NetCDF file of `save` into memory; values from an EXR file have 32 bits.
+
+    With `signals`, the signals of a receiver (`analysis.receiver.detect_waveforms`) are read, too.
 
     Raises
     ------
@@ -310,6 +312,9 @@ def open(path: str | os.PathLike[str]) -> xr.Dataset:
     path = Path(path)
     dataset = _read_exr(path) if input_format(path) == "exr" else netcdf.read_netcdf(path)
     if "signal" in dataset and "waveform" not in dataset:
+        if signals:
+            check_axes(path, dataset, "signal")
+            return dataset
         raise UserError(f"{path} holds signals of a receiver; give the result that they were recorded from.")
     if any(name not in dataset for name in _VARIABLES):
         raise UserError(f"{path} is a NetCDF file, but not a result of mitransient-lidar.")

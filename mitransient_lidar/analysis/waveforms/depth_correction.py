@@ -84,7 +84,7 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
         The echoes with ``depth_m`` less the bias, ``depth_correction_m`` (what was subtracted), and the spread that is
         left in renders as ``depth_m_method_error``. Errors are interpolated linearly in the angle from nadir, the wind,
         the attenuation of the column (the median over the waveforms), and the depth; outside the table they are those
-        of its ends.
+        of its ends. A bias counts with the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
     Raises
     ------
@@ -103,6 +103,10 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
             raise UserError(f"the corrections lack the {name} {missing[0]!r}")
     several = "estimator" in found.dims
     names = found["estimator"].values if several else found.attrs["estimators"]
+    # Biases that are small beside their own error, over the places of a sea, count little.
+    noise = (table["spread"] ** 2 / float(table.attrs.get("shots", np.inf))).fillna(0)
+    certain = table["bias"] ** 2 / (table["bias"] ** 2 + noise).where(lambda square: square > 0, 1.0)
+    table = table.assign(bias=table["bias"] * certain)
     own_table = table.sel(pixel=found["pixel"].values, estimator=list(names))
     wind = _wind(found) if wind_speed is None else non_negative("wind_speed", wind_speed)
     place = {"off_nadir_deg": required_number(found.attrs, "off_nadir_deg"), "wind_speed": wind}

@@ -81,6 +81,13 @@ def test_one_estimator_has_no_dimension_and_ends_hold_beyond():
     np.testing.assert_allclose(level["depth_m"].values[0, 0, 3], 6 - (0.15 + 0.09 + 0.03))
 
 
+def test_a_bias_within_its_error_counts_little():
+    made = table().assign_attrs(shots=4)
+    made["bias"][:], made["spread"][:] = 0.02, 0.08
+    corrected = correct_depths(echoes([6.0]), made).sel(echo="bottom")
+    np.testing.assert_allclose(corrected["depth_correction_m"], 0.02 * 0.2)
+
+
 def test_unknown_cells_take_the_nearest_known_one():
     made = table()
     made["bias"][{"depth": 2}] = np.nan
