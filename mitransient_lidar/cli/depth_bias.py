@@ -27,7 +27,10 @@ def depth_bias(
     shots: Annotated[int, typer.Option(help="Random places of a sea with waves.")] = 12,
     records: Annotated[int, typer.Option(help="Records with noise of each place.")] = 5,
     corrections: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Table of another seed, to also correct the depths by.")
+        str | None,
+        typer.Option(
+            metavar="FILE", help="Table of another seed to also correct the depths by; auto for the shipped one."
+        ),
     ] = None,
     seed: Seed = 1,
     output: Annotated[
@@ -50,10 +53,10 @@ def depth_bias(
     lists: dict[str, Any] = {"winds": numbers("--winds", winds), "depths": numbers("--depths", depths)}
     if angles is not None:
         lists["angles_deg"] = numbers("--angles", angles)
-    from mitransient_lidar.analysis.waveforms.depth_correction import read_corrections
+    from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
     from mitransient_lidar.studies import depth_bias as study
 
-    former = None if corrections is None else read_corrections(corrections)
+    former = None if corrections is None else corrections_for(instrument, corrections)
     with reporting(quiet) as progress:
         found = study.depth_bias(
             instrument,

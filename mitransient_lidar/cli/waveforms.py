@@ -69,7 +69,8 @@ def waveforms(
     from mitransient_lidar.analysis.waveforms import echo_table as measuring
 
     dataset = records.open_waveforms(file)
-    corrections = None if correct is None else depth_correction.corrections_for(dataset, correct)
+    instrument = str(dataset.attrs.get("instrument", ""))
+    corrections = None if correct is None else depth_correction.corrections_for(instrument, correct)
     found = measuring.extract(
         dataset,
         estimator or ["gaussian"],

@@ -24,8 +24,11 @@ from mitransient_lidar.studies.shot_series import render_shots
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")
 
+#: Wavelength of their tables [nm].
+_WAVELENGTH = 532.0
+
 #: Relative standard error of renders, over a level sea and over waves.
-_ERRORS = (0.02, 0.06)
+_ERRORS = (0.02, 0.1)
 
 #: Speed of the wind whose ripples a level sea has [m/s].
 _RIPPLES = 5.0
@@ -83,7 +86,7 @@ def depth_bias(
     winds
         Wind speeds [m/s], ascending, at least 0; 0 for a level sea with the ripples of 5 m/s.
     waters
-        Jerlov types, from clear to turbid.
+        Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
         Depths of the bottom [m], ascending.
     estimators
@@ -134,6 +137,7 @@ def depth_bias(
     for number, place in enumerate(np.ndindex(*(values.size for values in axes.values()))):
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
         given = {
+            "wavelength_nm": _WAVELENGTH,
             **(params or {}),
             "off_nadir_deg": float(angle),
             "wind_speed": float(wind) or _RIPPLES,

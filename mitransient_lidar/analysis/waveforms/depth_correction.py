@@ -47,8 +47,8 @@ def read_corrections(path: str | os.PathLike[str]) -> xr.Dataset:
     return table.transpose(*AXES, "estimator", "pixel")
 
 
-def corrections_for(dataset: xr.Dataset, given: str | os.PathLike[str]) -> xr.Dataset:
-    """Return the table of a file, or with ``auto`` the shipped one of the instrument of a result.
+def corrections_for(instrument: str, given: str | os.PathLike[str]) -> xr.Dataset:
+    """Return the table of a file, or with ``auto`` the shipped one of an instrument.
 
     Raises
     ------
@@ -57,7 +57,6 @@ def corrections_for(dataset: xr.Dataset, given: str | os.PathLike[str]) -> xr.Da
     """
     if given != "auto":
         return read_corrections(given)
-    instrument = str(dataset.attrs.get("instrument", ""))
     if not instrument:
         raise UserError("corrections = 'auto' needs a result of an instrument: give the file of a table of depth-bias")
     path = Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments" / f"{instrument}_depths.nc"

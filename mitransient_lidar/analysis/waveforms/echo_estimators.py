@@ -126,20 +126,20 @@ def summit(window: Window, flags: IntArray) -> Echoes:
     few = np.count_nonzero(usable, axis=1) < 3
     weights[few] = 1.0  # regular, but not used
     for _ in range(3):
-        normal = np.einsum("ib,nb,jb->nij", columns, weights, columns, optimize=True)
+        normal = _regular(np.einsum("ib,nb,jb->nij", columns, weights, columns, optimize=True))
         right = np.einsum("ib,nb->ni", columns, weights * log, optimize=True)
         c = np.linalg.solve(normal, right[..., np.newaxis])[..., 0]
         model = np.exp(np.clip(c @ columns, -300, 300))
         weights = np.where(usable, (model / window.noise) ** 2, 0.0)
         weights[few] = 1.0
-    covariance = np.linalg.inv(np.einsum("ib,nb,jb->nij", columns, weights, columns, optimize=True))
+    covariance = np.linalg.inv(_regular(np.einsum("ib,nb,jb->nij", columns, weights, columns, optimize=True)))
 
     bad = few | (c[:, 2] >= 0)
     curvature = np.where(bad, -1.0, c[:, 2])
     peak = -0.5 * c[:, 1] / curvature
     bad |= np.abs(peak) > 1
     peak = np.where(bad, 0.0, peak)
-    height = np.exp(np.clip(c[:, 0] - 0.25 * c[:, 1] ** 2 / curvature, -700, 700))
+    height = np.exp(np.where(bad, 0.0, np.clip(c[:, 0] - 0.25 * c[:, 1] ** 2 / curvature, -700, 700)))
     width = scale * np.sqrt(-4 * np.log(2) / curvature)
     zero = np.zeros_like(peak)
     to_time = scale * np.stack([zero, -0.5 / curvature, 0.5 * c[:, 1] / curvature**2], axis=1)
@@ -163,6 +163,12 @@ def summit(window: Window, flags: IntArray) -> Echoes:
         flags,
     )
     return found.known_only(exists & ~bad)
+
+
+def _regular(normal: FloatArray) -> FloatArray:
+    """Return normal equations, shape (n, 3, 3), that can be solved, even where a fit has lost its samples."""
+    trace = np.einsum("nii->n", normal)[:, np.newaxis, np.newaxis]
+    return np.asarray(normal + np.where(trace > 0, 1e-13 * trace, 1.0) * np.eye(3))
 
 
 def _top(window: Window) -> BoolArray:

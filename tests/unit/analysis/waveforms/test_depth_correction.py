@@ -133,9 +133,9 @@ def test_tables_of_something_else_are_refused(found, message):
 
 def test_files_without_corrections_are_refused(tmp_path):
     with pytest.raises(UserError, match="needs a result of an instrument"):
-        corrections_for(echoes([5.0], instrument=""), "auto")
+        corrections_for("", "auto")
     with pytest.raises(UserError, match="no shipped corrections of the instrument mine"):
-        corrections_for(echoes([5.0], instrument="mine"), "auto")
+        corrections_for("mine", "auto")
     echoes([5.0]).to_netcdf(tmp_path / "echoes.nc")
     with pytest.raises(UserError, match="holds no corrections of depths"):
         read_corrections(tmp_path / "echoes.nc")
