@@ -383,7 +383,7 @@ SINGULAR = mi.ScalarTransform4f().scale(0)
         (quietly(passes=np.array([3, 4])), "passes = array([3, 4]) must be an integer"),
         (quietly(seed="x"), "seed = 'x' must be an integer"),
         (quietly(seed=1.5), "seed = 1.5 must be an integer"),
-        (quietly(seed=None), "seed = None must be an integer"),
+        (quietly(seed="a"), "seed = 'a' must be an integer"),
         (quietly(seed=2**64), "seed = 18446744073709551616 must lie between"),
         (quietly(target_error="a"), "target_error = 'a' must be a number"),
         (quietly(target_error=[0.1]), "target_error = [0.1] must be a number"),
