@@ -129,8 +129,13 @@ def extract(
     `geometry.LinesOfSight`. Time, depth and energy of the column are those of the samples between the surface echo and
     the next one, its amplitude is extrapolated to the surface, and its width is the time of decay to one half.
 
+    An ideal echo has the shape of the pulse after bins, response and, of a signal, the receiver (``impulse_response``).
+    ``gaussian`` fits sums of Gaussians of this shape; the column behind the surface has the mean focusing of light by
+    waves that the result states (``wave_focusing``). Later than the lowest point of the sea there is no surface echo.
+
     Surface echoes are held against beam and geometry; see `surface_times.surface_times`. A pixel without direct light
-    has the flag ``no_surface_light``, and ``surface_time_ns`` from the other pixels of its shot. The estimator
+    has the flag ``no_surface_light``, ``surface_time_ns`` from the other pixels of its shot, and echoes with the flag
+    ``scattered_light``. Echoes no higher than single events of the detector have the flag ``few_events``. The estimator
     ``gaussian`` flags a surface echo of less than 3 standard errors as ``no_echo``; its time is that of the column's
     onset.
 

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.loading import instruments, scenes
+from mitransient_lidar.loading import catalogue, instruments, scenes
 
 NAMES = (
     *("icesat2_atlas", "leica_chiroptera4x", "leica_hawkeye4x_deep", "published_airborne", "published_mast"),
@@ -223,3 +224,14 @@ def test_the_documentation_lists_the_instruments():
     text = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
     for part in table():
         assert part in text
+
+
+def test_shipped_corrections_are_of_their_instrument():
+    tables = sorted((catalogue.folder_of_scenes() / "instruments").glob("*_depths.nc"))
+    assert tables
+    for path in tables:
+        name = path.stem.removesuffix("_depths")
+        table = corrections_for(name, "auto")
+        assert table.attrs["instrument"] == name
+        assert tuple(table["pixel"].values) == instruments.read_instrument(name).channels
+        assert np.isfinite(table["bias"].sel(estimator="gaussian", wind_speed=0)).any()
