@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
@@ -25,6 +26,9 @@ _LONGEST_TEXT = 60_000
 
 #: Largest distance of simplified outlines from their points, relative to the size.
 _TOLERANCE = 5e-4
+
+#: Most samples of a pulse.
+_MOST_SAMPLES = 1000
 
 #: Rays along each side of the view that tell which targets are near it.
 _VIEW_TICKS = 9
@@ -50,6 +54,7 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
             transmitter.optical_efficiency * optics.optical_efficiency * optics.two_way_atmospheric_transmittance
         ),
         "pulse_fwhm_ns": transmitter.pulse.fwhm_ns,
+        **_describe_pulse(transmitter.pulse),
         "beam_profile": transmitter.beam_profile,
         "divergence_mrad": 1e3 * profile.divergence[0],
         "divergence_across_mrad": 1e3 * profile.divergence[1],
@@ -62,6 +67,17 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
         "surface_slope_variance": scene.slope_variance,
         **describe_layout(scene),
     }
+
+
+def _describe_pulse(pulse: Pulse) -> dict[str, list[float]]:
+    """Return times [ns] and power [1/ns] of a pulse that is not Gaussian, as lists of at most 1000 samples."""
+    if pulse.shape == "gaussian":
+        return {}
+    times = pulse.times_ns
+    if times.size > _MOST_SAMPLES:
+        times = np.linspace(times[0], times[-1], _MOST_SAMPLES)
+    power = np.interp(times, pulse.times_ns, pulse.power)
+    return {"pulse_times_ns": times.tolist(), "pulse_power": power.tolist()}
 
 
 def describe_layout(scene: LidarScene) -> dict[str, Any]:

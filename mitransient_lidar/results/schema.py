@@ -45,6 +45,8 @@ _LISTS: dict[str, int | None] = {
     "slope_deviation": 2,
     "error_inflation_bins": None,
     "error_inflation": None,
+    "pulse_times_ns": None,
+    "pulse_power": None,
     "wave_focusing_depths": None,
     "wave_focusing": None,
 }

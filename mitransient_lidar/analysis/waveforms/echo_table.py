@@ -85,7 +85,8 @@ def extract(
         summit), ``centroid``, ``gaussian`` (decomposition into Gaussians and the column, which alone separates the
         surface from the column), or ``deconvolution`` (Richardson-Lucy).
     pulse : Pulse, optional
-        The transmitted pulse. By default, a Gaussian of the attribute ``pulse_fwhm_ns``.
+        The transmitted pulse. By default, that of the attributes ``pulse_times_ns`` and ``pulse_power``, or a Gaussian
+        of ``pulse_fwhm_ns``.
     noise : float or array-like, optional
         Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
         ``waveform_stderr`` times the attribute ``error_inflation``, or ``signal_deviation``, or the spread before the

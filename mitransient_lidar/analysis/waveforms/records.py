@@ -24,7 +24,7 @@ from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.dataset import check_axes
 from mitransient_lidar.results.formats import input_format
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, required_number
+from mitransient_lidar.results.geometry import Attributes, LidarGeometry, LinesOfSight, required_number
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -139,7 +139,7 @@ class Waveforms:
         if not np.isfinite(samples).all():
             raise UserError(f"{name} holds values that are not finite: render or record it again")
         geometry = LidarGeometry.from_attributes(dataset.attrs)
-        shape = pulse or Pulse.gaussian(required_number(dataset.attrs, "pulse_fwhm_ns"))
+        shape = pulse or _pulse(dataset.attrs)
         step = results.time_axis(dataset).bin_width_ns
         response = float(dataset.attrs.get("response_time_ns", 0.0))
         receiver = _receiver_response(dataset, step) if name == "signal" else None
@@ -226,6 +226,13 @@ class Waveforms:
         pixel = np.arange(rows.start, rows.stop) % self.baseline.size
         noise = self.noise[rows] if len(self.noise) == self.count else self.noise[pixel]
         return Records.of(self.samples[rows] - self.baseline[pixel, np.newaxis], self.time_ns, noise)
+
+
+def _pulse(attributes: Attributes) -> Pulse:
+    """Return the transmitted pulse of a result: its samples, or a Gaussian of its width."""
+    if {"pulse_times_ns", "pulse_power"} <= set(attributes):
+        return Pulse.sampled(attributes["pulse_times_ns"], attributes["pulse_power"])
+    return Pulse.gaussian(required_number(attributes, "pulse_fwhm_ns"))
 
 
 def _event_height(dataset: xr.Dataset, pixels: int) -> FloatArray:

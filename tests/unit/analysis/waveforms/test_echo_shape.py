@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from mitransient_lidar import results
+from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.column_onset import ColumnOnset, Focusing
 from mitransient_lidar.analysis.waveforms.echo_shape import EchoShape, Response, Template
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.presets import RECEIVERS
 
 
@@ -92,3 +95,35 @@ def test_onset_without_waves_is_the_normal_distribution():
 def test_invalid_focusing_is_refused(depths, factors):
     with pytest.raises(UserError, match="wave_focusing"):
         Focusing.from_attributes({"wave_focusing_depths": depths, "wave_focusing": factors})
+
+
+@pytest.mark.parametrize("estimator", ["gaussian", "peak", "centroid"])
+def test_echoes_of_a_pulse_with_a_tail_have_its_shape(estimator):
+    """A result that holds the samples of its pulse: a rise of 1 ns and a fall of 6 ns."""
+    times = np.linspace(-4, 30, 400)
+    pulse = Pulse.sampled(times, np.where(times < 0, np.exp(-0.5 * times**2), np.exp(-times / 6)))
+    first, weights = pulse.kernel(0.5)
+    waveform = np.zeros(400)
+    surface, bottom = 80, 240
+    for place, energy in ((surface, 1.0), (bottom, 0.5)):
+        waveform[place + first : place + first + weights.size] += 1e-6 * energy * weights
+    attributes = {"altitude": 200.0, "off_nadir_deg": 0.0, "refractive_index": 1.34, "group_index": 1.34}
+    attributes |= {"pulse_fwhm_ns": pulse.fwhm_ns, "layout": "1x1"}
+    start = 2e9 * 200 / 299792458 - 80.5 * 0.5
+
+    def depth(**samples):
+        made = results.build(
+            *(one[np.newaxis] for one in (waveform, 0 * waveform, waveform, 0 * waveform)),
+            time=TimeAxis(start, 0.5, 400),
+            pixel_names=["single"],
+            pixel_centres_mrad=np.zeros((1, 2)),
+            attributes={**attributes, **samples},
+        )
+        found = echo_table.extract(made, estimator).isel(pixel=0)
+        return found["time_ns"].sel(echo=["surface", "bottom"]).values - start
+
+    own = depth(pulse_times_ns=pulse.times_ns.tolist(), pulse_power=pulse.power.tolist())
+    # The others take the tail for the signal around the echo.
+    np.testing.assert_allclose(own, [40.25, 120.25], atol=0.15 if estimator == "gaussian" else 0.6)
+    assert own[0] == pytest.approx(40.25, abs=0.02)
+    assert np.abs(depth() - [40.25, 120.25]).max() > 0.6
