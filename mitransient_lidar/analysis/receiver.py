@@ -73,7 +73,7 @@ def detect_waveforms(
         ``fitting_optical_density``, each of which avoids saturation while the other one is kept
         (`ReceiverChain.fitting_gain`). Where channels differ, attributes of the chain are
         ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels is that of
-        `ReceiverChain.event_height`. ``impulse_response`` over ``lag`` [ns] is
+        `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is
         the weight of the light of a bin in later samples.
 
     Raises
@@ -192,7 +192,7 @@ def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int
     }
     first, weights = receiver.low_pass(width).by_bin()
     lag = ("lag", (first + np.arange(weights.size)) * width, {"units": "ns", "long_name": "delay of the sample"})
-    values["impulse_response"] = (
+    values["receiver_response"] = (
         ("lag",),
         weights,
         {**share, "long_name": "weight of the light of a bin in a sample"},

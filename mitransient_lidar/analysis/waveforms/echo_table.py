@@ -130,7 +130,7 @@ def extract(
     `geometry.LinesOfSight`. Time, depth and energy of the column are those of the samples between the surface echo and
     the next one, its amplitude is extrapolated to the surface, and its width is the time of decay to one half.
 
-    An ideal echo has the shape of the pulse after bins, response and, of a signal, the receiver (``impulse_response``).
+    An ideal echo has the shape of the pulse after bins and responses, of signals the ``receiver_response``, too.
     ``gaussian`` fits sums of Gaussians of this shape; the column behind the surface has the mean focusing of light by
     waves that the result states (``wave_focusing``). Later than the lowest point of the sea there is no surface echo.
 

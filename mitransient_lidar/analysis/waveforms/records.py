@@ -244,17 +244,17 @@ def _event_height(dataset: xr.Dataset, pixels: int) -> FloatArray:
 
 def _receiver_response(dataset: xr.Dataset, step: float) -> Response | None:
     """Return the response of the receiver that recorded a signal; None where it is not known."""
-    if "impulse_response" not in dataset:
+    if "receiver_response" not in dataset:
         return None
-    response = dataset["impulse_response"]
+    response = dataset["receiver_response"]
     if response.dims != ("lag",) or response.size == 0 or "lag" not in response.coords:
-        raise UserError(f"impulse_response of the dimensions {response.dims} must have the dimension lag")
+        raise UserError(f"receiver_response of the dimensions {response.dims} must have the dimension lag")
     weights, lag = (np.asarray(one.values, dtype=np.float64) for one in (response, response["lag"]))
     if not (np.isfinite(weights).all() and np.isfinite(lag).all() and weights.sum() > 0):
-        raise UserError("impulse_response must be finite, of a positive sum")
+        raise UserError("receiver_response must be finite, of a positive sum")
     width = step if lag.size == 1 else float(lag[-1] - lag[0]) / (lag.size - 1)
     if width <= 0 or np.any(np.abs(lag - lag[0] - width * np.arange(lag.size)) > 1e-3 * width):
-        raise UserError("lag of impulse_response must increase in equal steps")
+        raise UserError("lag of receiver_response must increase in equal steps")
     return Response(round(lag[0] / width), weights / weights.sum(), width)
 
 

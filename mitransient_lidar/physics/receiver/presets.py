@@ -257,10 +257,9 @@ class ReceiverChain:
         low_pass = self.low_pass(bin_width_ns)
         events = self.events(light, bin_width_ns, sky)
         number = np.minimum(events, _OVERLAPPING / low_pass.parts).sum(axis=-1)
-        spread = self.detector.charge_spread
-        shape = 1 / max(spread, 1e-6)
+        spread = max(self.detector.charge_spread, 1e-6)
         rare = np.clip(_RARE / np.maximum(number, 1e-12), 0, 1)
-        charge = np.where(rare < 1, gamma.isf(rare, shape, scale=spread), 0.0) * self.detector.gain
+        charge = np.where(rare < 1, gamma.isf(rare, 1 / spread, scale=spread), 0.0) * self.detector.gain
         peak = float(low_pass.weights.max()) * self._volts_per_electron(bin_width_ns)
         return (charge * peak).reshape(np.shape(power)[:-1])
 

@@ -123,7 +123,7 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     cells = lines[-1].split()
     assert cells[:5] == ["20.0", "0", "IB", "5", "single"]
     assert float(cells[6]) == 100
-    before, after = float(cells[8]), float(cells[13])
+    before, after = float(cells[8]), float(cells[14])
     assert abs(before) < 4
     assert abs(after) < min(abs(before), 1)
     scene = ["-D", "jerlov=IB", "-D", "spectrum=flat", "-D", "wind_speed=5", "-D", "bottom_depth=5"]
