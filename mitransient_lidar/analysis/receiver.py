@@ -18,7 +18,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver, Setting
+from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver, Setting, instrument_receiver
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 
 _LOG = logging.getLogger(__name__)
@@ -88,8 +88,7 @@ def detect_waveforms(
     shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     Dead times of counters and cells lose light without being marked as saturated.
     """
-    own = chain if chain is not None else str(dataset.attrs.get("instrument", "apd"))
-    receiver = receiver_of("chain", own)
+    receiver = receiver_of("chain", chain) if chain is not None else _own_receiver(dataset)
     if gain is not None or optical_density is not None:
         receiver = receiver.with_settings(gain, optical_density)
     names = [str(name) for name in np.atleast_1d(dataset["pixel"].values)] if "pixel" in dataset.dims else []
@@ -112,6 +111,11 @@ def detect_waveforms(
     if recorded["saturated"].any():
         _LOG.warning("%s", saturation_advice(recorded))
     return recorded
+
+
+def _own_receiver(dataset: xr.Dataset) -> Receiver:
+    """Return the receiver of a result's instrument, or the preset ``apd`` where it has none."""
+    return instrument_receiver(str(dataset.attrs.get("instrument", ""))) or receiver_named("apd")
 
 
 def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
@@ -147,7 +151,7 @@ def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int
     dims, light = _waveform(dataset)
     pixels, series = tuple(dim for dim in dims[:-1] if dim != "shot"), dims[0] == "shot"
     width = results.time_axis(dataset).bin_width_ns
-    smoothed = given.amplifier is not None and given.amplifier.bandwidth_mhz is not None
+    smoothed = given.low_pass(width).weights.size > 1
     if smoothed and float(dataset.attrs.get("response_time_ns", 0)) > 0:
         _LOG.warning("the waveform includes a response time already, and the amplifier's bandwidth smooths it again")
     receiver, density, fitting = _in_range(given, channel.gain, channel.optical_density, light, width, sky)
@@ -368,6 +372,9 @@ def _described(name: str, part: Any) -> Mapping[str, int | float | str | list[fl
             found |= _described(f"{name}.{field.name}", getattr(part, field.name))
     elif isinstance(part, bool):
         found[name] = int(part)
+    elif isinstance(part, tuple) and part and isinstance(part[0], tuple):
+        # A measured response; the record holds that of its bins.
+        found[name] = f"{len(part[0])} samples, {part[0][0]:g} to {part[0][-1]:g} ns"
     elif isinstance(part, tuple):
         found |= {name: list(part)} if part else {}
     elif part is not None:

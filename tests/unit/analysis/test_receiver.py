@@ -326,6 +326,19 @@ def test_the_receiver_of_the_instrument_is_the_default():
         detect_waveforms(make(), "eye")
 
 
+def test_a_record_behind_a_measured_response_is_written(tmp_path):
+    times = np.linspace(-1, 8, 60)
+    response = (tuple(times.tolist()), tuple(np.exp(-0.5 * (times - 2) ** 2).tolist()))
+    chain = ReceiverChain(CHAIN.detector, Amplifier(1e4, 3.0, impulse_response=response))
+    recorded = detect_waveforms(make(instrument="of my own"), chain)
+    assert recorded.attrs["receiver.amplifier.impulse_response"] == "60 samples, -1 to 8 ns"
+    assert float((recorded["receiver_response"] * recorded["lag"]).sum()) == pytest.approx(2, abs=0.05)
+    dump(recorded, tmp_path / "measured.nc", encoding(recorded))
+    assert open_waveforms(tmp_path / "measured.nc")["lag"].size == recorded["lag"].size
+    # An instrument without a receiver has the usual one.
+    assert detect_waveforms(make(instrument="of my own")).attrs["receiver"] == "apd"
+
+
 def test_codes_in_a_file_are_volts_by_their_attributes(tmp_path):
     recorded = detect_waveforms(make(), CHAIN, shots=5)
     path = tmp_path / "codes.nc"
