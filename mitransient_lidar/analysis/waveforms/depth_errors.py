@@ -38,7 +38,8 @@ _LEAST_SHARE = 0.05  # of the beam in a pixel whose column counts, relative to t
 _TYPICAL_ATTENUATION = 0.14  # of a column that is too short for a fit [1/m]
 _TYPICAL_BACKSCATTERING = 0.05  # relative to the attenuation of the column
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
-_MEAN_SLOPE = 0.4  # slope of waves averaged over a pixel, relative to the standard deviation of all slopes
+# Slope of waves averaged over a beam of 2 m, relative to the standard deviation of all slopes; its power of the width.
+_MEAN_SLOPE, _OF_WIDTH, _WIDTH = 0.4, -0.25, 2.0
 _HEIGHTS = 8.0  # standard deviations from the lowest to the highest point of a sea
 
 
@@ -93,15 +94,16 @@ class DepthErrors:
         variance = optional_number(attributes, "surface_slope_variance")
         level = highest - lowest < 1e-6
         variance = _TYPICAL_SLOPE_VARIANCE if variance is None else variance
-        slope = 0.0 if level else _MEAN_SLOPE * math.sqrt(0.5 * variance)
+        share = min(_MEAN_SLOPE * (max(width, 1e-3) / _WIDTH) ** _OF_WIDTH, 1.0)
+        slope = 0.0 if level else share * math.sqrt(0.5 * variance)
         height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
         gain = _column_gain(attributes, geometry)
         bin_ns = optional_number(attributes, "bin_width_ns") or 0.0
         return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
-    def of_surface(self, own: BoolArray, faint: BoolArray) -> FloatArray:
-        """Return the errors of surface times [ns], shape (n,), 0 where the time is not the pixel's own.
+    def of_surface(self, faint: BoolArray) -> FloatArray:
+        """Return the errors of the times of surface echoes [ns], shape (n,).
 
         The light of a surface echo comes from few places in the pixel, and its time is that of these places. Without a
         distinct (`faint`) echo, it is that of the column's onset. Echo and column overlap by a pulse, which limits the
@@ -113,7 +115,7 @@ class DepthErrors:
         overlap = np.where(faint, _OF_LOST_PULSE, _OF_PULSE) * self.pulse_ns
         spread = self.lines.surface_spread
         rounding = self.bin_ns / math.sqrt(12) * np.exp(-2 * (math.pi * spread / max(self.bin_ns, 1e-9)) ** 2)
-        return np.asarray(np.where(own, np.hypot(np.hypot(share * spread, overlap), rounding), 0))
+        return np.asarray(np.hypot(np.hypot(share * spread, overlap), rounding))
 
     def of_echoes(
         self,

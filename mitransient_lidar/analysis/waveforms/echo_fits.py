@@ -16,10 +16,17 @@ from mitransient_lidar.core.validation import FloatArray
 Model = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 _ITERATIONS = 60
+_FEWEST_BINS = 4  # on either side of a peak
 _SIGNIFICANT = 9.0  # decrease of the squared residuals by which a surface height is distinct from the column's onset
 _CLEAR = 10.0  # standard errors of a height above which it is not tested
-_OF_WAVES = 0.1  # deviation of a column's onset from the mean over waves, relative
+_OF_WAVES, _OF_FOCUSING = (
+    0.1,
+    0.8,
+)  # relative deviation of a column from the mean over waves, at its onset and behind it
 _FAINT = 0.1  # first guess of the height of a surface whose column is brighter, over the peak
+_RISE = 0.5  # level of the column that its rise crosses
+_BRIGHT = 10.0  # levels of the column beyond which a peak is that of the surface
+_WEAK = 0.3  # first guess of the height of a surface without such a peak, in levels of the column
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
 
 
@@ -38,7 +45,9 @@ def gaussian_surface(
     The model is A E(u) plus a column C F(u) exp(-k u) from u = 0 on, blurred by E, where u is the time since the
     surface, E the shape of an ideal echo, blurred by a Gaussian of free width, and F the focusing of light by waves.
     It is fitted from two echo widths before the peak to two after it, and determines the surface even where the peak is
-    that of the column. Amplitude, energy and width are those of A E.
+    that of the column. Amplitude, energy and width are those of A E. The focusing of a single shot differs from its
+    mean: over waves, samples that are later than an echo width behind the rise to C / 2 have a relative error of 0.8,
+    unless the peak is above 10 C.
 
     A surface echo that is weak relative to the column is fitted nearly as well without A, one or two nanoseconds
     earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to
@@ -61,18 +70,25 @@ def gaussian_surface(
         C from the column behind the echo, and its standard error; NaN where it is not known.
     """
     begin = column or ColumnOnset()
-    # The brightest depth may be the peak, later than the surface.
+    # The brightest depth may be the peak, later than the surface; that of a single shot may be twice as deep.
     early = begin.brightest_ns
-    data = _Data.of(records, bins, width, decay, (-2 - early / width, 2), shape)
-    data = replace(data, earliest=-1.2 * width - early)
+    data = _Data.of(records, bins, width, decay, (-2 - 2 * early / width, 2), shape)
+    data = replace(data, earliest=-1.2 * width - 2 * early)
     if level is not None:
         data = replace(data, known=(3, *level))
-    if early > 0:
-        data = replace(data, noise=np.hypot(data.noise, _OF_WAVES * np.maximum(data.power, 0)))
     peak = data.peak()
+    rise = np.full(peak.shape, np.nan)
+    if early > 0:
+        data, rise = data.about_rise(rise if level is None else level[0])
     sigma = np.full(peak.shape, shape.sigma_of(width))
     start = np.stack([np.full(peak.shape, -0.3 * width), sigma, 0.5 * peak, 0.7 * peak], axis=1)
     faint = start if early == 0 else np.stack([start[:, 0] - early, sigma, 0 * peak, 0.7 * peak], axis=1)
+
+    if level is not None:
+        rises = np.isfinite(rise)
+        for first in (start, faint):
+            first[rises, 0], first[rises, 3] = rise[rises], level[0][rises]
+        start[rises, 2] = _WEAK * level[0][rises]
 
     def model(p: FloatArray, u: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
         time, s, height, level = (p[:, i : i + 1] for i in range(4))
@@ -193,13 +209,30 @@ class _Data:
         span: tuple[float, float],
         shape: EchoShape,
     ) -> _Data:
-        """Return the samples in a span of echo widths about the peaks."""
+        """Return the samples in a span of echo widths about the peaks, and at least four bins on both sides."""
         rate = np.broadcast_to(np.asarray(decay, dtype=np.float64), bins.shape)[:, np.newaxis]
         low, high = (end * width / records.bin_ns for end in span)
-        lags = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
+        # Coarse samples of short pulses determine all parameters only together with their surroundings.
+        lags = np.arange(min(int(np.floor(low)), -_FEWEST_BINS), max(int(np.ceil(high)), _FEWEST_BINS) + 1)
         power, noise, inside = records.around(bins, lags)
         u = np.asarray(lags * records.bin_ns + shape.peak_ns, dtype=np.float64)
         return cls(u, power, noise, inside, rate, width, shape, -1.2 * width)
+
+    def about_rise(self, level: FloatArray) -> tuple[_Data, FloatArray]:
+        """Return the samples with the uncertainty of the focusing, and the times of the rises of columns with a level.
+
+        Samples later than a width behind the rise are uncertain, unless their peak is far above the column. The time of
+        such a peak, and that of a column without a level, is NaN.
+        """
+        known = np.isfinite(level) & (level > 0)
+        height = np.where(known, level, np.inf)[:, np.newaxis]
+        above = self.usable & (self.power > _RISE * height)
+        first = self.u[np.argmax(above, axis=1)]
+        rises = above.any(axis=1) & (self.peak() < _BRIGHT * height[:, 0])
+        late = rises[:, np.newaxis] & (self.u > first[:, np.newaxis] + self.width)
+        share = np.where(late, _OF_FOCUSING, _OF_WAVES)
+        noise = np.hypot(self.noise, share * np.maximum(self.power, 0))
+        return replace(self, noise=noise), np.where(rises, first - self.shape.peak_ns, np.nan)
 
     def peak(self) -> FloatArray:
         """Return the largest sample within half an echo width, shape (n,)."""

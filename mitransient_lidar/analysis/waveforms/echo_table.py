@@ -317,9 +317,13 @@ def _with_depths(
     table["flags"][..., 2:] |= np.where(dark, int(EchoFlag.SCATTERED_LIGHT), 0)[:, np.newaxis, np.newaxis]
     for number, estimator in enumerate(settings.estimators):
         measured = time[:, number, 0]
+        faint = np.isnan(measured)
+        if estimator == "gaussian":
+            faint |= table["amplitude"][:, number, 0] < _SIGNIFICANT * table["amplitude_stderr"][:, number, 0]
         found = surface_times(
             measured.reshape(shots, -1),
             error[:, number, 0].reshape(shots, -1),
+            errors.of_surface(faint).reshape(shots, -1),
             lines.reshaped((shots, -1)),
             slope_variance=_TYPICAL_SLOPE_VARIANCE if variance is None else variance,
             heights_m=(lowest, highest),
@@ -330,15 +334,13 @@ def _with_depths(
         flags |= np.where((own | np.isnan(measured)) & ~dark, 0, int(EchoFlag.NO_SURFACE_LIGHT))
         # Without a distinct echo, the onset of the column gives the time.
         absent = np.isnan(measured) | ~own
-        faint = absent.copy()
-        if estimator == "gaussian":
-            faint |= table["amplitude"][:, number, 0] < _SIGNIFICANT * table["amplitude_stderr"][:, number, 0]
+        faint |= absent
         flags |= np.where(faint, int(EchoFlag.NO_ECHO), 0)
         for name in ("amplitude", "energy", "width_ns"):
             for column in (name, f"{name}_stderr"):
                 table[column][faint, number, 0] = np.nan
         time[absent, number, 0] = error[absent, number, 0] = np.nan
-        by_light[:, number] = errors.of_surface(own, faint)
+        by_light[:, number] = found.method_ns.ravel()
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
     table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error}
     if settings.depth_from == "echo":

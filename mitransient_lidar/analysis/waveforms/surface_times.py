@@ -16,19 +16,22 @@ LEAST_SHARE = 1e-3
 _LIMIT = 4.0  # standard deviations by which an echo may deviate from the other pixels' surface
 _LEVEL = 0.15  # error of the mean sea level [m]
 _SHAPE = 0.1  # error of an echo's time by its unknown shape, in echo widths
+_LEAST_ERROR = 1e-3  # of a time [ns]
 
 
 class SurfaceTimes(NamedTuple):
-    """Arrival of the surface [ns] and its standard error, and whether it is the pixel's own; shape (shots, pixels)."""
+    """Arrival of the surface in every pixel, shape (shots, pixels)."""
 
     time_ns: FloatArray
-    stderr_ns: FloatArray
-    own: BoolArray
+    stderr_ns: FloatArray  #: Error by noise; of a time that is inferred from other pixels, the whole error.
+    method_ns: FloatArray  #: Error by the few places that return light, 0 where it is inferred.
+    own: BoolArray  #: Whether the pixel's own echo is a surface echo.
 
 
 def surface_times(
     time_ns: FloatArray,
     stderr_ns: FloatArray,
+    method_ns: FloatArray,
     lines: LinesOfSight,
     *,
     slope_variance: float,
@@ -40,7 +43,9 @@ def surface_times(
     Parameters
     ----------
     time_ns, stderr_ns : ndarray, shape (shots, pixels)
-        Arrival of the first echoes and its standard error [ns]; NaN without one.
+        Arrival of the first echoes and its standard error by noise [ns]; NaN without one.
+    method_ns : ndarray, shape (shots, pixels)
+        Standard deviation of these times about the mean surface in the pixel [ns], as few places return the light.
     lines : LinesOfSight
         Lines of sight with arrays of shape (shots, pixels).
     slope_variance : float
@@ -53,52 +58,61 @@ def surface_times(
     Returns
     -------
     SurfaceTimes
-        A pixel's own time where it has at least a thousandth of the light of the brightest pixel, and where its
+        From the own times of pixels that have at least a thousandth of the light of the brightest pixel, and whose
         deviation from the level sea agrees, within 4 standard deviations, with the heights of the sea and with the
-        median of the pixels, weighted with their light; a noisy one is drawn towards the level sea. Otherwise, that of
-        the level sea plus the mean deviation of the former pixels; without any of them, that of the mean sea level,
-        with the standard deviation of the heights as error, or NaN where the heights are unknown. Where the shares of
-        the beam are unknown, all times are own.
+        median of the pixels, weighted with their light. The times of other pixels follow these; without any, they are
+        those of the mean sea level with the standard deviation of the heights as error, or NaN where the heights are
+        unknown. Where the shares of the beam are unknown, all times are own.
 
     Notes
     -----
-    The variance of a pixel's deviation has four parts: the error of its time; the spread of the arrival over its light,
-    since few facets return the light; the pixel's distance from the middle of the light times the deviation of the
-    slopes along it; a tenth of the echo's width for its unknown shape. A replaced time has the error of the mean
-    deviation, and the third part.
+    The deviation from the level sea is the same in all pixels of a shot, with the variance of the sea's heights, plus
+    that of each pixel, whose standard deviation is the slope of the sea times the distance of the pixel from the middle
+    of the light; its echo has the errors by noise and method. The times are the means of the deviations given all
+    echoes of the shot, which draws uncertain times to the mean sea level and to those of the other pixels. An echo
+    agrees with these within its error, that of its shape, a tenth of its width, and the spread of the light.
     """
     known = np.isfinite(time_ns)
     share = lines.beam_share
     if np.isnan(share).any():
-        return SurfaceTimes(time_ns, stderr_ns, known)
+        return SurfaceTimes(time_ns, stderr_ns, np.where(known, method_ns, 0), known)
     light = share >= LEAST_SHARE * share.max(axis=1, keepdims=True)
     tilt = _tilt_ns(lines, np.sqrt(0.5 * slope_variance))
-    own_error = np.hypot(np.hypot(np.nan_to_num(stderr_ns), lines.surface_spread), _SHAPE * echo_fwhm_ns)
+    noise = np.nan_to_num(stderr_ns)
+    extent = np.hypot(np.hypot(noise, lines.surface_spread), _SHAPE * echo_fwhm_ns)
     deviation = np.where(known, time_ns, 0) - lines.surface_time
     # A crest is nearer than the mean sea level.
-    latest, earliest = (-height / (0.5e-9 * C0 * np.cos(lines.off_nadir)) for height in heights_m)
-    within = (deviation >= earliest - _LIMIT * own_error) & (deviation <= latest + _LIMIT * own_error)
+    per_metre = 1 / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+    latest, earliest = (-height * per_metre for height in heights_m)
+    within = (deviation >= earliest - _LIMIT * extent) & (deviation <= latest + _LIMIT * extent)
     candidate = known & light & (share > 0) & within
     middle = _weighted_median(deviation, np.where(candidate, share, 0))
-    lit = candidate & (np.abs(deviation - middle) <= _LIMIT * np.hypot(own_error, tilt))
-    weight = np.where(lit, 1 / np.hypot(own_error, tilt) ** 2, 0)
-    total = weight.sum(axis=1, keepdims=True)
-    some = total > 0
-    total = np.where(some, total, 1.0)
-    mean = np.sum(weight * deviation, axis=1, keepdims=True) / total
+    lit = candidate & (np.abs(deviation - middle) <= _LIMIT * np.hypot(extent, tilt))
     # An eighth of the heights' range is their standard deviation.
-    spread = 0.125 * (heights_m[1] - heights_m[0]) / (0.5e-9 * C0 * np.cos(lines.off_nadir))
-    level = np.where(np.isfinite(spread), 0.0, np.nan)
-    inferred = lines.surface_time + np.where(some, mean, level)
-    error = np.where(some, np.hypot(1 / np.sqrt(total), tilt), np.where(np.isfinite(spread), spread, np.nan))
-    # A noisy time is drawn towards that of the mean sea level, by its own error and the heights of the sea.
-    level_error = np.hypot(
-        np.where(np.isfinite(spread), spread, np.inf), _LEVEL / (0.5e-9 * C0 * np.cos(lines.off_nadir))
+    heights = 0.125 * (heights_m[1] - heights_m[0]) * per_metre
+    level = np.hypot(heights, _LEVEL * per_metre)
+    variance = np.maximum(noise**2 + method_ns**2, _LEAST_ERROR**2)
+    weight = np.where(lit, 1 / (variance + tilt**2), 0)
+    precision = weight.sum(axis=1, keepdims=True) + 1 / level**2
+    mean = np.sum(weight * deviation, axis=1, keepdims=True) / np.where(precision > 0, precision, 1.0)
+    some = lit.any(axis=1, keepdims=True)
+    mean_error = 1 / np.sqrt(np.where(precision > 0, precision, 1.0))
+    inferred = lines.surface_time + np.where(some, mean, np.where(np.isfinite(heights), 0.0, np.nan))
+    error = np.where(some, np.hypot(mean_error, tilt), np.where(np.isfinite(heights), heights, np.nan))
+    share_of_own = tilt**2 / (variance + tilt**2)
+    own = lines.surface_time + mean + share_of_own * (deviation - mean)
+    own_variance = share_of_own * variance + (1 - share_of_own) ** 2 * mean_error**2
+    # Noise of the mean comes from all pixels, noise of the pixel's part from one.
+    gain = weight / np.where(precision > 0, precision, 1.0)
+    shared = np.sum((gain * noise) ** 2, axis=1, keepdims=True) - (gain * noise) ** 2
+    by_noise = (share_of_own + (1 - share_of_own) * gain) ** 2 * noise**2 + (1 - share_of_own) ** 2 * shared
+    by_method = np.sqrt(np.maximum(own_variance - by_noise, 0))
+    return SurfaceTimes(
+        np.where(lit, own, inferred),
+        np.where(lit, np.sqrt(by_noise), error),
+        np.where(lit, by_method, 0),
+        lit,
     )
-    noise = np.nan_to_num(stderr_ns)
-    drawn = np.where(np.isfinite(level_error), noise**2 / (noise**2 + level_error**2), 0)
-    own_time, own_noise = time_ns - drawn * deviation, noise * np.sqrt(1 - drawn)
-    return SurfaceTimes(np.where(lit, own_time, inferred), np.where(lit, own_noise, error), lit)
 
 
 def _tilt_ns(lines: LinesOfSight, slope: float) -> FloatArray:

@@ -21,10 +21,19 @@ def lines(shots, share=SHARE):
     return LinesOfSight(*(np.tile(one, (shots, 1)) for one in values))
 
 
-def infer(time, error=0.05, heights=(-1.0, 1.0), share=SHARE, slope_variance=0.02):
-    errors = np.full(time.shape, error)
+def tilts(at, slope_variance):
+    """Deviation [ns] of pixels by slopes of the sea about the middle of their light, as a closed form."""
+    away = at.surface_time * HALF
+    x, y = away * at.sight_x / np.cos(at.off_nadir), away * at.sight_y
+    share = at.beam_share / at.beam_share.sum(axis=1, keepdims=True)
+    x, y = (one - np.sum(share * one, axis=1, keepdims=True) for one in (x, y))
+    return np.sqrt(0.5 * slope_variance) * np.hypot(x, y) / (np.cos(at.off_nadir) * HALF)
+
+
+def infer(time, error=0.05, heights=(-1.0, 1.0), share=SHARE, slope_variance=0.02, method=0.0):
+    errors, methods = (np.full(time.shape, one) for one in (error, method))
     at = lines(len(time), share)
-    return surface_times(time, errors, at, slope_variance=slope_variance, heights_m=heights, echo_fwhm_ns=5.0)
+    return surface_times(time, errors, methods, at, slope_variance=slope_variance, heights_m=heights, echo_fwhm_ns=5.0)
 
 
 def test_times_of_tilted_seas_are_kept_and_the_dark_pixel_follows_them():
@@ -44,8 +53,8 @@ def test_times_of_tilted_seas_are_kept_and_the_dark_pixel_follows_them():
     # One in 1400 looks late by chance.
     assert np.count_nonzero(~found.own[:, :4]) <= largest_count(4 * shots, 1e-3)
     assert not found.own[:, 4].any()
-    # Their noise is small beside the heights of the sea.
-    np.testing.assert_allclose(found.time_ns[found.own], seen[found.own], atol=0.01)
+    # Their noise is small beside the heights and slopes of the sea.
+    np.testing.assert_allclose(found.time_ns[found.own], seen[found.own], atol=0.03)
     z = (found.time_ns - truth)[:, 4] / found.stderr_ns[:, 4]
     assert abs(z.mean()) < largest_z(shots) / np.sqrt(shots)
     # The true slopes have the assumed variance; the part of the echoes' shape, which this model lacks, is small.
@@ -71,20 +80,27 @@ def test_an_echo_outside_the_heights_of_the_sea_is_not_the_surface():
     assert np.isnan(unknown.time_ns).all()
 
 
-def test_a_noisy_time_is_drawn_to_the_mean_sea_level():
-    """Heights of 0.2 m and a level known to 0.15 m, times with errors of 3 ns: the mean of both has a true error."""
+@pytest.mark.parametrize(("noise", "method"), [(3.0, 0.0), (0.5, 2.0), (0.05, 0.1)])
+def test_times_are_the_means_given_all_echoes_and_the_heights_of_the_sea(noise, method):
+    """Heights of 0.2 m and a level known to 0.15 m, deviations of single pixels, and errors of both kinds."""
     rng = np.random.default_rng(2)
     at = lines(1)
     per_metre = 1 / (np.cos(at.off_nadir) * HALF)
+    variance = 0.02
     height = np.hypot(0.2, 0.15) * rng.standard_normal((4000, 1))
-    truth = at.surface_time - height * per_metre
-    seen = truth + 3.0 * rng.standard_normal(truth.shape)
-    one = [0]
-    found = infer(seen, error=3.0, heights=(-0.8, 0.8), slope_variance=1.0)
-    z = ((found.time_ns - truth) / found.stderr_ns)[:, one][found.own[:, one]]
-    assert abs(z.mean()) < largest_z(z.size) / np.sqrt(z.size)
-    assert 0.9 < z.std() < 1.1
-    assert found.stderr_ns[0, 0] < 2.0
+    own = tilts(at, variance) * rng.standard_normal((4000, 5))
+    truth = at.surface_time - height * per_metre + own
+    seen = truth + np.hypot(noise, method) * rng.standard_normal(truth.shape)
+    found = infer(seen, error=noise, heights=(-0.8, 0.8), slope_variance=variance, method=method)
+    error = np.hypot(found.stderr_ns, found.method_ns)
+    z = ((found.time_ns - truth) / error)[:, :4][found.own[:, :4]]
+    # Pixels of a shot share the error of the height.
+    assert abs(z.mean()) < largest_z(4000) / np.sqrt(4000)
+    assert z.var() == pytest.approx(1, abs=largest_z(4000) * np.sqrt(2 / 4000))
+    # In a single pixel in the middle, noise and method are parts of the same share.
+    if noise == 0.5:
+        assert found.stderr_ns[0, 0] < found.method_ns[0, 0]
+        assert error[0, 0] < 0.6 * np.hypot(noise, method)
 
 
 def test_unknown_shares_leave_the_times_as_they_are():
@@ -98,5 +114,5 @@ def test_unknown_shares_leave_the_times_as_they_are():
 def test_a_pixel_without_an_echo_takes_the_others(pixel):
     time = lines(1).surface_time - 3.0
     time[0, pixel] = np.nan
-    found = infer(time)
+    found = infer(time, heights=(-np.inf, np.inf))
     assert found.time_ns[0, pixel] == pytest.approx(lines(1).surface_time[0, pixel] - 3.0)
