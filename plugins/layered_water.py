@@ -147,6 +147,8 @@ class LayeredWater(mi.Medium):
         of_layers = phases_of_layers(self.column, phases, kind, phase_g, molecules, chi_p, tabulated)
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
+        #: Scattering by water molecules of each layer, a part of b [1/m]; 0 where it is not known.
+        self.water_scattering = molecules[kept]
         #: Runs of layers of one refractive and one group index.
         self.index_layers = IndexLayers(self.column.layer_tops, *(values[kept] for values in indices))
         #: Indices of the uppermost layer, where the sea surface is.

@@ -174,7 +174,7 @@ def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int
     over, sampled, share = ("shot", *pixels, "time"), {"units": receiver.units}, {"units": "1"}
     values: dict[str, Any] = {
         "signal": (over, signal, {**sampled, "long_name": "recorded signal"}),
-        "saturated": (over, saturated, {"long_name": "sample at a limit of amplifier or digitiser"}),
+        "saturated": (over, saturated, {**share, "long_name": "sample at a limit of amplifier or digitiser"}),
         "signal_mean": (dims, forms[0], {**sampled, "long_name": "mean of the recorded signal"}),
         "signal_deviation": (
             dims,
@@ -217,7 +217,7 @@ def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int
         **dict(_described("receiver", receiver)),
         **fitting,
     }
-    shot = ("shot", labels, {"long_name": "number of the shot"})
+    shot = ("shot", labels, {"units": "1", "long_name": "number of the shot"})
     return xr.Dataset(values, {**coords, "time": time, "shot": shot, "lag": lag}, attributes)
 
 

@@ -27,6 +27,7 @@ from mitransient_lidar.campaigns.design import MOST_RUNS, Campaign, Column
 from mitransient_lidar.campaigns.runs import Array, RunRenderer, record_of
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, sweep, temporary_beside
+from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
@@ -59,7 +60,12 @@ _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError,
 #: Options of a store's arrays when they are written.
 _WRITING = {"array.write_empty_chunks": True}
 
-_STATUS = {"long_name": "state of the run", "flag_values": [0, 1, 2], "flag_meanings": "planned done failed"}
+_STATUS = {
+    "units": "1",
+    "long_name": "state of the run",
+    "flag_values": [0, 1, 2],
+    "flag_meanings": "planned done failed",
+}
 
 
 class Store:
@@ -340,8 +346,9 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
 
     Over ``run``: the parameters of the scene as coordinates; ``status`` (0 planned, 1 done, 2 failed), ``error`` (why a
     run failed), ``error_median`` (relative standard error of the median bin) and ``passes``; then ``shot`` if runs have
-    several, the dimensions of the pixels, and those of each variable: what `campaigns.design.Campaign` keeps. Values of
-    runs that are not done are NaN, or 0 for integers. Runs of which the store has lost an array are planned; a damaged
+    several, the dimensions of the pixels, and those of each variable: what `campaigns.design.Campaign` keeps. All have
+    ``long_name``, and numbers ``units``, but for parameters whose names are not those of shipped scenes. Values of runs
+    that are not done are NaN, or 0 for integers. Runs of which the store has lost an array are planned; a damaged
     array raises ``ValueError`` when it is read.
 
     Raises
@@ -406,10 +413,12 @@ def _fill(
     for name, found in coordinates.items():
         make(name, found, found.values, chunk=_LARGEST)
     numbers = np.arange(count)
-    make("run", Array(("run",), numbers, {"long_name": "number of the run"}), numbers, chunk=_LARGEST)
+    make("run", Array(("run",), numbers, {"units": "1", "long_name": "number of the run"}), numbers, chunk=_LARGEST)
     for name, column in columns.items():
         text = {"long_name": f"parameter {name} of the scene"}
-        make(inputs[name], Array(("run",), column, text), column, chunk=_LARGEST)
+        unit = unit_of(name) if column.dtype.kind in "iuf" else None
+        described = text if unit is None else {"units": unit, **text}
+        make(inputs[name], Array(("run",), column, described), column, chunk=_LARGEST)
     make("status", Array((), np.zeros((), dtype=np.uint8), _STATUS))
     make("error", Array((), np.array("", dtype=object), {"long_name": "why the run failed"}))
     for name, found in arrays.items():
@@ -417,7 +426,8 @@ def _fill(
     dims = {dim for found in arrays.values() for dim in found.dims}
     if "shot" in dims:
         shots = np.arange(renderer.campaign.design.shots)
-        make("shot", Array(("shot",), shots, {"long_name": "number of the shot over the sea of the run"}), shots)
+        number = {"units": "1", "long_name": "number of the shot over the sea of the run"}
+        make("shot", Array(("shot",), shots, number), shots)
     axis, time = renderer.axis, coordinates["time"].values
     secondary = [name for name in (*coordinates, *inputs.values(), "surface_seed") if name not in dims]
     about: dict[str, Any] = {

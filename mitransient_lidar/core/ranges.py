@@ -54,3 +54,30 @@ def ranged(name: str, value: object) -> float:
     low, high = RANGES[name]
     check = positive if low > 0 else non_negative if low == 0 else finite
     return in_range(name, check(name, value), low, high)
+
+
+#: Units of parameters of plugins and scenes by the ends of their names.
+_UNIT_OF_END = {
+    **{"_ns": "ns", "_mrad": "mrad", "_deg": "degree", "_nm": "nm", "_mj": "mJ", "_mm": "mm", "_um": "um"},
+    **{"_reflectance": "1", "_seed": "1", "_count": "1", "_x": "m", "_y": "m", "_depth": "m", "_height": "m"},
+    **{"_size": "m", "_length": "m", "_width": "m"},
+}
+
+_UNITS = {
+    **dict.fromkeys(("altitude", "layer_tops", "depth_left", "depth_middle", "depth_right"), "m"),
+    **dict.fromkeys(("depth", "size", "secchi", "surface_shortest_wave", "point_spacing"), "m"),
+    **dict.fromkeys(("attenuation", "scattering", "backscattering", "water_scattering"), "1/m"),
+    **dict.fromkeys(("plume_scattering", "kd"), "1/m"),
+    **dict.fromkeys(("wind_speed", "wake_speed"), "m s-1"),
+    **dict.fromkeys(("refractive_index", "group_index", "phase_g", "chi_p", "slope_variance"), "1"),
+    **dict.fromkeys(("optical_efficiency", "two_way_atmospheric_transmittance", "pulses"), "1"),
+    "aperture_area": "m2",
+    "chlorophyll": "mg m-3",
+    **dict.fromkeys(("time", "surface_time"), "s"),
+}
+
+
+def unit_of(name: str) -> str | None:
+    """Return the unit of a parameter of a plugin or a shipped scene; None for texts and other names."""
+    end = next((unit for end, unit in _UNIT_OF_END.items() if name.endswith(end)), None)
+    return _UNITS.get(name, end)

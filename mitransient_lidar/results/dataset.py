@@ -135,7 +135,7 @@ def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
         name: (("shot", *labelled[name].dims), array.reshape(-1, *labelled[name].shape), labelled[name].attrs)
         for name, array in zip(_VARIABLES, values, strict=True)
     }
-    number = ("shot", np.arange(len(values[0])), {"long_name": "number of the shot"})
+    number = ("shot", np.arange(len(values[0])), {"units": "1", "long_name": "number of the shot"})
     return labelled.assign(data).assign_coords(shot=number)
 
 
@@ -249,8 +249,8 @@ def pixel_coordinates(
         if rows < 1 or columns < 1 or rows * columns != count:
             raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
         coords = {
-            "row": ("row", np.arange(rows), {"long_name": "row of the image, 0 farthest from nadir"}),
-            "column": ("column", np.arange(columns), {"long_name": "column of the image, 0 at the -angle_y edge"}),
+            "row": ("row", np.arange(rows), {"units": "1", "long_name": "row of the image, 0 farthest from nadir"}),
+            "column": ("column", np.arange(columns), {"units": "1", "long_name": "column of the image, 0 leftmost"}),
         }
     dims, layout = tuple(coords), grid or (count,)
     where = {"angle_x": "in the plane of incidence, away from nadir", "angle_y": "across the plane of incidence"}

@@ -147,7 +147,7 @@ def build_gates(
             raise UserError(f"{name} has shape {array.shape}; it must be {(*shape, train.count)}.")
         variables[name] = ((*dims, "gate"), array.reshape(*shape, train.count), {"units": "J", **about})
     axis = {
-        "gate": (np.arange(train.count), {"long_name": "number of the gate"}),
+        "gate": (np.arange(train.count), {"units": "1", "long_name": "number of the gate"}),
         "gate_start": (train.starts_ns, {"units": "ns", "long_name": "half height of the gate's rising edge"}),
         "gate_width": (
             np.full(train.count, train.width_ns),

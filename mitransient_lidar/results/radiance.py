@@ -59,7 +59,7 @@ def build_radiance(
     coords = dict(coords)
     if times is not None:
         coords |= {
-            "frame": ("frame", np.arange(len(times)), {"long_name": "frame number"}),
+            "frame": ("frame", np.arange(len(times)), {"units": "1", "long_name": "frame number"}),
             "time_s": ("frame", times, {"units": "s", "long_name": "time since the first frame"}),
         }
     area = {"units": "m2 sr", "long_name": "open area times solid angle times transmittance"}

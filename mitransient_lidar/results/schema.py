@@ -64,6 +64,8 @@ _COORDINATES = (
     *("angle_x", "angle_y", "sight_x", "sight_y", "off_nadir", "surface_time", "surface_spread", "depth_per_ns"),
     *("beam_share", "gate_start", "gate_width", "gate_depth", "aim_x", "aim_y", "shot"),
     *("true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth"),
+    *("true_bottom_depth_below_surface", "true_absorption", "true_scattering", "true_backscattering"),
+    *("true_attenuation", "true_kd"),
 )
 
 

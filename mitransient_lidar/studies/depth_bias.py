@@ -196,7 +196,7 @@ def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[
 
 def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return the numbers of one sea, over estimator and pixel, or pixel, or without dimensions."""
-    truth = (recorded["true_bottom_depth"] + recorded["true_surface_height"]).values
+    truth = recorded["true_bottom_depth_below_surface"].values
     found = extract(recorded, list(estimators))
     numbers: dict[str, Any] = dict(summarize_depths(found, truth))
     if corrections is not None:

@@ -25,6 +25,7 @@ from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
 from mitransient_lidar.studies.sea_map import SeaMap
+from mitransient_lidar.studies.shot_truth import sea_of, truth_coordinates
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -36,9 +37,6 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-#: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
-_REACH, _FEWEST_CELLS = 4.5, 4
-
 #: Farthest place [m]: single precision resolves a millimetre there.
 _FARTHEST = 1e4
 
@@ -48,17 +46,14 @@ _PLACE = Column("x", ("aim x",), _METRES), Column("y", ("aim y",), _METRES)
 #: Parameters of the scene that shots replace, and those that they replace to move the target.
 _AIM, _TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 
+#: Coordinates in the table of a series.
+_LISTED = (
+    *(*_AIM, "true_slope_along", "true_slope_across", "true_surface_height"),
+    *("true_bottom_depth", "true_bottom_depth_below_surface"),
+)
+
 #: Arrays of a series, as of `results.build_series`.
 _ARRAYS = ("energy", "energy_stderr", "power", "power_stderr")
-
-_TRUTH = {
-    "aim_x": ("m", "place where the axis meets the mean sea level, x"),
-    "aim_y": ("m", "place where the axis meets the mean sea level, y"),
-    "true_slope_along": ("1", "mean slope over the beam's footprint, positive for a face towards the lidar"),
-    "true_slope_across": ("1", "mean slope over the beam's footprint, positive for a rise to the left"),
-    "true_surface_height": ("m", "mean height over the beam's footprint above the mean sea level"),
-    "true_bottom_depth": ("m", "depth of the bottom below the mean sea level where the refracted axis meets it"),
-}
 
 
 def read_places(path: str | os.PathLike[str]) -> FloatArray:
@@ -136,10 +131,14 @@ def render_shots(
         ``shot``: ``aim_x``, ``aim_y`` [m]; the means over the beam's footprint ``true_slope_along`` (positive for a
         face towards the lidar), ``true_slope_across`` (positive for a rise to the left) [1] and ``true_surface_height``
         [m] above the mean sea level; ``true_bottom_depth`` [m] below the mean sea level where the axis, refracted at a
-        level sea, meets the bottom (`WaterScene.bottoms`), NaN where it misses. Attributes such as ``surface_time_ns``
-        and the limits of the echo window are those of the first shot; positions are left out. ``series_parameters``:
-        JSON of the scene's parameters that shots replace. ``slope_deviation``: standard deviations of the two slopes of
-        a sea with waves. After Ctrl-C the dataset holds the completed shots, and the attribute ``interrupted`` is 1.
+        level sea, meets the bottom (`WaterScene.bottoms`), NaN where it misses; ``true_bottom_depth_below_surface`` [m]
+        below the mean surface in the footprint, as depths of echoes are, the sum of depth and surface height; of the
+        water, whichever way it is given, ``true_absorption`` a, ``true_scattering`` b, ``true_backscattering`` bb,
+        ``true_attenuation`` c and ``true_kd`` [1/m], means over depth from the mean sea level to that bottom, without
+        bubbles (`shot_truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
+        those of the first shot; positions are left out. ``series_parameters``: JSON of the scene's parameters that
+        shots replace. ``slope_deviation``: standard deviations of the two slopes of a sea with waves. After Ctrl-C the
+        dataset holds the completed shots, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -165,8 +164,8 @@ def render_shots(
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
-    truth = true_values(series.session, series.lidar, places)
-    if missed := np.count_nonzero(np.isnan(truth[-1])):
+    truth = truth_coordinates(series.session, series.lidar, places)
+    if missed := np.count_nonzero(np.isnan(truth["true_bottom_depth"][1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
     batches = series.batches(passes, share, wanted)
     records: list[ShotRecord] = []
@@ -213,12 +212,8 @@ def render_shots(
     )
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
-    dataset = series.dataset(joined, parts, attributes)
-    coordinates = {
-        name: ("shot", values[:done], {"units": unit, "long_name": text})
-        for (name, (unit, text)), values in zip(_TRUTH.items(), truth, strict=True)
-    }
-    return dataset.assign_coords(coordinates)
+    known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
+    return series.dataset(joined, parts, attributes).assign_coords(known)
 
 
 class _Series:
@@ -393,15 +388,18 @@ def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: A
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:
-    """Return the lines of a table of the shots of `render_shots`: places, truth and the highest power of a pixel."""
+    """Return the lines of a table of the shots of `render_shots`: places, truth and the highest power of a pixel.
+
+    The bottom is below the mean sea level, the depth below the mean surface in the beam.
+    """
     peak = series["waveform"].max([dim for dim in series["waveform"].dims if dim != "shot"]).values
     lines = [f"{'shot':>5}{'x (m)':>10}{'y (m)':>10}{'along (deg)':>13}{'across (deg)':>14}{'height (m)':>12}"]
-    lines[0] += f"{'bottom (m)':>12}{'peak (W)':>12}"
-    columns = zip(series["shot"].values, *(series[name].values for name in _TRUTH), peak, strict=True)
-    for shot, x, y, along, across, height, depth, power in columns:
+    lines[0] += f"{'bottom (m)':>12}{'depth (m)':>12}{'peak (W)':>12}"
+    columns = zip(series["shot"].values, *(series[name].values for name in _LISTED), peak, strict=True)
+    for shot, x, y, along, across, height, bottom, depth, power in columns:
         slopes = (math.degrees(math.atan(slope)) for slope in (along, across))
         line = f"{shot:>5}{x:>10.2f}{y:>10.2f}" + "{:>13.2f}{:>14.2f}".format(*slopes)
-        lines.append(f"{line}{height:>12.3f}{depth:>12.3f}{power:>12.4g}")
+        lines.append(f"{line}{height:>12.3f}{bottom:>12.3f}{depth:>12.3f}{power:>12.4g}")
     return lines
 
 
@@ -435,46 +433,6 @@ def _target_offset(session: Session) -> tuple[float, float]:
     return x, y
 
 
-def _sea(scene: mi.Scene) -> Any:
-    """Return the sea of an ``ocean_surface``, None without one."""
-    return next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
-
-
 def _has_waves(scene: mi.Scene) -> bool:
-    sea = _sea(scene)
+    sea = sea_of(scene)
     return sea is not None and math.isfinite(sea.cell_size)
-
-
-def true_values(session: Session, lidar: LidarScene, places: FloatArray) -> tuple[FloatArray, ...]:
-    """Return the values of `_TRUTH` at places [m], shape (shots, 2)."""
-    from mitransient_lidar.rendering.describe import axis_on_bottom
-
-    sea = np.array([footprint_means(_sea(session.scene), lidar.transmitter, x, y) for x, y in places])
-    depth = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2])[:, 2]
-    # Rays in single precision are known to a tenth of a millimetre.
-    return *places.T, *sea.T, np.round(depth, 4)
-
-
-def footprint_means(sea: Any, transmitter: Any, x: float, y: float) -> tuple[float, float, float]:
-    """Return the slopes along the lidar's azimuth and to its left [1] and the height [m] at a place [m] of a sea.
-
-    They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves.
-    """
-    if sea is None or not math.isfinite(sea.cell_size):
-        return 0.0, 0.0, 0.0
-    pose = transmitter.pose
-    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
-    along = across / max(-float(pose.axis[2]), 1e-3)
-    azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
-    reach = max(math.ceil(_REACH * along / sea.cell_size), _FEWEST_CELLS)
-    steps = np.arange(-reach, reach + 1)
-    lines_x, lines_y = ((round(place / sea.cell_size) + steps) * sea.cell_size for place in (x, y))
-    heights = sea.heights(lines_x, lines_y)
-    up, right = np.gradient(heights, sea.cell_size)
-    cos, sin = math.cos(azimuth), math.sin(azimuth)
-    dx, dy = np.meshgrid(lines_x - x, lines_y - y)
-    weight = np.exp(-0.5 * (((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2))
-    weight /= weight.sum()
-    values = (cos * right + sin * up, cos * up - sin * right, heights)
-    slope_along, slope_across, height = (float(np.sum(weight * value)) for value in values)
-    return slope_along, slope_across, height

@@ -16,6 +16,7 @@ import pytest
 import significance
 import xarray as xr
 from command_line import assert_refused, run
+from descriptions import assert_described
 from few_paths import few_paths
 
 from mitransient_lidar import results
@@ -122,6 +123,10 @@ def test_everything_that_can_be_kept(tmp_path):
     }
     assert len(np.unique(done["surface_seed"])) == 2
     np.testing.assert_allclose(done["true_bottom_depth"], 12, atol=1e-3)
+    heights = done["true_bottom_depth_below_surface"] - done["true_bottom_depth"]
+    np.testing.assert_allclose(heights, done["true_surface_height"], atol=1e-12)
+    np.testing.assert_allclose(done["true_attenuation"], done["attenuation"].broadcast_like(done["true_attenuation"]))
+    assert_described(data)
     assert len(np.unique(done["aim_x"])) == 4
     # The parts add up to the whole, and come from where they should.
     np.testing.assert_allclose(done["waveform_by_origin"].sum("origin"), done["waveform"], rtol=1e-5, atol=1e-12)

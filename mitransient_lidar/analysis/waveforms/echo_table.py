@@ -38,7 +38,7 @@ _LEVEL = 0.2  # typical deviation of the column at the surface from the one belo
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
 _QUANTITIES = {
     "time_ns": "arrival of the echo",
-    "depth_m": "depth of the echo below the surface",
+    "depth_m": "depth of the echo below",
     "amplitude": "height of the echo",
     "energy": "integral of the echo over time",
     "width_ns": "full width of the echo at half maximum",
@@ -381,7 +381,8 @@ def _label(
     data: dict[str, Any] = {}
     for name, description in _QUANTITIES.items():
         for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
-            described = {"units": units[name], "long_name": of + description}
+            end = f" the {'local surface' if settings.depth_from == 'echo' else 'mean sea level'}" * (name == "depth_m")
+            described = {"units": units[name], "long_name": f"{of}{description}{end}"}
             data[name + suffix] = of_echoes(table[name + suffix], described)
     by_method = {"units": "m", "long_name": "typical error of the depth by scattering and the light's distribution"}
     data["depth_m_method_error"] = of_echoes(table["depth_m_method_error"], by_method)
@@ -395,6 +396,7 @@ def _label(
             described,
         )
     meanings = {
+        "units": "1",
         "long_name": "problems of the echo",
         "flag_masks": [int(flag) for flag in EchoFlag],
         "flag_meanings": " ".join(str(flag.name).lower() for flag in EchoFlag),
@@ -408,9 +410,9 @@ def _label(
     coords: dict[str, Any] = {
         str(name): coordinate for name, coordinate in dataset.coords.items() if set(coordinate.dims) <= set(dims)
     }
-    coords["echo"] = list(ECHOES)
+    coords["echo"] = ("echo", list(ECHOES), {"long_name": "kind of echo"})
     if several:
-        coords["estimator"] = list(settings.estimators)
+        coords["estimator"] = ("estimator", list(settings.estimators), {"long_name": "estimator of the echo's time"})
     provenance = {
         "estimators": list(settings.estimators),
         "echo_fwhm_ns": waveforms.echo_fwhm_ns,

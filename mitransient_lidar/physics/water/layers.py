@@ -121,6 +121,19 @@ class WaterColumn:
         ends = np.clip(np.asarray(depth, dtype=np.float64)[..., np.newaxis], self.layer_tops, self._layer_ends)
         return np.asarray((ends - self.layer_tops) @ self.scattering)
 
+    def layer_shares(self, depth: npt.ArrayLike) -> FloatArray:
+        """Share of each layer in the water from z = 0 to `depth` [m], shape (..., L).
+
+        At or above the mean sea level all is the first layer. At an unknown depth (NaN) the shares are those of a
+        single layer, or NaN where there are several.
+        """
+        z = np.asarray(depth, dtype=np.float64)[..., np.newaxis]
+        if self.count == 1:
+            return np.ones(z.shape)
+        thickness = np.clip(z, self.layer_tops, self._layer_ends) - self.layer_tops
+        first = np.arange(self.count) == 0
+        return np.where(z > 0, thickness / np.where(z > 0, z, 1.0), np.where(np.isnan(z), np.nan, first))
+
     @property
     def _layer_ends(self) -> FloatArray:
         """Lower edges of the layers [m]."""

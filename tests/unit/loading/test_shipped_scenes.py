@@ -6,6 +6,7 @@ import itertools
 import mitsuba as mi
 import pytest
 
+from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.loading import catalogue, scenes
 
 #: Parameters of table1 in their order.
@@ -171,3 +172,22 @@ def test_scenes_share_few_lines():
     for first, second in itertools.combinations(lines, 2):
         matcher = difflib.SequenceMatcher(None, lines[first], lines[second], autojunk=False)
         assert matcher.find_longest_match().size <= 7, (first, second)
+
+
+def test_all_parameters_but_texts_have_a_unit():
+    names = {name for scene in catalogue.scene_names() for name in catalogue.scene_parameters(scene)}
+    texts = {
+        "layout",
+        "spectrum",
+        "slope_distribution",
+        "ripple_focusing",
+        "jerlov",
+        "petzold",
+        "pure",
+        "profile",
+        "phase",
+    }
+    assert {name for name in names if unit_of(name) is None} == texts
+    given = {"bottom_depth": "m", "gate_width_ns": "ns", "plume_width": "m", "sphere_reflectance": "1", "kd": "1/m"}
+    assert {name: unit_of(name) for name in given} == given
+    assert unit_of("my_parameter") is None

@@ -13,14 +13,18 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import shot_batches
 from mitransient_lidar.rendering.session import Session
-from mitransient_lidar.studies import shot_series
+from mitransient_lidar.studies import shot_series, shot_truth
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
 
 FLAT = {"spectrum": "flat", "surface_size": 60}
 PLANE = {"spectrum": "flat"}
 PLACES = [(1.0, 2.0), (-3.0, 4.5), (10.0, -7.0)]
-TRUTH = ("aim_x", "aim_y", "true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth")
+TRUTH = (
+    *("aim_x", "aim_y", "true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth"),
+    *("true_bottom_depth_below_surface", "true_absorption", "true_scattering", "true_backscattering"),
+    *("true_attenuation", "true_kd"),
+)
 
 
 class Wave:
@@ -59,7 +63,7 @@ def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(k_x, k_y, azimuth
     phase = k_x * x + k_y * y + 0.4
     expected = [-k_along * damped * math.sin(phase), -k_across * damped * math.sin(phase), damped * math.cos(phase)]
     # Central differences of the wave's heights are flatter by up to (k h)^2/6 = 0.8 %.
-    found = shot_series.footprint_means(Wave(k_x, k_y), Beam(azimuth), x, y)
+    found = shot_truth.footprint_means(Wave(k_x, k_y), Beam(azimuth), x, y)
     np.testing.assert_allclose(found, expected, rtol=0.01, atol=1e-4)
 
 
@@ -72,13 +76,64 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
     scene = lidar_scene(integrator={"type": "lidar_merging"}, bottom=None, extra={"floor": bottom, "target": small})
     session = Session(scene, scene.sensors()[0], "made", {})
     lidar = LidarScene.from_scene(scene, scene.sensors()[0])
-    truth = shot_series.true_values(session, lidar, np.array([*PLACES, (400.0, 0.0)]))
+    truth = shot_truth.truth_coordinates(session, lidar, np.array([*PLACES, (400.0, 0.0)]))
+    depth, below = (truth[f"true_bottom_depth{end}"][1] for end in ("", "_below_surface"))
     sine = math.sin(math.radians(20)) / 1.34
     tangent = sine / math.sqrt(1 - sine**2)
     expected = [(8 - 0.1 * x) / (1 + 0.1 * tangent) for x, _ in PLACES]
-    np.testing.assert_allclose(truth[5][:3], expected, atol=2e-4)
-    assert np.isnan(truth[5][3])
-    np.testing.assert_array_equal(np.array(truth[2:5]), 0)
+    np.testing.assert_allclose(depth[:3], expected, atol=2e-4)
+    assert np.isnan(depth[3])
+    np.testing.assert_array_equal(below, depth)
+    for name in ("slope_along", "slope_across", "surface_height"):
+        np.testing.assert_array_equal(truth[f"true_{name}"][1], 0)
+
+
+def test_depth_below_the_surface_of_a_wave(lidar_scene, monkeypatch):
+    """The wave of 0.3 m is damped over the footprint in closed form; the beam's standard deviations are 5 mrad."""
+    scene = lidar_scene(integrator={"type": "lidar_merging"})
+    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    monkeypatch.setattr(shot_truth, "sea_of", lambda _: Wave(0.4, 0.0))
+    truth = shot_truth.truth_coordinates(Session(scene, scene.sensors()[0], "made", {}), lidar, np.array(PLACES))
+    along = lidar.transmitter.widest_angular_spread * 200 / math.cos(math.radians(20)) ** 2
+    x = np.array(PLACES)[:, 0]
+    heights = 0.3 * math.exp(-0.5 * (0.4 * along) ** 2) * np.cos(0.4 * x + 0.4)
+    np.testing.assert_allclose(
+        truth["true_bottom_depth_below_surface"][1] - truth["true_bottom_depth"][1], heights, atol=2e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("water", "depth", "expected"),
+    [
+        # Kd is that of Jerlov's table and b as measured; the rest follows by the sources of `water_types.jerlov`.
+        ({"jerlov": "5C"}, [4.0, np.nan], {"true_kd": 0.3072, "true_scattering": 1.21}),
+        ({"kd": 0.1}, [4.0], {"true_kd": 0.1}),
+        ({"secchi": 10}, [4.0], {"true_kd": 0.17, "true_attenuation": 0.7}),
+        # Petzold's San Diego harbour.
+        ({"petzold": "turbid"}, [4.0], {"true_absorption": 0.366, "true_scattering": 1.824}),
+        # Half of the scattering by molecules is backscattering.
+        ({"pure": "true"}, [4.0], {"true_scattering": 0.00196, "true_backscattering": 0.00098}),
+        # 3 of 8 m are the upper layer.
+        ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [8.0], {"true_kd": (3 * 0.1272 + 5 * 0.4816) / 8}),
+        ({"jerlov": "1C, 7C", "layer_tops": "0, 3"}, [np.nan], {"true_kd": np.nan, "true_scattering": np.nan}),
+    ],
+)
+def test_coefficients_of_waters_by_name(water, depth, expected):
+    medium = mi.load_dict({"type": "layered_water", **{name: str(value) for name, value in water.items()}})
+    found = shot_truth.water_means(medium, np.array(depth))
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=3e-3)
+    np.testing.assert_allclose(found["true_absorption"] + found["true_scattering"], found["true_attenuation"])
+
+
+def test_backscattering_is_that_of_the_phase_function_that_is_rendered():
+    """(1 - g)/(2 g) ((1 + g)/sqrt(1 + g^2) - 1) of Henyey-Greenstein's function."""
+    water = {"attenuation": "1", "scattering": "0.8", "backscattering": "0.1", "phase_function": "hg", "phase_g": 0.9}
+    medium = mi.load_dict({"type": "layered_water", **water})
+    share = (1 - 0.9) / (2 * 0.9) * ((1 + 0.9) / math.sqrt(1 + 0.9**2) - 1)
+    assert shot_truth.water_means(medium, np.array([5.0]))["true_backscattering"][0] == pytest.approx(
+        0.8 * share, rel=1e-3
+    )
 
 
 @pytest.fixture

@@ -33,6 +33,14 @@ def test_cumulative_is_piecewise_linear(layered):
     np.testing.assert_allclose(layered.cumulative([-1, 0, 1, 3, 5]), [-0.9, 0, 0.9, 2.7, 3.7], atol=1e-15)
 
 
+def test_shares_of_the_layers_in_the_water_above_a_depth(layered):
+    # Of 8 m, 3 m are the upper layer; mean values times depth are integrals.
+    np.testing.assert_allclose(layered.layer_shares([-1, 0, 2, 8]), [[1, 0], [1, 0], [1, 0], [3 / 8, 5 / 8]])
+    assert layered.layer_shares(8.0) @ layered.attenuation * 8 == pytest.approx(float(layered.cumulative(8)))
+    assert np.isnan(layered.layer_shares(np.nan)).all()
+    assert WaterColumn.from_text(0, 0.3, 0.1, 0).layer_shares(np.nan).tolist() == [1]
+
+
 def test_slanted_segment_is_independent_of_direction(layered):
     # 2 m of the upper and 2 m of the lower layer, stretched by 1.25: (2 * 0.9 + 2 * 0.5) * 1.25
     assert layered.optical_depth(1, 5, 5) == pytest.approx(3.5)

@@ -1,0 +1,127 @@
+"""True slope, heights, depths and water at the places of a series of shots."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.water.water_types import InherentProperties
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitransient_lidar.rendering.session import Session
+    from mitransient_lidar.transport.scene import LidarScene
+
+#: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
+_REACH, _FEWEST_CELLS = 4.5, 4
+
+_IN_BEAM = "mean over the beam's footprint"
+_OF_WATER = "of the water, mean from the mean sea level to the bottom"
+
+#: Unit and description of the coordinates of a series of shots, by name.
+_DESCRIBED = {
+    "aim_x": ("m", "place where the axis meets the mean sea level, x"),
+    "aim_y": ("m", "place where the axis meets the mean sea level, y"),
+    "true_slope_along": ("1", f"slope of the surface, {_IN_BEAM}, positive for a face towards the lidar"),
+    "true_slope_across": ("1", f"slope of the surface, {_IN_BEAM}, positive for a rise to the left"),
+    "true_surface_height": ("m", f"height of the surface above the mean sea level, {_IN_BEAM}"),
+    "true_bottom_depth": ("m", "depth of the bottom below the mean sea level where the refracted axis meets it"),
+    "true_bottom_depth_below_surface": ("m", "depth of that point below the mean surface in the beam's footprint"),
+    "true_absorption": ("1/m", f"absorption coefficient a {_OF_WATER}"),
+    "true_scattering": ("1/m", f"scattering coefficient b {_OF_WATER}"),
+    "true_backscattering": ("1/m", f"backscattering coefficient bb {_OF_WATER}"),
+    "true_attenuation": ("1/m", f"beam attenuation coefficient c {_OF_WATER}"),
+    "true_kd": ("1/m", f"diffuse attenuation coefficient Kd {_OF_WATER}"),
+}
+
+
+def truth_coordinates(session: Session, lidar: LidarScene, places: FloatArray) -> dict[str, Any]:
+    """Return the coordinates over ``shot`` of shots at places [m], shape (shots, 2), with units and descriptions.
+
+    Places, slopes and depths as of `shot_series.render_shots`, and in scenes with water its coefficients
+    (`water_means`).
+    """
+    from mitransient_lidar.rendering.describe import axis_on_bottom
+
+    sea = sea_of(session.scene)
+    along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y) for x, y in places]).T
+    found = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2])[:, 2]
+    # Rays in single precision are known to a tenth of a millimetre.
+    depth = np.round(found, 4)
+    values = {
+        "aim_x": places[:, 0],
+        "aim_y": places[:, 1],
+        "true_slope_along": along,
+        "true_slope_across": across,
+        "true_surface_height": height,
+        "true_bottom_depth": depth,
+        "true_bottom_depth_below_surface": depth + height,
+        **({} if lidar.water is None else water_means(lidar.water, depth)),
+    }
+    return {
+        name: ("shot", values[name], {"units": unit, "long_name": text})
+        for name, (unit, text) in _DESCRIBED.items()
+        if name in values
+    }
+
+
+def water_means(water: Any, depth: FloatArray) -> dict[str, FloatArray]:
+    """Return the mean coefficients of a ``layered_water`` from the mean sea level to depths [m], bubbles left out.
+
+    They are ``true_absorption``, ``true_scattering``, ``true_backscattering``, ``true_attenuation`` and ``true_kd``
+    [1/m], each with the shape of `depth`. Backscattering is that of the phase functions that are rendered, and Kd
+    follows by the formula of `water_types.InherentProperties.kd`. At an unknown depth (NaN) the values are those of a
+    water that is the same at all depths, and NaN in others.
+    """
+    from mitransient_lidar.transport.medium.water_phases import table_of
+
+    column = water.column
+    phases = water.phases.phases[: column.count]
+    ratios = {id(phase): table_of(phase).backscatter_ratio for phase in phases}
+    backscattering = column.scattering * [ratios[id(phase)] for phase in phases]
+    # Rounding of a phase function may give a little less than half of the scattering by molecules.
+    molecules = np.minimum(water.water_scattering, 2 * backscattering)
+    rows = zip(column.absorption, column.scattering, backscattering, molecules, strict=True)
+    layers = {
+        "true_absorption": column.absorption,
+        "true_scattering": column.scattering,
+        "true_backscattering": backscattering,
+        "true_attenuation": column.attenuation,
+        "true_kd": np.array([InherentProperties(*map(float, row)).kd for row in rows]),
+    }
+    shares = column.layer_shares(depth)
+    return {name: np.asarray(shares @ values) for name, values in layers.items()}
+
+
+def sea_of(scene: mi.Scene) -> Any:
+    """Return the sea of an ``ocean_surface``, None without one."""
+    return next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
+
+
+def footprint_means(sea: Any, transmitter: Any, x: float, y: float) -> tuple[float, float, float]:
+    """Return the slopes along the lidar's azimuth and to its left [1] and the height [m] at a place [m] of a sea.
+
+    They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves.
+    """
+    if sea is None or not math.isfinite(sea.cell_size):
+        return 0.0, 0.0, 0.0
+    pose = transmitter.pose
+    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
+    along = across / max(-float(pose.axis[2]), 1e-3)
+    azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
+    reach = max(math.ceil(_REACH * along / sea.cell_size), _FEWEST_CELLS)
+    steps = np.arange(-reach, reach + 1)
+    lines_x, lines_y = ((round(place / sea.cell_size) + steps) * sea.cell_size for place in (x, y))
+    heights = sea.heights(lines_x, lines_y)
+    up, right = np.gradient(heights, sea.cell_size)
+    cos, sin = math.cos(azimuth), math.sin(azimuth)
+    dx, dy = np.meshgrid(lines_x - x, lines_y - y)
+    weight = np.exp(-0.5 * (((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2))
+    weight /= weight.sum()
+    values = (cos * right + sin * up, cos * up - sin * right, heights)
+    slope_along, slope_across, height = (float(np.sum(weight * value)) for value in values)
+    return slope_along, slope_across, height

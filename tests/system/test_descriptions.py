@@ -1,0 +1,62 @@
+"""Units and descriptions of all that commands write; those of campaigns are tested with these."""
+
+import pytest
+from descriptions import assert_described
+from few_paths import few_paths
+
+import mitransient_lidar
+from mitransient_lidar import results
+from mitransient_lidar.analysis.gates.cut import cut_gates
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.results.gate_files import open_stack, save_stack
+from mitransient_lidar.studies.shot_series import render_shots
+
+FLAT = {"spectrum": "flat", "wind_speed": 5}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return few_paths("table1", tmp_path_factory.mktemp("scene"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["2x2", "16x16"])
+def test_render_record_echoes_and_gates(scene, tmp_path, layout):
+    result = mitransient_lidar.render(scene, params={**FLAT, "layout": layout}, passes=2, components=True)
+    assert ("row" in result.dims) == (layout == "16x16")
+    results.save(result, tmp_path / "result.nc")
+    read = results.open(tmp_path / "result.nc")
+    recorded = detect_waveforms(read, "apd", shots=2, optical_density="auto")
+    gates = cut_gates(read, GateTrain(read.attrs["surface_time_ns"] + 20, 5.0, 5.0, 3))
+    save_stack(gates, tmp_path / "gates.exr")
+    for dataset in (read, recorded, gates, open_stack(tmp_path / "gates.exr")):
+        assert_described(dataset)
+    for dataset in (read, recorded):
+        assert_described(extract(dataset, ESTIMATORS, layers=1))
+
+
+@pytest.mark.slow
+def test_shots_their_record_and_echoes(scene):
+    shots = render_shots(scene, FLAT, positions=[(0, 0), (5, 2)], passes=2, components=True)
+    recorded = detect_waveforms(shots, "apd", shots=3, optical_density="auto")
+    echoes = extract(recorded)
+    assert "true_kd" in echoes.coords
+    for dataset in (shots, recorded, echoes):
+        assert_described(dataset)
+
+
+@pytest.mark.slow
+def test_depths_of_echoes_say_below_what(scene):
+    result = mitransient_lidar.render(scene, params=FLAT, passes=2)
+    local, mean = (extract(result, depth_from=zero)["depth_m"].attrs["long_name"] for zero in ("echo", "mean"))
+    assert local == "depth of the echo below the local surface"
+    assert mean == "depth of the echo below the mean sea level"
+
+
+@pytest.mark.slow
+def test_images_by_daylight():
+    few = {"type": "passive_volpath", "paths_per_pass": 4096}
+    assert_described(render_passive("passive_sea", integrator=few, passes=2, frames=2, filter_width_nm=2.0))
