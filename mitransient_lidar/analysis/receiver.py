@@ -64,7 +64,8 @@ def detect_waveforms(
     xarray.Dataset
         ``signal`` and ``saturated`` over (shot, pixel, time) or (shot, row, column, time), for a series all records of
         its first shot first; over the same dimensions, without shot unless it is a series, the closed forms
-        ``signal_mean``, ``signal_deviation`` (standard deviation of a shot), ``snr`` and ``saturation`` (probability).
+        ``signal_mean``, ``signal_deviation`` (standard deviation of a shot), ``snr`` and ``saturation`` (probability),
+        and ``signal_mean_stderr``, what ``waveform_stderr`` of a render changes in the mean.
         The signal is in V, after a counter in counts per bin, without an amplifier in electrons per bin. Per pixel,
         ``saturated_shots`` is the share of shots with saturated samples, ``saturated_samples`` that of the samples
         [1]. ``time`` [ns], ``time_start_ns`` and ``bin_width_ns`` are those of the samples; other coordinates and
@@ -201,6 +202,13 @@ def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int
         weights,
         {**share, "long_name": "weight of the light of a bin in a sample"},
     )
+    if "waveform_stderr" in dataset:
+        # The errors of a render's neighbouring bins agree in sign, as its pulse smooths them.
+        error = np.nan_to_num(dataset["waveform_stderr"].transpose(*dims).values)
+        shifted = receiver.expected(power + 10**-density * error, width, background).mean - expected.mean
+        shifted = np.repeat(np.abs(shifted), number, axis=0) if series else np.abs(shifted)
+        text = "standard error of the mean signal by the Monte Carlo of the render"
+        values["signal_mean_stderr"] = (dims, shifted, {**sampled, "long_name": text})
     heights = receiver.event_height(power, width, background)
     values["event_height"] = (
         pixels,

@@ -91,7 +91,8 @@ def extract(
         Standard deviation of the samples: a number, or one per pixel, or per pixel and bin. By default,
         ``waveform_stderr`` times the attribute ``error_inflation``, or ``signal_deviation``, or the spread before the
         surface echo. For a signal it is at least this spread, times the ratio of the standard deviation of means over
-        a pulse to that of independent bins, from at least 20 shots, or else before the surface echo.
+        a pulse to that of independent bins, from at least 20 shots, or else before the surface echo; and it includes
+        ``signal_mean_stderr``, so that errors of a render are no echoes.
     threshold, contrast
         As for `echo_detection.find_echoes`.
     echo_fwhm_ns : float, optional

@@ -273,15 +273,16 @@ def _logarithm(dataset: xr.Dataset) -> LogAmplifier | None:
 
 
 def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
-    """Return a dataset with the signal before the logarithm, and its standard deviation to first order."""
+    """Return a dataset with the signal before the logarithm, and its standard deviations to first order."""
     signal = dataset["signal"]
     replaced = {"signal": signal.copy(data=logarithm.expand(signal.values))}
     if "event_height" in dataset:
         replaced["event_height"] = dataset["event_height"].copy(data=logarithm.expand(dataset["event_height"].values))
-    if "signal_deviation" in dataset:
-        deviation = dataset["signal_deviation"]
-        mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean({"shot"} & set(signal.dims))
-        replaced["signal_deviation"] = deviation * logarithm.expansion(mean.transpose(*deviation.dims).values)
+    for name in ("signal_deviation", "signal_mean_stderr"):
+        if name in dataset:
+            error = dataset[name]
+            mean = dataset["signal_mean"] if "signal_mean" in dataset else signal.mean({"shot"} & set(signal.dims))
+            replaced[name] = error * logarithm.expansion(mean.transpose(*error.dims).values)
     return dataset.assign(replaced)
 
 
@@ -314,6 +315,22 @@ def _noise(
         bins, inflation = (dataset.attrs.get(key, 1.0) for key in ("error_inflation_bins", "error_inflation"))
         factor = np.interp(math.log(run), np.log(np.atleast_1d(bins)), np.atleast_1d(inflation))
         return float(factor) * dataset["waveform_stderr"].values.reshape(-1, count)
+    by_receiver = _receiver_noise(dataset, samples, baseline, quiet, run)
+    if "signal_mean_stderr" not in dataset:
+        return by_receiver
+    # Structures within the error of a render are no echoes, though they are in all records of a shot. That of a peak is
+    # its own, without the factor of means, with which most bottoms of renders to 10 % would be lost.
+    by_render = dataset["signal_mean_stderr"].values.reshape(-1, count)
+    if len(by_receiver) not in (1, len(by_render)):
+        by_receiver = np.tile(by_receiver, (len(by_render) // pixels, 1))
+    return np.hypot(by_receiver, by_render)
+
+
+def _receiver_noise(
+    dataset: xr.Dataset, samples: npt.NDArray[Any], baseline: FloatArray, quiet: npt.NDArray[np.bool_], run: int
+) -> FloatArray:
+    """Return the noise of the receiver's signal for means of `run` samples."""
+    pixels, count = baseline.size, samples.shape[1]
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
         raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
     rest = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]

@@ -9,6 +9,7 @@ from significance import largest_z
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import describe_recording, detect_waveforms, encoding
+from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.analysis.waveforms.records import open_waveforms
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -143,6 +144,44 @@ def series(*scales):
     """Return shots of the result at several strengths, with a truth of each."""
     shots = xr.concat([make() * scale for scale in scales], "shot").assign_attrs(make().attrs)
     return shots.assign_coords(shot=np.arange(len(scales)) + 3, true_slope_along=("shot", 0.1 * np.array(scales)))
+
+
+def test_errors_of_a_render_are_those_of_the_mean_signal():
+    """Behind a linear chain, an error of 30 % of the light is 30 % of the mean signal."""
+    dataset = make()
+    dataset["waveform_stderr"] = 0.3 * dataset["waveform"]
+    shots = detect_waveforms(dataset, CHAIN, seed=3)
+    dark = detect_waveforms((0 * dataset).assign_attrs(dataset.attrs), CHAIN)["signal_mean"]
+    np.testing.assert_allclose(shots["signal_mean_stderr"], 0.3 * (shots["signal_mean"] - dark), rtol=1e-6, atol=1e-12)
+    assert "signal_mean_stderr" not in detect_waveforms(dataset.drop_vars("waveform_stderr"), CHAIN)
+
+
+@pytest.mark.parametrize("repeats", [1, 2])
+def test_peaks_within_the_error_of_a_render_are_no_echoes(repeats):
+    """A render whose single paths make a peak behind the bottom: all records of the shot show it."""
+    time = np.arange(300)
+    wave = np.exp(-0.5 * ((time - 60) / 4) ** 2) + 0.5 * np.exp(-0.5 * ((time - 160) / 4) ** 2)
+    peak = 0.05 * np.exp(-0.5 * ((time - 240) / 4) ** 2)
+    one = results.build(
+        *(1e-9 * x[np.newaxis] for x in (wave + peak, peak)),
+        *(1e-6 * x[np.newaxis] for x in (wave + peak, peak)),
+        time=TimeAxis(1400.0, 0.5, time.size),
+        pixel_names=["single"],
+        pixel_centres_mrad=np.zeros((1, 2)),
+        attributes={
+            **{"scene": "made up", "layout": "1x1", "altitude": 0.5e-9 * 299792458 * 1430, "off_nadir_deg": 0.0},
+            **{"refractive_index": 1.34, "group_index": 1.36, "surface_time_ns": 1430.0, "pulse_fwhm_ns": 4.7},
+        },
+    )
+    dataset = one
+    if repeats > 1:
+        dataset = xr.concat([one] * repeats, "shot").assign_attrs(one.attrs).assign_coords(shot=np.arange(repeats))
+    shots = detect_waveforms(dataset, CHAIN, shots=30 // repeats, seed=1)
+    bottom = echo_table.extract(shots).sel(echo="bottom")["time_ns"]
+    assert np.all(np.abs(bottom - bottom.median()) < 1)
+    assert float(bottom.median()) == pytest.approx(1480, abs=2)
+    behind = echo_table.extract(shots.drop_vars("signal_mean_stderr")).sel(echo="bottom")["time_ns"]
+    assert float(behind.median()) == pytest.approx(1520, abs=2)
 
 
 def test_every_shot_of_a_series_is_recorded():
