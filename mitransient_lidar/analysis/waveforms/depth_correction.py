@@ -24,6 +24,8 @@ AXES = ("off_nadir_deg", "wind_speed", "water", "depth")
 
 _TABLE = ("bias", "spread", "found", "attenuation")
 _LEAST_ERROR = 0.01  # of a corrected depth [m]
+#: Error of biases between the nodes of a table, relative: that of 32 cells of level seas at other angles and depths.
+_OF_BIAS = 0.25
 _NEAR = 2.0  # largest error of a depth that counts [m]
 
 
@@ -80,10 +82,11 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
     Returns
     -------
     xarray.Dataset
-        The echoes with ``depth_m`` less the bias, ``depth_correction_m`` (what was subtracted), and the spread that is
-        left in renders as ``depth_m_method_error``. Errors are interpolated linearly in the angle from nadir, the wind,
-        the attenuation of the column (the median over the waveforms), and the depth; outside the table they are those
-        of its ends. A bias counts with the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
+        The echoes with ``depth_m`` less the bias, ``depth_correction_m`` (what was subtracted), and as
+        ``depth_m_method_error`` the spread that is left in renders with a quarter of the bias, the error of biases
+        between nodes. Errors are interpolated linearly in the angle from nadir, the wind, the attenuation of the column
+        (the median over the waveforms), and the depth; outside the table they are those of its ends. A bias counts with
+        the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
     Raises
     ------
@@ -129,7 +132,7 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
                 target[e, p] = _interpolated(values[:, :, e, p], water, _place_of(nodes, arranged.values[e, p]))
     amount[..., :2] = 0.0
     correction = arranged.copy(data=np.where(np.isfinite(arranged.values), amount, np.nan)).transpose(*depth.dims)
-    error = arranged.copy(data=np.maximum(left, _LEAST_ERROR)).transpose(*depth.dims)
+    error = arranged.copy(data=np.maximum(np.hypot(left, _OF_BIAS * amount), _LEAST_ERROR)).transpose(*depth.dims)
     if not several:
         correction, error = correction.isel(estimator=0, drop=True), error.isel(estimator=0, drop=True)
     correction = correction.transpose(*found["depth_m"].dims)
@@ -157,7 +160,7 @@ def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, Float
     Returns
     -------
     dict
-        ``found``, the share of shots with a depth; ``bias`` and ``spread``, median error and its standard deviation,
+        ``found``, the share of shots with a depth; ``bias`` and ``spread``, mean error and its standard deviation,
         of depths within 2 m; ``noise_error`` and ``error``, the medians of the stated error by noise, and of all;
         ``z``, the root mean square of error over stated error; ``wrong``, the share of shots that err by more than
         0.5 m without a flag.

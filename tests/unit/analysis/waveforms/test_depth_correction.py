@@ -66,7 +66,8 @@ def test_the_bias_of_the_place_between_nodes_is_subtracted():
             bias = factor * (0.15 + 0.06 + 0.09 + 0.005 * np.array([4.0, 8.0])) + p
             np.testing.assert_allclose(bottom["depth_m"].values[:2, p, e], np.array([4.0, 8.0]) - bias)
             np.testing.assert_allclose(bottom["depth_correction_m"].values[:2, p, e], bias)
-            np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], [0.04, 0.08])
+            left = np.hypot([0.04, 0.08], 0.25 * bottom["depth_correction_m"].values[:2, p, e])
+            np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], left)
     assert np.isnan(bottom["depth_m"].values[2]).all()
     surface = corrected.sel(echo="surface")
     np.testing.assert_allclose(surface["depth_m"], 0)
