@@ -62,10 +62,10 @@ if TYPE_CHECKING:
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
     from mitransient_lidar.rendering.passes import ProgressCallback
+    from mitransient_lidar.rendering.shot_series import render_shots
     from mitransient_lidar.studies.depth_bias import depth_bias
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
-    from mitransient_lidar.studies.shot_series import render_shots
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -77,7 +77,7 @@ _FUNCTIONS = {
     "instrument_names": ("loading.instruments", "instrument_names"),
     "read_instrument": ("loading.instruments", "read_instrument"),
     "record": ("analysis.receiver", "detect_waveforms"),
-    "render_shots": ("studies.shot_series", "render_shots"),
+    "render_shots": ("rendering.shot_series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
@@ -179,7 +179,7 @@ def render(
     -------
     xarray.Dataset
         Impulse response [J per bin] and waveform [W] with standard errors, or gates; as of `rendering.render.render`,
-        `rendering.again.render_again` and `studies.shot_series.render_shots_again`.
+        `rendering.again.render_again` and `rendering.shot_series.render_shots_again`.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def render(
     result: Any = scene
     if again.result_kind(again.read_attributes(result)) != "shots":
         return again.render_again(result, **options, **others)
-    from mitransient_lidar.studies.shot_series import render_shots_again
+    from mitransient_lidar.rendering.shot_series import render_shots_again
 
     return render_shots_again(result, **options, **others)
 

@@ -18,7 +18,7 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.studies.shot_series import render_shots
+from mitransient_lidar.rendering.shot_series import render_shots
 
 #: Half of the side of the square of the places of a sea [m].
 _REACH = 256.0

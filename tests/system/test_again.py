@@ -14,9 +14,9 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.rendering.shot_series import render_shots, render_shots_again
 from mitransient_lidar.results.gate_files import save_sequence, save_stack
 from mitransient_lidar.results.radiance import save_radiance
-from mitransient_lidar.studies.shot_series import render_shots, render_shots_again
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 SMALL = {"surface_size": "60", "bin_width_ns": "4", "bin_count": "40"}

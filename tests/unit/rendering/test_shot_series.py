@@ -11,9 +11,8 @@ from command_line import assert_refused, run
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering import shot_batches
+from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
 from mitransient_lidar.rendering.session import Session
-from mitransient_lidar.studies import shot_series, shot_truth
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
 

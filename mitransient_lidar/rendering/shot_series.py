@@ -23,9 +23,9 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, in_range
 from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
 from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
+from mitransient_lidar.rendering.sea_map import SeaMap
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
-from mitransient_lidar.studies.sea_map import SeaMap
-from mitransient_lidar.studies.shot_truth import sea_of, truth_coordinates
+from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
 if TYPE_CHECKING:
     import mitsuba as mi
