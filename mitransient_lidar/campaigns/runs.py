@@ -16,7 +16,7 @@ from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE
+from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import render_shots
 

@@ -16,7 +16,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
+from mitransient_lidar.rendering.options import SMALLEST_SHARE
+from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.scene import ScenePart
 

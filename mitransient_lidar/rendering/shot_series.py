@@ -20,9 +20,8 @@ from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer, positive
-from mitransient_lidar.loading.parameters import check_params
-from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
+from mitransient_lidar.rendering.options import SMALLEST_SHARE
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
 from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
@@ -80,7 +79,7 @@ def render_shots(
     seed: int = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
-    components: bool = False,
+    components: bool | None = None,
     instrument: str | None = None,
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
@@ -116,7 +115,7 @@ def render_shots(
         Time bins instead of automatic ones, which hold the light of all shots; they must hold it, too, up to a
         twentieth of the record.
     components
-        Whether to separate the light by its origin, as for `rendering.render.render`.
+        Whether to separate the light by its origin, by default not, as for `rendering.render.render`.
     instrument
         Name of the instrument whose laser and receiver replace those of the scene.
     describe_sea
@@ -160,7 +159,7 @@ def render_shots(
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = _Series(scene, params, instrument, target, places, axis, components)
+    series = _Series(scene, params, instrument, target, places, axis, bool(components))
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
@@ -205,7 +204,7 @@ def render_shots(
         first_seed=first_seed,
         interrupted=int(interrupted),
         moved_target=int(move_target),
-        components=int(components),
+        components=int(bool(components)),
         series_parameters=json.dumps(own),
         **({} if wanted is None else {"target_error": wanted}),
         **({"places_seed": seed} if given is None else {}),
@@ -239,8 +238,8 @@ class _Series:
         axis: TimeAxis | None,
         components: bool,
     ) -> None:
-        from mitransient_lidar.rendering.echo_window import probe_echoes
-        from mitransient_lidar.rendering.render import describe_scene, error_window
+        from mitransient_lidar.rendering.describe import describe_scene
+        from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shot_batches import check_size
         from mitransient_lidar.transport.scene import LidarScene
@@ -313,7 +312,7 @@ class _Series:
         self, arrays: Sequence[FloatArray], parts: Sequence[FloatArray], attributes: Mapping[str, Any]
     ) -> xr.Dataset:
         """Return the labelled result of arrays of shape (shots, pixels, bins), and (shots, pixels, origins, bins)."""
-        from mitransient_lidar.rendering.render import with_lines_of_sight
+        from mitransient_lidar.rendering.describe import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
         dataset = results.build_series(
@@ -344,47 +343,6 @@ def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, targe
         target_quantile=0.5,
         error=None if target is None else float(median),
     )
-
-
-def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
-    """Render a series of shots of `render_shots`, or its file, again: the same bits on the same machine.
-
-    Parameters
-    ----------
-    series
-        A complete series, or the shots that were completed before Ctrl-C.
-    options
-        Options of `render_shots` that change it; `params` are added to the parameters of its scene.
-
-    Raises
-    ------
-    UserError
-        If shots were selected or reordered, the series does not hold its scene, a file of the scene has changed, or an
-        option is invalid.
-    """
-    from mitransient_lidar import results
-    from mitransient_lidar.rendering.again import compare_versions
-
-    found = series if isinstance(series, xr.Dataset) else results.open(series)
-    attributes = found.attrs
-    if "shot" not in found.dims or not np.array_equal(found["shot"], np.arange(attributes.get("shots", 0))):
-        raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
-    compare_versions(attributes)
-    given = {name: value for name, value in options.items() if value is not None}
-    check_params(given.get("params"))
-    # The bins of some shots are those of all of them.
-    same = {} if "params" in given or "positions" in given else {"axis": results.time_axis(found)}
-    params = {**json_attribute(attributes, "series_parameters"), **given.pop("params", {})}
-    own = {
-        "positions": np.column_stack([found["aim_x"], found["aim_y"]]),
-        "pass_share": float(attributes["pass_share"]),
-        # Batches end with their error, or after their passes.
-        **{name: attributes[name] for name in ["target_error" if "target_error" in attributes else "passes"]},
-        "move_target": bool(attributes["moved_target"]),
-        "components": bool(attributes.get("components", 0)),
-        "first_seed": int(attributes.get("first_seed", 0)),
-    }
-    return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:

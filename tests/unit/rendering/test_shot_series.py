@@ -12,6 +12,7 @@ from command_line import assert_refused, run
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
+from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.session import Session
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
@@ -199,7 +200,7 @@ def test_time_bins_that_leave_out_light_are_refused(rendered):
 def test_seeds_and_instrument_of_a_series(rendered):
     options = {"positions": PLACES[:2], "passes": 2, "first_seed": 40, "instrument": "teledyne_czmil"}
     series = shot_series.render_shots("table1", FLAT, **options)
-    again = shot_series.render_shots_again(series)
+    again = render_again(series)
     assert [seed for one in rendered for seed in one["seeds"]] == [40, 41, 40, 41]
     assert series.attrs["instrument"] == again.attrs["instrument"] == "teledyne_czmil"
 
