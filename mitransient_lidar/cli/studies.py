@@ -72,6 +72,7 @@ def find_shots(
 @render_options(
     "components",
     target_error="Relative standard error of the median bin, instead of full passes (greater than 0).",
+    max_time="Stop before this many seconds for all shots, with fewer passes or shots (greater than 0).",
     passes="Most passes of each shot (2 to 10000), 8 by default, 400 with a target error.",
 )
 def shots(

@@ -127,12 +127,16 @@ def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[s
     if "shot" not in series.dims or not np.array_equal(series["shot"], np.arange(attributes.get("shots", 0))):
         raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
     check_params(given.get("params"))
-    # The bins of some shots are those of all of them.
-    same = {} if "params" in given or "positions" in given else {"axis": results.time_axis(series)}
+    # The bins of some shots are those of all of them. Series of earlier versions do not hold the passes of each shot.
+    same: dict[str, Any] = {} if "params" in given or "positions" in given else {"axis": results.time_axis(series)}
+    if same and "shot_passes" in series.coords and not any(name in given for name in _ENDS):
+        same |= {"passes": int(_held(attributes, "most_passes")), "shot_passes": series["shot_passes"].values}
+    elif "target_error" in attributes:
+        same["passes"] = None
     return {
         "positions": np.column_stack([series["aim_x"], series["aim_y"]]),
         # Batches end with their error, or after their passes.
-        **({"target_error": attributes["target_error"], "passes": None} if "target_error" in attributes else {}),
+        "target_error": attributes.get("target_error"),
         "move_target": bool(attributes["moved_target"]),
         "first_seed": int(attributes.get("first_seed", 0)),
         **same,

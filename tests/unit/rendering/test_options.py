@@ -1,6 +1,8 @@
 """Options of a render: one list for functions, commands and results."""
 
+import importlib
 import inspect
+import pkgutil
 import re
 from dataclasses import fields
 
@@ -9,11 +11,15 @@ import typer
 from command_line import assert_refused, run
 
 import mitransient_lidar
+from mitransient_lidar import campaigns, rendering, studies
+from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.cli.app import app
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering.options import MOST_PASSES, SMALLEST_SHARE, RenderOptions
 
 NAMES = [one.name for one in fields(RenderOptions)]
+#: Functions that reduce passes to a time, whatever else ends a render.
+FITTED = {"mitransient_lidar.rendering.pass_size.fit_to_time."}
 COMMANDS = typer.main.get_command(app).commands
 
 
@@ -66,3 +72,30 @@ def test_values_at_the_ends_are_accepted_and_texts_are_numbers():
 def test_unknown_options_of_a_scene_are_errors():
     with pytest.raises(TypeError, match="unexpected keyword argument 'frames'"):
         mitransient_lidar.render("table1", frames=2)
+
+
+def public_functions():
+    """Return the functions and methods of rendering, studies, campaigns and the top of the package, by their names."""
+    found = {name: getattr(mitransient_lidar, name) for name in mitransient_lidar.__all__}
+    for package in (rendering, studies, campaigns):
+        for about in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            module = importlib.import_module(about.name)
+            for name, one in vars(module).items():
+                if name.startswith("_") or getattr(one, "__module__", None) != about.name:
+                    continue
+                members = vars(one).items() if inspect.isclass(one) else [("", one)]
+                found |= {f"{about.name}.{name}.{part}": each for part, each in members if not part.startswith("_")}
+    found = {name: getattr(one, "__func__", one) for name, one in found.items()}
+    return {name: set(inspect.signature(one).parameters) for name, one in found.items() if inspect.isfunction(one)}
+
+
+def test_what_takes_an_error_takes_a_time():
+    functions = public_functions()
+    with_error = {name for name, parameters in functions.items() if "target_error" in parameters}
+    assert with_error == {name for name, parameters in functions.items() if "max_time" in parameters} - FITTED
+    assert {"render", "render_shots", "mitransient_lidar.rendering.passes.Goal.from_options"} < with_error
+    commands = {name: {one.name for one in command.params} for name, command in COMMANDS.items()}
+    with_error = {name for name, options in commands.items() if "target_error" in options}
+    assert with_error == {name for name, options in commands.items() if "max_time" in options}
+    assert with_error == {"render", "passive", "shots", "bench"}
+    assert {"target_error", "max_time"} <= {one.name for one in fields(Campaign)}
