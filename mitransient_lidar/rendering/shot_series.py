@@ -107,7 +107,7 @@ def render_shots(
         lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
     max_time
         Longest time for the passes of all shots [s], greater than 0. It is shared among the batches, which end with
-        fewer passes, at least two. Where these take longer, too, the result holds the shots that are completed then.
+        fewer passes, at least two. Where these take longer, too, the result holds the batches begun by then.
     pass_share
         Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and with a `target_error` one that
         needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
