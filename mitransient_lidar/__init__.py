@@ -49,8 +49,6 @@ except _UserError as _error:
     raise ImportError(str(_error)) from None
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import xarray
 
     from mitransient_lidar.analysis.gates.cut import cut_gates
@@ -61,11 +59,11 @@ if TYPE_CHECKING:
     from mitransient_lidar.campaigns.sweep import sweep
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
-    from mitransient_lidar.rendering.passes import ProgressCallback
+    from mitransient_lidar.rendering.render import render
+    from mitransient_lidar.rendering.shot_series import render_shots
     from mitransient_lidar.studies.depth_bias import depth_bias
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
-    from mitransient_lidar.studies.shot_series import render_shots
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -77,7 +75,8 @@ _FUNCTIONS = {
     "instrument_names": ("loading.instruments", "instrument_names"),
     "read_instrument": ("loading.instruments", "read_instrument"),
     "record": ("analysis.receiver", "detect_waveforms"),
-    "render_shots": ("studies.shot_series", "render_shots"),
+    "render": ("rendering.render", "render"),
+    "render_shots": ("rendering.shot_series", "render_shots"),
     "retrieve": ("analysis.retrieval.retrieve", "retrieve"),
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
@@ -119,85 +118,6 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """Return the names of the functions that are imported later, too."""
     return sorted({*globals(), *_FUNCTIONS})
-
-
-def render(
-    scene: str | Path | Mapping[str, Any] | _mi.Scene | xarray.Dataset,
-    *,
-    params: Mapping[str, Any] | None = None,
-    instrument: str | None = None,
-    integrator: str | Mapping[str, Any] | _mi.Integrator | None = None,
-    target_error: float | None = None,
-    target_quantile: float | None = None,
-    max_time: float | None = None,
-    passes: int | None = None,
-    seed: int | None = None,
-    max_memory: float | None = None,
-    pass_share: float | None = None,
-    components: bool | None = None,
-    variant: str | None = None,
-    progress: ProgressCallback | None = None,
-    **others: Any,
-) -> xarray.Dataset:
-    """Render a lidar scene to an accuracy, or a result again.
-
-    Parameters
-    ----------
-    scene
-        Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, or a loaded scene; or a
-        result (a dataset, or its EXR or NetCDF file), which is rendered again with its own options unless others are
-        given.
-    params
-        Values for the ``<default>`` parameters of an XML scene.
-    instrument
-        Name of the instrument whose laser and receiver replace those of the scene; see `instrument_names`.
-    integrator
-        Name or dict of an integrator plugin, or an integrator; by default that of the scene.
-    target_error, target_quantile
-        Relative standard error, greater than 0, that ends the render, and the share of the bins or gates that must have
-        reached it, 0.01 to 1; 0.03 and 0.95 by default.
-    max_time
-        Longest time for the passes [s], greater than 0; 300 by default.
-    passes
-        Number of passes, 2 to 10^9, instead of an error.
-    seed
-        Integer from -2^63 to 2^63 - 1, 0 by default; the same seed gives the same result on the same machine.
-    max_memory
-        Memory for histograms, means and errors [GB], greater than 0; 2 by default.
-    pass_share
-        Share of the paths of a full pass in each pass, 1/512 to 1.
-    components
-        Whether to separate the light by its origin.
-    variant
-        ``llvm_ad_mono`` or ``cuda_ad_mono``.
-    progress
-        Called with a `rendering.passes.Progress` after every pass.
-    others
-        Options of `render_shots` or of daylight images, for results of these.
-
-    Returns
-    -------
-    xarray.Dataset
-        Impulse response [J per bin] and waveform [W] with standard errors, or gates; as of `rendering.render.render`,
-        `rendering.again.render_again` and `studies.shot_series.render_shots_again`.
-
-    Raises
-    ------
-    UserError
-        If the scene, the result, a parameter or an option is invalid, or no light returns.
-    """
-    options = {name: value for name, value in locals().items() if name not in ("scene", "others") and value is not None}
-    from mitransient_lidar.rendering import again
-    from mitransient_lidar.rendering.render import render as render_scene
-
-    if not again.is_result(scene):
-        return render_scene(scene, **options, **others)
-    result: Any = scene
-    if again.result_kind(again.read_attributes(result)) != "shots":
-        return again.render_again(result, **options, **others)
-    from mitransient_lidar.studies.shot_series import render_shots_again
-
-    return render_shots_again(result, **options, **others)
 
 
 def open(path: str | Path) -> xarray.Dataset:  # the name that xarray and this project's users expect

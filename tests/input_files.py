@@ -78,7 +78,8 @@ def use_again(path: Path) -> None:
     from mitransient_lidar.analysis.gates.cut import cut_gates
     from mitransient_lidar.analysis.receiver import detect_waveforms
     from mitransient_lidar.physics.lidar.gate_train import GateTrain
-    from mitransient_lidar.rendering.again import describe_result, render_again
+    from mitransient_lidar.rendering.again import describe_result
+    from mitransient_lidar.rendering.render import render_again
 
     _each(
         lambda: describe_result(path),

@@ -103,6 +103,8 @@ class Campaign:
         Scene by name or path, and instrument, as for `render_shots`.
     target_error
         Relative standard error of the median bin of each run.
+    max_time
+        Longest time for the passes of each run [s], None for any. A run that it ends has other bits elsewhere.
     keep
         What the store holds, of `KEPT`.
     receiver
@@ -122,6 +124,7 @@ class Campaign:
 
     scene: str
     target_error: float = 0.05
+    max_time: float | None = None
     keep: tuple[str, ...] = ("waveform", "truth")
     instrument: str | None = None
     receiver: str | None = None
@@ -164,6 +167,7 @@ class Campaign:
         campaign = cls(
             scene=_resolved(str(scene), folder),
             target_error=positive("target_error", given.get("target_error", 0.05)),
+            max_time=None if given.get("max_time") is None else positive("max_time", given["max_time"]),
             keep=_kept(given.get("keep", ["waveform", "truth"])),
             instrument=given.get("instrument"),
             receiver=given.get("receiver"),

@@ -16,9 +16,9 @@ from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE
+from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.studies.shot_series import render_shots
+from mitransient_lidar.rendering.shot_series import render_shots
 
 #: Half of the side of the square of the places of a sea [m].
 _REACH = 256.0
@@ -98,6 +98,7 @@ class RunRenderer:
             "positions": places,
             "move_target": "target_x" in known and "target_y" in known,
             "target_error": campaign.target_error,
+            "max_time": campaign.max_time,
             "components": "components" in campaign.keep,
             "first_seed": int(random.integers(2**40)),
             "axis": self.axis,
@@ -123,12 +124,16 @@ class RunRenderer:
         )
 
     def arrays(self, number: int, values: Mapping[str, Any]) -> dict[str, Array]:
-        """Return what the store holds of a run, without its dimension; raises as `series`."""
-        return self._stored(number, values, self.series(number, values))
+        """Return what the store holds of a run, without its dimension; raises as `series`, or if shots are missing."""
+        series, planned = self.series(number, values), self.campaign.design.shots
+        if series.sizes["shot"] < planned:
+            done = f"ended after {series.sizes['shot']} of {planned} shots of the run"
+            raise UserError(f"max_time = {self.campaign.max_time:g} s {done}: it must be longer")
+        return self._stored(number, values, series)
 
     def sample(self, number: int, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return `arrays` of few paths, and the coordinates of their dimensions; raises as `series`."""
-        series = self.series(number, values, target_error=None, passes=2, pass_share=SMALLEST_SHARE)
+        series = self.series(number, values, target_error=None, max_time=None, passes=2, pass_share=SMALLEST_SHARE)
         return self._stored(number, values, series), self._coordinates(number, series)
 
     def _stored(self, number: int, values: Mapping[str, Any], series: xr.Dataset) -> dict[str, Array]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_type_hints
 
 import typer
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, number_list
+from mitransient_lidar.rendering.options import RenderOptions
 
 Instrument = Annotated[
     str | None, typer.Option(help="Instrument instead of the scene's lidar, from the list of instruments.")
@@ -25,7 +28,6 @@ SceneOrResult = Annotated[
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
 ]
-OptionalSeed = Annotated[int | None, typer.Option(help="Seed of the random numbers, 0 by default.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
@@ -35,6 +37,30 @@ RECEIVERS = (
     "Receiver: ideal, photodiode, pmt, pmt_log, apd, sipm, spad or spad_array, the name of an instrument, or a TOML "
     "file."
 )
+
+
+def render_options(*names: str, **helps: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add options of `RenderOptions` to a command, by their names, some with a help of the command's own.
+
+    The command takes them as keywords, None for those that are not given. They follow the scene and its parameters.
+    """
+    types = get_type_hints(RenderOptions)
+
+    def add(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True)
+        added = []
+        for name in (*names, *helps):
+            flags = [f"--{name.replace('_', '-')}"] if types[name] == bool | None else []
+            option = typer.Option(*flags, help=helps.get(name) or RenderOptions.help(name))
+            kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+            added.append(inspect.Parameter(name, kind, default=None, annotation=Annotated[types[name], option]))
+
+        plain = [one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        # Typer reads the signature, and calls the command with all options as keywords.
+        command.__signature__ = own.replace(parameters=[*plain[:2], *added, *plain[2:]])  # type: ignore[attr-defined]
+        return command
+
+    return add
 
 
 def parameters(definitions: list[str] | None) -> dict[str, str]:

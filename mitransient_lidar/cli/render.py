@@ -10,52 +10,29 @@ import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import Define, Instrument, OptionalSeed, Quiet, SceneOrResult, parameters
+from mitransient_lidar.cli.options import Define, Instrument, Quiet, SceneOrResult, parameters, render_options
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
 if TYPE_CHECKING:
     import xarray as xr
 
-TargetError = Annotated[
-    float | None,
-    typer.Option(
-        help="Stop when 95 % of the bins of lit pixels, from the surface echo to the end of the bottom echo, have "
-        "reached this relative standard error, e.g. 0.03; of gates, 95 % of them; of images, 95 % of the lit pixels."
-    ),
-]
-TargetQuantile = Annotated[
-    float | None, typer.Option(help="Share that must reach the target error instead of 0.95; 0.5 is the median.")
-]
-MaxTime = Annotated[float | None, typer.Option(help="Stop before this many seconds, after at least two passes.")]
-GoalPasses = Annotated[int | None, typer.Option("--passes", help="Stop after this many independent passes.")]
-Variant = Annotated[str | None, typer.Option(help="Mitsuba variant, e.g. llvm_ad_mono.")]
 Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
 
 
+@render_options("target_error", "target_quantile", "max_time", "passes", "seed", "max_memory", "components", "variant")
 def render(
     scene: SceneOrResult,
     define: Define = None,
     output: Folder = Path("."),
     instrument: Instrument = None,
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
-    target_error: TargetError = None,
-    target_quantile: TargetQuantile = None,
-    max_time: MaxTime = None,
-    passes: GoalPasses = None,
-    seed: OptionalSeed = None,
-    variant: Variant = None,
-    max_memory: Annotated[
-        float | None, typer.Option(help="Memory for histograms [GB], 2 by default. With less, only gates are kept.")
-    ] = None,
-    components: Annotated[
-        bool, typer.Option("--components", help="Also separate the light of surface, water, bottom and targets.")
-    ] = False,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
     mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates; needs ffmpeg.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
+    **options: Any,
 ) -> None:
     """Render the waveforms and gates of a scene.
 
@@ -70,28 +47,15 @@ def render(
     if (gif or mp4 or html) and "gate_count" not in text:
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
-    targets += [output / f"{name}_components.png"] if plot and components else []
+    targets += [output / f"{name}_components.png"] if plot and options["components"] else []
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
     check_targets(output, [*targets, *gates.names()], scene)
-    from mitransient_lidar.rendering import again
     from mitransient_lidar.rendering import render as rendering
 
     with DeferredInterrupt(at_once=False):
         with reporting(quiet) as progress:
-            dataset = (again.render_again if again.is_result(scene) else rendering.render)(
-                scene,
-                params=params,
-                instrument=instrument,
-                integrator=integrator,
-                target_error=target_error,
-                target_quantile=target_quantile,
-                max_time=max_time,
-                passes=passes,
-                **({} if seed is None else {"seed": seed}),
-                max_memory=max_memory,
-                components=components or None,
-                variant=variant,
-                progress=progress,
+            dataset = rendering.render(
+                scene, params=params, instrument=instrument, integrator=integrator, progress=progress, **options
             )
         output.mkdir(parents=True, exist_ok=True)
         if "waveform" not in dataset:
@@ -134,6 +98,7 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
             typer.echo(f"no drawing of the pixels: {error}", err=True)
 
 
+@render_options("target_error", "target_quantile", "max_time", "passes", "seed", "variant")
 def passive(
     scene: SceneOrResult,
     define: Define = None,
@@ -143,14 +108,9 @@ def passive(
     filter_width_nm: Annotated[
         float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")
     ] = None,
-    target_error: TargetError = None,
-    target_quantile: TargetQuantile = None,
-    max_time: MaxTime = None,
-    passes: GoalPasses = None,
-    seed: OptionalSeed = None,
-    variant: Variant = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
     quiet: Quiet = False,
+    **options: Any,
 ) -> None:
     """Render an image by daylight.
 
@@ -164,26 +124,17 @@ def passive(
     targets = [output / f"{name}_passive{suffix}" for suffix in suffixes]
     check_targets(output, targets, scene)
     from mitransient_lidar.plots import passive as passive_plots
-    from mitransient_lidar.rendering.again import is_result, render_again
+    from mitransient_lidar.rendering.again import is_result
     from mitransient_lidar.rendering.passive import render_passive
+    from mitransient_lidar.rendering.render import render_again
     from mitransient_lidar.results.radiance import save_radiance
 
-    options: dict[str, Any] = {
-        "target_error": target_error,
-        "target_quantile": target_quantile,
-        "max_time": max_time,
-        "passes": passes,
-        "seed": seed,
-        "frames": frames,
-        "frame_step_s": frame_step,
-        "filter_width_nm": filter_width_nm,
-        "variant": variant,
-    }
-    given = {option: value for option, value in options.items() if value is not None}
+    series = {"frames": frames, "frame_step_s": frame_step, "filter_width_nm": filter_width_nm}
+    options |= {option: value for option, value in series.items() if value is not None}
     with DeferredInterrupt(at_once=False):
         with reporting(quiet) as progress:
             image = (render_again if is_result(scene) else render_passive)(
-                scene, params=params, progress=progress, **given
+                scene, params=params, progress=progress, **options
             )
         output.mkdir(parents=True, exist_ok=True)
         writers: dict[str, Callable[[xr.Dataset, Path], object]] = {

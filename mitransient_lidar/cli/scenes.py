@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from mitransient_lidar.cli.options import render_options
 from mitransient_lidar.core.errors import UserError
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a shipped scene.")]
@@ -92,15 +93,19 @@ def info(
         typer.echo(f"{name:{width}}  {value}")
 
 
+@render_options(
+    target_error="Stop when 95 % of the bins of lit pixels have reached this relative standard error (greater than 0).",
+    max_time="Stop each render before this many seconds (greater than 0), by default 120 with a target error.",
+)
 def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer cases, in less than a minute.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     case: Annotated[str | None, typer.Option(help="Run only this case.")] = None,
-    target_error: Annotated[float | None, typer.Option(help="Relative standard error to reach.")] = None,
     images: Annotated[bool, typer.Option("--images", help="Time a gate of 4 to 65536 pixels to 10 % instead.")] = False,
     beams: Annotated[
         bool, typer.Option("--beams", help="Compare beams of 0.1 to 20 mrad in all views instead.")
     ] = False,
+    **options: Any,
 ) -> None:
     """Measure the time to a given accuracy."""
     from mitransient_lidar.studies import bench as benchmark
@@ -113,4 +118,5 @@ def bench(
     elif beams:
         bench_beams.run(json=json)
     else:
-        benchmark.run(quick=quick, json=json, case=case, target_error=target_error)
+        ends = {name: value for name, value in options.items() if value is not None}
+        benchmark.run(quick=quick, json=json, case=case, **ends)

@@ -22,6 +22,7 @@ from mitransient_lidar.cli.options import (
     numbers,
     pair,
     parameters,
+    render_options,
 )
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
@@ -68,6 +69,12 @@ def find_shots(
         typer.echo(output)
 
 
+@render_options(
+    "components",
+    target_error="Relative standard error of the median bin, instead of full passes (greater than 0).",
+    max_time="Stop before this many seconds for all shots, with fewer passes or shots (greater than 0).",
+    passes="Most passes of each shot (2 to 10000), 8 by default, 400 with a target error.",
+)
 def shots(
     scene: SceneOrResult,
     define: Define = None,
@@ -82,16 +89,10 @@ def shots(
     move_target: Annotated[
         bool, typer.Option("--move-target", help="Keep the target's place relative to the aim of each shot.")
     ] = False,
-    target_error: Annotated[
-        float | None, typer.Option(help="Relative standard error of the median bin, instead of full passes.")
-    ] = None,
-    passes: Annotated[int | None, typer.Option(help="Passes of each shot, 8 by default, 4 for a target error.")] = None,
-    components: Annotated[
-        bool, typer.Option("--components", help="Also separate the light of surface, water, bottom and targets.")
-    ] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of random places, 1 by default.")] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = Path("shots.nc"),
     quiet: Quiet = False,
+    **options: Any,
 ) -> None:
     """Render a series of shots over one sea.
 
@@ -104,24 +105,22 @@ def shots(
     scene_of(scene, "shots")
     check_targets(output.parent, [output], scene)
     from mitransient_lidar import results
+    from mitransient_lidar.rendering import shot_series as study
     from mitransient_lidar.rendering.again import is_result
-    from mitransient_lidar.studies import shot_series as study
+    from mitransient_lidar.rendering.render import render_again
 
     given: Any = [pair("--at", text) for text in at] if at else None
     if places is not None:
         given = study.read_places(places)
-    where = {"count": count, "positions": given, "move_target": move_target or None, "seed": seed}
-    options = {name: value for name, value in where.items() if value is not None}
-    if is_result(scene) and options:
-        raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(options)}.")
-    options |= {} if passes is None else {"passes": passes}
-    options |= {} if target_error is None else {"target_error": target_error}
-    options |= {"components": True} if components else {}
+    every = {"count": count, "positions": given, "move_target": move_target or None, "seed": seed}
+    where = {name: value for name, value in every.items() if value is not None}
+    if is_result(scene) and where:
+        raise UserError(f"{scene} is a series with its own places: leave out {' and '.join(where)}.")
     default = {} if is_result(scene) else {"count": 20}
-    render = study.render_shots_again if is_result(scene) else study.render_shots
+    render = render_again if is_result(scene) else study.render_shots
     with DeferredInterrupt(at_once=False):
         with reporting(quiet) as progress:
-            series = render(scene, params=parameters(define), progress=progress, **{**default, **options})
+            series = render(scene, params=parameters(define), progress=progress, **{**default, **where}, **options)
         output.parent.mkdir(parents=True, exist_ok=True)
         results.save(series, output)
         typer.echo(output)

@@ -1,4 +1,4 @@
-"""Rendering of a result again, from the scene, the parameters and the passes in its attributes."""
+"""Options that render a result again, from the scene, the parameters and the passes in its attributes."""
 
 from __future__ import annotations
 
@@ -6,27 +6,34 @@ import logging
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
+from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading import variants
+from mitransient_lidar.loading.parameters import check_params
 from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
-from mitransient_lidar.rendering.passive import MOST_FRAMES, render_passive
-from mitransient_lidar.rendering.render import render
+from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.passive import MOST_FRAMES
 from mitransient_lidar.results import exr, netcdf
 from mitransient_lidar.results.formats import input_format
 
 logger = logging.getLogger(__name__)
 
-#: Attributes that are options of a render.
-_RENDER_OPTIONS = ("seed", "variant", "passes", "pass_share", "max_memory_gb")
-_PASSIVE_OPTIONS = ("seed", "variant", "frame_passes", "frame_step_s")
+#: Options that a result holds, by the command that rendered it.
+_RECORDED = {
+    "render": ("seed", "variant", "max_memory", "passes", "pass_share"),
+    "passive": ("seed", "variant"),
+    "shots": ("passes", "pass_share"),
+}
 
-#: Options that end a render.
+#: Options that end a render; with another end the recorded ones do not count.
 _ENDS = ("target_error", "max_time", "passes")
 
 
@@ -58,51 +65,82 @@ def result_kind(attributes: Mapping[str, Any]) -> str:
     )
 
 
-def render_again(result: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
-    """Render a result again: the same bits on the same machine, unless options change it.
+def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the command that rendered a result, and the options that render it again, with `scene`.
 
     Parameters
     ----------
     result
-        Dataset of `render.render` or `passive.render_passive`, or its file. Of one that was computed from a result, as
-        gates or signals of a receiver, that result is rendered.
+        Dataset of `render.render`, `passive.render_passive` or `shot_series.render_shots`, or its file.
     options
-        Options of the function that rendered the result, by default those of its attributes. `params` are added to the
-        parameters of its scene.
-
-    Returns
-    -------
-    xarray.Dataset
-        As of the function that rendered the result.
+        Options of that function which replace those of the result, unless they are None; its parameters are added to
+        those of the scene.
 
     Raises
     ------
     UserError
-        If the result does not hold its scene, a file of the scene has changed, or an option is invalid.
+        If the result does not hold its scene or an option, or holds only some shots of a series.
     """
     attributes = read_attributes(result)
     kind = result_kind(attributes)
-    if kind == "shots":
-        raise UserError("the result is a series of shots: use mitransient_lidar.render, or the command shots")
-    record = SceneRecord.from_attributes(attributes)
-    needed = {"passive": _PASSIVE_OPTIONS, "render": _RENDER_OPTIONS}[kind]
-    if missing := [name for name in needed if name not in attributes]:
-        raise UserError(f"the result has no attribute {missing[0]}, without which it is not rendered again")
-    compare_versions(attributes)
-    own = {"seed": attributes["seed"], "variant": attributes["variant"], "integrator": _integrator(attributes)}
     given = {name: value for name, value in options.items() if value is not None}
-    if kind == "passive":
-        passes = attributes["frame_passes"]
-        frames = integer("frames", given.get("frames", len(passes)), 1, MOST_FRAMES)
-        own |= {"frames": frames, "frame_step_s": attributes["frame_step_s"]}
-        own["filter_width_nm"] = attributes.get("filter_width_nm")
-        ends: dict[str, Any] = {"passes": [*passes, *[passes[-1]] * frames][:frames]}
+    scene = SceneRecord.from_attributes(attributes)
+    held = {one.name: one.metadata["attribute"] for one in fields(RenderOptions)}
+    own = {name: _held(attributes, held[name]) for name in _RECORDED[kind]}
+    compare_versions(attributes)
+    if kind == "shots":
+        own |= _series_options(result, attributes, given)
+        given["params"] = {**json_attribute(attributes, "series_parameters"), **given.get("params", {})}
     else:
-        own["max_memory"] = attributes["max_memory_gb"]
+        own["integrator"] = _integrator(attributes)
+    if kind == "passive":
+        own |= _frame_options(attributes, given)
+    else:
         own["components"] = bool(attributes.get("components", 0))
-        ends = {"passes": attributes["passes"], "pass_share": attributes["pass_share"]}
-    chosen = {**own, **({} if any(name in given for name in _ENDS) else ends), **given}
-    return render_passive(record, **chosen) if kind == "passive" else render(record, **chosen)
+    if any(name in given for name in _ENDS):
+        own = {name: value for name, value in own.items() if name not in (*_ENDS, "pass_share")}
+    return kind, {"scene": scene, **own, **given}
+
+
+def _held(attributes: Mapping[str, Any], name: str) -> Any:
+    """Return an attribute of a result; raise UserError if it has none."""
+    if name not in attributes:
+        raise UserError(f"the result has no attribute {name}, without which it is not rendered again")
+    return attributes[name]
+
+
+def _frame_options(attributes: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of daylight images alone."""
+    passes, step = _held(attributes, "frame_passes"), _held(attributes, "frame_step_s")
+    frames = integer("frames", given.get("frames", len(passes)), 1, MOST_FRAMES)
+    return {
+        "frames": frames,
+        "frame_step_s": step,
+        "filter_width_nm": attributes.get("filter_width_nm"),
+        "passes": [*passes, *[passes[-1]] * frames][:frames],
+    }
+
+
+def _series_options(result: Any, attributes: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of series of shots alone, of a complete series or of the shots before Ctrl-C."""
+    series = result if isinstance(result, xr.Dataset) else results.open(result)
+    if "shot" not in series.dims or not np.array_equal(series["shot"], np.arange(attributes.get("shots", 0))):
+        raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
+    check_params(given.get("params"))
+    # The bins of some shots are those of all of them. Series of earlier versions do not hold the passes of each shot.
+    same: dict[str, Any] = {} if "params" in given or "positions" in given else {"axis": results.time_axis(series)}
+    if same and "shot_passes" in series.coords and not any(name in given for name in _ENDS):
+        same |= {"passes": int(_held(attributes, "most_passes")), "shot_passes": series["shot_passes"].values}
+    elif "target_error" in attributes:
+        same["passes"] = None
+    return {
+        "positions": np.column_stack([series["aim_x"], series["aim_y"]]),
+        # Batches end with their error, or after their passes.
+        "target_error": attributes.get("target_error"),
+        "move_target": bool(attributes["moved_target"]),
+        "first_seed": int(attributes.get("first_seed", 0)),
+        **same,
+    }
 
 
 def describe_result(path: str | os.PathLike[str]) -> dict[str, str]:

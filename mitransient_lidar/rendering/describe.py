@@ -1,4 +1,4 @@
-"""Attributes of a result that describe its lidar, and the layout of pixels, beam and targets."""
+"""Attributes of a result that describe lidar, sea and the layout of pixels, beam and targets; lines of sight."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.rendering.accuracy import ErrorWindow
+from mitransient_lidar.rendering.echo_window import EchoProbe, lines_of_sight
 from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_point
+from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
 
@@ -35,6 +39,41 @@ _VIEW_TICKS = 9
 
 #: Most shapes that the receiver's axis passes on its way to the bottom.
 _MOST_HITS = 64
+
+
+def with_lines_of_sight(dataset: xr.Dataset, lidar: LidarScene) -> xr.Dataset:
+    """Return a result with the pixels' lines of sight as coordinates, unless the scene has no surface."""
+    if not lidar.surfaces:
+        return dataset
+    pixels = lidar.receiver.pixels
+    dims = ("pixel",) if pixels.grid is None else ("row", "column")
+    return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
+
+
+def describe_scene(
+    lidar: LidarScene, probe: EchoProbe, window: ErrorWindow, focusing: RippleFocusing | None
+) -> dict[str, Any]:
+    """Return the attributes of a result that describe lidar, sea and expected echoes."""
+    # Depths are relative to the mean arrival of the surface echo over all pixels.
+    arrivals = probe.surface_ns[:, 1]
+    surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
+    return {
+        "beam_outside_surface": probe.missed_beam,
+        **describe_lidar(lidar),
+        **surface,
+        **_surface_heights(lidar),
+        **({} if focusing is None else focusing.describe()),
+        "window_start_ns": float(window.start_ns.min()),
+        "window_end_ns": float(window.end_ns.max()),
+    }
+
+
+def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
+    """Return the lowest and highest point of the sea [m] as an attribute; none without a surface."""
+    boxes = [surface.bbox() for surface in lidar.surfaces]
+    if not boxes:
+        return {}
+    return {"surface_heights_m": [min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)]}
 
 
 def describe_lidar(scene: LidarScene) -> dict[str, Any]:

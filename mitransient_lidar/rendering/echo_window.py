@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import Pose
@@ -170,6 +171,15 @@ def _quantiles(
             else:
                 result[index, column] = values[part][np.searchsorted(cumulative, share * cumulative[-1])]
     return result
+
+
+def error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
+    """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
+    time_ns = lidar.axis.centres_ns
+    start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * lidar.transmitter.pulse.fwhm_ns
+    # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
+    start = np.where(np.isnan(start), time_ns[0], start)
+    return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
 
 
 def lines_of_sight(scene: LidarScene) -> LinesOfSight:

@@ -9,21 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_out_of_memory
+from mitransient_lidar.core.errors import is_interruption, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import DeferredInterrupt
-from mitransient_lidar.core.validation import FloatArray, in_range, integer, positive
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.rendering.options import RenderOptions
 
 logger = logging.getLogger(__name__)
 
 #: Fewest passes to compare a standard error with the target; its own relative error is then 27 %.
 SMALLEST_PASS_COUNT = 8
-
-#: Largest number of passes that can be asked for.
-MOST_PASSES = 10**9
-
-#: Smallest share of the paths of a full pass.
-SMALLEST_SHARE = 2**-9
-
 
 #: Quantile of the relative standard errors that is compared with the target, unless another one is requested.
 DEFAULT_QUANTILE = 0.95
@@ -84,19 +78,10 @@ class Goal:
         target_quantile: float | None = None,
     ) -> Goal:
         """Check the options of a render; without any of them, return the default."""
-        target_error = None if target_error is None else positive("target_error", target_error)
-        max_time = None if max_time is None else positive("max_time", max_time)
-        if passes is not None:
-            # Their spread gives the standard error.
-            passes = integer("passes", passes, 2, MOST_PASSES)
-        given = not target_error is max_time is passes is None
-        goal = cls(target_error, max_time, passes) if given else default
-        if target_quantile is None:
-            return goal
-        quantile = in_range("target_quantile", target_quantile, 0.01, 1)
-        if goal.target_error is None:
-            raise UserError(f"target_quantile = {quantile:g} needs a target_error: the error that it must reach")
-        return replace(goal, target_quantile=quantile)
+        options = RenderOptions(target_error, target_quantile, max_time, passes)
+        ends = options.target_error, options.max_time, options.passes
+        goal = default if ends == (None, None, None) else cls(*ends)
+        return goal if options.target_quantile is None else replace(goal, target_quantile=options.target_quantile)
 
     def reached(self, done: int, elapsed: float, last: float, error: float | None) -> bool:
         """Return whether to stop after `done` passes: another one, as long as the last [s], would exceed the time."""
@@ -176,7 +161,7 @@ def run_passes(
     goal
         End of the render.
     seed
-        Seed of the render, as from `check_seed`.
+        Seed of the render, a 64-bit integer with a sign.
     errors
         Returns the relative standard errors, an array of any size; called from the second pass on.
     errors_of
@@ -271,11 +256,6 @@ def _pace(ends: list[float]) -> float:
     """
     first = 1 if len(ends) > 2 else 0
     return (ends[-1] - ends[first]) / (len(ends) - 1 - first)
-
-
-def check_seed(seed: object) -> int:
-    """Return the seed of a render, an integer of 64 bits with a sign; raise UserError for others."""
-    return integer("seed", seed, -(2**63), 2**63 - 1)
 
 
 def pass_seed(seed: int, number: int) -> int:

@@ -19,7 +19,8 @@ from mitransient_lidar.core.validation import FloatArray, integer, positive, sho
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.rendering.accuracy import RatioStatistics
-from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, check_seed, pass_seed, run_passes
+from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, pass_seed, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     choose_integrator,
@@ -54,7 +55,7 @@ def render_passive(
     target_quantile: float | None = None,
     max_time: float | None = None,
     passes: int | Sequence[int] | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     frames: int = 1,
     frame_step_s: float = 0.1,
     filter_width_nm: float | None = None,
@@ -75,7 +76,7 @@ def render_passive(
     params, variant
         As for `render.render`.
     seed
-        Integer from -2^63 to 2^63 - 1; frames and passes have independent random numbers.
+        Integer from -2^63 to 2^63 - 1, 0 by default; frames and passes have independent random numbers.
     frames
         Number of frames, 1 to 10 000.
     frame_step_s
@@ -101,7 +102,7 @@ def render_passive(
     """
     frames, step = integer("frames", frames, 1, MOST_FRAMES), positive("frame_step_s", frame_step_s)
     width = None if filter_width_nm is None else positive("filter_width_nm", filter_width_nm)
-    seed = check_seed(seed)
+    seed = RenderOptions(seed=seed).seed or 0
     counts: list[Any] = list(passes) if isinstance(passes, (list, tuple)) else [passes] * frames
     if len(counts) != frames:
         raise UserError(f"passes = {shown(passes)} must be one number, or {frames}, one a frame")

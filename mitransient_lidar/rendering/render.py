@@ -1,18 +1,16 @@
-"""Rendering of a lidar scene to an accuracy."""
+"""Rendering of a lidar scene to an accuracy, or of a result again."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from mitransient_lidar.core.validation import in_range, positive
+from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
-from mitransient_lidar.rendering.accuracy import ErrorWindow
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Goal, ProgressCallback, check_seed, run_passes
+from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     Session,
@@ -26,8 +24,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
     import xarray
 
-    from mitransient_lidar.rendering.echo_window import EchoProbe
-    from mitransient_lidar.transport.ripple_focusing import RippleFocusing
+    from mitransient_lidar.loading.scene_record import SceneRecord
     from mitransient_lidar.transport.scene import LidarScene
 
 logger = logging.getLogger(__name__)
@@ -40,7 +37,7 @@ _DEFAULT_MAX_MEMORY_GB = 2.0
 
 
 def render(
-    scene: str | Path | Mapping[str, Any] | mi.Scene | Session,
+    scene: str | Path | Mapping[str, Any] | mi.Scene | Session | SceneRecord | xarray.Dataset,
     *,
     params: Mapping[str, Any] | None = None,
     instrument: str | None = None,
@@ -49,20 +46,22 @@ def render(
     target_quantile: float | None = None,
     max_time: float | None = None,
     passes: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     max_memory: float | None = None,
     pass_share: float | None = None,
     components: bool | None = None,
     variant: str | None = None,
     progress: ProgressCallback | None = None,
+    **others: Any,
 ) -> xarray.Dataset:
-    """Render a lidar scene in independent passes until it is accurate enough.
+    """Render a lidar scene in independent passes until it is accurate enough, or a result again.
 
     Parameters
     ----------
     scene
         Name of a shipped scene, path of a Mitsuba XML file, dict for ``mitsuba.load_dict``, a loaded scene, the
-        record of a scene, or a session. `again.render_again` takes a result.
+        record of a scene, or a session; or a result (a dataset, or its EXR or NetCDF file), which is rendered again
+        with its own options unless others are given. See `render_again`.
     params
         Values for the ``<default>`` parameters of an XML scene; they have priority over those of an instrument.
     instrument
@@ -83,7 +82,7 @@ def render(
         Number of passes, 2 to 10^9. By default, the render ends at an error of 0.03 or after 300 s, with gates at 0.1
         or after 60 s.
     seed
-        Integer from -2^63 to 2^63 - 1; the same seed gives the same result on the same machine.
+        Integer from -2^63 to 2^63 - 1, 0 by default; the same seed gives the same result on the same machine.
     max_memory
         Memory for histograms, means and errors [GB], greater than 0; 2 by default. If a scene with gates exceeds it,
         only the gates are kept, with a warning.
@@ -97,6 +96,8 @@ def render(
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
         Called with a `passes.Progress` after every pass.
+    others
+        Options of `shot_series.render_shots` or `passive.render_passive`, for results of these.
 
     Returns
     -------
@@ -106,7 +107,7 @@ def render(
         ``gate_energy`` [J] in addition or instead; see `results.gate_stack`. With `components`, the parts
         ``impulse_response_by_origin`` and ``waveform_by_origin``, with standard errors, over ``origin`` and the same
         dimensions, whose sums over ``origin`` are the whole. After Ctrl-C it includes the completed
-        passes, and the attribute ``interrupted`` is 1.
+        passes, and the attribute ``interrupted`` is 1. Of a result, as of the function that rendered it.
 
     Notes
     -----
@@ -117,21 +118,67 @@ def render(
     Raises
     ------
     UserError
-        If the scene, a parameter or an option is invalid, or no light returns.
+        If the scene, the result, a parameter or an option is invalid, or no light returns.
     """
-    Goal.from_options(target_error, max_time, passes, DEFAULT_GOAL, target_quantile)
-    seed = check_seed(seed)
-    max_memory = _DEFAULT_MAX_MEMORY_GB if max_memory is None else positive("max_memory", max_memory)
-    if pass_share is not None:
-        pass_share = in_range("pass_share", pass_share, SMALLEST_SHARE, 1.0)
-    session = open_scene(scene, params, variant, instrument)
+    options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
+    if again.is_result(scene):
+        result: Any = scene
+        scene_options = {"params": params, "instrument": instrument, "integrator": integrator, "progress": progress}
+        return render_again(result, **scene_options, **options, **others)
+    chosen = RenderOptions(**options, **others)
+    return _render(open_scene(scene, params, chosen.variant, instrument), integrator, chosen, progress)
+
+
+def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.Dataset:
+    """Render a result again: the same bits on the same machine, unless options change it.
+
+    Parameters
+    ----------
+    result
+        Dataset of `render`, `passive.render_passive` or `shot_series.render_shots`, or its file. Of one that was
+        computed from a result, as gates or signals of a receiver, that result is rendered. Of a series, all shots, or
+        those that were completed before Ctrl-C.
+    options
+        Options of the function that rendered the result, by default those of its attributes. `params` are added to the
+        parameters of its scene.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of the function that rendered the result.
+
+    Raises
+    ------
+    UserError
+        If the result does not hold its scene, a file of the scene has changed, shots were selected or reordered, or an
+        option is invalid.
+    """
+    from mitransient_lidar.rendering.passive import render_passive
+    from mitransient_lidar.rendering.shot_series import render_shots
+
+    functions: dict[str, Callable[..., xarray.Dataset]] = {
+        "render": render,
+        "passive": render_passive,
+        "shots": render_shots,
+    }
+    kind, chosen = again.recall(result, options)
+    return functions[kind](**chosen)
+
+
+def _render(
+    session: Session, integrator: Any, options: RenderOptions, progress: ProgressCallback | None
+) -> xarray.Dataset:
+    """Render a loaded scene, as `render` describes."""
+    seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
+    max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
     session.tell_record()
-    from mitransient_lidar.rendering.echo_window import probe_echoes
+    from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+    from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
     from mitransient_lidar.rendering.pass_size import fit_to_time
     from mitransient_lidar.rendering.scene_checks import check_scene
 
@@ -143,14 +190,13 @@ def render(
     accumulator = choose_accumulator(lidar, window, described.get("surface_time_ns"), max_memory, origins)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
-    goal = Goal.from_options(target_error, max_time, passes, default, target_quantile)
-    share = 1.0 if pass_share is None else pass_share
+    goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
     fitted = renderer if share == 1 else renderer.scaled(share)
 
     def render_pass(number: int, seed: int) -> float:
         nonlocal fitted, share
         gates, first = accumulator.gate_weights, None
-        if number == 0 and goal.max_time is not None and pass_share is None:
+        if number == 0 and goal.max_time is not None and options.pass_share is None:
             start_ns = float(window.start_ns.min())
             fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
         record = first or fitted.render_pass(seed, gates=gates)
@@ -180,7 +226,7 @@ def render(
         **pass_attributes(log, seed),
         pass_share=share,
         max_memory_gb=max_memory,
-        components=int(bool(components)),
+        components=int(components),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,
@@ -188,51 +234,3 @@ def render(
         **described,
     )
     return with_lines_of_sight(accumulator.dataset(attributes), lidar)
-
-
-def with_lines_of_sight(dataset: xarray.Dataset, lidar: LidarScene) -> xarray.Dataset:
-    """Return a result with the pixels' lines of sight as coordinates, unless the scene has no surface."""
-    from mitransient_lidar.rendering.echo_window import lines_of_sight
-
-    if not lidar.surfaces:
-        return dataset
-    pixels = lidar.receiver.pixels
-    dims = ("pixel",) if pixels.grid is None else ("row", "column")
-    return dataset.assign_coords(lines_of_sight(lidar).coordinates(dims, pixels.grid or (pixels.count,)))
-
-
-def describe_scene(
-    lidar: LidarScene, probe: EchoProbe, window: ErrorWindow, focusing: RippleFocusing | None
-) -> dict[str, Any]:
-    """Return the attributes of a result that describe lidar, sea and expected echoes."""
-    from mitransient_lidar.rendering.describe import describe_lidar
-
-    # Depths are relative to the mean arrival of the surface echo over all pixels.
-    arrivals = probe.surface_ns[:, 1]
-    surface = {"surface_time_ns": float(np.nanmean(arrivals))} if np.isfinite(arrivals).any() else {}
-    return {
-        "beam_outside_surface": probe.missed_beam,
-        **describe_lidar(lidar),
-        **surface,
-        **_surface_heights(lidar),
-        **({} if focusing is None else focusing.describe()),
-        "window_start_ns": float(window.start_ns.min()),
-        "window_end_ns": float(window.end_ns.max()),
-    }
-
-
-def _surface_heights(lidar: LidarScene) -> dict[str, list[float]]:
-    """Return the lowest and highest point of the sea [m] as an attribute; none without a surface."""
-    boxes = [surface.bbox() for surface in lidar.surfaces]
-    if not boxes:
-        return {}
-    return {"surface_heights_m": [min(float(box.min.z) for box in boxes), max(float(box.max.z) for box in boxes)]}
-
-
-def error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
-    """Return the bins from each pixel's surface echo to the end of its bottom echo, with half the pulse width."""
-    time_ns = lidar.axis.centres_ns
-    start, end = probe.surface_ns[:, 0], probe.bottom_ns[:, 1] + 0.5 * lidar.transmitter.pulse.fwhm_ns
-    # Without a surface (a plate in the air) or a bottom, the window begins or ends with the record.
-    start = np.where(np.isnan(start), time_ns[0], start)
-    return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -16,7 +18,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE, pass_seed
+from mitransient_lidar.rendering.options import SMALLEST_SHARE
+from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.scene import ScenePart
 
@@ -58,6 +61,8 @@ class ShotRecord:
         Number of passes.
     parts
         The same four arrays of light by origin; none unless the renderer separates it.
+    missed
+        Whether the passes ended before the error that was requested.
     """
 
     energy: FloatArray
@@ -67,6 +72,7 @@ class ShotRecord:
     lost: float
     passes: int
     parts: tuple[FloatArray, ...] = ()
+    missed: bool = False
 
 
 class ShotBatches:
@@ -109,6 +115,7 @@ class ShotBatches:
         self._loaded_at = loaded_at if has_plume else None
         self._renderer, self._aim, self.passes, self.share = renderer.scaled(share), np.array(aim), passes, share
         self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR
+        self._seconds = math.inf
         response = lidar.receiver.optics.response_time_ns
         self._kernel = lidar.transmitter.pulse.kernel(lidar.axis.bin_width_ns, response)
         waves = [shape for shape in lidar.surfaces if np.isfinite(getattr(shape, "cell_size", np.nan))]
@@ -145,9 +152,20 @@ class ShotBatches:
 
         return several
 
+    def limited(self, passes: int, seconds: float) -> ShotBatches:
+        """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].
+
+        The shots of a launch stay the same, so that a batch which the time has ended has the same bits again with its
+        number of passes. Two passes are rendered in any time.
+        """
+        other = copy.copy(self)
+        other.passes, other._seconds = passes, seconds
+        return other
+
     def render(self, places: FloatArray, seeds: Sequence[int]) -> ShotRecord:
         """Render the shots of a batch, each with its own seed."""
         shots, done, copies, lost, needed = len(places), 0, 0, 0.0, self._together
+        ends = [time.perf_counter()]
         energy, power, parts = PassStatistics(), PassStatistics(), (PassStatistics(), PassStatistics())
         try:
             several = self.at(places)
@@ -166,10 +184,13 @@ class ShotBatches:
                         if self._origins > 1:
                             part.add(values)
                 done += here
+                ends.append(time.perf_counter())
                 if self._goal is not None and done >= _PASSES_FOR_ERROR:
                     target, window = self._goal
                     error = float(np.median(relative_errors(power.mean, power.stderr, window)))
                     needed = 0 if error <= target else math.ceil(done * min((error / target) ** 2 - 1, 1e3))
+                if done >= 2 and 2 * ends[-1] - ends[-2] - ends[0] > self._seconds:
+                    break
         except (RuntimeError, MemoryError) as error:
             raise_if_out_of_memory(error)
             raise
@@ -179,7 +200,8 @@ class ShotBatches:
             # The whole is the sum of its parts to the bit.
             means = [part.mean.sum(axis=2) for part in parts]
             by_origin = tuple(values for part in parts for values in (part.mean, part.stderr))
-        return ShotRecord(means[0], energy.stderr, means[1], power.stderr, lost / done, done, by_origin)
+        missed = self._goal is not None and needed > 0
+        return ShotRecord(means[0], energy.stderr, means[1], power.stderr, lost / done, done, by_origin, missed)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""
@@ -192,9 +214,9 @@ class ShotBatches:
         return self._renderer.used_values
 
 
-def share_for_error(target_error: float) -> float:
-    """Return the share of the paths of a full pass for passes that are repeated until an error is reached."""
-    return float(np.clip(_SHARE * (_ERROR / target_error) ** (1 / _EXPONENT), SMALLEST_SHARE, 1.0))
+def share_for_error(error: float) -> float:
+    """Return the share of the paths of a full pass for passes that are repeated until a relative error is reached."""
+    return float(np.clip(_SHARE * (_ERROR / error) ** (1 / _EXPONENT), SMALLEST_SHARE, 1.0))
 
 
 def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) -> FloatArray:

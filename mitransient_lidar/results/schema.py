@@ -22,7 +22,7 @@ _NUMBERS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("field_of_view_mrad", "pulse_energy_mj", "wavelength_nm", "gate_step_ns"), _POSITIVE),
     **dict.fromkeys(("pulse_fwhm_ns", "response_time_ns", "obscuration", "two_way_efficiency"), _NOT_NEGATIVE),
     **dict.fromkeys(("surface_slope_variance", "gate_rise_ns", "gate_fall_ns", "max_memory_gb"), _NOT_NEGATIVE),
-    **dict.fromkeys(("passes", "pulses", "shots", "elapsed_s", "pass_share"), _NOT_NEGATIVE),
+    **dict.fromkeys(("passes", "most_passes", "pulses", "shots", "elapsed_s", "pass_share"), _NOT_NEGATIVE),
     **dict.fromkeys(("time_start_ns", "altitude", "surface_time_ns", "window_start_ns", "window_end_ns"), _ANY),
     **dict.fromkeys(("off_nadir_deg", "ellipse_deg"), (-360.0, 360.0)),
     **dict.fromkeys(("refractive_index", "group_index"), _INDEX),
@@ -30,7 +30,7 @@ _NUMBERS: dict[str, tuple[float, float]] = {
 }
 
 #: Those that count something, which is known.
-_COUNTS = ("passes", "pulses", "shots")
+_COUNTS = ("passes", "most_passes", "pulses", "shots")
 
 #: Those that are a list over the pixels where they differ.
 _PER_PIXEL = ("gain", "optical_density", "background_power_w")
@@ -62,7 +62,7 @@ _OUTLINES, _LISTED = ("pixel_outlines",), {"beam_outlines": ("share", "lines"), 
 #: Coordinates that hold finite numbers, or NaN where they are unknown.
 _COORDINATES = (
     *("angle_x", "angle_y", "sight_x", "sight_y", "off_nadir", "surface_time", "surface_spread", "depth_per_ns"),
-    *("beam_share", "gate_start", "gate_width", "gate_depth", "aim_x", "aim_y", "shot"),
+    *("beam_share", "gate_start", "gate_width", "gate_depth", "aim_x", "aim_y", "shot", "shot_passes"),
     *("true_slope_along", "true_slope_across", "true_surface_height", "true_bottom_depth"),
     *("true_bottom_depth_below_surface", "true_absorption", "true_scattering", "true_backscattering"),
     *("true_attenuation", "true_kd"),

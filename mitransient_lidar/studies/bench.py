@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import positive
+from mitransient_lidar.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -75,6 +75,9 @@ INTEGRATORS = ("lidar_merging", "lidar_volpath")
 #: Passes after the first one, which compiles.
 _QUICK_PASSES, _PASSES = 16, 64
 
+#: Longest time of a render to a given error [s].
+_LONGEST_S = 120.0
+
 #: Headings of the figures.
 _COLUMNS = {
     "wall_s": "wall s",
@@ -90,22 +93,29 @@ _COLUMNS = {
 }
 
 
-def run(*, quick: bool = False, json: bool = False, case: str | None = None, target_error: float | None = None) -> None:
+def run(
+    *,
+    quick: bool = False,
+    json: bool = False,
+    case: str | None = None,
+    target_error: float | None = None,
+    max_time: float | None = None,
+) -> None:
     """Measure every case with every integrator, and instruments with merging; print a table or one JSON object.
 
     With `quick` only the cases ``flat`` and ``clear``, with few passes; with `case` only this one, which may be the
     name of an instrument. With `target_error`, above 0, renders end when the 95th percentile of the relative standard
-    errors has reached it.
+    errors has reached it, or after `max_time`, above 0 [s], by default 120 s. A `max_time` alone ends them, too.
     """
     from mitransient_lidar.loading.instruments import instrument_names
 
     instruments = instrument_names()
     if case is not None and case not in CASES and case not in instruments:
         raise UserError(f"case = {case!r} must be one of {', '.join([*CASES, *instruments])}")
-    if target_error is not None:
-        positive("target_error", target_error)
+    RenderOptions(target_error=target_error, max_time=max_time)
+    ends = {"target_error": target_error, "max_time": max_time}
     tasks: dict[tuple[str, ...], dict[str, Any]] = {
-        (name, integrator): {"case": name, "integrator": integrator, "quick": quick, "target_error": target_error}
+        (name, integrator): {"case": name, "integrator": integrator, "quick": quick, **ends}
         for name in ([case] if case else list(QUICK_CASES if quick else (*CASES, *instruments)))
         for integrator in INTEGRATORS[: None if name in CASES else 1]
     }
@@ -149,7 +159,9 @@ def _row(labels: Iterable[str], cells: Iterable[str]) -> str:
     return " ".join([*(f"{label:<14}" for label in labels), *(f"{cell:>10}" for cell in cells)])
 
 
-def measure(case: str, integrator: str, quick: bool, target_error: float | None) -> dict[str, float]:
+def measure(
+    case: str, integrator: str, quick: bool, target_error: float | None, max_time: float | None
+) -> dict[str, float]:
     """Measure one case with one integrator in this process.
 
     Rates and times are those of the passes after the first one, which also compiles. The figure of merit is
@@ -164,9 +176,9 @@ def measure(case: str, integrator: str, quick: bool, target_error: float | None)
     result = render(
         loaded,
         integrator=integrator,
-        passes=None if target_error else 1 + (_QUICK_PASSES if quick else _PASSES),
+        passes=None if target_error or max_time else 1 + (_QUICK_PASSES if quick else _PASSES),
         target_error=target_error,
-        max_time=120.0 if target_error else None,
+        max_time=_LONGEST_S if target_error and max_time is None else max_time,
         progress=lambda _: marks.append((time.perf_counter(), time.process_time())),
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -19,7 +19,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite_array, integer
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
-from mitransient_lidar.studies.shot_series import render_shots
+from mitransient_lidar.rendering.shot_series import render_shots
 
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")

@@ -103,8 +103,8 @@ def estimate(
     """
     paths, seed = integer("paths", paths, 8 * _PARTS, _MOST_PATHS), integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params, instrument=instrument)
-    from mitransient_lidar.rendering.echo_window import probe_echoes
-    from mitransient_lidar.rendering.render import describe_scene, error_window, with_lines_of_sight
+    from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
+    from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
     from mitransient_lidar.transport.ripple_focusing import RippleFocusing
     from mitransient_lidar.transport.scene import LidarScene
     from mitransient_lidar.transport.sensor.receiver import SensorSampler

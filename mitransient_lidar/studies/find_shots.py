@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.rendering.sea_map import KINDS, SeaMap, Shot, footprint, transmitter_of
 from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.studies.sea_map import KINDS, SeaMap, Shot, footprint, transmitter_of
-from mitransient_lidar.studies.shot_series import render_shots
+from mitransient_lidar.rendering.shot_series import render_shots
 
 if TYPE_CHECKING:
     import mitsuba as mi

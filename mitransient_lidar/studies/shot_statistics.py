@@ -12,8 +12,8 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.rendering.passes import ProgressCallback
+from mitransient_lidar.rendering.shot_series import render_shots
 from mitransient_lidar.results.geometry import LidarGeometry
-from mitransient_lidar.studies.shot_series import render_shots
 
 _PASSES = 8
 

@@ -11,7 +11,7 @@ from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import henyey_greenstein
 from mitransient_lidar.plots.waveforms import plot_components
-from mitransient_lidar.rendering.again import render_again
+from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.results import dataset as results
 from mitransient_lidar.transport.path_classes import PathClasses
 

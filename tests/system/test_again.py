@@ -14,9 +14,10 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.rendering.passive import render_passive
+from mitransient_lidar.rendering.render import render_again
+from mitransient_lidar.rendering.shot_series import render_shots
 from mitransient_lidar.results.gate_files import save_sequence, save_stack
 from mitransient_lidar.results.radiance import save_radiance
-from mitransient_lidar.studies.shot_series import render_shots, render_shots_again
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
 SMALL = {"surface_size": "60", "bin_width_ns": "4", "bin_count": "40"}
@@ -254,7 +255,7 @@ def test_series_of_shots_give_the_same_bits(tmp_path):
     }
     results.save(first, tmp_path / "a.nc")
     assert_same_bits(first, mitransient_lidar.render(tmp_path / "a.nc"))
-    deeper = render_shots_again(first, params={"target_depth": 6})
+    deeper = render_again(first, params={"target_depth": 6})
     assert not np.array_equal(deeper["waveform"], first["waveform"])
     np.testing.assert_array_equal(deeper["aim_x"], first["aim_x"])
     with pytest.raises(UserError, match="rendered again as a whole"):

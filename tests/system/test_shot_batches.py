@@ -10,7 +10,7 @@ from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.session import choose_integrator, open_scene
 from mitransient_lidar.rendering.shot_batches import ShotBatches
-from mitransient_lidar.studies.shot_series import render_shots
+from mitransient_lidar.rendering.shot_series import render_shots
 
 PLACES = np.array([[0.0, 0.0], [17.3, -42.1], [-250.4, 130.2]])
 RECORD = {"time_start_ns": 1380, "bin_count": 200}

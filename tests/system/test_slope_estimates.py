@@ -18,8 +18,8 @@ from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.rendering import shot_series
 from mitransient_lidar.results.geometry import LidarGeometry
-from mitransient_lidar.studies import shot_series
 
 TILTS = ((-0.15, 0.0), (-0.075, 0.07), (0.0, 0.0), (0.075, -0.07), (0.15, 0.0))
 

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.rendering.sea_map import Shot
 from mitransient_lidar.studies.find_shots import RenderedShots
-from mitransient_lidar.studies.sea_map import Shot
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:

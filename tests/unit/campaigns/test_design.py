@@ -169,6 +169,7 @@ def test_file_that_is_not_text(tmp_path):
         ({"keep": ["waveform", "light"]}, "keep holds 'light'"),
         ({"keep": []}, r"keep = \[\] must be a list"),
         ({"target_error": 0}, "target_error = 0"),
+        ({"max_time": -1}, "max_time = -1 must be greater than 0"),
         ({"receiver": 3}, "receiver = 3 must be a name"),
         ({"gain": "auto"}, "gain = 'auto' needs a receiver"),
         ({"fixed": 3}, "fixed = 3 must be a table"),

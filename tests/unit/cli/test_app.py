@@ -256,6 +256,24 @@ def test_info_and_bench(monkeypatch):
     assert seen == [{"quick": True, "json": False, "case": "clear", "target_error": 0.02}]
 
 
+def test_time_of_a_benchmark(monkeypatch):
+    tasks, renders = [], []
+    monkeypatch.setattr(bench, "run_processes", lambda module, heading, given, *others: tasks.extend(given.values()))
+    assert run("bench", "--case", "clear", "--max-time", 3).exit_code == 0
+    assert [(one["target_error"], one["max_time"]) for one in tasks] == [(None, 3.0)] * 2
+
+    def render(scene, **options):
+        renders.append((options["passes"], options["target_error"], options["max_time"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mitransient_lidar.rendering.render.render", render)
+    monkeypatch.setattr(bench, "_load", lambda case: case)
+    for error, longest in ((None, None), (None, 3.0), (0.02, None), (0.02, 3.0)):
+        with pytest.raises(KeyboardInterrupt):
+            bench.measure("clear", "lidar_merging", True, error, longest)
+    assert renders == [(17, None, None), (None, None, 3.0), (None, 0.02, 120.0), (None, 0.02, 3.0)]
+
+
 def test_bench_refuses_a_negative_error():
     assert_refused(run("bench", "--target-error", "-1"), "target_error = -1 must be greater than 0")
 

@@ -16,7 +16,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plots import retrieval
-from mitransient_lidar.studies import shot_series
+from mitransient_lidar.rendering import shot_series
 
 C0 = 0.299792458  # m/ns
 N = 1.34

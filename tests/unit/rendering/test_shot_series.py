@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
+from few_paths import few_paths
+from same_bits import assert_same_bits
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.rendering import shot_batches
+from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
+from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.session import Session
-from mitransient_lidar.studies import shot_series, shot_truth
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -200,7 +202,7 @@ def test_time_bins_that_leave_out_light_are_refused(rendered):
 def test_seeds_and_instrument_of_a_series(rendered):
     options = {"positions": PLACES[:2], "passes": 2, "first_seed": 40, "instrument": "teledyne_czmil"}
     series = shot_series.render_shots("table1", FLAT, **options)
-    again = shot_series.render_shots_again(series)
+    again = render_again(series)
     assert [seed for one in rendered for seed in one["seeds"]] == [40, 41, 40, 41]
     assert series.attrs["instrument"] == again.attrs["instrument"] == "teledyne_czmil"
 
@@ -273,6 +275,71 @@ def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     assert series.attrs["interrupted"] == 1
 
 
+@pytest.fixture
+def clock(monkeypatch):
+    """Replace the time [s], which goes on by itself where `step` is not 0."""
+
+    class Clock:
+        now, step = 0.0, 0.0
+
+        def read(self):
+            self.now += self.step
+            return self.now
+
+    made = Clock()
+    monkeypatch.setattr("time.perf_counter", made.read)
+    return made
+
+
+@pytest.mark.slow
+def test_time_is_shared_among_batches_and_ends_a_series(rendered, clock, monkeypatch, caplog):
+    """Each batch of one shot takes 3 s of 10 s, more than its share of what is left."""
+    whole, limits = shot_batches.ShotBatches.limited, []
+
+    def limited(batches, passes, seconds):
+        clock.now += 3.0
+        limits.append(seconds)
+        return whole(batches, passes, seconds)
+
+    monkeypatch.setattr(shot_batches.ShotBatches, "limited", limited)
+    reports = []
+    options = {"positions": [*PLACES, (4, 4), (5, 5)], "max_time": 10.0, "progress": reports.append}
+    series = shot_series.render_shots("fig09_2x2", FLAT, **options)
+    assert limits == pytest.approx([10 / 5, 7 / 4, 4 / 3, 1 / 2])
+    assert [one.remaining_s for one in reports] == pytest.approx([7, 4, 1, 0])
+    assert (series.sizes["shot"], series.attrs["shots"], series.attrs["interrupted"]) == (4, 4, 0)
+    assert "max_time = 10 s ended after 4 of 5 shots" in caplog.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"target_error": 1e-4, "pass_share": 1.0}, {"passes": 200}])
+def test_time_ends_the_passes_of_a_batch(clock, caplog, tmp_path, options):
+    """A launch takes 1 s and holds 4 passes of an error; the limit of 4 s begins 1 s before the batch."""
+    clock.step = 1.0
+    scene = few_paths("fig09_2x2", tmp_path)
+    params = {**FLAT, "bin_width_ns": 4, "bin_count": 40}
+    first = shot_series.render_shots(scene, params, positions=PLACES[:2], max_time=4.0, **options)
+    assert len(set(first["shot_passes"].values)) == 1
+    assert first["shot_passes"][0] == first.attrs["passes"] < first.attrs["most_passes"]
+    assert first.attrs["most_passes"] == options.get("passes", shot_batches.MOST_PASSES_FOR_ERROR)
+    if "target_error" in options:
+        assert first.attrs["passes"] == 12
+        assert "2 of 2 shots ended before target_error = 0.0001" in caplog.text
+    clock.step = 0.0
+    results.save(first, tmp_path / "a.nc")
+    assert_same_bits(first, render_again(tmp_path / "a.nc"))
+    assert render_again(first, passes=2).attrs["passes"] == 2
+
+
+@pytest.mark.slow
+def test_the_first_batch_has_two_passes_in_any_time(clock, monkeypatch, tmp_path):
+    monkeypatch.setattr(shot_batches, "_BINS", 1)  # one pass in a launch
+    clock.step = 1.0
+    scene, params = few_paths("fig09_2x2", tmp_path), {**FLAT, "bin_width_ns": 4, "bin_count": 40}
+    series = shot_series.render_shots(scene, params, positions=PLACES, passes=200, max_time=0.5)
+    assert series["shot_passes"].values.tolist() == [2]
+
+
 @pytest.mark.slow
 def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
     whole = shot_batches.ShotBatches.render
@@ -301,6 +368,9 @@ def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, t
         ("fig09_2x2", {"positions": "here"}, "positions = 'here' must hold numbers only"),
         ("fig09_2x2", {"positions": [(0, -1e5)]}, "positions holds -100000 m; it must lie within 10000 m"),
         ("fig09_2x2", {"positions": PLACES, "passes": 1}, "passes = 1 must lie between 2"),
+        ("fig09_2x2", {"positions": PLACES, "max_time": 0}, "max_time = 0 must be greater than 0"),
+        ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 2]}, r"shot_passes of shape \(2,\) must be one number"),
+        ("fig09_2x2", {"positions": PLACES, "shot_passes": [2, 9, 2]}, "shot_passes = 9 must lie between 2 and 8"),
         ("fig09_2x2", {"count": 3}, "every shot on a flat sea is the same"),
         ("fig09_2x2", {"positions": PLACES, "move_target": True}, "has no parameter target_x, which move_target needs"),
     ],

@@ -19,13 +19,12 @@ from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.text_tables import read_two_columns
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer, positive
-from mitransient_lidar.loading.parameters import check_params
-from mitransient_lidar.loading.scene_record import SceneRecord, json_attribute
-from mitransient_lidar.rendering.passes import SMALLEST_SHARE, Progress, ProgressCallback
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer
+from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.sea_map import SeaMap
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
-from mitransient_lidar.studies.sea_map import SeaMap
-from mitransient_lidar.studies.shot_truth import sea_of, truth_coordinates
+from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -76,11 +75,13 @@ def render_shots(
     move_target: bool = False,
     passes: int | None = None,
     target_error: float | None = None,
+    max_time: float | None = None,
     pass_share: float | None = None,
     seed: int = 1,
     first_seed: int = 0,
     axis: TimeAxis | None = None,
-    components: bool = False,
+    shot_passes: npt.ArrayLike | None = None,
+    components: bool | None = None,
     instrument: str | None = None,
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
@@ -104,6 +105,9 @@ def render_shots(
     target_error
         Relative standard error, greater than 0, that ends the passes of a batch of shots when the median of the bins of
         lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
+    max_time
+        Longest time for the passes of all shots [s], greater than 0. It is shared among the batches, which end with
+        fewer passes, at least two. Where these take longer, too, the result holds the batches begun by then.
     pass_share
         Share of the paths of a full pass in each pass, 1/512 to 1; by default 1, and with a `target_error` one that
         needs few passes. The automatic cells of passes of few paths are up to twice as wide, which changes the water's
@@ -115,8 +119,10 @@ def render_shots(
     axis
         Time bins instead of automatic ones, which hold the light of all shots; they must hold it, too, up to a
         twentieth of the record.
+    shot_passes
+        Most passes of each shot, shape (shots,), 2 to `passes`, as the coordinate of a series that is rendered again.
     components
-        Whether to separate the light by its origin, as for `rendering.render.render`.
+        Whether to separate the light by its origin, by default not, as for `rendering.render.render`.
     instrument
         Name of the instrument whose laser and receiver replace those of the scene.
     describe_sea
@@ -137,8 +143,9 @@ def render_shots(
         ``true_attenuation`` c and ``true_kd`` [1/m], means over depth from the mean sea level to that bottom, without
         bubbles (`shot_truth.water_means`). Attributes such as ``surface_time_ns`` and the limits of the echo window are
         those of the first shot; positions are left out. ``series_parameters``: JSON of the scene's parameters that
-        shots replace. ``slope_deviation``: standard deviations of the two slopes of a sea with waves. After Ctrl-C the
-        dataset holds the completed shots, and the attribute ``interrupted`` is 1.
+        shots replace. ``passes`` is the largest number of passes of a shot, of the coordinate ``shot_passes``, and
+        ``most_passes`` the option. ``slope_deviation``: standard deviations of the two slopes of a sea with waves.
+        After Ctrl-C the dataset holds the completed shots, and the attribute ``interrupted`` is 1.
 
     Raises
     ------
@@ -147,10 +154,11 @@ def render_shots(
     """
     from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
 
-    wanted = None if target_error is None else positive("target_error", target_error)
+    options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
+    wanted = options.target_error
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
-    share = in_range("pass_share", usual[1] if pass_share is None else pass_share, SMALLEST_SHARE, 1.0)
+    share = options.pass_share or usual[1]
     seed, count = integer("seed", seed, 0, 2**53), integer("count", count, 2, 100_000)
     first_seed = integer("first_seed", first_seed, 0, 2**40)
     given = None if positions is None else _checked_places(positions)
@@ -160,7 +168,7 @@ def render_shots(
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = _Series(scene, params, instrument, target, places, axis, components)
+    series = _Series(scene, params, instrument, target, places, axis, bool(components))
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*_AIM, *(_TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
@@ -168,17 +176,23 @@ def render_shots(
     if missed := np.count_nonzero(np.isnan(truth["true_bottom_depth"][1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
     batches = series.batches(passes, share, wanted)
+    most = _checked_passes(shot_passes, len(places), passes)
     records: list[ShotRecord] = []
     errors: list[FloatArray] = []
     began, done, interrupted = time.perf_counter(), 0, False
     try:
         with DeferredInterrupt() as interruption:
             for part in batches.parts(len(places)):
-                records.append(batches.render(places[part], range(first_seed + part.start, first_seed + part.stop)))
+                left = (options.max_time or math.inf) - (time.perf_counter() - began)
+                if records and left <= 0:
+                    break
+                seconds = left * (part.stop - part.start) / (len(places) - part.start)
+                batch = batches.limited(int(most[part].max()), seconds)
+                records.append(batch.render(places[part], range(first_seed + part.start, first_seed + part.stop)))
                 errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
                 done = part.stop
                 if progress is not None:
-                    progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], wanted))
+                    progress(_progress(done, len(places), time.perf_counter() - began, errors[-1], options))
                 interruption.check()
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):
@@ -186,8 +200,9 @@ def render_shots(
         if not records:
             raise KeyboardInterrupt from error
         interrupted = True
+    _warn_of_the_end(records, done, len(places), options, interrupted)
     joined = [np.concatenate([getattr(record, name) for record in records]) for name in _ARRAYS]
-    parts = [np.concatenate(arrays) for arrays in zip(*(record.parts for record in records), strict=True)]
+    by_origin = [np.concatenate(arrays) for arrays in zip(*(record.parts for record in records), strict=True)]
     found = np.concatenate(errors)
     median, p95 = np.quantile(found, [0.5, 0.95], method="higher")
     lost, received = (sum(values) for values in zip(*((one.lost, one.energy.sum()) for one in records), strict=True))
@@ -196,6 +211,7 @@ def render_shots(
     attributes = series.attributes(
         used=batches.used_values,
         passes=max(record.passes for record in records),
+        most_passes=passes,
         pass_share=share,
         elapsed_s=time.perf_counter() - began,
         error_median=float(median),
@@ -205,7 +221,7 @@ def render_shots(
         first_seed=first_seed,
         interrupted=int(interrupted),
         moved_target=int(move_target),
-        components=int(components),
+        components=int(bool(components)),
         series_parameters=json.dumps(own),
         **({} if wanted is None else {"target_error": wanted}),
         **({"places_seed": seed} if given is None else {}),
@@ -213,7 +229,9 @@ def render_shots(
     if sea is not None:
         attributes["slope_deviation"] = [float(np.sqrt(np.mean(slopes**2))) for slopes in (sea.along, sea.across)]
     known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
-    return series.dataset(joined, parts, attributes).assign_coords(known)
+    rendered = np.repeat([record.passes for record in records], [len(record.power) for record in records])
+    known["shot_passes"] = ("shot", rendered, {"units": "1", "long_name": "number of passes of the shot"})
+    return series.dataset(joined, by_origin, attributes).assign_coords(known)
 
 
 class _Series:
@@ -239,8 +257,8 @@ class _Series:
         axis: TimeAxis | None,
         components: bool,
     ) -> None:
-        from mitransient_lidar.rendering.echo_window import probe_echoes
-        from mitransient_lidar.rendering.render import describe_scene, error_window
+        from mitransient_lidar.rendering.describe import describe_scene
+        from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shot_batches import check_size
         from mitransient_lidar.transport.scene import LidarScene
@@ -313,7 +331,7 @@ class _Series:
         self, arrays: Sequence[FloatArray], parts: Sequence[FloatArray], attributes: Mapping[str, Any]
     ) -> xr.Dataset:
         """Return the labelled result of arrays of shape (shots, pixels, bins), and (shots, pixels, origins, bins)."""
-        from mitransient_lidar.rendering.render import with_lines_of_sight
+        from mitransient_lidar.rendering.describe import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
         dataset = results.build_series(
@@ -329,7 +347,7 @@ class _Series:
         return with_lines_of_sight(dataset, self.lidar)
 
 
-def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, target: float | None) -> Progress:
+def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
     """Return the progress of a series, with the errors of its last batch."""
     median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
     return Progress(
@@ -337,54 +355,13 @@ def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, targe
         planned=planned,
         unit="shot",
         elapsed_s=elapsed,
-        remaining_s=elapsed * (planned - done) / done,
+        remaining_s=max(0.0, min(elapsed * (planned - done) / done, (options.max_time or math.inf) - elapsed)),
         error_median=float(median),
         error_p95=float(p95),
-        target_error=target,
+        target_error=options.target_error,
         target_quantile=0.5,
-        error=None if target is None else float(median),
+        error=None if options.target_error is None else float(median),
     )
-
-
-def render_shots_again(series: xr.Dataset | str | os.PathLike[str], **options: Any) -> xr.Dataset:
-    """Render a series of shots of `render_shots`, or its file, again: the same bits on the same machine.
-
-    Parameters
-    ----------
-    series
-        A complete series, or the shots that were completed before Ctrl-C.
-    options
-        Options of `render_shots` that change it; `params` are added to the parameters of its scene.
-
-    Raises
-    ------
-    UserError
-        If shots were selected or reordered, the series does not hold its scene, a file of the scene has changed, or an
-        option is invalid.
-    """
-    from mitransient_lidar import results
-    from mitransient_lidar.rendering.again import compare_versions
-
-    found = series if isinstance(series, xr.Dataset) else results.open(series)
-    attributes = found.attrs
-    if "shot" not in found.dims or not np.array_equal(found["shot"], np.arange(attributes.get("shots", 0))):
-        raise UserError("the dataset holds some shots of a series, which is rendered again as a whole: give all shots")
-    compare_versions(attributes)
-    given = {name: value for name, value in options.items() if value is not None}
-    check_params(given.get("params"))
-    # The bins of some shots are those of all of them.
-    same = {} if "params" in given or "positions" in given else {"axis": results.time_axis(found)}
-    params = {**json_attribute(attributes, "series_parameters"), **given.pop("params", {})}
-    own = {
-        "positions": np.column_stack([found["aim_x"], found["aim_y"]]),
-        "pass_share": float(attributes["pass_share"]),
-        # Batches end with their error, or after their passes.
-        **{name: attributes[name] for name in ["target_error" if "target_error" in attributes else "passes"]},
-        "move_target": bool(attributes["moved_target"]),
-        "components": bool(attributes.get("components", 0)),
-        "first_seed": int(attributes.get("first_seed", 0)),
-    }
-    return render_shots(SceneRecord.from_attributes(attributes), params, **{**own, **same, **given})
 
 
 def describe_shots(series: xr.Dataset) -> list[str]:
@@ -411,6 +388,25 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     if np.abs(pairs).max() > _FARTHEST:
         raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {_FARTHEST:g} m")
     return pairs
+
+
+def _checked_passes(given: npt.ArrayLike | None, shots: int, passes: int) -> IntArray:
+    """Return the most passes of each shot."""
+    if given is None:
+        return np.full(shots, passes)
+    if (counts := finite_array("shot_passes", given)).shape != (shots,):
+        raise UserError(f"shot_passes of shape {counts.shape} must be one number for each of {shots} shots")
+    return np.array([integer("shot_passes", count, 2, passes) for count in counts])
+
+
+def _warn_of_the_end(
+    records: Sequence[ShotRecord], done: int, planned: int, options: RenderOptions, interrupted: bool
+) -> None:
+    """Warn of shots that are missing, or have not reached the requested error, unless Ctrl-C has ended them."""
+    if done < planned and not interrupted:
+        _LOG.warning("max_time = %g s ended after %d of %d shots", options.max_time, done, planned)
+    if missed := sum(len(record.power) for record in records if record.missed):
+        _LOG.warning("%d of %d shots ended before target_error = %g", missed, done, options.target_error)
 
 
 def _checked_axis(axis: TimeAxis, own: TimeAxis) -> TimeAxis:
