@@ -323,7 +323,7 @@ def _noise(
     by_render = dataset["signal_mean_stderr"].values.reshape(-1, count)
     if len(by_receiver) not in (1, len(by_render)):
         by_receiver = np.tile(by_receiver, (len(by_render) // pixels, 1))
-    return np.hypot(by_receiver, by_render)
+    return np.asarray(np.hypot(by_receiver, by_render))
 
 
 def _receiver_noise(
