@@ -311,7 +311,7 @@ def share_in_view(dataset: xr.Dataset) -> FloatArray:
     It is the sum of the coordinate ``beam_share``: light that overlapping pixels share counts in each, as in the sum of
     their waveforms. Without the coordinate, it is that of a Gaussian beam in the middle of a full field of view.
     """
-    if "beam_share" in dataset.coords:
+    if "beam_share" in dataset.coords and "pixel" in dataset["beam_share"].dims:
         share = np.asarray(dataset["beam_share"].sum("pixel", skipna=False).values, dtype=np.float64)
         if np.isfinite(share).all():
             return share

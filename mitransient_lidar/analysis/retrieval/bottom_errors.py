@@ -18,7 +18,7 @@ from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.sea.surface_echoes import inside_outline
-from mitransient_lidar.results.geometry import LidarGeometry
+from mitransient_lidar.results.geometry import LidarGeometry, optional_number
 
 #: Largest relative standard error with which a reflectance is given.
 LARGEST_ERROR = 0.5
@@ -119,7 +119,8 @@ def _excess_before_bottom(summed: xr.Dataset, echoes: xr.Dataset) -> FloatArray:
 
 def slope_variance(attributes: Mapping[str, Any]) -> float:
     """Return the total variance of the sea's slopes [1], a typical one if it is unknown."""
-    return float(attributes.get("surface_slope_variance", _TYPICAL_SLOPE_VARIANCE))
+    known = optional_number(attributes, "surface_slope_variance")
+    return _TYPICAL_SLOPE_VARIANCE if known is None else known
 
 
 def focusing(attributes: Mapping[str, Any]) -> float:
@@ -209,12 +210,13 @@ def target_flags(
 
 def hidden_share(attributes: Mapping[str, Any], targets: list[dict[str, Any]]) -> float:
     """Return the share of a Gaussian beam that meets targets of a result, 0 to 1; 0 if the beam is unknown."""
-    if not {"receiver_pose", "divergence_mrad"} <= set(attributes):
+    divergence = optional_number(attributes, "divergence_mrad")
+    if "receiver_pose" not in attributes or divergence is None:
         return 0.0
     origin, axis, far, left = np.reshape(attributes["receiver_pose"], (4, 3))
-    along = 0.5e-3 * float(attributes["divergence_mrad"])
-    across = 0.5e-3 * float(attributes.get("divergence_across_mrad", attributes["divergence_mrad"]))
-    turn = np.radians(float(attributes.get("ellipse_deg", 0.0)))
+    along = 0.5e-3 * divergence
+    across = 0.5e-3 * (optional_number(attributes, "divergence_across_mrad") or divergence)
+    turn = math.radians(optional_number(attributes, "ellipse_deg") or 0.0)
     ticks = _REACH * ((np.arange(_GRID) + 0.5) / _GRID * 2 - 1)
     u, v = np.meshgrid(ticks, ticks)
     weight = np.exp(-0.5 * (u**2 + v**2))
