@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,7 @@ from mitransient_lidar.cli.options import pair
 from mitransient_lidar.core.errors import UserError
 
 _MOST_SHOTS = 200  # of a printed table
-_WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd", "c": "attenuation"}
+_WATER = {"a": "absorption", "bb": "backscattering", "Kd": "kd"}
 
 
 def retrieve(
@@ -80,75 +81,80 @@ def _table(found: Any) -> list[str]:
     from mitransient_lidar.plots.retrieval import estimates, truth_statistics
 
     columns = estimates(found)
-    reflectance = found["reflectance"].sel(correction="column").values
     numbers = found["shot"].values if "shot" in found.coords else range(found.sizes["shot"])
     line = f"{'shot':>5}"
     for one in columns:
         line += f"{one.head:>18}" + (f"{'true':>9}" if one.truth is not None else "")
-    lines = [f"{line}{'reflectance':>13}"]
+    lines = [line]
     for place, number in list(enumerate(numbers))[:_MOST_SHOTS]:
         line = f"{number:>5}"
         for one in columns:
-            known = f"{one.values[place]:.3f}"
-            if one.errors is not None:
-                known += f" +- {one.errors[place]:.3f}"
-            line += f"{known:>18}" + (f"{one.truth[place]:>9.3f}" if one.truth is not None else "")
-        lines.append(f"{line}{reflectance[place]:>13.4f}")
-    if len(reflectance) > _MOST_SHOTS:
-        lines.append(f"{len(reflectance) - _MOST_SHOTS} more shots: write them all with -o OUT.nc")
+            line += f"{_with_error(one.values[place], one.errors[place]):>18}"
+            line += f"{one.truth[place]:>9.3f}" if one.truth is not None else ""
+        lines.append(line)
+    if len(numbers) > _MOST_SHOTS:
+        lines.append(f"{len(numbers) - _MOST_SHOTS} more shots: write them all with -o OUT.nc")
     return lines + [text for one in columns if (text := truth_statistics(one))]
+
+
+def _with_error(value: float, error: float, form: str = ".3f") -> str:
+    """Return a value with its error, or that it is not observable."""
+    return (
+        "not observable" if math.isnan(value) or math.isnan(error) else f"{value:{form}} +- {error:{form.lstrip('+')}}"
+    )
 
 
 def _lines(found: Any) -> list[str]:
     """Return lines that describe the estimates."""
-    import numpy as np
-
     value = {str(name): float(one) for name, one in found.data_vars.items() if one.ndim == 0}
     lines = [f"slope from {found.attrs['slope_method']}"]
     for name, positive in (("along", "a face towards the lidar"), ("across", "a rise to the left")):
-        slope, error = value[f"slope_{name}"], value[f"slope_{name}_stderr"]
-        known = f"{slope:+.4f} +- {error:.4f} (+ is {positive})"
+        known = f"{_with_error(value[f'slope_{name}'], value[f'slope_{name}_stderr'], '+.4f')} (+ is {positive})"
         unknown = "not observable with these pixels"
         if value["slope_refused"]:
             unknown = (
                 f"refused, an estimate is steeper than {found.attrs['steepest_slope']:.2f}, beyond what the sea has"
             )
-        lines.append(f"slope {name}: {unknown if np.isnan(slope) else known}")
-    height, error = value["surface_height"], value["surface_height_stderr"]
-    known = f"surface: {height:+.3f} +- {error:.3f} m from the mean level"
-    lines.append("surface: no echo" if np.isnan(height) else known)
+        lines.append(f"slope {name}: {unknown if math.isnan(value[f'slope_{name}']) else known}")
+    height = value["surface_height"]
+    known = f"surface: {_with_error(height, value['surface_height_stderr'], '+.3f')} m from the mean level"
+    lines.append("surface: not observable, no echo" if math.isnan(height) else known)
     lines += _bottom_lines(found)
     if "kd" not in value:
         return [*lines, "water: not observable, the field of view is too narrow"]
-    if np.isnan(value["kd"]):
-        return [*lines, "water: no column that can be fitted"]
-    lines.append("water (1/m): " + ", ".join(f"{name} {value[key]:.4g}" for name, key in _WATER.items()))
+    if math.isnan(value["kd"]):
+        return [*lines, "water: not observable, no column that can be fitted"]
+    water = ", ".join(
+        f"{name} {_with_error(value[key], value[f'{key}_stderr'], '.3g')}" for name, key in _WATER.items()
+    )
     low, high = value["attenuation_low"], value["attenuation_high"]
     from mitransient_lidar.analysis.retrieval.column_retrieval import BACKSCATTER_RATIOS
 
     least, most = BACKSCATTER_RATIOS
-    return [*lines, f"c is uncertain: {low:.2g} to {high:.2g} 1/m for particles of bb/b from {most:g} to {least:g}"]
+    c = f"c {value['attenuation']:.3g}, {low:.2g} to {high:.2g} for particles of bb/b from {most:g} to {least:g}"
+    return [*lines, f"water (1/m): {water}", f"attenuation (1/m): {c}"]
 
 
 def _bottom_lines(found: Any) -> list[str]:
-    import numpy as np
+    from mitransient_lidar.analysis.retrieval.bottom_errors import REASONS, ReflectanceFlag
 
     depth, error = found["depth_m"].values, found["depth_m_stderr"].values
-    if np.isnan(depth[0]):
-        return ["bottom: no echo"]
-    errors = ["" if np.isnan(one) else f" +- {one:.3f}" for one in error]
-    level, corrected = (f"{one:.3f}{by} m" for one, by in zip(depth[:2], errors, strict=False))
-    lines = [f"bottom: {corrected} deep, {level} through a level sea"]
+    flags = int(found["reflectance_flags"])
+    reasons = ", ".join(text for flag, text in REASONS.items() if flags & flag)
+    if math.isnan(depth[0]):
+        return [f"bottom: not observable, {reasons if flags & ReflectanceFlag.TARGET else 'no echo'}"]
+    level, corrected = (f"{_with_error(*each)} m" for each in zip(depth[:2], error[:2], strict=True))
+    lines = [f"bottom depth: {corrected}, {level} through a level sea"]
     if not found["depth_corrected"].values[1]:
         lines[0] += " (not corrected for the slope: it is known no better than the sea's slopes are)"
-    reflectance = found["reflectance"].values
-    if np.isnan(reflectance).all():
-        return [*lines, "bottom reflectance: no column that can be fitted"]
+    if flags:
+        return [*lines, f"bottom reflectance: not observable, {reasons}"]
     applied = [True, *found["reflectance_corrected"].values[1:]]
+    estimates = (found[name].values for name in ("correction", "reflectance", "reflectance_stderr"))
     text = ", ".join(
-        f"{by} {rho:.4f}" + ("" if known else " (not corrected)")
-        for by, rho, known in zip(found["correction"].values, reflectance, applied, strict=True)
+        f"{by} {_with_error(rho, error)}" + ("" if known else " (not corrected)")
+        for by, rho, error, known in zip(*estimates, applied, strict=True)
     )
     shares = zip(found["bottom_class"].values, found["class_probability"].values, strict=True)
     classes = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares)
-    return [*lines, f"bottom reflectance: {text}", f"bottom class: {classes}"]
+    return [*lines, f"bottom reflectance: {text}", f"probability of the bottom's class: {classes}"]

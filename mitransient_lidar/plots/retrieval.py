@@ -65,14 +65,15 @@ class Estimate(NamedTuple):
 
     head: str
     values: FloatArray
-    errors: FloatArray | None
+    errors: FloatArray
     truth: FloatArray | None
 
 
 def estimates(found: xr.Dataset) -> list[Estimate]:
-    """Return slopes, heights and depths of a result of `analysis.retrieval.retrieve.retrieve` over ``shot``.
+    """Return slopes, heights, depths and reflectances of a result of `analysis.retrieval.retrieve.retrieve`.
 
-    Depths are those below the mean sea level through the slope of the shot.
+    The result is over ``shot``. Depths are those below the mean sea level through the slope of the shot, reflectances
+    those by the ratio to the column.
     """
     through_slope = found.sel(correction="slope")
     columns = {
@@ -82,13 +83,18 @@ def estimates(found: xr.Dataset) -> list[Estimate]:
         "depth (m)": ("depth_m", "true_bottom_depth"),
     }
 
-    def values(name: str) -> FloatArray | None:
-        return through_slope[name].values if name in through_slope else None
-
-    return [
-        Estimate(head, through_slope[name].values, values(f"{name}_stderr"), values(truth))
+    listed = [
+        Estimate(
+            head,
+            through_slope[name].values,
+            through_slope[f"{name}_stderr"].values,
+            through_slope[truth].values if truth in through_slope else None,
+        )
         for head, (name, truth) in columns.items()
     ]
+    by_column = found.sel(correction="column")
+    values, errors = (by_column[name].values for name in ("reflectance", "reflectance_stderr"))
+    return [*listed, Estimate("reflectance", values, errors, None)]
 
 
 def truth_statistics(one: Estimate) -> str:
@@ -102,8 +108,7 @@ def truth_statistics(one: Estimate) -> str:
     text = f"{one.head}: bias {error.mean():+.3f}, rms error {np.sqrt(np.mean(error**2)):.3f}"
     if np.ptp(one.truth[known]) > 0 and np.ptp(one.values[known]) > 0:
         text += f", correlation {np.corrcoef(one.values[known], one.truth[known])[0, 1]:+.2f}"
-    if one.errors is not None:
-        text += f", rms of error / standard error {np.sqrt(np.mean((error / one.errors[known]) ** 2)):.2f}"
+    text += f", rms of error / standard error {np.sqrt(np.mean((error / one.errors[known]) ** 2)):.2f}"
     return f"{text}, {np.count_nonzero(known)} shots"
 
 

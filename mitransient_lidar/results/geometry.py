@@ -137,10 +137,10 @@ class LidarGeometry:
         return 1e-3 * required_number(attributes, "field_of_view_mrad") * self.height / math.cos(self.off_nadir)
 
     def lidar_system(self, attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
-        """Return the system of the lidar equation, with the pulse energy inside the receiver's field of view.
+        """Return the system of the lidar equation, with the energy of the whole beam and the open area of the aperture.
 
         The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default
-        it is the attribute ``two_way_efficiency``.
+        it is the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see.
 
         Raises
         ------
@@ -151,8 +151,8 @@ class LidarGeometry:
         return LidarSystem(
             self.height,
             self.off_nadir,
-            energy * _fraction_in_view(attributes),
-            required_number(attributes, "aperture_area"),
+            energy,
+            open_aperture(attributes),
             self.refractive_index,
             self.group_index,
         )
@@ -299,8 +299,27 @@ def _columns(values: FloatArray, dimensions: int) -> FloatArray:
     return values.reshape(-1, *(1,) * (dimensions - 1))
 
 
-def _fraction_in_view(attributes: Attributes) -> float:
-    """Return the fraction of a Gaussian beam inside the receiver's field of view."""
+def open_aperture(attributes: Attributes) -> float:
+    """Return the area of the aperture [m^2] that is not obscured: ``aperture_area`` times 1 - ``obscuration``."""
+    blocked = in_range("obscuration", optional_number(attributes, "obscuration") or 0.0, 0, 1)
+    return required_number(attributes, "aperture_area") * (1 - blocked)
+
+
+def share_in_view(dataset: xr.Dataset) -> FloatArray:
+    """Return the share of the beam's energy in all pixels of a result over ``pixel``, shape () or (shots,).
+
+    It is the sum of the coordinate ``beam_share``: light that overlapping pixels share counts in each, as in the sum of
+    their waveforms. Without the coordinate, it is that of a Gaussian beam in the middle of a full field of view.
+    """
+    if "beam_share" in dataset.coords and "pixel" in dataset["beam_share"].dims:
+        share = np.asarray(dataset["beam_share"].sum("pixel", skipna=False).values, dtype=np.float64)
+        if np.isfinite(share).all():
+            return share
+    return np.asarray(_gaussian_share(dataset.attrs))
+
+
+def _gaussian_share(attributes: Attributes) -> float:
+    """Return the share of a Gaussian beam inside a field of view about its axis, without gaps between pixels."""
     half = required_number(attributes, "field_of_view_mrad") / required_number(attributes, "divergence_mrad")
     if attributes.get("field_of_view_shape", "circle") == "circle":
         return 1 - math.exp(-0.5 * half**2)

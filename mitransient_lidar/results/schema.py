@@ -148,7 +148,7 @@ def _has_lines(described: Mapping[str, Any]) -> bool:
         "id": lambda value: isinstance(value, str),
         "share": _is_number,
         "z": lambda value: _are_numbers(value) and len(value) == 2,
-        "line": _is_line,
+        **dict.fromkeys(("line", "seen", "shadow"), _is_line),
         "lines": lambda value: isinstance(value, list) and all(map(_is_line, value)),
     }
     return all(kinds[key](value) for key, value in described.items() if key in kinds)

@@ -26,6 +26,9 @@ SMALLEST_SPOT = 6.0
 #: Level of a column by multiple scattering over that by bb alone.
 MULTIPLE_SCATTERING = 1.13
 
+#: Relative error of bb and Kd by the method.
+METHOD_ERROR = 0.1
+
 #: bb/b of particles: the typical one, and a range that includes those of most natural waters.
 BACKSCATTER_RATIO, BACKSCATTER_RATIOS = PETZOLD_BACKSCATTER_RATIO, (0.003, 0.03)
 
@@ -44,6 +47,17 @@ class WaterEstimate:
     attenuation: FloatArray
     attenuation_low: FloatArray
     attenuation_high: FloatArray
+
+    def errors(self, decay_error: FloatArray, level_error: FloatArray) -> dict[str, FloatArray]:
+        """Return the standard errors of ``absorption``, ``backscattering`` and ``kd`` by noise and method [1/m].
+
+        `decay_error` is that of the column's attenuation [1/m], `level_error` the relative one of its level. Those of
+        the method are 10 % of bb and Kd: in ten rendered waters the largest errors were 10 and 13 %.
+        """
+        backscattering = self.backscattering * np.hypot(METHOD_ERROR, level_error)
+        kd = np.hypot(METHOD_ERROR * self.kd, decay_error)
+        per_bb = (self.kd - self.absorption) / np.where(self.backscattering > 0, self.backscattering, np.nan)
+        return {"absorption": np.hypot(kd, per_bb * backscattering), "backscattering": backscattering, "kd": kd}
 
 
 def backscatter_of_level(level: npt.ArrayLike, gain: npt.ArrayLike, group_index: float) -> FloatArray:

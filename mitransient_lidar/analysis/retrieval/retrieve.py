@@ -14,14 +14,21 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.analysis.retrieval import column_retrieval, surface_inputs, surface_slope
-from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
+from mitransient_lidar.analysis.retrieval import bottom_errors, column_retrieval, surface_inputs, surface_slope
+from mitransient_lidar.analysis.retrieval.bottom_errors import ReflectanceFlag
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain
 from mitransient_lidar.analysis.waveforms import echo_table
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, in_range, positive
+from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.physics.sea.surface_echoes import PixelMap, SeaLidar, sea_shots
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number, required_number
+from mitransient_lidar.results.geometry import (
+    LidarGeometry,
+    LinesOfSight,
+    optional_number,
+    required_number,
+    share_in_view,
+)
 
 _LOG = logging.getLogger(__name__)
 _FEWEST_SHOTS = 8  # whose scatter of reflectance is known
@@ -165,7 +172,6 @@ def bottom(
     slopes: xr.Dataset,
     *,
     efficiency: float | None = None,
-    relative_error: float = 0.15,
     classes: dict[str, float] | None = None,
 ) -> xr.Dataset:
     """Estimate depth and reflectance of the bottom, without and with the surface's slope and height.
@@ -179,8 +185,6 @@ def bottom(
     efficiency : float, optional
         Efficiencies of transmitter and receiver times the two-way transmittance of the atmosphere, 0 to 1. By default,
         from the attribute ``two_way_efficiency``.
-    relative_error : float
-        Relative error of the scale of the reflectance, for the classes [1], 0 to 1.
     classes : dict of str to float, optional
         As for `column_retrieval.bottom_class`.
 
@@ -189,12 +193,12 @@ def bottom(
     xarray.Dataset
         Over ``shot`` if present and ``correction``: ``reflectance`` [1] through a level sea at its mean height
         (``level``), through the plane of the shot (``slope``), and from the ratio of the echo to the column
-        (``column``), and ``depth_m`` below the mean sea level [m], NaN for the last, with ``depth_m_stderr`` by noise,
-        method, slope and height of the sea; ``reflectance_corrected`` and
+        (``column``), with ``reflectance_stderr``; ``depth_m`` below the mean sea level [m], NaN for the last, with
+        ``depth_m_stderr`` by noise, method, slope and height of the sea; ``reflectance_corrected`` and
         ``depth_corrected``, whether the correction was applied: otherwise the value is the one before it. Also
-        ``bottom_energy`` [J], and for the last reflectance ``reflectance_stderr`` from noise, an upper bound, and
-        ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN without a column,
-        with a warning.
+        ``bottom_energy`` [J], ``reflectance_flags``, sums of `bottom_errors.ReflectanceFlag`, and from the last
+        reflectance ``class_probability`` over ``bottom_class``. NaN without a bottom echo; reflectances are NaN where
+        a flag is set, without a column with a warning. Depth and energy are NaN if the echo is that of a target.
 
     Raises
     ------
@@ -206,6 +210,13 @@ def bottom(
     Reflectances ``level`` and ``slope`` use the mean attenuation of all shots. The ratio needs a column of at least 8
     bins in each shot, but hardly depends on the slope, and corrects for focusing by waves.
 
+    The light is that of the beam in the pixels (coordinate ``beam_share``) through the open part of the aperture. The
+    errors of reflectances include noise, 5 % of the energy of the echo, 5 % of the optical depth of both ways (15 %
+    where the column is too short to be tested for layers), the difference between one and two exponentials through the
+    column, waves that focus light, slope and height of the sea, and the share of the beam that targets of a scene hide.
+    A relative error above 0.5 leaves no value. Errors of efficiencies and of
+    the pulse's energy are not included.
+
     A correction that is not expected to lower the variance is not applied: that for the slope where
     `slope_corrections.variances` gives no lower one with it, that by the column where its noise exceeds the scatter of
     the reflectances over the shots. With at least 8 shots, one after which the reflectances of the shots scatter more
@@ -213,9 +224,12 @@ def bottom(
     known.
     """
     lidar = LidarGeometry.from_attributes(dataset.attrs)
-    share = in_range("relative_error", relative_error, 0, 1)
-    echoes = echo_table.extract(_summed(dataset), depth_from="mean").isel(pixel=0)
+    summed = _summed(dataset)
+    echoes = echo_table.extract(summed, depth_from="mean", layers=2).isel(pixel=0)
+    margin = 0.5 * float(echoes.attrs["echo_fwhm_ns"]) * lidar.depth_per_ns
+    flags, hidden = bottom_errors.target_flags(echoes, dataset.attrs, margin, one_place="shot" not in echoes.dims)
     seabed, column = (echoes.sel(echo=name) for name in ("bottom", "column"))
+    seabed = seabed.where(xr.DataArray(flags & ReflectanceFlag.TARGET == 0, dims=seabed["time_ns"].dims))
     time, energy = seabed["time_ns"].values, seabed["energy"].values
     along, across = (np.nan_to_num(slopes[f"slope_{name}"].values) for name in ("along", "across"))
     known_range = slopes["surface_range"].values
@@ -230,17 +244,21 @@ def bottom(
 
     system = lidar.lidar_system(dataset.attrs, efficiency)
     power, attenuation = column["amplitude"].values, echoes["attenuation"].values
-    mean_level, mean_attenuation = (_mean(values) for values in (power, attenuation))
+    mean_attenuation = _mean(attenuation)
     if math.isnan(mean_attenuation):
         _LOG.warning("no waveform has a column long enough for a fit: the reflectance of the bottom is unknown")
-    helpful, by_waves, by_estimate = _helpful(lidar, time, mean_attenuation, slopes)
+    share = share_in_view(dataset)
+    flags |= np.where(share < bottom_errors.LEAST_SHARE, int(ReflectanceFlag.NO_DIRECT_LIGHT), 0)
+    share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
+    helpful, by_sea = bottom_errors.sea_variances(lidar, time, mean_attenuation, slopes)
+    by_waves, by_estimate = by_sea["depth"]
     depth_corrected = helpful["depth"] & np.isfinite(depth[1])
     depth[1] = np.where(depth_corrected, depth[1], depth[0])
     # The error through a level sea includes that by typical waves, which estimated slope and height replace.
     level_error = np.hypot(seabed["depth_m_stderr"].values, seabed["depth_m_method_error"].values)
     others = np.maximum(level_error**2 - np.where(np.isfinite(by_waves), by_waves, 0), 0)
     depth_error = [level_error, np.where(depth_corrected, np.sqrt(others + by_estimate), level_error)]
-    received = system.energy * system.aperture_area
+    received = system.energy * system.aperture_area * share
     reflectance = []
     for distance, path, one in surfaces:
         gain = bottom_gain(distance, np.nan_to_num(path), lidar.refractive_index, one)
@@ -248,30 +266,36 @@ def bottom(
     slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & _steadier(reflectance[1], reflectance[0])
     reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
     water_gain = system.water_gain(0.0, lidar.off_nadir)
-    backscatter = column_retrieval.backscatter_of_level(mean_level, water_gain, lidar.group_index)
+    backscatter = column_retrieval.backscatter_of_level(_mean(power / share), water_gain, lidar.group_index)
     delay = time - echoes["time_ns"].sel(echo="surface").values
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
     vertical = np.where(slope_corrected, ray.cos_vertical, level.cos_vertical)
     ratio = column_retrieval.bottom_reflectance(energy, at_bottom, backscatter, vertical, lidar.group_index)
-    parts = (
-        seabed["energy_stderr"].values / energy,
-        column["amplitude_stderr"].values / power,
-        2 * delay * lidar.metres_per_ns * echoes["attenuation_stderr"].values,
-    )
+    of_echo = bottom_errors.echo_error(energy, seabed["energy_stderr"].values)
+    of_decay = 2 * delay * lidar.metres_per_ns * echoes["attenuation_stderr"].values
+    parts = (seabed["energy_stderr"].values / energy, column["amplitude_stderr"].values / power, of_decay)
     relative = np.sqrt(sum(np.nan_to_num(part) ** 2 for part in parts))
     column_corrected = np.isfinite(ratio) & (relative < _scatter(reflectance[1])) & _steadier(ratio, reflectance[1])
     reflectance.append(np.where(column_corrected, ratio, np.where(np.isfinite(ratio), reflectance[1], np.nan)))
-    names, probability = column_retrieval.bottom_class(
-        reflectance[2], np.abs(np.nan_to_num(reflectance[2])) * np.hypot(relative, share), classes
-    )
+
+    loss = bottom_errors.loss_error(summed, echoes, depth[0], surfaces[0][1], mean_attenuation)
+    common = of_echo**2 + loss**2 + hidden**2 + _mean(of_decay**2) / _count(of_decay)
+    wavy = bottom_errors.focusing(dataset.attrs) ** 2
+    without, corrected = by_sea["reflectance"]
+    of_sea = [wavy + without, wavy + np.where(slope_corrected, corrected, without)]
+    # The ratio to the column takes out what the sea does to a shot, but not to the mean of all.
+    of_ratio = relative**2 + of_sea[1] / _count(ratio)
+    of_sea.append(np.where(column_corrected, of_ratio, of_sea[1]))
+    deviation = np.sqrt(common[..., np.newaxis] + np.stack(np.broadcast_arrays(*of_sea), axis=-1))
+    flags |= np.where(np.isfinite(time) & np.isnan(attenuation), int(ReflectanceFlag.NO_COLUMN), 0)
+    flags |= np.where(deviation[..., 2] > bottom_errors.LARGEST_ERROR, int(ReflectanceFlag.UNCERTAIN), 0)
+    unclear = (deviation > bottom_errors.LARGEST_ERROR) | (flags != 0)[..., np.newaxis]
+    known = np.where(unclear, np.nan, np.stack(reflectance, axis=-1))
+    errors = np.abs(known) * deviation
+    names, probability = column_retrieval.bottom_class(known[..., 2], errors[..., 2], classes)
     found = _labelled(
-        dataset,
-        {
-            "bottom_energy": (energy, "J", "energy of the bottom echo"),
-            "reflectance_stderr": (reflectance[2] * relative, "1", "standard error of the reflectance from noise"),
-        },
-        echoes["attenuation"].shape,
+        dataset, {"bottom_energy": (energy, "J", "energy of the bottom echo")}, echoes["attenuation"].shape
     )
     dims = tuple(found["bottom_energy"].dims)
     unknown = np.full(np.shape(time), np.nan)
@@ -279,50 +303,23 @@ def bottom(
     depth_errors = np.where(np.isfinite(depths), np.stack(np.broadcast_arrays(*depth_error, unknown), axis=-1), np.nan)
     applied = {"reflectance": (slope_corrected, column_corrected), "depth": (depth_corrected, False)}
     for name, (by_slope, by_column) in applied.items():
-        flags = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
-        found[f"{name}_corrected"] = ((*dims, "correction"), flags, {"long_name": f"correction of the {name} applied"})
+        steps = np.stack(np.broadcast_arrays(np.zeros(np.shape(time), dtype=bool), by_slope, by_column), axis=-1)
+        found[f"{name}_corrected"] = ((*dims, "correction"), steps, {"long_name": f"correction of the {name} applied"})
     for name, values, dim, unit, text in (
-        ("reflectance", np.stack(reflectance, axis=-1), "correction", "1", "reflectance of the bottom"),
+        ("reflectance", known, "correction", "1", "reflectance of the bottom"),
+        ("reflectance_stderr", errors, "correction", "1", "error of the reflectance by the sea, noise and method"),
         ("depth_m", depths, "correction", "m", "depth of the bottom below the mean sea level"),
         ("depth_m_stderr", depth_errors, "correction", "m", "error of the depth by the sea, noise and method"),
         ("class_probability", probability, "bottom_class", "1", "probability of the bottom's class"),
     ):
         found[name] = ((*dims, dim), values, {"units": unit, "long_name": text})
+    meanings = {
+        "long_name": "reasons for which the reflectance is not given",
+        "flag_masks": [int(flag) for flag in ReflectanceFlag],
+        "flag_meanings": " ".join(str(flag.name).lower() for flag in ReflectanceFlag),
+    }
+    found["reflectance_flags"] = (dims, np.broadcast_to(flags, np.shape(time)), meanings)
     return found.assign_coords(correction=["level", "slope", "column"], bottom_class=names)
-
-
-def _helpful(
-    lidar: LidarGeometry, time: FloatArray, attenuation: float, slopes: xr.Dataset
-) -> tuple[dict[str, npt.NDArray[np.bool_]], FloatArray, FloatArray]:
-    """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance.
-
-    Also return the variances of the depth without and with them [m^2]; the former is infinite if the sea is unknown.
-    """
-
-    def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:
-        ray = SlopeRefraction.of(along, across, lidar.off_nadir, lidar.refractive_index)
-        return np.nan_to_num((time - 2e9 * distance / C0) * lidar.metres_per_ns), ray
-
-    def depth(along: FloatArray, across: FloatArray, distance: FloatArray) -> FloatArray:
-        path, ray = through(along, across, distance)
-        return bottom_depth(distance, path, lidar.height, lidar.off_nadir, ray)
-
-    def log_reflectance(along: FloatArray, across: FloatArray, distance: FloatArray) -> FloatArray:
-        path, ray = through(along, across, distance)
-        gain = bottom_gain(distance, path, lidar.refractive_index, ray)
-        return np.asarray(2 * np.nan_to_num(attenuation) * path - np.log(gain))
-
-    names = ("slope_along_stderr", "slope_across_stderr", "surface_range_stderr")
-    errors = [slopes[name].values if name in slopes else np.zeros(1) for name in names]
-    before = slopes.attrs.get("slope_prior_deviation", [math.inf] * 3)
-    helpful = {}
-    for name, quantity in (("depth", depth), ("reflectance", log_reflectance)):
-        without, corrected = variances(quantity, lidar.slant_range, before, errors)
-        helpful[name] = np.reshape(corrected < without, time.shape)
-    # A slope that is not estimated is as uncertain as on the sea.
-    known = [np.where(np.isnan(error), deviation, error) for error, deviation in zip(errors, before, strict=True)]
-    without, corrected = variances(depth, lidar.slant_range, before, known)
-    return helpful, np.broadcast_to(without, time.size).reshape(time.shape), corrected.reshape(time.shape)
 
 
 def _scatter(reflectance: FloatArray) -> float:
@@ -357,8 +354,10 @@ def water(
     Returns
     -------
     xarray.Dataset
-        Over ``shot`` if present: ``column_attenuation``, ``absorption``, ``backscattering``, ``kd``, ``attenuation``,
-        ``attenuation_low`` and ``attenuation_high`` [1/m]; see `column_retrieval.WaterEstimate`.
+        Over ``shot`` if present: ``column_attenuation``, ``absorption``, ``backscattering`` and ``kd`` with
+        ``_stderr``, and ``attenuation`` with its bounds ``attenuation_low`` and ``attenuation_high`` [1/m]; see
+        `column_retrieval.WaterEstimate`. NaN without a column or where the pixels see less than a twentieth of the
+        beam.
 
     Raises
     ------
@@ -369,16 +368,20 @@ def water(
     summed = _summed(dataset)
     end = lidar.surface_time_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
     echoes = echo_table.extract(summed.isel(time=summed["time"].values < end)).isel(pixel=0)
-    level = echoes["amplitude"].sel(echo="column").values
+    column = echoes.sel(echo="column")
+    level = column["amplitude"].values
     start = _COLUMN_START * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
     gain = lidar.lidar_system(dataset.attrs, efficiency).water_gain(0.0, lidar.off_nadir)
-    backscatter = column_retrieval.backscatter_of_level(level, gain, lidar.group_index)
-    decay = echoes["attenuation"].values
+    share = share_in_view(dataset)
+    share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
+    backscatter = column_retrieval.backscatter_of_level(level / share, gain, lidar.group_index)
+    decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
     found = column_retrieval.water_of_column(
         decay, backscatter, lidar.spot_diameter(dataset.attrs), first_path=start, phase_factor=phase_factor
     )
     table = {
         "column_attenuation": (decay, "1/m", "attenuation of the column's signal along the path"),
+        "column_attenuation_stderr": (decay_error, "1/m", "standard error of the attenuation by noise"),
         "absorption": (found.absorption, "1/m", "absorption coefficient"),
         "backscattering": (found.backscattering, "1/m", "backscattering coefficient"),
         "kd": (found.kd, "1/m", "diffuse attenuation coefficient"),
@@ -386,6 +389,9 @@ def water(
         "attenuation_low": (found.attenuation_low, "1/m", "smallest beam attenuation coefficient"),
         "attenuation_high": (found.attenuation_high, "1/m", "largest beam attenuation coefficient"),
     }
+    level_error = column["amplitude_stderr"].values / level
+    for name, error in found.errors(decay_error, level_error).items():
+        table[f"{name}_stderr"] = (error, "1/m", f"error of {table[name][2]} by noise and method")
     return _labelled(dataset, table, np.shape(decay))
 
 
@@ -446,6 +452,11 @@ def _labelled(dataset: xr.Dataset, table: dict[str, tuple[FloatArray, str, str]]
     }
     coords: dict[Any, Any] = {name: one for name, one in dataset.coords.items() if shape and one.dims == ("shot",)}
     return xr.Dataset(data, coords, dataset.attrs)
+
+
+def _count(values: FloatArray) -> int:
+    """Return the number of known values, at least 1."""
+    return max(int(np.isfinite(values).sum()), 1)
 
 
 def _mean(values: FloatArray) -> float:

@@ -15,7 +15,7 @@ from mitransient_lidar.core.validation import FloatArray, finite
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
-from mitransient_lidar.results.geometry import LidarGeometry, required_number, two_way_efficiency
+from mitransient_lidar.results.geometry import LidarGeometry, open_aperture, required_number, two_way_efficiency
 
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
 
@@ -37,7 +37,11 @@ def largest_deviations(dataset: xr.Dataset) -> tuple[float, float, float]:
     (Pierson and Moskowitz 1964, doi:10.1029/JZ069i024p05181), total 0.003 + 5.08e-3 U (Cox and Munk 1954,
     doi:10.1364/JOSA.44.000838). They are infinite where it is unknown.
     """
-    total = float(dataset.attrs.get("surface_slope_variance", math.inf))
+    return deviations_of_sea(float(dataset.attrs.get("surface_slope_variance", math.inf)))
+
+
+def deviations_of_sea(total: float) -> tuple[float, float, float]:
+    """Return the deviations of `largest_deviations` for a total slope variance [1], at least 0."""
     wind = max(total - 0.003, 0.0) / 5.08e-3
     return math.sqrt(0.5 * total), math.sqrt(0.5 * total), 0.21 * wind**2 / (4 * GRAVITY)
 
@@ -74,14 +78,14 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
 
 
 def energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
-    """Return the pulse energy times efficiencies and aperture [J m^2], None if echoes are not in J or it is unknown."""
+    """Return energy times efficiencies and open aperture [J m^2], None if echoes are not in J or it is unknown."""
     names = ("scene.optical_efficiency", "scene.two_way_atmospheric_transmittance")
     of_scene = all(name in dataset.attrs for name in names)
     known = efficiency is not None or "two_way_efficiency" in dataset.attrs or of_scene
     if "signal" in dataset or not known:
         return None
-    energy, aperture = (required_number(dataset.attrs, name) for name in ("pulse_energy_mj", "aperture_area"))
-    return 1e-3 * energy * two_way_efficiency(dataset.attrs, efficiency) * aperture
+    energy = 1e-3 * required_number(dataset.attrs, "pulse_energy_mj")
+    return energy * two_way_efficiency(dataset.attrs, efficiency) * open_aperture(dataset.attrs)
 
 
 def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) -> PixelEchoes:

@@ -12,7 +12,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_files, gate_stack
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
+from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number, share_in_view
 
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
@@ -66,11 +66,23 @@ def test_beam_edge_and_spot():
 
 def test_system_of_the_lidar_equation():
     system = LidarGeometry.from_attributes(ATTRIBUTES).lidar_system(ATTRIBUTES)
-    # A circle of 3 standard deviations of the beam.
-    assert system.energy == pytest.approx(5e-3 * 0.9**2 * 0.8 * (1 - math.exp(-4.5)))
-    square = {**ATTRIBUTES, "field_of_view_shape": "square"}
-    energy = LidarGeometry.from_attributes(square).lidar_system(square, efficiency=0.5).energy
-    assert energy == pytest.approx(5e-3 * 0.5 * math.erf(3 / math.sqrt(2)) ** 2)
+    assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.9**2 * 0.8), 0.025)
+    obscured = {**ATTRIBUTES, "obscuration": 0.3}
+    system = LidarGeometry.from_attributes(obscured).lidar_system(obscured, efficiency=0.5)
+    assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.5), pytest.approx(0.7 * 0.025))
+
+
+def test_share_of_the_beam_in_view():
+    """The sum of the shares that are stored; without them, that of a circle or square of 3 standard deviations."""
+    stored = xr.Dataset(coords={"beam_share": ("pixel", [0.25, 0.5])}, attrs=ATTRIBUTES)
+    assert share_in_view(stored) == 0.75
+    shots = xr.Dataset(coords={"beam_share": (("shot", "pixel"), [[0.25, 0.5], [0.1, 0.1]])}, attrs=ATTRIBUTES)
+    np.testing.assert_allclose(share_in_view(shots), [0.75, 0.2])
+    unknown = xr.Dataset(coords={"beam_share": ("pixel", [0.25, np.nan])}, attrs=ATTRIBUTES)
+    for dataset in (unknown, xr.Dataset(attrs=ATTRIBUTES)):
+        assert share_in_view(dataset) == pytest.approx(1 - math.exp(-4.5))
+    square = xr.Dataset(attrs={**ATTRIBUTES, "field_of_view_shape": "square"})
+    assert share_in_view(square) == pytest.approx(math.erf(3 / math.sqrt(2)) ** 2)
 
 
 def test_numbers_that_are_missing_or_invalid():

@@ -7,102 +7,33 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import assert_refused, run
-from scipy.stats import exponnorm, norm, truncnorm
+from scipy.stats import truncnorm
 from significance import largest_z
+from synthetic_shots import (
+    ANGLE_X,
+    ANGLE_Y,
+    BB,
+    BINS,
+    C0,
+    COS_WATER,
+    DEPTH,
+    LEVEL,
+    RHO,
+    SURFACE,
+    THETA,
+    A,
+    N,
+    on_axis,
+    plane_delays,
+    result,
+    waveform,
+)
 
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve, surface_inputs
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.plots import retrieval
 from mitransient_lidar.rendering import shot_series
-
-C0 = 0.299792458  # m/ns
-N = 1.34
-THETA = math.radians(20)
-COS_WATER = math.sqrt(1 - (math.sin(THETA) / N) ** 2)
-DT, START, BINS = 0.5, 1385.0, 400
-EDGES = START + DT * np.arange(BINS + 1)
-TIME = EDGES[:-1] + 0.5 * DT
-SIGMA = 4.0 / FWHM_PER_SIGMA
-SURFACE = 2 * 200 / math.cos(THETA) / C0
-ANGLE_X = np.array([3.0, 3.0, -3.0, -3.0])
-ANGLE_Y = np.array([-3.0, 3.0, -3.0, 3.0])
-ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # pulse, optics, air, aperture [J m^2]
-A, BB, RHO, DEPTH = 0.12, 0.008, 0.25, 8.0
-ATTRIBUTES = {
-    "altitude": 200.0,
-    "off_nadir_deg": 20.0,
-    "refractive_index": N,
-    "group_index": N,
-    "pulse_fwhm_ns": 4.0,
-    "pulse_energy_mj": 5.0,
-    "aperture_area": 0.025,
-    "field_of_view_mrad": 60.0,
-    "divergence_mrad": 0.1,
-    "surface_time_ns": SURFACE,
-    "scene.optical_efficiency": "0.9",
-    "scene.two_way_atmospheric_transmittance": "0.9",
-}
-
-
-def normal_transmittance():
-    s = (math.cos(THETA) - N * COS_WATER) / (math.cos(THETA) + N * COS_WATER)
-    p = (N * math.cos(THETA) - COS_WATER) / (N * math.cos(THETA) + COS_WATER)
-    return 1 - 0.5 * (s**2 + p**2)
-
-
-def solid_angle(path):
-    """Per area of the aperture, from a path below a level sea."""
-    reach = 200 / math.cos(THETA)
-    ratio = COS_WATER / math.cos(THETA)
-    return 1 / ((N * reach + path) * (N * reach * ratio + path / ratio))
-
-
-def waveform(delay=0.0, share=0.25, glint=2e-13, factor=1.0, k=A + BB, depth=DEPTH):
-    """A pixel's share of the power [W] over a level sea; a sea surface factor on all that has crossed it."""
-    rate = C0 / N * k  # 1/ns
-    path = depth / COS_WATER
-    surface, bottom = SURFACE + delay, SURFACE + delay + 2 * N * path / C0
-    through = factor * share * ENERGY * normal_transmittance() ** 2
-    # 1.13 is the multiple scattering that `column_retrieval` assumes.
-    level = through * solid_angle(0.0) * 1.13 * BB / (2 * np.pi) * C0 * 1e9 / (2 * N)
-    echo = through * solid_angle(path) * RHO / np.pi * COS_WATER * math.exp(-2 * k * path)
-
-    def onset(at):
-        return level / rate * exponnorm.pdf(TIME, 1 / (rate * SIGMA), loc=at, scale=SIGMA)
-
-    def pulse(at, energy):
-        return energy / (DT * 1e-9) * np.diff(norm.cdf(EDGES, at, SIGMA))
-
-    spreading = solid_angle(np.clip((TIME - surface) * C0 / (2 * N), 0, path)) / solid_angle(0.0)
-    column = (onset(surface) - math.exp(-rate * (bottom - surface)) * onset(bottom)) * spreading
-    return pulse(surface, share * glint) + column + pulse(bottom, echo)
-
-
-def plane_delays(along, across):
-    """Two-way delays [ns] of the pixels over a plane through the origin, from rays as vectors."""
-    ray = np.array([math.sin(THETA), 0, -math.cos(THETA)]) + 1e-3 * (
-        np.outer(ANGLE_X, [math.cos(THETA), 0, math.sin(THETA)]) + np.outer(ANGLE_Y, [0, 1, 0])
-    )
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    normal = np.array([-along, -across, 1])
-    return -2 / C0 * (np.array([-200 * math.tan(THETA), 0, 200]) @ normal) / (ray @ normal) - SURFACE
-
-
-def result(values=None, **attributes):
-    values = np.stack([waveform(delay) for delay in plane_delays(0.0, 0.0)]) if values is None else values
-    return results.build(
-        values * DT * 1e-9,
-        1e-4 * values * DT * 1e-9,
-        values,
-        1e-4 * values + 1e-9,
-        time=TimeAxis(START, DT, BINS),
-        pixel_names=["red", "green", "blue", "black"][: len(values)],
-        pixel_centres_mrad=np.stack([ANGLE_X, ANGLE_Y], axis=1)[: len(values)],
-        attributes={**ATTRIBUTES, **attributes},
-    )
 
 
 @pytest.mark.slow
@@ -128,14 +59,6 @@ def test_a_slope_that_the_sea_cannot_have_is_refused(tmp_path):
 
 def series(shots):
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
-
-
-def on_axis(**changes):
-    """Four pixels that all see the axis: what a bottom and a column are without the spread of arrivals."""
-    return result(np.stack([waveform(**changes)] * 4))
-
-
-LEVEL = xr.Dataset({"slope_along": 0.0, "slope_across": 0.0, "surface_range": 200 / math.cos(THETA)})
 
 
 def test_slopes_of_shots():
@@ -323,7 +246,10 @@ def test_estimates_without_a_column(tmp_path, caplog):
         results.save(shot, tmp_path / "short.nc")
         done = run("retrieve", tmp_path / "short.nc")
         assert done.exit_code == 0, done.output
-        for text in ("slope along: +0.1", "bottom: ", "water: no column that can be fitted"):
+        unseen = (
+            "bottom: not observable, no echo" if math.isnan(depth) else "bottom reflectance: not observable, no column"
+        )
+        for text in ("slope along: +0.1", unseen, "water: not observable, no column that can be fitted"):
             assert text in done.output
         assert "nan" not in done.output
 
@@ -339,8 +265,10 @@ def test_command(tmp_path):
     written = tmp_path / "out" / "found.nc"
     done = run("retrieve", tmp_path / "shot.nc", "-o", written, "--slope-deviation", "0.1,0.1")
     assert done.exit_code == 0, done.output
-    for text in ("slope along: ", "bottom: 8.0", "bright 9", "water (1/m): a 0.1", "c is uncertain: "):
+    for text in ("slope along: ", "bottom depth: 8.0", "bright 9", "water (1/m): a 0.1", "attenuation (1/m): c "):
         assert text in done.output
+    for line in done.output.splitlines()[1:-1]:
+        assert " +- " in line or " %" in line or " to " in line, line
     expected = retrieve.retrieve(results.open(tmp_path / "shot.nc"), slope_deviation=(0.1, 0.1))
     xr.testing.assert_allclose(xr.load_dataset(written, engine="h5netcdf"), expected)
     results.save(result(field_of_view_mrad=20.0), tmp_path / "narrow.nc")
@@ -376,7 +304,8 @@ def test_estimates_of_a_series_are_compared_with_its_truth(shots_with_truth):
     assert retrieval.truth_statistics(made) == text
     assert retrieval.truth_statistics(made._replace(truth=None)) == ""
     figure = retrieval.plot_retrieval(found)
-    assert [ax.get_ylabel() for ax in figure.axes] == [f"estimated {head}" for head in listed]
+    # The truth of the reflectance is not known, and nothing is drawn.
+    assert [ax.get_ylabel() for ax in figure.axes] == [f"estimated {head}" for head in listed if head != "reflectance"]
     np.testing.assert_allclose(figure.axes[3].lines[0].get_xdata(), [8.0, 7.8, 8.3])
     # Slopes that are all the same have no spread to be drawn over.
     assert figure.axes[0].get_xlabel() == "shot"
@@ -456,7 +385,7 @@ def drop(name):
         ),
         (lambda: retrieve.surface_slopes(result(), facets=-1), "facets = -1 must be greater"),
         (lambda: retrieve.bottom(result().drop_vars("waveform"), LEVEL), "the dataset has no waveform"),
-        (lambda: retrieve.bottom(result(), LEVEL, relative_error=2), "relative_error = 2 must lie between"),
+        (lambda: retrieve.bottom(result(obscuration=2.0), LEVEL), "obscuration = 2 must lie between 0 and 1"),
         (lambda: retrieve.bottom(drop("scene.optical_efficiency"), LEVEL), "efficiency must be given"),
         (lambda: retrieve.water(result(field_of_view_mrad=20.0)), r"spot_diameter = 4\.2\d+ must be at least 6"),
         (lambda: retrieve.water(result(), efficiency=3), "efficiency = 3 must lie between"),

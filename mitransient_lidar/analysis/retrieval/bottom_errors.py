@@ -1,0 +1,232 @@
+"""Errors of depth and reflectance of a bottom, and reasons for which the reflectance is unknown."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from enum import IntFlag
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.retrieval import surface_inputs
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction, bottom_depth, bottom_gain, variances
+from mitransient_lidar.analysis.waveforms.records import Waveforms
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.sea.surface_echoes import inside_outline
+from mitransient_lidar.results.geometry import LidarGeometry, optional_number
+
+#: Largest relative standard error with which a reflectance is given.
+LARGEST_ERROR = 0.5
+#: Smallest share of the beam's energy in the pixels at which scattered light does not dominate their echoes.
+LEAST_SHARE = 0.05
+
+_TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
+_OF_ECHO = 0.05  # relative error of the energy of the bottom echo: light scattered forwards arrives later, in its tail
+_OF_LOSS = 0.05  # relative error of the optical depth of both ways: the bottom's light decays unlike the column's
+_UNTESTED = 0.15  # the same for a column that is too short to be tested for layers
+_DEEPEST_CHANGE = 0.65  # of the column, over the depth of the bottom
+_WINDOW = (2.7, 1.8)  # before the bottom echo where the column is compared with its fit, in echo widths
+_FOCUSING = 0.45  # relative deviation of the light at the bottom by waves over the deviation of the sea's slopes
+_GRID, _REACH = 128, 4.0  # points along each side of a beam, and half of its side in standard deviations
+
+
+class ReflectanceFlag(IntFlag):
+    """Reasons for which the reflectance of a bottom is not given; 0 if it is."""
+
+    NO_COLUMN = 1  # no column that can be fitted: the attenuation is unknown
+    NO_DIRECT_LIGHT = 2  # the pixels see less than a twentieth of the beam
+    TARGET = 4  # the echo comes from the depth of a target
+    EARLIER_ECHO = 8  # a target or a layer returns or absorbs an unknown share of the light before the bottom
+    UNCERTAIN = 16  # its standard error would exceed half of the reflectance
+
+
+#: What the flags say to a user.
+REASONS = {
+    ReflectanceFlag.NO_COLUMN: "no column that can be fitted",
+    ReflectanceFlag.NO_DIRECT_LIGHT: "the pixels see too little of the beam",
+    ReflectanceFlag.TARGET: "the echo comes from the depth of a target",
+    ReflectanceFlag.EARLIER_ECHO: "a target or a layer of the water returns an echo before the bottom's",
+    ReflectanceFlag.UNCERTAIN: "its error would exceed half of it",
+}
+
+
+def loss_error(
+    summed: xr.Dataset, echoes: xr.Dataset, depth: FloatArray, path: FloatArray, attenuation: float
+) -> float:
+    """Return the error of the optical depth of both ways to the bottom by the method [1], infinite if unknown.
+
+    The loss is that of one exponential through the column. Two signs that the water differs below count in full: the
+    loss by two exponentials (`column_fits.change_points`), and the logarithm of the signal before the bottom echo over
+    the exponential. Both are means over the shots, of the same water.
+
+    Parameters
+    ----------
+    summed
+        Waveforms over (pixel, time) or (shot, pixel, time), of one pixel.
+    echoes
+        Table of `echo_table.extract` of these waveforms with `layers`, without the dimension pixel.
+    depth, path
+        Depths of the bottom and one-way paths to it in the water [m], of the shots.
+    attenuation
+        Mean attenuation of the columns along the path [1/m].
+    """
+    depths = 2 * attenuation * path
+    if not np.isfinite(depths).any():
+        return np.inf
+    split, ahead = _loss_of_layers(echoes, depth, path, depths), _excess_before_bottom(summed, echoes)
+    parts = [(_OF_LOSS if np.isfinite(split).any() else _UNTESTED) * float(np.nanmean(depths))]
+    parts += [float(np.mean(part[np.isfinite(part)])) for part in (split, ahead) if np.isfinite(part).any()]
+    return float(np.linalg.norm(parts))
+
+
+def _loss_of_layers(echoes: xr.Dataset, depth: FloatArray, path: FloatArray, loss: FloatArray) -> FloatArray:
+    """Return the optical depth of both ways by two exponentials less that by one, NaN for too short a column."""
+    names = ("layer_depth_m", "layer_attenuation_above", "layer_attenuation_below")
+    at, above, below = (np.moveaxis(echoes[name].transpose(..., "layer").values, -1, 0) for name in names)
+    share = at / np.where(depth > 0, depth, np.nan)
+    # The edge of the bottom echo looks like a change shortly before it.
+    usable = (share > 0) & (share < _DEEPEST_CHANGE)
+    first = np.argmax(usable, axis=0)[np.newaxis]
+    part, upper, lower = (np.take_along_axis(one, first, axis=0)[0] for one in (share, above, below))
+    difference = 2 * path * (upper * part + np.maximum(lower, 0) * (1 - part)) - loss
+    return np.asarray(np.where(usable.any(axis=0), difference, np.where(np.isfinite(share[0]), 0.0, np.nan)))
+
+
+def _excess_before_bottom(summed: xr.Dataset, echoes: xr.Dataset) -> FloatArray:
+    """Return the logarithm of the signal before bottom echoes over the columns', NaN without both; of the shots."""
+    waveforms = Waveforms.from_dataset(summed, None, None, None, None)
+    rows = slice(0, waveforms.count)
+    time, width = waveforms.records(rows).time_ns, waveforms.echo_fwhm_ns
+    start, middle, level = (
+        echoes[name].sel(echo=echo).values.reshape(-1, 1)
+        for name, echo in (("time_ns", "surface"), ("time_ns", "bottom"), ("amplitude", "column"))
+    )
+    metres = 2 * waveforms.geometry.metres_per_ns
+    decay = echoes["attenuation"].values.reshape(-1, 1) * metres
+    inside = (time > np.maximum(middle - _WINDOW[0] * width, start + width)) & (time < middle - _WINDOW[1] * width)
+    column = level * waveforms.gain(rows) * np.exp(-decay * (time - start))
+    power = waveforms.records(rows).power
+    measured, fitted = (np.sum(np.where(inside & np.isfinite(column), one, 0), axis=1) for one in (power, column))
+    known = (measured > 0) & (fitted > 0)
+    ratio = np.divide(measured, fitted, out=np.ones_like(measured), where=known)
+    return np.where(known, np.log(ratio), np.nan).reshape(echoes["attenuation"].shape)
+
+
+def slope_variance(attributes: Mapping[str, Any]) -> float:
+    """Return the total variance of the sea's slopes [1], a typical one if it is unknown."""
+    known = optional_number(attributes, "surface_slope_variance")
+    return _TYPICAL_SLOPE_VARIANCE if known is None else known
+
+
+def focusing(attributes: Mapping[str, Any]) -> float:
+    """Return the relative standard deviation of the light at a bottom by waves that focus it [1]."""
+    return _FOCUSING * math.sqrt(slope_variance(attributes))
+
+
+def sea_variances(
+    lidar: LidarGeometry, time: FloatArray, attenuation: float, slopes: xr.Dataset
+) -> tuple[dict[str, npt.NDArray[np.bool_]], dict[str, tuple[FloatArray, FloatArray]]]:
+    """Return whether slopes and ranges of `surface_slopes` lower the variances of depth and of log reflectance.
+
+    Also return these variances without and with them, [m^2] and [1]. The former of the depth is infinite if the sea is
+    unknown; that of the reflectance is then that over a typical sea.
+    """
+
+    def through(along: FloatArray, across: FloatArray, distance: FloatArray) -> tuple[FloatArray, SlopeRefraction]:
+        ray = SlopeRefraction.of(along, across, lidar.off_nadir, lidar.refractive_index)
+        return np.nan_to_num((time - 2e9 * distance / C0) * lidar.metres_per_ns), ray
+
+    def depth(along: FloatArray, across: FloatArray, distance: FloatArray) -> FloatArray:
+        path, ray = through(along, across, distance)
+        return bottom_depth(distance, path, lidar.height, lidar.off_nadir, ray)
+
+    def log_reflectance(along: FloatArray, across: FloatArray, distance: FloatArray) -> FloatArray:
+        path, ray = through(along, across, distance)
+        gain = bottom_gain(distance, path, lidar.refractive_index, ray)
+        return np.asarray(2 * np.nan_to_num(attenuation) * path - np.log(gain))
+
+    names = ("slope_along_stderr", "slope_across_stderr", "surface_range_stderr")
+    errors = [slopes[name].values if name in slopes else np.zeros(1) for name in names]
+    before = slopes.attrs.get("slope_prior_deviation", [math.inf] * 3)
+    # A slope that is not estimated is as uncertain as on the sea.
+    typical = surface_inputs.deviations_of_sea(slope_variance(slopes.attrs))
+    helpful: dict[str, npt.NDArray[np.bool_]] = {}
+    by_sea: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for name, quantity in (("depth", depth), ("reflectance", log_reflectance)):
+        without, corrected = variances(quantity, lidar.slant_range, before, errors)
+        helpful[name] = np.reshape(corrected < without, time.shape)
+        sea = list(before if name == "depth" else np.where(np.isfinite(before), before, typical))
+        known = [np.where(np.isfinite(error), error, deviation) for error, deviation in zip(errors, sea, strict=True)]
+        without, corrected = (
+            np.broadcast_to(one, time.size).reshape(time.shape)
+            for one in variances(quantity, lidar.slant_range, sea, known)
+        )
+        by_sea[name] = without, corrected
+    return helpful, by_sea
+
+
+def echo_error(energy: FloatArray, stderr: FloatArray) -> FloatArray:
+    """Return the relative error of the energies of bottom echoes by noise and by the method."""
+    return np.hypot(_OF_ECHO, np.nan_to_num(stderr / energy))
+
+
+def target_flags(
+    echoes: xr.Dataset, attributes: Mapping[str, Any], margin: float, *, one_place: bool
+) -> tuple[IntArray, float]:
+    """Return flags of bottom echoes that targets disturb, and the share of the beam that targets hide from the bottom.
+
+    Targets are those of the attribute ``target_outlines``, for shots of `one_place`. Otherwise the share is 0, and
+    every echo before the bottom's has a flag.
+
+    Parameters
+    ----------
+    echoes
+        Table of `echo_table.extract` with depths below the mean sea level.
+    attributes
+        Those of the result.
+    margin
+        Distance between a target and the depth of its echo [m].
+    one_place
+        Whether all shots are of one place.
+    """
+    bottom, before = (echoes["depth_m"].sel(echo=name).values for name in ("bottom", "target"))
+    targets = json.loads(attributes.get("target_outlines", "[]"))
+    floor = -float(attributes["bottom_point"][2]) if "bottom_point" in attributes else np.inf
+    flags = np.zeros(np.shape(bottom), dtype=np.int64)
+    for target in targets:
+        deep, shallow = (-float(height) for height in target["z"])
+        at_target = (bottom > shallow - margin) & (bottom < deep + margin) & (bottom < floor - margin)
+        flags |= np.where(at_target, int(ReflectanceFlag.TARGET), 0)
+    hidden = hidden_share(attributes, targets) if one_place and targets else 0.0
+    if not hidden:
+        flags |= np.where(np.isfinite(before), int(ReflectanceFlag.EARLIER_ECHO), 0)
+    return flags, hidden
+
+
+def hidden_share(attributes: Mapping[str, Any], targets: list[dict[str, Any]]) -> float:
+    """Return the share of a Gaussian beam that meets targets of a result, 0 to 1; 0 if the beam is unknown."""
+    divergence = optional_number(attributes, "divergence_mrad")
+    if "receiver_pose" not in attributes or divergence is None:
+        return 0.0
+    origin, axis, far, left = np.reshape(attributes["receiver_pose"], (4, 3))
+    along = 0.5e-3 * divergence
+    across = 0.5e-3 * (optional_number(attributes, "divergence_across_mrad") or divergence)
+    turn = math.radians(optional_number(attributes, "ellipse_deg") or 0.0)
+    ticks = _REACH * ((np.arange(_GRID) + 0.5) / _GRID * 2 - 1)
+    u, v = np.meshgrid(ticks, ticks)
+    weight = np.exp(-0.5 * (u**2 + v**2))
+    angle_x = along * u * np.cos(turn) - across * v * np.sin(turn)
+    angle_y = along * u * np.sin(turn) + across * v * np.cos(turn)
+    hidden = np.zeros(u.shape, dtype=bool)
+    for target in targets:
+        line = np.reshape(target.get("seen", []), (-1, 2))
+        if len(line) >= 3:
+            rays = np.pad(line, ((0, 0), (0, 1))) - origin
+            corners = np.stack([rays @ far, rays @ left], axis=1) / (rays @ axis)[:, np.newaxis]
+            hidden |= inside_outline([corners], angle_x, angle_y)
+    return float(np.sum(weight * hidden) / np.sum(weight))
