@@ -16,6 +16,7 @@ from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, opti
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
 _SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most significant gate
+_CERTAIN = 4.0  # standard errors that are enough for any gate
 _FIRST_ECHOES = 1.0  # percentile of the echoes' times before which all pixels see the column
 _BLOCK = 8192  # pixels computed at once
 
@@ -124,15 +125,16 @@ def range_from_gates(
     between these and the 2 gates behind the echo; behind the echo, at most the level of these 2 gates, since a target
     may end the column. Energies below their error are replaced by it.
 
-    Echo: the gate with the largest excess over the column, of those at least half as significant as the most
-    significant one, which excludes the noise of the bright column near the surface. The depth is the centroid of the
+    Echo: the gate with the largest excess over the column, of those that exceed it by 4 standard errors or are at least
+    half as significant as the most significant one, which excludes the noise of the bright column near the surface. The
+    depth is the centroid of the
     excess within `reach`. Its error assumes independent errors and gates not wider than the pulse; the position of an
     echo within a wider gate is unknown.
 
     The confidence is Phi(z)^m for an excess of z standard errors, the largest of m gates.
 
-    The first `reach` + 2 gates are only used to estimate the column: start the train between surface and target, since
-    a surface echo would be found instead of the target.
+    The first `reach` + 1 gates are only used to estimate the column, behind a single one constant: start the train
+    between surface and target, since a surface echo would be found instead of the target.
     """
     e, s = np.asarray(energy, dtype=np.float64), np.asarray(stderr, dtype=np.float64)
     mid = finite_array("gate_mid", gate_mid)
@@ -176,7 +178,8 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
     Raises
     ------
     UserError
-        If the stack has too few gates or lacks the lidar geometry.
+        If the stack has too few gates, gaps between gates in which the pulse of an echo fits, or lacks the lidar
+        geometry.
 
     Notes
     -----
@@ -187,6 +190,13 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
     """
     middles = stack["gate_start"].values + 0.5 * stack["gate_width"].values
     energy, stderr = stack["gate_energy"].values, stack["gate_energy_stderr"].values
+    pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
+    gap = float(np.max(np.diff(stack["gate_start"].values) - stack["gate_width"].values[:-1], initial=0.0))
+    if pulse and gap > pulse:
+        raise UserError(
+            f"the gates leave gaps of {gap:.3g} ns, in which echoes of the pulse of {pulse:.3g} ns are lost: depths need "
+            "gates that adjoin"
+        )
     found = range_from_gates(energy, stderr, middles, reach=reach)
     try:
         lines = LinesOfSight.from_dataset(stack)
@@ -200,7 +210,6 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
         return DepthImage(depth, found.sigma * per_ns, np.full_like(depth, np.nan), found.confidence)
     zero, per_ns = (values.reshape(energy.shape[:-1]) for values in (lines.surface_time, lines.depth_per_ns))
     depth = (found.depth - zero) * per_ns
-    pulse = optional_number(stack.attrs, "pulse_fwhm_ns") or 0.0
     errors = DepthErrors.of(stack.attrs, lines, 1, geometry, pulse)
     attenuation, level = _column(stack, found, lines, geometry, pulse)
     method = errors.of_echoes(found.depth.ravel(), depth.ravel(), attenuation, level, from_mean=True, gated=True)
@@ -246,7 +255,7 @@ class _ColumnModel:
 
     def __init__(self, mid: FloatArray, half: int) -> None:
         count = mid.size
-        self.mid, self.half, self.first = mid, half, half + 2
+        self.mid, self.half, self.first = mid, half, half + 1
         self.lever = np.zeros(count)
         self.mean, self.slope, self.between, self.deep = (np.zeros((count, count)) for _ in range(4))
         self.has_deep = np.arange(count) + half + 1 < count
@@ -256,7 +265,8 @@ class _ColumnModel:
             x = mid[near] - mid[near].mean()
             self.lever[k] = mid[k] - mid[near].mean()
             self.mean[near, k] = 1 / near.size
-            self.slope[near, k] = x / np.sum(x**2)
+            if near.size > 1:
+                self.slope[near, k] = x / np.sum(x**2)
             if behind.size:
                 last = near[-2:]
                 share = (mid[k] - mid[last].mean()) / (mid[behind].mean() - mid[last].mean())
@@ -287,7 +297,7 @@ def _ranges(energy: FloatArray, stderr: FloatArray, column: _ColumnModel) -> Flo
     eligible = slice(column.first, None)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(excess > 0, excess / error, 0)[:, eligible]
-    significant = z >= _SIGNIFICANT * z.max(axis=1, keepdims=True)
+    significant = z >= np.minimum(_SIGNIFICANT * z.max(axis=1, keepdims=True), _CERTAIN)
     peak = column.first + np.argmax(np.where(significant, excess[:, eligible], -np.inf), axis=1)
     at_peak = peak[:, None]
     z_peak = np.take_along_axis(z, at_peak - column.first, axis=1)[:, 0]

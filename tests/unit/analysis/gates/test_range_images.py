@@ -4,11 +4,13 @@ import time
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.special import ndtr
 from scipy.stats import binom, chi2
 from significance import largest_z
 
-from mitransient_lidar.analysis.gates.range_images import contrast, range_from_gates
+from mitransient_lidar.analysis.gates.range_images import contrast, depth_image, range_from_gates
+from mitransient_lidar.core.errors import UserError
 
 
 def test_contrast_and_its_error():
@@ -136,3 +138,28 @@ def test_range_of_a_large_image_is_fast():
     assert found.depth.shape == (256, 256)
     # A loop over pixels would take minutes; this takes 0.3 to 0.7 s.
     assert time.process_time() - start < 5
+
+
+def test_the_strongest_of_two_echoes_counts_though_its_error_is_larger():
+    """A sphere in front of a bottom of half its energy, with errors of a fifth and of a hundredth."""
+    sphere, bottom = (height * np.exp(-0.5 * ((MID - at) / 0.3) ** 2) for height, at in ((1.0, 6.0), (0.5, 10.0)))
+    energy = (sphere + bottom + 1e-3)[np.newaxis]
+    found = range_from_gates(energy, (0.2 * sphere + 0.01 * bottom + 1e-4)[np.newaxis], MID, reach=4)
+    assert found.depth[0] == pytest.approx(6.0, abs=0.05)
+
+
+def test_an_echo_behind_a_single_gate_of_the_column_is_found():
+    energy = np.full((1, 12), 1e-3)
+    energy[0, 5] = 1.0
+    found = range_from_gates(energy, 0.01 * energy, np.arange(12.0), reach=4)
+    assert found.depth[0] == pytest.approx(5.0, abs=0.01)
+
+
+def test_gates_with_gaps_give_no_depths():
+    stack = xr.Dataset(
+        {name: (("pixel", "gate"), np.ones((1, 4))) for name in ("gate_energy", "gate_energy_stderr")},
+        {"gate_start": ("gate", 18.0 * np.arange(4)), "gate_width": ("gate", np.full(4, 10.0))},
+        {"pulse_fwhm_ns": 5.0},
+    )
+    with pytest.raises(UserError, match="the gates leave gaps of 8 ns"):
+        depth_image(stack)
