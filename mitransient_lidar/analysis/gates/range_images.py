@@ -194,8 +194,8 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
     gap = float(np.max(np.diff(stack["gate_start"].values) - stack["gate_width"].values[:-1], initial=0.0))
     if pulse and gap > pulse:
         raise UserError(
-            f"the gates leave gaps of {gap:.3g} ns, in which echoes of the pulse of {pulse:.3g} ns are lost: depths need "
-            "gates that adjoin"
+            f"the gates leave gaps of {gap:.3g} ns, in which echoes of the pulse of {pulse:.3g} ns are lost: "
+            "depths need gates that adjoin"
         )
     found = range_from_gates(energy, stderr, middles, reach=reach)
     try:

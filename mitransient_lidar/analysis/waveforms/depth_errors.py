@@ -18,6 +18,7 @@ from mitransient_lidar.results.geometry import (
     Attributes,
     LidarGeometry,
     LinesOfSight,
+    open_aperture,
     optional_number,
     required_number,
     two_way_efficiency,
@@ -210,8 +211,8 @@ def _column_gain(attributes: Attributes, geometry: LidarGeometry) -> float:
     The phase function at 180 degrees is taken as bb/(2 pi b); see `column_retrieval.backscatter_of_level`.
     """
     try:
-        energy, aperture = (required_number(attributes, name) for name in ("pulse_energy_mj", "aperture_area"))
-        energy *= 1e-3 * two_way_efficiency(attributes)
+        energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes)
+        aperture = open_aperture(attributes)
         system = LidarSystem(geometry.height, geometry.off_nadir, energy, aperture, geometry.refractive_index)
     except UserError:
         return math.nan
