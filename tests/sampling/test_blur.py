@@ -38,9 +38,9 @@ def energies(receiver, transmitter):
 
 
 def gaussian_shares(centre, sigma, edges):
-    """Return the shares of a round Gaussian in rectangles between edges [mrad], rows from far to near."""
+    """Return the shares of a round Gaussian in rectangles between edges [mrad], from far to near and left to right."""
     x, y = (np.diff(0.5 * erf((edges - g) / (np.sqrt(2) * sigma))) for g in centre)
-    return x[::-1, None] * y
+    return x[::-1, None] * y[::-1]
 
 
 @pytest.mark.parametrize(

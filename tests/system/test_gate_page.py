@@ -282,7 +282,9 @@ def test_left_is_left_as_seen_from_the_lidar(show, scene):
         assert places[angles.index(0.0)] == pytest.approx(left + width / 2, abs=1)
         page.choose(slider=26, log=False)
         values = stack["gate_energy"].values[..., 26]
-        assert (page.colours(SIZE, SIZE) == expected_colours(values, 0, stack["gate_energy"].values.max(), "viridis")).all()
+        assert (
+            page.colours(SIZE, SIZE) == expected_colours(values, 0, stack["gate_energy"].values.max(), "viridis")
+        ).all()
         page.point_at(PLATE)
         assert "angle_x −3.98, angle_y 2.58 mrad" in page.text("reading")
 
