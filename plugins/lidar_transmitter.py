@@ -51,8 +51,8 @@ class LidarTransmitter(EmitterWithoutExtent):
     ellipse_deg             float      Azimuth of the ellipse's axis of ``divergence_mrad``, from +angle_x (far) towards
                                        +angle_y [deg]. Default: 0
     profile_file            string     ``image``: measured irradiance in any unit, a grey .png, a .npy array or an .exr
-                                       image about the axis. Row 0 is the far edge (+angle_x), column 0 the -angle_y
-                                       edge
+                                       image about the axis. Row 0 is the far edge (+angle_x), column 0 the left one
+                                       (+angle_y)
     profile_mrad            float      ``image``: full angle from the image's left edge to its right one [mrad],
                                        0.001 to 2000; its cells are squares
     wavelength_nm           float      Vacuum wavelength [nm], 300 to 1100; recorded in results. Default: 532
@@ -65,9 +65,10 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     .. math:: g(g_x, g_y) = \exp(-(g_x^2 + g_y^2) / 2\sigma^2) / (2 \pi \sigma^2)
 
-    (+angle_x is away from nadir, +angle_y along +y), with a sigma for each axis when it is elliptic; that of an image
-    is even within each cell. The radiant intensity follows from :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\,
-    dg_y`. The pulse's shape is applied to waveforms, not in the transport.
+    (+angle_x is away from nadir, +angle_y to the left, along +y), with a sigma for each axis when it is elliptic; that
+    of an image is even within each cell. The radiant intensity follows from
+    :math:`d\Omega = (1 + g_x^2 + g_y^2)^{-3/2}\, dg_x\, dg_y`. The pulse's shape is applied to waveforms, not in the
+    transport.
 
     Laser and receiver are both above the sea or both under water. Under water, angles are those in the water: behind a
     flat window, the angles of beam and view in air divided by the refractive index. Radiance is that in the water and

@@ -20,18 +20,18 @@ class MultipixelReceiver(ReceiverSensor):
     Parameter                          Type     Meaning
     =================================  =======  ========================================================================
     layout                             string   ``1x1``, ``2x2``, ``1x4`` or ``RxC``: the field of view cut into R rows
-                                                along range (row 0 is the far edge) and C columns (column 0 is the
-                                                -angle_y edge). ``1x4`` is the published receiver of four strips across
-                                                range, the same as ``4x1``. ``hexN``, with N = 1, 7, 19, 37, ... up to
-                                                2^20: a hexagon and complete rings of hexagons around it, in rows along
-                                                angle_y. Default: ``2x2``
+                                                along range (row 0 is the far edge) and C columns (column 0 is the left
+                                                edge). ``1x4`` is the published receiver of four strips across range,
+                                                the same as ``4x1``. ``hexN``, with N = 1, 7, 19, 37, ... up to 2^20: a
+                                                hexagon and complete rings of hexagons around it, in rows along angle_y.
+                                                Default: ``2x2``
     fill_factor                        float    Share of each cell or hexagon of a layout that receives light, 0.01 to
                                                 1; the gaps receive none. Default: 1
     imager                             boolean  Result of shape (row, column, time) instead of (pixel, time). Default:
                                                 true above 16 pixels of ``RxC``
     pixel_map                          string   Instead of layout: image file (.png, .npy or .exr, one channel) of
                                                 labels over a square field of view, integers from 0 to 2^24. Row 0 is
-                                                the far edge, column 0 the -angle_y edge. Each label is a pixel, in
+                                                the far edge, column 0 the left edge. Each label is a pixel, in
                                                 increasing order and named ``label1``, ...; 0 is no pixel
     field_of_view_mrad                 float    Full angle of the field of view [mrad], 0.001 to 3000: diameter, side,
                                                 or diameter of the hexagons' circumscribed circle. Default: 30
@@ -60,7 +60,9 @@ class MultipixelReceiver(ReceiverSensor):
     (nested)                           film     ``time_gated_film``
     =================================  =======  ========================================================================
 
-    Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is +y.
+    Angles are tangent-plane coordinates about the optical axis: +angle_x is away from nadir ("far"), +angle_y is to
+    the left of the line of sight, along +y. Rows, columns and image files are in the order of a picture taken from the
+    lidar: row 0 far, column 0 left.
     Pixels of a circular field of view that lie outside the circle exist and stay dark.
 
     Paths are drawn over the field of view and then assigned to pixels: more pixels take no more time, and the pixels of

@@ -95,8 +95,8 @@ FAULTS = (
     Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
     Fault(
         *("left_and_right_exchanged", f"{_T}/sensor/pixels.py"),
-        "across = (angle_y + opaque(0.5 * width))",
         "across = (opaque(0.5 * width) - angle_y)",
+        "across = (angle_y + opaque(0.5 * width))",
     ),
     Fault(
         "efficiency_squared", f"{_T}/sensor/receiver.py", "self.optical_efficiency *", "self.optical_efficiency**2 *"

@@ -17,6 +17,11 @@ SIGNIFICANCE = 0.01
 #: contributions are both too small.
 _NEIGHBOURS = 5
 
+_ANGLES = ("angle_x", "angle_y")
+
+#: Largest difference of the angles of a pixel in two results, relative to the largest angle of all.
+_SAME_PLACE = 0.1
+
 #: Largest relative error of a bin; larger ones are estimated poorly by the spread of few passes.
 _LARGEST_RELATIVE_ERROR = 0.3
 
@@ -78,6 +83,11 @@ def compare(first: xr.Dataset, second: xr.Dataset) -> Comparison:
     if shapes[0] != shapes[1] or not np.allclose(times[0], times[1]):
         described = " and ".join(f"{pixels} pixels x {bins} bins" for pixels, bins in shapes)
         raise UserError(f"the results have {described}: they must have the same pixels and time bins")
+    angles = [
+        np.ravel([result[name].values for name in _ANGLES]) for result in results if {*_ANGLES} <= {*result.coords}
+    ]
+    if len(angles) == 2 and np.max(np.abs(angles[1] - angles[0])) > _SAME_PLACE * np.max(np.abs(angles[0])) + 1e-6:
+        raise UserError("the results have pixels at different angles: they must have the same pixels and time bins")
     values, errors = (
         np.stack([_by_pixel(result, name) for result in results])
         for name in ("impulse_response", "impulse_response_stderr")

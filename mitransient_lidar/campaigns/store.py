@@ -33,6 +33,7 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.again import compare_versions
+from mitransient_lidar.results.formats import picture_order
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,6 +60,12 @@ _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError,
 
 #: Options of a store's arrays when they are written.
 _WRITING = {"array.write_empty_chunks": True}
+
+#: Attribute with the order of pixels in layouts, which stores of versions up to 0.1 lack: they have right before left.
+_ORDER = ("pixel_order", "far to near, left to right")
+
+#: Largest angle of pixels that are on the axis [mrad].
+_ON_AXIS = 1e-3
 
 _STATUS = {
     "units": "1",
@@ -155,6 +162,16 @@ class Store:
             SceneRecord.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
         )
+
+    def check_pixel_order(self) -> None:
+        """Raise `UserError` if runs that are rendered now would have their pixels in another order than the store."""
+        if _ORDER[0] in self.attributes or "angle_y" not in self._group:
+            return
+        if np.any(np.abs(self._read("angle_y", slice(None))) > _ON_AXIS):
+            raise UserError(
+                f"{self.path} was begun by an earlier version, whose pixels are in order from right to left: it can be "
+                "read but not completed; choose another place"
+            )
 
     def is_of(self, campaign: Campaign, columns: Mapping[str, Column]) -> bool:
         """Return whether it is the store of a campaign with these columns, and of its scene as it is now."""
@@ -360,7 +377,7 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     with _reading(path, "a coordinate"):
         dataset: xr.Dataset = xr.open_zarr(path, consolidated=False, mask_and_scale=False, decode_times=False)
     dataset["status"] = dataset["status"].copy(data=store.status())
-    return dataset
+    return picture_order(dataset)
 
 
 def describe_campaign(path: str | os.PathLike[str]) -> list[str]:
@@ -444,6 +461,7 @@ def _fill(
         "variables": list(arrays),
         "arrays": sorted(group.array_keys()),
         "coordinates": " ".join(name for name in secondary if name in group),
+        _ORDER[0]: _ORDER[1],
         **versions(),
     }
     group.attrs.update({**about, _SEAL: seal(about)})

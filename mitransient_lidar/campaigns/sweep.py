@@ -186,6 +186,7 @@ def _swept(
         wanted = (PLANNED, FAILED) if retry_failed else (PLANNED,)
         shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
         if shards:
+            store.check_pixel_order()
             # Here for the warning of other versions: the processes of shards tell nothing.
             store.renderer()
             try:

@@ -25,7 +25,7 @@ from mitransient_lidar.results.geometry import optional_number
 FilePath = str | os.PathLike[str]
 
 TIME_LABEL = "time since the pulse left the transmitter (ns)"
-ANGLE_X_LABEL, ANGLE_Y_LABEL = "away from nadir, angle_x (mrad)", "across, angle_y (mrad)"
+ANGLE_X_LABEL, ANGLE_Y_LABEL = "away from nadir, angle_x (mrad)", "to the left, angle_y (mrad)"
 
 #: Most pixels that a legend lists by name.
 LISTED_PIXELS = 12
@@ -142,17 +142,24 @@ def draw_band(
 
 
 def draw_image(ax: Axes, values: FloatArray, dataset: xr.Dataset, *, label: bool = True, **style: Any) -> AxesImage:
-    """Draw values of shape (row, column) over the angles of the pixels, with the far edge on top."""
+    """Draw values of shape (row, column) over the angles of the pixels, as seen from the lidar: far is up, +y left."""
     if label:
         ax.set(xlabel=ANGLE_Y_LABEL, ylabel=ANGLE_X_LABEL)
-    return ax.imshow(values, extent=image_extent(dataset), origin="upper", interpolation="nearest", **style)
+    left, right, near, far = image_extent(dataset)
+    # Results of versions up to 0.1 have the right edge in column 0.
+    angle_x, angle_y = dataset["angle_x"].isel(column=0).values, dataset["angle_y"].isel(row=0).values
+    across = (right, left) if angle_y[-1] > angle_y[0] else (left, right)
+    along = (far, near) if angle_x[-1] > angle_x[0] else (near, far)
+    image = ax.imshow(values, extent=(*across, *along), origin="upper", interpolation="nearest", **style)
+    ax.set(xlim=(left, right), ylim=(near, far))
+    return image
 
 
 def image_extent(dataset: xr.Dataset) -> tuple[float, float, float, float]:
-    """Return the edges of an image [mrad]: left, right, near and far."""
+    """Return the edges of an image [mrad]: left, the largest angle_y, right, near and far."""
     angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
     along, across = (0.5 * pitch for pitch in pixel_pitch(dataset))
-    left, right = float(angle_y.min() - across), float(angle_y.max() + across)
+    left, right = float(angle_y.max() + across), float(angle_y.min() - across)
     return left, right, float(angle_x.min() - along), float(angle_x.max() + along)
 
 

@@ -21,6 +21,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.results.formats import picture_order
 from mitransient_lidar.results.geometry import optional_number
 
 #: Most cells along a side of an imager that are drawn with edges.
@@ -62,7 +63,10 @@ class _Plane:
 
 
 def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw pixels, beam and targets of a result on horizontal planes, away from the lidar upwards.
+    """Draw pixels, beam and targets of a result on horizontal planes, seen from above, away from the lidar upwards.
+
+    The left of the line of sight is on the left, as in a picture taken from the lidar. Where the lidar does not look
+    along +x, the label of the vertical axis gives the direction of +x.
 
     The planes are the mean sea level, the mean heights of the targets (of three at most; others are drawn on the
     nearest of them), and the height of the bottom on the receiver's axis. Lines of sight and the beam are refracted by
@@ -92,9 +96,9 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
         heights.append(_draw_plane(ax, dataset, ground.at(plane.z), plane, handles if index == 0 else []))
         title = "\n".join([plane.name, *ground.axis_points(plane.z)])
         ax.set_title(f"{_title(attributes)}\n{title}" if len(planes) == 1 else title, fontsize="medium")
-        names = ("y (m)", "x (m)") if abs(ground.azimuth) < 1e-6 else ("across (m)", "along (m)")
+        names = ground.axis_names()
         ax.set_xlabel(names[0] if ax.get_aspect() == 1 else f"{names[0]}, not to scale")
-        ax.set_ylabel("" if index % columns else f"{names[1]}, away from the lidar")
+        ax.set_ylabel("" if index % columns else names[1])
     figure.set_figheight(sum(max(heights[row * columns : (row + 1) * columns]) for row in range(rows)))
     labelled = {
         label: handle for ax in figure.axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
@@ -177,7 +181,7 @@ def _draw_plane(ax: Axes, dataset: xr.Dataset, ground: _Ground, plane: _Plane, h
 
 @dataclass(frozen=True)
 class _Ground:
-    """Map of angles and positions to distances across and along the lidar's azimuth on a horizontal plane [m].
+    """Map of angles and positions to distances to the left of and along the lidar's azimuth on a horizontal plane [m].
 
     A pose has origin, axis, far and left, shape (4, 3).
     """
@@ -209,6 +213,14 @@ class _Ground:
         """Return (across, along) of rays (angle_x, angle_y) [mrad], shape (..., 2); NaN for rays above the horizon."""
         rays = pose[1] + 1e-3 * (angles[..., :1] * pose[2] + angles[..., 1:] * pose[3])
         return self.place(self.sea.at_height(pose[0], rays, self.z))
+
+    def axis_names(self) -> tuple[str, str]:
+        """Return the names of the axes across and along the lidar's azimuth, with the direction of +x."""
+        if abs(self.azimuth) < 1e-6:
+            return "y (m)", "x (m), away from the lidar"
+        side = "right" if self.azimuth > 0 else "left"
+        turn = f"{abs(math.degrees(self.azimuth)):.3g}° to the {side}"
+        return "to the left (m)", f"away from the lidar (m); +x points {turn}"
 
     def axis_points(self, z: float) -> list[str]:
         """Return the points where the receiver's axis, and the laser's where it differs, meet a height, as text."""
@@ -264,13 +276,14 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset, ground: _Ground, handles: list[A
 def _draw_image(ax: Axes, dataset: xr.Dataset, ground: _Ground) -> FloatArray:
     """Draw the received energy in the cells of an imager; return the points of its outline."""
     outline = _draw_field(ax, dataset.attrs, ground)
-    width = optional_number(dataset.attrs, "field_of_view_mrad")
-    if width is None or not np.isfinite(outline).all():
+    if len(outline) == 0 or not np.isfinite(outline).all():
         return outline
-    energy = dataset["impulse_response"].sum("time").values
+    seen = picture_order(dataset)
+    energy = seen["impulse_response"].sum("time").values
     rows, columns = energy.shape
-    far, left = np.linspace(width / 2, -width / 2, rows + 1), np.linspace(-width / 2, width / 2, columns + 1)
-    corners = ground.project(ground.receiver, np.stack(np.meshgrid(far, left, indexing="ij"), axis=-1))
+    left, right, near, far = drawing.image_extent(seen)
+    angles = np.meshgrid(np.linspace(far, near, rows + 1), np.linspace(left, right, columns + 1), indexing="ij")
+    corners = ground.project(ground.receiver, np.stack(angles, axis=-1))
     factor, prefix = drawing.si_prefix(float(np.nanmax(energy, initial=0.0)))
     image = ax.pcolormesh(
         *np.moveaxis(corners, -1, 0),
@@ -326,7 +339,7 @@ def _draw_targets(ax: Axes, ground: _Ground, plane: _Plane) -> None:
         label = _once(ax, "target" if plane.outline == "line" else "target as seen, refracted")
         style = (0, (4, 1.2)) if plane.outline == "line" else (0, (1.5, 1.2))
         ax.plot(*points.T, linewidth=1.6, linestyle=style, label=label, **marks)
-        first, last = np.transpose([ax.get_xlim(), ax.get_ylim()])
+        first, last = np.transpose([sorted(ax.get_xlim()), ax.get_ylim()])
         low, high = np.maximum(points.min(axis=0), first), np.minimum(points.max(axis=0), last)
         if np.any(low > high):
             continue
@@ -368,7 +381,7 @@ def _set_limits(ax: Axes, seen: FloatArray, lit: FloatArray) -> float:
     size = np.maximum(high - low, 1e-3)
     lit = np.clip(lit, low - size, high + size)
     low, high = np.min([low, *lit], axis=0) - 0.05 * size, np.max([high, *lit], axis=0) + 0.05 * size
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    ax.set(xlim=(high[0], low[0]), ylim=(low[1], high[1]))
     aspect = float((high[1] - low[1]) / (high[0] - low[0]))
     to_scale = 1 / _LARGEST_ASPECT <= aspect <= _LARGEST_ASPECT
     ax.set_aspect("equal" if to_scale else "auto")

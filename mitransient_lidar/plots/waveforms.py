@@ -192,7 +192,7 @@ def _add_depth_axis(ax: Axes, dataset: xr.Dataset) -> None:
 
 
 def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
-    """Draw the pixels in the field of view: far from nadir on top, +angle_y to the right."""
+    """Draw the pixels in the field of view: far from nadir on top, +angle_y to the left."""
     attributes, names = dataset.attrs, [str(name) for name in dataset["pixel"].values]
     colours = drawing.pixel_colours(len(names))
     ax.set_axis_off()
@@ -213,6 +213,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
         if len(names) > 1:
             ax.scatter(angle_y, angle_x, c=colours, s=24)
             ax.set_aspect("equal", "datalim")
+            ax.invert_xaxis()
         return
     sides = tuple(attributes.get("field_of_view_sides_mrad") or (width, width))
     outline: Patch
@@ -226,12 +227,12 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
     if cells is None:
         ax.scatter(angle_y, angle_x, c=colours, s=12)
     else:
-        for (left, bottom, cell_width, cell_height), colour in zip(cells, colours, strict=True):
-            cell = Rectangle((left, bottom), cell_width, cell_height, facecolor=colour, edgecolor="white", alpha=0.9)
+        for (right, bottom, cell_width, cell_height), colour in zip(cells, colours, strict=True):
+            cell = Rectangle((right, bottom), cell_width, cell_height, facecolor=colour, edgecolor="white", alpha=0.9)
             ax.add_patch(cell)
             cell.set_clip_path(outline)
     edge = 0.56 * width
-    ax.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
+    ax.set(xlim=(edge, -edge), ylim=(-edge, edge), aspect="equal")
     for y, text, side in ((edge, "far", "bottom"), (-edge, f"near · {width:g} mrad", "top")):
         ax.text(0, y, text, ha="center", va=side, fontsize="small", color="0.3")
 
@@ -239,7 +240,7 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
 def _cells(
     layout: str, angle_x: FloatArray, angle_y: FloatArray, sides: Sequence[float]
 ) -> list[tuple[float, float, float, float]] | None:
-    """Return the rectangle (left, bottom, width, height) of each pixel in a layout of equal cells, else None.
+    """Return the rectangle (right, bottom, width, height) of each pixel in a layout of equal cells, else None.
 
     The layout counts cells in both directions; the centres of the pixels show which count is along range.
     """
@@ -249,12 +250,12 @@ def _cells(
     for along, across in {(int(first), int(second)), (int(second), int(first))}:
         height, breadth = sides[0] / along, sides[1] / across
         rows = np.floor((sides[0] / 2 - angle_x) / height).astype(int)
-        columns = np.floor((angle_y + sides[1] / 2) / breadth).astype(int)
+        columns = np.floor((sides[1] / 2 - angle_y) / breadth).astype(int)
         inside = ((rows >= 0) & (rows < along) & (columns >= 0) & (columns < across)).all()
         places = list(zip(rows.tolist(), columns.tolist(), strict=True))
         if inside and len(set(places)) == len(angle_x):
             return [
-                (column * breadth - sides[1] / 2, sides[0] / 2 - (row + 1) * height, breadth, height)
+                (sides[1] / 2 - (column + 1) * breadth, sides[0] / 2 - (row + 1) * height, breadth, height)
                 for row, column in places
             ]
     return None

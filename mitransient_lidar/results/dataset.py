@@ -31,7 +31,15 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import finite, positive
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import exr, netcdf
-from mitransient_lidar.results.formats import attribute, describe, input_format, labelled, output_format, text
+from mitransient_lidar.results.formats import (
+    IMAGE_AXES,
+    attribute,
+    describe,
+    input_format,
+    labelled,
+    output_format,
+    text,
+)
 from mitransient_lidar.results.geometry import optional_number
 from mitransient_lidar.results.schema import check_attributes, check_coordinates
 
@@ -249,11 +257,14 @@ def pixel_coordinates(
         if rows < 1 or columns < 1 or rows * columns != count:
             raise ValueError(f"grid = {grid} must have as many cells as there are pixels, {count}.")
         coords = {
-            "row": ("row", np.arange(rows), {"units": "1", "long_name": "row of the image, 0 farthest from nadir"}),
-            "column": ("column", np.arange(columns), {"units": "1", "long_name": "column of the image, 0 leftmost"}),
+            dim: (dim, np.arange(size), {"units": "1", "long_name": IMAGE_AXES[dim][0]})
+            for dim, size in zip(("row", "column"), grid, strict=True)
         }
     dims, layout = tuple(coords), grid or (count,)
-    where = {"angle_x": "in the plane of incidence, away from nadir", "angle_y": "across the plane of incidence"}
+    where = {
+        "angle_x": "in the plane of incidence, away from nadir",
+        "angle_y": "across the plane of incidence, to the left",
+    }
     for axis, (name, direction) in enumerate(where.items()):
         described = {"units": "mrad", "long_name": f"angle of the pixel's centre {direction}"}
         coords[name] = (dims, centres[:, axis].reshape(layout), described)

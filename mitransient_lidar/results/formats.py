@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,15 @@ from mitransient_lidar.core.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.errors import UserError
 
 Format = Literal["exr", "netcdf"]
+
+#: Dimension of an image, its description, and the angle that is largest in its first place, as seen from the lidar.
+IMAGE_AXES = {
+    "row": ("row of the image, 0 farthest from nadir", "angle_x"),
+    "column": ("column of the image, 0 leftmost as seen from the lidar", "angle_y"),
+}
+
+#: Attributes that are a list over the pixels where they differ.
+PER_PIXEL = ("gain", "optical_density", "background_power_w", "fitting_gain", "fitting_optical_density")
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"  # the first eight bytes of a NetCDF-4 file
 
@@ -76,7 +86,7 @@ def describe(dataset: xr.Dataset, variables: Sequence[str]) -> tuple[dict[str, A
 
 
 def labelled(images: Mapping[str, npt.NDArray[Any]], exact: Mapping[str, Any]) -> xr.Dataset:
-    """Return the dataset of images (row, column, ...) by variable with the metadata of `describe`.
+    """Return the dataset of images (row, column, ...) by variable with the metadata of `describe`, in picture order.
 
     Raises
     ------
@@ -84,7 +94,7 @@ def labelled(images: Mapping[str, npt.NDArray[Any]], exact: Mapping[str, Any]) -
         If metadata and images disagree.
     """
     dims = tuple(exact["dims"])
-    return xr.Dataset(
+    dataset = xr.Dataset(
         {
             name: (dims, (image if len(dims) == 3 else image[0]).astype(np.float64), exact["variables"][name])
             for name, image in images.items()
@@ -95,6 +105,33 @@ def labelled(images: Mapping[str, npt.NDArray[Any]], exact: Mapping[str, Any]) -
         },
         exact["attributes"],
     )
+    return picture_order(dataset)
+
+
+def picture_order(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset in the order of a picture taken from the lidar: row 0 far, column 0 left.
+
+    The coordinates `angle_x` and `angle_y` show its order: versions up to 0.1 had the right edge in column 0. Datasets
+    without an image, or in this order, are returned as they are.
+    """
+    for dim, (description, name) in IMAGE_AXES.items():
+        if dim not in dataset.dims or dim not in dataset.variables.get(name, xr.Variable((), 0)).dims:
+            continue
+        angle = dataset[name]
+        if angle.sizes[dim] < 2 or not bool((angle.diff(dim) > 0).all()):
+            continue
+        shape = tuple(dataset.sizes.get(axis, 1) for axis in IMAGE_AXES)
+        lists = {
+            key: np.flip(np.reshape(dataset.attrs[key], shape), list(IMAGE_AXES).index(dim)).ravel().tolist()
+            for key in PER_PIXEL
+            if np.size(dataset.attrs.get(key, ())) == math.prod(shape)
+        }
+        numbers = np.arange(dataset.sizes[dim])
+        numbered = dim in dataset.coords and np.array_equal(dataset[dim].values, numbers)
+        dataset = dataset.isel({dim: slice(None, None, -1)}).assign_attrs(lists)
+        if numbered:
+            dataset = dataset.assign_coords({dim: (dim, numbers, {"long_name": description})})
+    return dataset
 
 
 def attribute(name: str, value: Any) -> int | float | str | list[int] | list[float] | list[str]:

@@ -16,7 +16,7 @@ from xarray.backends import H5NetCDFStore
 
 from mitransient_lidar.core.array_files import check_size, damaged_file, largest_result
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.results.formats import attribute
+from mitransient_lidar.results.formats import attribute, picture_order
 
 _CHECKSUM = b"mitransient-lidar sha256 "  # what the SHA-256 of a file follows at its end
 _LISTS = "mitransient_lidar_lists"  # NetCDF attribute with the names of the attributes to read back as lists
@@ -81,7 +81,7 @@ def check_sum(path: str | os.PathLike[str]) -> None:
 
 
 def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a file of `write_netcdf` into memory.
+    """Read a file of `write_netcdf` into memory, images in picture order.
 
     Raises
     ------
@@ -103,4 +103,4 @@ def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
         for name, coordinate in dataset.coords.items():
             if coordinate.dtype.kind == "O":
                 dataset[name] = coordinate.astype(str)
-    return dataset
+    return picture_order(dataset)

@@ -13,6 +13,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.results.formats import PER_PIXEL
 
 _POSITIVE, _NOT_NEGATIVE, _ANY, _INDEX = (1e-30, 1e30), (0.0, 1e30), (-1e30, 1e30), (1.0, 10.0)
 
@@ -31,9 +32,6 @@ _NUMBERS: dict[str, tuple[float, float]] = {
 
 #: Those that count something, which is known.
 _COUNTS = ("passes", "most_passes", "pulses", "shots")
-
-#: Those that are a list over the pixels where they differ.
-_PER_PIXEL = ("gain", "optical_density", "background_power_w")
 
 #: Number of values of attributes that are lists of finite numbers, None for any.
 _LISTS: dict[str, int | None] = {
@@ -74,7 +72,7 @@ def check_attributes(place: object, attributes: Mapping[Any, Any]) -> None:
     for name, (low, high) in _NUMBERS.items():
         high = min(high, RANGES[name][1]) if name in RANGES else high
         value = attributes.get(name, low)
-        if name in _PER_PIXEL and _are_numbers(value) and min(value) >= low and max(value) <= high:
+        if name in PER_PIXEL and _are_numbers(value) and min(value) >= low and max(value) <= high:
             continue
         if not _is_number(value) or value < low or value > high or (name in _COUNTS and math.isnan(value)):
             raise _refusal(place, name, value, f"a number between {low:g} and {high:g}")

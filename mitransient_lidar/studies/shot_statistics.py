@@ -140,7 +140,8 @@ def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]
     dict
         Slope and effect, each over ``shot``: ``strength`` (log10 of the surface echo [W]), ``separation`` (delay of the
         surface echo of the far pair after that of the near pair [ns]) and ``depth`` (error of the depth of the bottom
-        [m]) for the slope along the azimuth; ``sideways`` (delay of green after red [ns]) for the slope across.
+        [m]) for the slope along the azimuth; ``sideways`` (delay of green, on the right, after red [ns]) for the rise
+        to the left.
 
     Raises
     ------

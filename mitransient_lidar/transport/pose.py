@@ -90,8 +90,10 @@ class Pose:
             if not (np.isfinite(matrix).all() and np.all(lengths > 0)):
                 raise UserError(f"{props.plugin_name()}: to_world must be finite, and no axis have a scale of 0")
             frame = matrix[:3, :3] / lengths
-            if not np.allclose(frame.T @ frame, np.eye(3), atol=1e-4):
-                raise UserError(f"{props.plugin_name()}: to_world must be a rotation and a translation, without shear")
+            if not np.allclose(frame.T @ frame, np.eye(3), atol=1e-4) or np.linalg.det(frame) < 0:
+                raise UserError(
+                    f"{props.plugin_name()}: to_world must be a rotation and a translation, without shear or reflection"
+                )
             return cls(matrix[:3, 3], frame[:, 2], frame[:, 1], frame[:, 0])
         return cls.from_angles(
             props.get("altitude", 200.0),

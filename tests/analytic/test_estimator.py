@@ -42,15 +42,14 @@ def test_pixels_sum_to_the_single_pixel_path_by_path(lidar_scene, passes, layout
 @pytest.mark.long
 def test_nested_pixels_see_what_layout_pixels_see(lidar_scene, passes):
     """Quadrants as sectors of a circle, drawn pixel by pixel, against the layout that cuts the circle."""
-    quadrants = {"red": 270.0, "green": 0.0, "blue": 180.0, "black": 90.0}
+    quadrants = {"red": 0.0, "green": 270.0, "blue": 90.0, "black": 180.0}
     nested = {
         name: {"type": "pixel_fov", "shape": "sector", "start_deg": start, "extent_deg": 90.0, "pixel_name": name}
         for name, start in quadrants.items()
     }
     nested_scene = lidar_scene(rx=nested, sea=ROUGH)
     names = nested_scene.sensors()[0].receiver.pixels.names
-    # +angle_x is far, +angle_y left: red is far and -angle_y, the azimuths 270 to 360 degrees; blue near and -angle_y,
-    # 180 to 270.
+    # +angle_x is far, +angle_y left: red is far and left, the azimuths 0 to 90 degrees; blue near and left, 90 to 180.
     order = [names.index(name) for name in ("red", "green", "blue", "black")]
     first = passes(nested_scene, 32)[:, order]
     second = passes(lidar_scene(sea=ROUGH), 32, 1000)

@@ -81,7 +81,7 @@ def test_map_moves_the_target():
     # Farther away it is seen by the far pixels, and to one side by the pixels of that side.
     assert np.all(far.sel(target_x=2.0) > far.sel(target_x=0.0) + 0.2)
     left = maps["echo"].sel(pixel=["red", "blue"]).sum("pixel") / maps["combined_echo"].sel(combination="sum")
-    assert np.all(left.sel(target_y=-1.0) > left.sel(target_y=1.0) + 0.3)
+    assert np.all(left.sel(target_y=1.0) > left.sel(target_y=-1.0) + 0.3)
     assert len(describe_map(maps)) == 5
 
 

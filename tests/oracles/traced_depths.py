@@ -55,11 +55,8 @@ def _pixels(dataset, angles):
     """Return the number of the pixel of each ray, -1 outside, and the number of pixels."""
     if "row" in dataset.dims:
         size, side = dataset.sizes["row"], 1e-3 * dataset.attrs["field_of_view_mrad"]
-        # Row 0 is the far edge, +angle_x; column 0 the edge of -angle_y.
-        row, column = (
-            np.clip((0.5 + sign * one / side) * size, 0, size - 1).astype(int)
-            for sign, one in zip((-1, 1), angles.T, strict=True)
-        )
+        # Row 0 is the far edge, +angle_x; column 0 the left one, +angle_y.
+        row, column = (np.clip((0.5 - one / side) * size, 0, size - 1).astype(int) for one in angles.T)
         return row * size + column, size**2
     pixel = np.full(len(angles), -1)
     outlines = json.loads(dataset.attrs["pixel_outlines"])

@@ -94,22 +94,22 @@ def test_elliptic_gaussian_falls_to_e_to_the_minus_half_at_its_half_angles():
 
 
 def test_image_cells_hold_their_shares():
-    """Row 0 is far (+angle_x) and column 0 at -angle_y: a flipped image would move the brightest cell, 12 of 25."""
+    """Row 0 is far (+angle_x) and column 0 left (+angle_y): a flipped image would move the brightest cell, 12 of 25."""
     angle_x, angle_y = tangent_samples(PROFILES["image"]())
-    far, left = 6 * MRAD - 4 * MRAD * np.arange(4), -8 * MRAD + 4 * MRAD * np.arange(5)
-    counts = np.histogram2d(-angle_x, angle_y, bins=(-far, left))[0]
+    far, left = 6 * MRAD - 4 * MRAD * np.arange(4), 8 * MRAD - 4 * MRAD * np.arange(5)
+    counts = np.histogram2d(-angle_x, -angle_y, bins=(-far, -left))[0]
     expected = COUNT * IMAGE / IMAGE.sum()
     assert counts.sum() == COUNT
     assert not counts[IMAGE == 0].any()
     lit = IMAGE > 0
     assert_counts(counts[lit], expected[lit], known=1)
-    density = np.array(ImageBeam(IMAGE, 16 * MRAD).density(mi.Float([-4e-3, 4e-3]), mi.Float([6e-3, 6e-3])))
+    density = np.array(ImageBeam(IMAGE, 16 * MRAD).density(mi.Float([-4e-3, 4e-3]), mi.Float([-6e-3, -6e-3])))
     np.testing.assert_allclose(density, [12 / 25 / 16e-6, 0], rtol=1e-6)
 
 
 def test_fine_image_of_a_gaussian_is_that_gaussian():
     ticks = (np.arange(400) - 199.5) * 0.05  # mrad
-    far, left = np.meshgrid(-ticks, ticks, indexing="ij")
+    far, left = np.meshgrid(-ticks, -ticks, indexing="ij")
     along, across = 0.8 * far + 0.6 * left, 0.8 * left - 0.6 * far
     profile = ImageBeam(np.exp(-0.5 * (along**2 / 4 + across**2)), 20 * MRAD)
     np.testing.assert_allclose(profile.spreads, [2 * MRAD, 1 * MRAD], rtol=1e-3)
@@ -158,7 +158,7 @@ def test_spreads_are_those_of_the_narrow_and_the_wide_axis():
 @pytest.mark.parametrize("suffix", [".npy", ".png", ".exr"])
 def test_files_of_all_kinds_hold_the_same_beam(suffix, tmp_path):
     beam = laser(beam_profile="image", profile_file=image_file(tmp_path, suffix=suffix), profile_mrad=16.0)
-    angle_x, angle_y = (g.ravel() for g in np.meshgrid([4e-3, 0, -4e-3], [-6e-3, -2e-3, 2e-3, 6e-3], indexing="ij"))
+    angle_x, angle_y = (g.ravel() for g in np.meshgrid([4e-3, 0, -4e-3], [6e-3, 2e-3, -2e-3, -6e-3], indexing="ij"))
     density = np.array(beam.tangent_density(mi.Float(angle_x), mi.Float(angle_y)))
     np.testing.assert_allclose(density * 16e-6, IMAGE.ravel() / 25, rtol=1e-5)
 

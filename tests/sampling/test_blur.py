@@ -38,9 +38,9 @@ def energies(receiver, transmitter):
 
 
 def gaussian_shares(centre, sigma, edges):
-    """Return the shares of a round Gaussian in rectangles between edges [mrad], rows from far to near."""
+    """Return the shares of a round Gaussian in rectangles between edges [mrad], from far to near and left to right."""
     x, y = (np.diff(0.5 * erf((edges - g) / (np.sqrt(2) * sigma))) for g in centre)
-    return x[::-1, None] * y
+    return x[::-1, None] * y[::-1]
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_blur_serves_every_kind_of_pixels(tmp_path):
 
 
 def test_measured_blur_puts_light_where_the_image_does(tmp_path):
-    """Three of four parts on the far, -angle_y side and one in the middle: row 0 is +angle_x, column 0 is -angle_y."""
+    """Three of four parts on the far left and one in the middle: row 0 is +angle_x, column 0 is +angle_y."""
     image = np.zeros((5, 5))
     image[0, 0], image[2, 2] = 3.0, 1.0
     np.save(tmp_path / "psf.npy", image)
@@ -119,7 +119,7 @@ def test_measured_blur_puts_light_where_the_image_does(tmp_path):
 def test_a_pixel_looks_where_its_light_comes_from(tmp_path):
     """Light is moved by (+3, -5) mrad: a pixel on the axis sees what is at (-3, +5), with or without a laser there."""
     image = np.zeros((15, 15))
-    image[4, 2] = 1.0
+    image[4, 12] = 1.0
     np.save(tmp_path / "psf.npy", image)
     blur = {"blur_file": str(tmp_path / "psf.npy"), "blur_file_mrad": 15.0}
     for aim_y in (0.0, 30.0):
@@ -140,7 +140,7 @@ def test_displacements_follow_the_measured_image():
     rng = mi.PCG32(COUNT, initstate=6 + significance.seed_shift)
     angle_x, angle_y = MeasuredPointSpread(values, 7 * MRAD).sample(mi.Point2f(rng.next_float32(), rng.next_float32()))
     fine = np.histogram2d(
-        -np.array(angle_x), np.array(angle_y), bins=(24, 14), range=((-6e-3, 6e-3), (-3.5e-3, 3.5e-3))
+        -np.array(angle_x), -np.array(angle_y), bins=(24, 14), range=((-6e-3, 6e-3), (-3.5e-3, 3.5e-3))
     )[0]
     expected = COUNT * np.repeat(np.repeat(values / values.sum() / 4, 2, axis=0), 2, axis=1)
     lit = expected > 50
@@ -212,6 +212,6 @@ def test_a_blurred_receiver_sees_the_sharp_image_convolved(lidar_scene, passes):
     ticks = (np.arange(pixels) + 0.5) * field / pixels - 0.5 * field
     edges = np.linspace(-6, 6, 4)
     share = np.diff(0.5 * erf((edges[:, None] - ticks) / (np.sqrt(2) * sigma)), axis=0)
-    expected = np.einsum("ax,by,pxy->pab", share[::-1, ::-1], share, image).reshape(12, 9)
+    expected = np.einsum("ax,by,pxy->pab", share[::-1, ::-1], share[::-1, ::-1], image).reshape(12, 9)
     # Light within a cell of 1 mrad counts at its middle: up to 1 / 24 mrad^2 more variance than 9 + 4 mrad^2.
     assert_same(measured, expected, error=0.01, bias=4e-3)

@@ -80,10 +80,10 @@ def test_strip_is_part_of_the_circle():
 
 
 def test_layout_follows_the_convention():
-    """Row 0 is the far edge (+angle_x), column 0 the -angle_y edge; red and green are far, red on the -angle_y side."""
+    """Row 0 is the far edge (+angle_x), column 0 the left one (+angle_y); red and green are far, red left."""
     pixels = LayoutPixels("2x2", 30 * MRAD, "circle")
     centres = dict(zip(pixels.names, np.sign(pixels.centres()).tolist(), strict=True))
-    assert centres == {"red": [1, -1], "green": [1, 1], "blue": [-1, -1], "black": [-1, 1]}
+    assert centres == {"red": [1, 1], "green": [1, -1], "blue": [-1, 1], "black": [-1, -1]}
     strips = LayoutPixels("1x4", 30 * MRAD, "circle")
     assert strips.names == ["red", "green", "blue", "black"]
     assert np.all(np.diff(strips.centres()[:, 0]) < 0)
@@ -232,8 +232,8 @@ def test_hexagons_fill_the_same_share_of_their_circle_whatever_their_number(layo
     pixel, count = pixels.pixel_at(*(mi.Float(g) for g in centres.T), mi.Float(0))
     np.testing.assert_array_equal(np.array(pixel), np.arange(pixels.count))
     assert np.all(np.array(count) == 1)
-    # Rows from far to near, and in a row from -angle_y to +angle_y.
-    order = np.lexsort((np.round(centres[:, 1], 9), -np.round(centres[:, 0], 9)))
+    # Rows from far to near, and in a row from left (+angle_y) to right.
+    order = np.lexsort((-np.round(centres[:, 1], 9), -np.round(centres[:, 0], 9)))
     np.testing.assert_array_equal(order, np.arange(pixels.count))
 
 
@@ -246,7 +246,7 @@ def test_cells_that_leave_gaps_are_smaller_about_the_same_centre(layout, shape):
     ticks = (np.arange(1500) + 0.5) / 1500
     x, y = ticks * rows, ticks * columns
     inside = (np.abs(x % 1 - 0.5) < 0.3)[:, None] & (np.abs(y % 1 - 0.5) < 0.3)
-    angle_x, angle_y = np.meshgrid(15 * MRAD * (1 - 2 * ticks), 15 * MRAD * (2 * ticks - 1), indexing="ij")
+    angle_x, angle_y = np.meshgrid(15 * MRAD * (1 - 2 * ticks), 15 * MRAD * (1 - 2 * ticks), indexing="ij")
     if shape == "circle":
         inside &= np.hypot(angle_x, angle_y) <= 15 * MRAD
     number = (x.astype(int)[:, None] * columns + y.astype(int)).ravel()
@@ -274,19 +274,19 @@ def test_cells_that_leave_gaps_are_smaller_about_the_same_centre(layout, shape):
 
 
 def test_a_map_has_a_pixel_for_each_label():
-    """Labels 2, 5 and 9 in cells of 10 mrad x 7.5 mrad: row 0 is far, column 0 on the -angle_y side."""
+    """Labels 2, 5 and 9 in cells of 10 mrad x 7.5 mrad: row 0 is far, column 0 left (+angle_y)."""
     labels = np.array([[5, 5, 0, 2], [0, 9, 0, 2], [9, 9, 0, 0]])
     pixels = MappedPixels(labels, 30 * MRAD)
     assert pixels.names == ["label2", "label5", "label9"]
     assert pixels.area == pytest.approx(7 * 75 * MRAD**2)
-    centres = [[5, 11.25], [10, -7.5], [-10 + 10 / 3, -3.75 - 2.5]]
+    centres = [[5, -11.25], [10, 7.5], [-10 + 10 / 3, 3.75 + 2.5]]
     np.testing.assert_allclose(pixels.centres(), np.array(centres) * MRAD, atol=1e-12)
     angle_x, angle_y = pixels.sample(random_points())
     pixel, count = (np.array(a) for a in pixels.pixel_at(angle_x, angle_y, mi.Float(0)))
     assert np.mean(count == 1) > 1 - 1e-5
     edges = np.linspace(-15, 15, 7) * MRAD, np.linspace(-15, 15, 9) * MRAD
     counts = np.histogram2d(np.array(angle_x), np.array(angle_y), bins=edges)[0]
-    expected = COUNT / 28 * np.repeat(np.repeat(labels[::-1] > 0, 2, axis=0), 2, axis=1)
+    expected = COUNT / 28 * np.repeat(np.repeat(labels[::-1, ::-1] > 0, 2, axis=0), 2, axis=1)
     lit = expected > 0
     assert counts[~lit].sum() <= 1e-5 * COUNT
     assert_counts(counts[lit], expected[lit])

@@ -16,7 +16,7 @@ METRES_PER_NS = 0.0299792458 * 5 / 1.364 * 0.967  # the depth axis at 20 degrees
 SURFACE_NS = 1420.0
 SIZE = 64  # rows and columns
 PLAIN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")  # of signs in labels
-PLATE, BALL, SAND = (40, 37), (23, 22), (50, 20)  # pixels on them
+PLATE, BALL, SAND = (40, 26), (23, 41), (50, 43)  # pixels on them
 
 
 def scene_of(size, gates=40, seed=3):
@@ -24,7 +24,7 @@ def scene_of(size, gates=40, seed=3):
     rng = np.random.default_rng(seed)
     time = 1411.0 + np.arange(120)
     angles = (np.arange(size) + 0.5) / size * 30 - 15
-    angle_y, angle_x = np.meshgrid(angles, angles[::-1])
+    angle_y, angle_x = np.meshgrid(angles[::-1], angles[::-1])
     x, y = 0.21 * angle_x[..., np.newaxis], 0.21 * angle_y[..., np.newaxis]
     depth = (time - SURFACE_NS) * METRES_PER_NS
     ripples = np.sin(2 * np.pi * (0.8 * x + 0.25 * y) / 0.7)
@@ -263,6 +263,33 @@ def test_gates(show, scene):
 
 
 @needs_browser
+def test_left_is_left_as_seen_from_the_lidar(show, scene):
+    """Angles to the left fall along the axis, also of an earlier version, with the right edge in column 0."""
+    stack, result = scene
+    for one in (stack, stack.isel(column=slice(None, None, -1))):
+        page = show(one, result)
+        labels = page.run(
+            "const texts = [...document.querySelectorAll('#image-axes text[text-anchor=middle]:not(.name)')];"
+            "return texts.map((text) => [Number(text.getAttribute('x')), text.textContent])"
+        )
+        places, angles = zip(*((x, float(text.translate(PLAIN))) for x, text in sorted(labels)), strict=True)
+        assert angles[0] == -angles[-1] > 0
+        assert np.all(np.diff(angles) < 0)
+        # The angle 0 is in the middle of the canvas.
+        left, width = page.run(
+            "const c = document.getElementById('pixels'); return [parseFloat(c.style.left), parseFloat(c.style.width)]"
+        )
+        assert places[angles.index(0.0)] == pytest.approx(left + width / 2, abs=1)
+        page.choose(slider=26, log=False)
+        values = stack["gate_energy"].values[..., 26]
+        assert (
+            page.colours(SIZE, SIZE) == expected_colours(values, 0, stack["gate_energy"].values.max(), "viridis")
+        ).all()
+        page.point_at(PLATE)
+        assert "angle_x −3.98, angle_y 2.58 mrad" in page.text("reading")
+
+
+@needs_browser
 def test_records(show, scene):
     stack, result = scene
     power, energy = result["waveform"].values, stack["gate_energy"].values
@@ -271,7 +298,7 @@ def test_records(show, scene):
     page.point_at(PLATE)
     assert page.peaks() == pytest.approx([1e9 * power[PLATE].max()], rel=0.01)
     value, error = energy[PLATE][22], stack["gate_energy_stderr"].values[PLATE][22]
-    assert page.text("reading").startswith("row 40, column 37 · angle_x −3.98, angle_y 2.58 mrad: ")
+    assert page.text("reading").startswith("row 40, column 26 · angle_x −3.98, angle_y 2.58 mrad: ")
     shown, shown_error = re.search(r"mrad: ([\d.]+) ± ([\d.]+) aJ", page.text("reading")).groups()
     assert float(shown) == pytest.approx(1e18 * value, rel=0.01)
     assert float(shown_error) == pytest.approx(1e18 * error, rel=0.06)
@@ -288,9 +315,9 @@ def test_records(show, scene):
     assert [line for line in lines if line.startswith("row")] == [
         f"row {row}, column {column} · angle_x {angle_x}, angle_y {angle_y} mrad"
         for row, column, angle_x, angle_y in (
-            (40, 37, "−3.98", "2.58"),
-            (23, 22, "3.98", "−4.45"),
-            (32, 32, "−0.23", "0.23"),
+            (40, 26, "−3.98", "2.58"),
+            (23, 41, "3.98", "−4.45"),
+            (32, 32, "−0.23", "−0.23"),
         )
     ]
 
@@ -376,9 +403,9 @@ def test_blocks(show, scene, limit, block, waveform_block):
     power = result["waveform"].values[rows, columns].mean((0, 1))
     assert page.peaks()[0] == pytest.approx(1e9 * power.max(), rel=0.01)
     place = (
-        "row 24, column 21 · angle_x 3.52, angle_y −4.92"
+        "row 24, column 21 · angle_x 3.52, angle_y 4.92"
         if block == 1
-        else "block (12, 10) · angle_x 3.28, angle_y −5.16"
+        else "block (12, 10) · angle_x 3.28, angle_y 5.16"
     )
     assert page.text("reading").startswith(f"{place} mrad: ")
 

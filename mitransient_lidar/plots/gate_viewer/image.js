@@ -109,8 +109,9 @@ class ImageView {
     this.plot.style.height = ""; // the height of the style sheet is the largest
     const box = this.plot.getBoundingClientRect();
     const room = [box.width - MARGIN.left - MARGIN.right, box.height - MARGIN.top - MARGIN.bottom];
-    const scale = Math.min(room[0] / (columns * axes.across), room[1] / (rows * axes.along));
-    this.width = Math.max(1, Math.round(scale * columns * axes.across));
+    const across = columns * Math.abs(axes.across);
+    const scale = Math.min(room[0] / across, room[1] / (rows * axes.along));
+    this.width = Math.max(1, Math.round(scale * across));
     this.height = Math.max(1, Math.round(scale * rows * axes.along));
     this.x = MARGIN.left + Math.round((room[0] - this.width) / 2);
     this.plot.style.height = `${this.height + MARGIN.top + MARGIN.bottom}px`;
@@ -164,8 +165,9 @@ class ImageView {
       return to(angle) >= start - 0.5 && to(angle) <= start + length + 0.5;
     });
     const elements = [];
-    const right = axes.left + (this.left + columns / zoom) * axes.across;
-    const across = linearTicks(axes.left + this.left * axes.across, right, this.width / 70);
+    // angle_y falls to the right.
+    const ends = [this.left, this.left + columns / zoom].map((column) => axes.left + column * axes.across);
+    const across = linearTicks(Math.min(...ends), Math.max(...ends), this.width / 70);
     if (names) Object.assign(across, { ticks: across.ticks.filter(Number.isInteger), digits: 0 });
     for (const tick of across.ticks.filter(seen[0])) {
       elements.push(
@@ -174,7 +176,7 @@ class ImageView {
       );
     }
     const middle = this.x + this.width / 2;
-    const across_name = names ? "pixel" : "across, angle_y (mrad)";
+    const across_name = names ? "pixel" : "to the left, angle_y (mrad)";
     elements.push(svg("text", { class: "name", x: middle, y: bottom + 35, "text-anchor": "middle" }, across_name));
     if (names) return elements;
     const upper = axes.top - this.top * axes.along;

@@ -29,6 +29,7 @@ from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.gates.images import known_depths
+from mitransient_lidar.results.formats import picture_order
 from mitransient_lidar.results.gate_files import check_stack
 
 _LOG = logging.getLogger(__name__)
@@ -92,6 +93,7 @@ def write_page(
     positive("limit_mb", limit_mb)
     gated = check_stack(stack)
     record = _record(gated, stack if result is None and "waveform" in stack else result)
+    gated = picture_order(gated)
     frame = _frame()
     room = 1e6 * limit_mb - sum(len(piece.encode()) for piece in frame) - _room_for_metadata(gated)
     gates, waveforms = _fit(gated, record, room, limit_mb)
@@ -110,7 +112,7 @@ def write_page(
 
 
 def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
-    """Return the result, if any, after checking that it holds waveforms of the pixels of the stack."""
+    """Return the result, if any, in picture order, after checking that it has waveforms of the pixels of the stack."""
     if result is None:
         return None
     if "waveform" not in result:
@@ -119,7 +121,9 @@ def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
     found = {name: size for name, size in result["waveform"].sizes.items() if name != "time"}
     if found != wanted:
         raise UserError(f"the result has the pixels {found}; they must be those of the gate stack, {wanted}.")
-    return result
+    # A result without angles is in the order of the stack.
+    known = {name: stack[name].variable for name in ("angle_x", "angle_y") if name not in result.coords}
+    return picture_order(result.assign_coords(known))
 
 
 def _fit(stack: xr.Dataset, record: xr.Dataset | None, room: float, limit_mb: float) -> tuple[_Blocks, _Blocks | None]:
@@ -234,13 +238,16 @@ def _metadata(
 
 
 def _axes(stack: xr.Dataset, gates: _Blocks) -> dict[str, float]:
-    """Return the left and upper edges of the image and the pitch of its blocks [mrad], or in pixels if no image."""
+    """Return the left and upper edges of the image and the pitch of its blocks [mrad], or in pixels if no image.
+
+    The pitch is the change of angle_x from a row to the one above it, and of angle_y from a column to the next one.
+    """
     if "pixel" in stack["gate_energy"].dims:
         height = max(1.0, gates.columns / _STRIP_ASPECT)
         return {"left": -0.5, "top": height / 2, "across": 1.0, "along": height}
     left, _, _, top = drawing.image_extent(stack)
     along, across = drawing.pixel_pitch(stack)
-    return {"left": left, "top": top, "across": across * gates.factor, "along": along * gates.factor}
+    return {"left": left, "top": top, "across": -across * gates.factor, "along": along * gates.factor}
 
 
 def _colour_maps() -> dict[str, str]:

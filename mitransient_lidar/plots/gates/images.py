@@ -200,7 +200,7 @@ def _draw_sheet(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
     columns = _columns(len(shown))
     rows = math.ceil(len(shown) / columns)
     left, right, near, far = drawing.image_extent(stack)
-    panel = 8.7 / columns * min(max((far - near) / (right - left), 0.3), 2.0)  # height in inches
+    panel = 8.7 / columns * min(max((far - near) / (left - right), 0.3), 2.0)  # height in inches
     figure.set_figheight(rows * (panel + 0.34) + 1.5)
     axes = figure.subplots(rows, columns, squeeze=False)
     scale = colour_scale(stack, log=log)

@@ -60,8 +60,10 @@ def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
         ax.add_patch(Ellipse((shot.x, shot.y), 2 * along, 2 * across, angle=angle, fill=False, color="gold"))
         ax.annotate(f"{number}", (shot.x, shot.y), color="gold", ha="center", va="center", fontweight="bold")
     ax.set_aspect("equal")
-    ax.set_xlabel("x (m), away from the lidar" if abs(rendered.azimuth) < 1e-6 else "x (m)")
-    ax.set_ylabel("y (m)")
+    turn = math.degrees(rendered.azimuth)
+    beam = "+x" if abs(turn) < 1e-4 else f"{abs(turn):.3g}° from +x towards {'+' if turn > 0 else '-'}y"
+    ax.set_title(f"seen from above; the beam points to {beam}", fontsize="small")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
 
 
 def _draw_waveforms(ax: Axes, shot: Shot, result: xr.Dataset) -> None:

@@ -28,7 +28,7 @@ def plot_shot_statistics(shots: xr.Dataset, path: drawing.FilePath | None = None
     effects, correlations = slope_effects(shots), slope_correlations(shots)
     for ax, (name, (slope, value)) in zip(figure.subplots(2, 2).flat, effects.items(), strict=True):
         ax.plot(np.degrees(np.arctan(slope)), value, ".", color="#1f5fd6", markersize=4)
-        ax.set_xlabel("mean slope across (deg)" if name == "sideways" else "mean slope towards the lidar (deg)")
+        ax.set_xlabel("mean rise to the left (deg)" if name == "sideways" else "mean slope towards the lidar (deg)")
         ax.set_ylabel(_LABELS[name])
         ax.set_title(f"correlation {correlations[name]:+.2f}, {np.isfinite(value).sum()} shots", fontsize="small")
         drawing.add_grid(ax)

@@ -49,7 +49,7 @@ def draw_against_background(ax: Axes, result: xr.Dataset, name: str) -> None:
 
 
 def plot_target_map(maps: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
-    """Draw the share of the echo in each pixel, and the gain in SNR, against the target's position.
+    """Draw the share of the echo in each pixel, and the gain in SNR, against the target's position, seen from above.
 
     `maps` is a result of `studies.target_signal.target_map`.
     """
@@ -71,7 +71,8 @@ def plot_target_map(maps: xr.Dataset, path: drawing.FilePath | None = None) -> F
             colour = "black" if value > low + 0.6 * (high - low) else "white"
             ax.text(y[j], x[i], f"{value:{digits}}", ha="center", va="center", size=7, color=colour)
         ax.set_title(title, fontsize="small")
-        ax.set(xlabel="target_y (m)", ylabel="target_x (m)")
+        # Seen from above with +x up, +y is on the left, as in a picture taken from the lidar.
+        ax.set(xlabel="target_y (m)", ylabel="target_x (m), +x up", xlim=(max(extent[:2]), min(extent[:2])))
         figure.colorbar(image, ax=ax, shrink=0.7)
     figure.suptitle(drawing.titled(maps.attrs, "share of the echo in each pixel against the place of the target"))
     return drawing.save(figure, path)

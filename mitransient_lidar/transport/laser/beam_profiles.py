@@ -146,7 +146,7 @@ class ImageBeam(BeamProfile):
     ----------
     irradiance
         Image in any unit, shape (rows, columns), 1 to 2048 each: row 0 is the far edge (+angle_x), column 0 the
-        -angle_y edge. Finite, not negative, not all 0; else UserError.
+        left one (+angle_y). Finite, not negative, not all 0; else UserError.
     side
         Full angle [rad] from the first column's outer edge to the last one's, positive. Cells are squares.
     """
@@ -176,7 +176,7 @@ class ImageBeam(BeamProfile):
     def _measure(self) -> None:
         """Set widths and azimuth from the second moments about the centre of gravity."""
         far = self._cell * (0.5 * self._rows - np.arange(self._rows) - 0.5)
-        left = self._cell * (np.arange(self._columns) + 0.5 - 0.5 * self._columns)
+        left = self._cell * (0.5 * self._columns - np.arange(self._columns) - 0.5)
         rows, columns = self._share.sum(axis=1), self._share.sum(axis=0)
         dx, dy = far - rows @ far, left - columns @ left
         # Variance of even light within a cell.
@@ -191,7 +191,7 @@ class ImageBeam(BeamProfile):
     def density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
         """Return the share of the energy per tangent-plane area [1/rad^2]."""
         row = 0.5 * self._rows - angle_x / self._cell
-        column = angle_y / self._cell + 0.5 * self._columns
+        column = 0.5 * self._columns - angle_y / self._cell
         inside = (row >= 0) & (row < self._rows) & (column >= 0) & (column < self._columns)
         index = mi.UInt32(dr.select(inside, row, 0)) * self._columns + mi.UInt32(dr.select(inside, column, 0))
         return dr.gather(mi.Float, self._density, index, inside)
@@ -199,14 +199,14 @@ class ImageBeam(BeamProfile):
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to points distributed as the density."""
         row, column = self._sampler.sample(u)
-        return self._cell * (0.5 * self._rows - row), self._cell * (column - 0.5 * self._columns)
+        return self._cell * (0.5 * self._rows - row), self._cell * (0.5 * self._columns - column)
 
     def outlines(self) -> list[tuple[float, list[Outline]]]:
         """Return the lines of equal irradiance, without islands of noise."""
         # A dark frame closes every line.
         padded = np.pad(self._share / self._share.max(), 1)
         far = self._cell * (0.5 * self._rows + 0.5 - np.arange(self._rows + 2))
-        left = self._cell * (np.arange(self._columns + 2) - 0.5 - 0.5 * self._columns)
+        left = self._cell * (0.5 * self._columns + 0.5 - np.arange(self._columns + 2))
         lines = contourpy.contour_generator(left, far, padded)
         found = []
         for level in OUTLINE_LEVELS:

@@ -51,9 +51,9 @@ class HexPixels(PixelArray):
         self.area = fill_factor * count * 1.5 * _ROOT3 * self._side**2
         self.field_of_view = field_of_view
         self.field_of_view_shape = "circle"
-        # Axial coordinates of each pixel, from the far row to the near one, and from -angle_y to +angle_y in a row.
+        # Axial coordinates of each pixel, from the far row to the near one, and from left (+angle_y) to right in a row.
         rows = [(rings - k, 2 * rings + 1 - abs(rings - k)) for k in range(2 * rings + 1)]
-        self._axial = np.array([(i - rings - min(row, 0), row) for row, length in rows for i in range(length)])
+        self._axial = np.array([(rings - max(row, 0) - i, row) for row, length in rows for i in range(length)])
         names = [f"r{k}c{i}" for k, (_, length) in enumerate(rows) for i in range(length)]
         self.names = names if count > 1 else ["single"]
 
@@ -93,7 +93,7 @@ class HexPixels(PixelArray):
         # Hexagons in the rows before this one: rows grow from rings + 1 hexagons to 2 rings + 1, and shrink again.
         past = dr.maximum(k - rings, 0)
         before = k * (rings + 1) + (k * (k - 1)) // 2 - past * past + past
-        index = before + i + rings + dr.minimum(rings - k, 0)
+        index = before + rings - dr.maximum(rings - k, 0) - i
         return mi.UInt32(dr.select(inside, index, 0)), dr.select(inside, mi.Float(1), 0)
 
     def centres(self) -> NDArray[np.float64]:

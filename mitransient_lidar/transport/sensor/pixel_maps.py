@@ -25,7 +25,8 @@ class MappedPixels(PixelArray):
     Parameters
     ----------
     labels
-        Integers from 0, not all 0, shape (rows, columns); row 0 is the far edge (+angle_x), column 0 the -angle_y edge.
+        Integers from 0, not all 0, shape (rows, columns); row 0 is the far edge (+angle_x), column 0 the left one
+        (+angle_y).
     field_of_view
         Side of the square [rad], positive.
     """
@@ -65,14 +66,14 @@ class MappedPixels(PixelArray):
         row, column = self._sampler.sample(u)
         rows, columns = self._pixel.shape
         half, full = opaque(0.5 * self.field_of_view), opaque(self.field_of_view)
-        return half - row * (full / rows), column * (full / columns) - half
+        return half - row * (full / rows), half - column * (full / columns)
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether its cell has a label (1 or 0)."""
         rows, columns = self._pixel.shape
         half, full = opaque(0.5 * self.field_of_view), opaque(self.field_of_view)
         row = mi.Int32(dr.floor((half - angle_x) * (rows / full)))
-        column = mi.Int32(dr.floor((angle_y + half) * (columns / full)))
+        column = mi.Int32(dr.floor((half - angle_y) * (columns / full)))
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         pixel = dr.gather(mi.Int32, self._table, mi.UInt32(row * columns + column), inside)
         inside &= pixel >= 0
@@ -85,5 +86,5 @@ class MappedPixels(PixelArray):
         pixel = self._pixel[row, column]
         cells = np.bincount(pixel)
         angle_x = 0.5 - (np.bincount(pixel, row + 0.5) / cells) / rows
-        angle_y = (np.bincount(pixel, column + 0.5) / cells) / columns - 0.5
+        angle_y = 0.5 - (np.bincount(pixel, column + 0.5) / cells) / columns
         return self.field_of_view * np.stack([angle_x, angle_y], axis=1)

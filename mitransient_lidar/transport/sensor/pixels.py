@@ -89,8 +89,8 @@ class LayoutPixels(PixelArray):
     Parameters
     ----------
     layout
-        ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the -angle_y edge. ``1x4`` is
-        ``4x1``.
+        ``RxC``: R rows along range, row 0 the far edge (+angle_x); C columns, column 0 the left edge (+angle_y).
+        ``1x4`` is ``4x1``.
     field_of_view
         Diameter or side [rad], positive; of a rectangle (height along angle_x, width along angle_y).
     shape
@@ -141,13 +141,13 @@ class LayoutPixels(PixelArray):
         row, column = u.x * self._rows, u.y * self._columns
         row, column = (dr.lerp(dr.floor(g) + 0.5, g, opaque(self._shrink)) for g in (row, column))
         top, left, down, across = map(opaque, (0.5 * height, 0.5 * width, height / self._rows, width / self._columns))
-        return top - row * down, column * across - left
+        return top - row * down, left - column * across
 
     def pixel_at(self, angle_x: mi.Float, angle_y: mi.Float, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Return the pixel at a point and whether the field of view contains it (1 or 0)."""
         height, width = self.sides
         down = (opaque(0.5 * height) - angle_x) * opaque(self._rows / height)
-        across = (angle_y + opaque(0.5 * width)) * opaque(self._columns / width)
+        across = (opaque(0.5 * width) - angle_y) * opaque(self._columns / width)
         row = dr.clip(mi.Int32(dr.floor(down)), 0, self._rows - 1)
         column = dr.clip(mi.Int32(dr.floor(across)), 0, self._columns - 1)
         inside = self.field.contains(angle_x, angle_y)
@@ -160,7 +160,7 @@ class LayoutPixels(PixelArray):
         """Return centres of gravity (angle_x, angle_y) [rad], shape (pixels, 2); of the uncut cells in imagers."""
         height, width = self.sides
         far = 0.5 * height - (np.arange(self._rows) + 0.5) * height / self._rows
-        left = (np.arange(self._columns) + 0.5) * width / self._columns - 0.5 * width
+        left = 0.5 * width - (np.arange(self._columns) + 0.5) * width / self._columns
         centres = np.stack(np.meshgrid(far, left, indexing="ij"), axis=-1).reshape(-1, 2)
         if self.count > _LARGEST_LAYOUT or self.field_of_view_shape != "circle":
             return centres

@@ -77,7 +77,7 @@ class MeasuredPointSpread(PointSpread):
     ----------
     values
         Values in any unit, not negative and not all 0, shape (rows, columns). Row 0 is the far edge (+angle_x), column
-        0 the -angle_y edge.
+        0 the left one (+angle_y).
     width
         Extent of the columns along angle_y [rad], positive.
     """
@@ -92,4 +92,4 @@ class MeasuredPointSpread(PointSpread):
         row, column = self._sampler.sample(u)
         rows, columns = self._sampler.shape
         cell = opaque(self._cell)
-        return (0.5 * rows - row) * cell, (column - 0.5 * columns) * cell
+        return (0.5 * rows - row) * cell, (0.5 * columns - column) * cell

@@ -75,6 +75,10 @@ def test_sidak_limit_has_the_significance():
 def test_results_that_cannot_be_compared_are_rejected():
     with pytest.raises(UserError, match="2 pixels x 100 bins and 2 pixels x 90 bins: they must have the same"):
         comparison.compare(result(1), result(2, bins=90))
+    # As of an earlier version, which had the pixels of a layout from right to left.
+    mirrored = result(2).assign_coords(angle_x=-result(2)["angle_x"])
+    with pytest.raises(UserError, match="the results have pixels at different angles"):
+        comparison.compare(result(1), mirrored)
     with pytest.raises(UserError, match="0 and 6 passes: both must have at least 2"):
         comparison.compare(result(1, passes=6).assign_attrs(passes=0), result(2))
     unknown = result(1)

@@ -33,7 +33,7 @@ INDEX = {"group_index": "1.34"}
 SPHERE = {"target_y": "0", "target_size": "1", "target_reflectance": "0.1"}
 SHOT = {**INDEX, "field_of_view_mrad": "15", "wind_speed": "6", "bottom_depth": "5"}
 FINE = {"bin_width_ns": "0.25", "bin_count": "200"}
-PLACES = (("25.15", "-47.56"), ("42.42", "-57.60"), ("20.35", "-32.63"))
+PLACES = (("-59.52", "57.68"), ("54.78", "-34.15"), ("-0.79", "-23.09"))
 SQUARE = {
     **{**INDEX, "field_of_view_mrad": "35", "surface_seed": "8", "bottom_depth": "12"},
     **{"target_x": "0", "target_y": "0", "target_depth": "8", "target_size": "1.5", "target_reflectance": "0.1"},

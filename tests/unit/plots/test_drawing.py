@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError
@@ -10,18 +11,18 @@ from mitransient_lidar.plots import drawing
 
 
 def image(rows, columns):
-    angle_x, angle_y = np.meshgrid(6.0 - 4.0 * np.arange(rows), 3.0 * np.arange(columns), indexing="ij")
+    angle_x, angle_y = np.meshgrid(6.0 - 4.0 * np.arange(rows), -3.0 * np.arange(columns), indexing="ij")
     return xr.Dataset(coords={"angle_x": (("row", "column"), angle_x), "angle_y": (("row", "column"), angle_y)})
 
 
 @pytest.mark.parametrize(
     ("rows", "columns", "extent"),
     [
-        (4, 5, (-1.5, 13.5, -8.0, 8.0)),
+        (4, 5, (1.5, -13.5, -8.0, 8.0)),
         # The pixels of a single row or column are square.
-        (1, 3, (-1.5, 7.5, 4.5, 7.5)),
-        (3, 1, (-2.0, 2.0, -4.0, 8.0)),
-        (1, 1, (-0.5, 0.5, 5.5, 6.5)),
+        (1, 3, (1.5, -7.5, 4.5, 7.5)),
+        (3, 1, (2.0, -2.0, -4.0, 8.0)),
+        (1, 1, (0.5, -0.5, 5.5, 6.5)),
     ],
 )
 def test_extent_reaches_half_a_pixel_beyond_the_centres(rows, columns, extent):
@@ -29,11 +30,28 @@ def test_extent_reaches_half_a_pixel_beyond_the_centres(rows, columns, extent):
     assert drawing.image_extent(image(rows, columns).transpose("column", "row")) == pytest.approx(extent)
 
 
-def test_images_have_the_far_row_on_top():
-    ax = Figure().subplots()
-    drawn = drawing.draw_image(ax, np.arange(20.0).reshape(4, 5), image(4, 5), cmap="gray")
-    assert (drawn.origin, drawn.get_extent()) == ("upper", [-1.5, 13.5, -8.0, 8.0])
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("across, angle_y (mrad)", "away from nadir, angle_x (mrad)")
+def test_images_are_pictures_taken_from_the_lidar_in_any_order_of_their_pixels():
+    """Far is up and +angle_y left; column 0 was the right one in results of earlier versions."""
+    pictures = []
+    values = np.arange(20.0).reshape(4, 5)
+    for order in ({}, {"column": slice(None, None, -1)}, {"row": slice(None, None, -1)}):
+        figure = Figure()
+        canvas = FigureCanvasAgg(figure)
+        ax = figure.subplots()
+        one = image(4, 5).assign(values=(("row", "column"), values)).isel(order)
+        drawing.draw_image(ax, one["values"].values, one, cmap="gray")
+        assert (ax.get_xlim(), ax.get_ylim()) == ((1.5, -13.5), (-8.0, 8.0))
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("to the left, angle_y (mrad)", "away from nadir, angle_x (mrad)")
+        canvas.draw()
+        pictures.append(np.asarray(canvas.buffer_rgba())[..., 0])
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    np.testing.assert_array_equal(pictures[0], pictures[2])
+    # The values 0 (far left), 4 (far right) and 15 (near left) from black to white, in the picture's rows from the top.
+    places = ax.transData.transform([(0.0, 6.0), (-12.0, 6.0), (0.0, -6.0)])
+    grey = [int(pictures[0][len(pictures[0]) - 1 - int(y), int(x)]) for x, y in places]
+    assert grey == pytest.approx([255 * value / 19 for value in (0, 4, 15)], abs=3)
+    assert places[0, 0] < places[1, 0]
+    assert places[0, 1] > places[2, 1]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def scene():
     rng = np.random.default_rng(5)
     angles = {
         "angle_x": (("row", "column"), np.repeat(np.linspace(3, -3, ROWS)[:, None], COLUMNS, 1)),
-        "angle_y": (("row", "column"), np.repeat(np.linspace(-2, 2, COLUMNS)[None], ROWS, 0)),
+        "angle_y": (("row", "column"), np.repeat(np.linspace(2, -2, COLUMNS)[None], ROWS, 0)),
     }
     gates = {"gate_start": ("gate", 1400 + 2.0 * np.arange(GATES)), "gate_width": ("gate", np.full(GATES, 4.0))}
     depth = {"gate_depth": ("gate", 0.22 * np.arange(GATES) - 0.5)}
@@ -67,12 +67,23 @@ def test_page_contains_all_data(scene, tmp_path):
         assert (values == data[name].transpose(*order).values.ravel().astype(np.float32)).all()
     assert (metadata["rows"], metadata["columns"], metadata["notes"]) == (ROWS, COLUMNS, [])
     assert ["note", "</script><!--<script>"] in metadata["attributes"]
-    # The centre of pixel (0, 0) is at angle_x = 3, angle_y = -2; depth = 0.22 (t - 1402) / 2 - 0.5.
+    # The centre of pixel (0, 0) is at angle_x = 3, angle_y = 2; depth = 0.22 (t - 1402) / 2 - 0.5.
     axes = metadata["axes"]
     assert axes["top"] - axes["along"] / 2 == pytest.approx(3)
-    assert axes["left"] + axes["across"] / 2 == pytest.approx(-2)
-    assert (axes["along"], axes["across"]) == pytest.approx((6 / 29, 4 / 20))
+    assert axes["left"] + axes["across"] / 2 == pytest.approx(2)
+    assert (axes["along"], axes["across"]) == pytest.approx((6 / 29, -4 / 20))
     assert metadata["depth_of_time"] == pytest.approx([-0.5 - 0.11 * 1402, 0.11])
+
+
+@pytest.mark.parametrize("angles_of_result", [True, False])
+def test_page_of_an_older_result_is_the_same(scene, tmp_path, angles_of_result):
+    """Column 0 was the right one in versions up to 0.1, as the angles of the pixels show."""
+    older = [dataset.isel(column=slice(None, None, -1)) for dataset in scene]
+    if not angles_of_result:
+        older[1] = older[1].drop_vars(["angle_x", "angle_y"])
+    write_page(scene[0], tmp_path / "page.html", scene[1])
+    write_page(older[0], tmp_path / "older.html", older[1])
+    assert (tmp_path / "older.html").read_bytes() == (tmp_path / "page.html").read_bytes()
 
 
 def test_page_contains_the_lines_of_sight(scene, tmp_path):

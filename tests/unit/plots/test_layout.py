@@ -24,7 +24,7 @@ def described(scene):
     return describe_layout(LidarScene.from_scene(scene, scene.sensors()[0]))
 
 
-def result(attributes, pixels=4, grid=None, energy=None):
+def result(attributes, pixels=4, grid=None, energy=None, centres=None):
     values = np.full((pixels, 3), 1e-15) if energy is None else np.outer(energy, [0, 1, 0])
     return results.build(
         values,
@@ -33,7 +33,7 @@ def result(attributes, pixels=4, grid=None, energy=None):
         values,
         time=TimeAxis(0, 1, values.shape[1]),
         pixel_names=[f"p{index}" for index in range(pixels)],
-        pixel_centres_mrad=[(index, -index) for index in range(pixels)],
+        pixel_centres_mrad=centres or [(index, -index) for index in range(pixels)],
         grid=grid,
         attributes={"altitude": 200.0, "off_nadir_deg": 20.0, "refractive_index": 1.34, **attributes},
     )
@@ -50,17 +50,19 @@ def patches(figure):
 
 
 def test_pixels_are_drawn_on_the_sea_in_their_colours(lidar_scene):
-    """Far is up and +y to the right; far and near edges lie 3.41 and 3.38 m from the shot, the sides 3.19 m."""
+    """Far is up and +y to the left; far and near edges lie 3.41 and 3.38 m from the shot, the sides 3.19 m."""
     figure = plot_layout(result(described(lidar_scene())))
     shapes = patches(figure)
     assert [int(np.argmax(to_rgb(shape.get_edgecolor()))) for shape in shapes[:3]] == [0, 1, 2]
     vertices = [shape.get_path().vertices for shape in shapes]
-    for index, (sign_y, edge) in enumerate([(-1, HALF), (1, HALF), (-1, -HALF), (1, -HALF)]):
+    for index, (sign_y, edge) in enumerate([(1, HALF), (-1, HALF), (1, -HALF), (-1, -HALF)]):
         y, x = vertices[index].T
         assert x[np.argmax(np.abs(x))] == pytest.approx(on_sea(edge), rel=3e-3)
         assert y[np.argmax(np.abs(y))] == pytest.approx(sign_y * 0.015 * 200 / np.cos(np.radians(20)), rel=3e-3)
     assert on_sea(HALF) == pytest.approx(3.416, abs=1e-3)
     ax = figure.axes[0]
+    left, right = ax.get_xlim()
+    assert left > 0 > right
     assert ax.get_aspect() == 1
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts == ["p0", "p1", "p2", "p3", "beam, e$^{-1/2}$", "beam, e$^{-2}$", "receiver's axis"]
@@ -73,7 +75,7 @@ def test_azimuth_points_up_for_every_direction_of_the_lidar(lidar_scene):
     top = max(shape.get_path().vertices[:, 1].max() for shape in patches(figure))
     assert top == pytest.approx(on_sea(HALF), rel=3e-3)
     assert patches(figure)[0].get_path().vertices[:, 1].min() > -0.02
-    assert figure.axes[0].get_ylabel() == "along (m), away from the lidar"
+    assert figure.axes[0].get_ylabel() == "away from the lidar (m); +x points 90° to the left"
 
 
 @pytest.mark.slow
@@ -81,14 +83,19 @@ def test_imager_cells_lie_on_the_sea_with_their_energy(lidar_scene):
     attributes = {"field_of_view_mrad": 30.0, "field_of_view_shape": "circle"}
     attributes |= described(lidar_scene(rx={"layout": "6x6"}))
     assert "pixel_outlines" not in attributes
-    figure = plot_layout(result(attributes, 6, (2, 3), 1e-15 * np.arange(6)))
-    (mesh,) = (item for item in figure.axes[0].collections if isinstance(item, QuadMesh))
-    corners = mesh.get_coordinates()
-    assert corners.shape == (3, 4, 2)
-    # Corner (0, 0) is far at -angle_y, and the middle row of corners passes through the shot.
-    assert corners[0, 0, 0] < 0 < corners[0, 0, 1]
-    np.testing.assert_allclose(corners[1, :, 1], 0, atol=1e-9)
-    np.testing.assert_allclose(mesh.get_array().ravel(), np.arange(6), atol=1e-12)
+    centres = [(angle_x, angle_y) for angle_x in (7.5, -7.5) for angle_y in (10.0, 0.0, -10.0)]
+    imager = result(attributes, 6, (2, 3), 1e-15 * np.arange(6), centres)
+    for dataset in (imager, imager.isel(column=slice(None, None, -1))):
+        figure = plot_layout(dataset)
+        (mesh,) = (item for item in figure.axes[0].collections if isinstance(item, QuadMesh))
+        corners = mesh.get_coordinates()
+        assert corners.shape == (3, 4, 2)
+        # Corner (0, 0) is far at +angle_y, and the middle row of corners passes through the shot.
+        assert np.all(corners[0, 0] > 0)
+        assert corners[0, 0, 1] == pytest.approx(on_sea(15.0), rel=1e-2)
+        assert corners[0, 0, 0] == pytest.approx(0.015 * 200 / np.cos(np.radians(20)), rel=0.02)
+        np.testing.assert_allclose(corners[1, :, 1], 0, atol=1e-9)
+        np.testing.assert_allclose(mesh.get_array().ravel(), np.arange(6), atol=1e-12)
     assert "received energy (fJ)" in [ax.get_xlabel() for ax in figure.axes]
 
 

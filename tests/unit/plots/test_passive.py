@@ -15,7 +15,7 @@ def frames():
     """Three frames of 4 x 5 pixels; one pixel in each of the first two is far too bright."""
     radiance = np.random.default_rng(4).uniform(2e-3, 4e-3, (3, 40, 50))
     radiance[0, 1, 2] = radiance[1, 3, 4] = 1.0
-    angle_x, angle_y = np.meshgrid(np.linspace(3, -3, 40), np.linspace(-4, 4, 50), indexing="ij")
+    angle_x, angle_y = np.meshgrid(np.linspace(3, -3, 40), np.linspace(4, -4, 50), indexing="ij")
     return xr.Dataset(
         {"radiance": (("frame", "row", "column"), radiance)},
         {
@@ -44,7 +44,7 @@ def test_frames_share_their_grey_levels(frames):
     assert black < 2.0
     assert 3.9 < white < 4.1
     left, right, near, far = drawn[0].get_extent()
-    assert (left, right) == pytest.approx((-4 - 4 / 49, 4 + 4 / 49))
+    assert (left, right) == pytest.approx((4 + 4 / 49, -4 - 4 / 49))
     assert (near, far) == pytest.approx((-3 - 3 / 39, 3 + 3 / 39))
     assert figures[1].axes[0].get_title() == "sea, sun at 40° from the zenith, uniform sky, 0.25 s"
     assert figures[0].axes[1].get_ylabel() == "radiance (mW m$^{-2}$ sr$^{-1}$ nm$^{-1}$)"
@@ -59,6 +59,8 @@ def test_pixels_without_a_grid_are_bars():
 
 def test_animation_shows_the_frames_in_their_time(frames, tmp_path):
     animate_passive(frames, tmp_path / "a.gif")
+    animate_passive(frames.isel(column=slice(None, None, -1)), tmp_path / "older.gif")
+    assert (tmp_path / "older.gif").read_bytes() == (tmp_path / "a.gif").read_bytes()
     with Image.open(tmp_path / "a.gif") as movie:
         assert (movie.n_frames, movie.info["duration"], movie.info["loop"]) == (3, 250, 0)
         assert movie.size == (400, 320)  # 8 x 8 points a pixel, for a width of at least 384

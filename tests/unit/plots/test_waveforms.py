@@ -29,7 +29,7 @@ ATTRIBUTES = {
     "error_median": 0.0098,
 }
 CENTRES = {
-    "2x2": [(6.4, -6.4), (6.4, 6.4), (-6.4, -6.4), (-6.4, 6.4)],
+    "2x2": [(6.4, 6.4), (6.4, -6.4), (-6.4, 6.4), (-6.4, -6.4)],
     "1x4": [(10.6, 0.0), (3.7, 0.0), (-3.7, 0.0), (-10.6, 0.0)],
 }
 
@@ -97,8 +97,8 @@ def test_depth_axis():
 @pytest.mark.parametrize(
     ("layout", "cells"),
     [
-        # (left, bottom) in (angle_y, angle_x): far (+angle_x) on top, +angle_y to the right.
-        ("2x2", [(-15, 0), (0, 0), (-15, -15), (0, -15)]),
+        # (right, bottom) in (angle_y, angle_x): far (+angle_x) on top, +angle_y to the left.
+        ("2x2", [(0, 0), (-15, 0), (0, -15), (-15, -15)]),
         ("1x4", [(-15, 7.5), (-15, 0), (-15, -7.5), (-15, -15)]),
     ],
 )
@@ -107,6 +107,8 @@ def test_layout_is_drawn_as_the_receiver_sees_it(layout, cells):
     drawn = [patch for patch in side_axes(figure).patches if isinstance(patch, Rectangle)]
     assert [patch.get_xy() for patch in drawn] == cells
     assert np.argmax(to_rgb(drawn[0].get_facecolor()[:3])) == 0
+    left, right = side_axes(figure).get_xlim()
+    assert left > 0 > right
 
 
 def test_other_layouts_are_dots_at_the_centres():
@@ -116,12 +118,12 @@ def test_other_layouts_are_dots_at_the_centres():
 
 
 def test_imager_shows_energy_with_the_far_row_on_top_and_the_summed_waveform():
-    centres = [(angle_x, angle_y) for angle_x in (5.0, -5.0) for angle_y in (-10.0, 0.0, 10.0)]
+    centres = [(angle_x, angle_y) for angle_x in (5.0, -5.0) for angle_y in (10.0, 0.0, -10.0)]
     dataset = make(6, (2, 3), centres)
     figure = waveforms.plot_waveforms(dataset, scale="linear")
     assert figure.axes[0].lines[0].get_ydata().max() == pytest.approx(420.0, rel=0.01)  # µW: 21 * 2e-5 W
     (image,) = side_axes(figure).images
-    assert image.get_extent() == [-15, 15, -10, 10]
+    assert image.get_extent() == [15, -15, -10, 10]
     assert image.origin == "upper"
     # Two Gaussian echoes of 2e-5 and 1e-6 W: 2.1e-5 W * 3 sqrt(pi) * 1e-9 s for the first pixel, in fJ.
     assert image.get_array()[0, 0] == pytest.approx(2.1e-5 * 3e-9 * math.sqrt(math.pi) / 1e-15, rel=1e-3)

@@ -23,9 +23,9 @@ def test_field_of_view_is_pixels_times_pitch_over_focal_length():
     assert pixels.area == pytest.approx(2.4e-3 * 8e-3)
     centres = pixels.centres().reshape(12, 40, 2)
     np.testing.assert_allclose(np.diff(centres[:, 0, 0]), -2e-4, rtol=1e-9)
-    np.testing.assert_allclose(np.diff(centres[0, :, 1]), 2e-4, rtol=1e-9)
-    # Row 0 is the far edge, column 0 the -angle_y edge.
-    np.testing.assert_allclose(centres[0, 0], [1.1e-3, -3.9e-3], rtol=1e-9)
+    np.testing.assert_allclose(np.diff(centres[0, :, 1]), -2e-4, rtol=1e-9)
+    # Row 0 is the far edge, column 0 the left one (+angle_y).
+    np.testing.assert_allclose(centres[0, 0], [1.1e-3, 3.9e-3], rtol=1e-9)
 
 
 def test_points_fall_into_the_pixel_that_holds_them():

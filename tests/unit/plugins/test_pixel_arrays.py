@@ -101,7 +101,7 @@ def test_hexagons_sum_to_a_polygon_of_their_outline(lidar_scene, passes):
 def test_a_cell_of_a_layout_is_the_polygon_in_its_place(lidar_scene, passes):
     """With gaps, away from the centre: row 1 of 4, column 2 of 3, with sides of 0.8 of a cell."""
     layout = lidar_scene(rx={**SQUARE, "layout": "4x3", "fill_factor": 0.64}, **MERGING)
-    centre, half = (2.5, 20 / 3), (2.0, 0.4 * 20 / 3)
+    centre, half = (2.5, -20 / 3), (2.0, 0.4 * 20 / 3)
     corners = [(centre[0] + i * half[0], centre[1] + j * half[1]) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     alone = lidar_scene(rx={"a": polygon(corners)}, **MERGING)
     pixels = layout.sensors()[0].receiver.pixels
@@ -133,7 +133,7 @@ def test_labels_are_read_as_they_are_written(png, name, kind):
     labels = np.array([[0, 1], [200, 7], [7, 1]], dtype=kind)
     pixels = mi.load_dict({"type": "multipixel_receiver", "pixel_map": png(labels, name)}).receiver.pixels
     assert pixels.names == ["label1", "label7", "label200"]
-    np.testing.assert_allclose(pixels.centres()[2] * 1e3, [0, -7.5], atol=1e-9)
+    np.testing.assert_allclose(pixels.centres()[2] * 1e3, [0, 7.5], atol=1e-9)
     assert (pixels.layout, pixels.field_of_view_shape, pixels.grid) == ("map", "square", None)
 
 

@@ -31,7 +31,7 @@ def test_outlines_enclose_the_areas_of_the_pixels(lidar_scene):
     """Holes turn the other way round, so that signed areas add up."""
     quarters = lines(described(lidar_scene())["pixel_outlines"])
     assert [len(pixel) for pixel in quarters] == [1, 1, 1, 1]
-    for (line,), (far, left) in zip(quarters, [(1, -1), (1, 1), (-1, -1), (-1, 1)], strict=True):
+    for (line,), (far, left) in zip(quarters, [(1, 1), (1, -1), (-1, 1), (-1, -1)], strict=True):
         assert abs(enclosed_area(line)) == pytest.approx(np.pi * HALF**2 / 4, rel=3e-3)
         assert np.all(line * [far, left] > -0.02)
     nested = {"a": SECTOR | {"extent_deg": 90.0}, "b": SECTOR | {"start_deg": 90.0, "extent_deg": 270.0}, "c": TRIANGLE}

@@ -11,6 +11,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.results.formats import picture_order
 
 ATTRIBUTES = {
     "scene": "fig09",
@@ -36,7 +37,8 @@ def make(pixels=4, bins=6, grid=None, names=None, attributes=ATTRIBUTES):
         *values,
         time=TimeAxis(1400.1, 0.3, bins),
         pixel_names=names or [f"p{i}" for i in range(pixels)],
-        pixel_centres_mrad=rng.normal(size=(pixels, 2)),
+        # In the order of a picture: far to near, left to right.
+        pixel_centres_mrad=-np.sort(-rng.normal(size=(pixels, 2)), axis=0),
         grid=grid,
         attributes=attributes,
     )
@@ -65,7 +67,7 @@ def test_build_labels_time_at_bin_centres():
 
 def test_build_orders_an_imager_row_by_row():
     energy = np.arange(12.0).reshape(6, 2)
-    centres = [(angle_x, angle_y) for angle_x in (5.0, -5.0) for angle_y in (-9.0, 0.0, 9.0)]
+    centres = [(angle_x, angle_y) for angle_x in (5.0, -5.0) for angle_y in (9.0, 0.0, -9.0)]
     dataset = results.build(
         energy,
         energy,
@@ -80,8 +82,37 @@ def test_build_orders_an_imager_row_by_row():
     assert dataset["impulse_response"].dims == ("row", "column", "time")
     assert dataset["impulse_response"].values[1, 0].tolist() == [6.0, 7.0]
     assert dataset["angle_x"].values[0].tolist() == [5.0, 5.0, 5.0]
-    assert dataset["angle_y"].values[1].tolist() == [-9.0, 0.0, 9.0]
+    assert dataset["angle_y"].values[1].tolist() == [9.0, 0.0, -9.0]
     assert "pixel" not in dataset.coords
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".nc"])
+def test_images_of_earlier_versions_are_read_in_picture_order(suffix, tmp_path):
+    """Until 0.1, column 0 was the right one: angle_y rose with the columns."""
+    centres = [(angle_x, angle_y) for angle_x in (5.0, -5.0) for angle_y in (-9.0, 0.0, 9.0)]
+    energy = np.arange(12.0).reshape(6, 2)
+    attributes = {"gain": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], "optical_density": 0.5, "background_power_w": [1.0, 2.0]}
+    old = results.build(
+        *[energy] * 4,
+        time=TimeAxis(0.0, 1.0, 2),
+        pixel_names=[],
+        pixel_centres_mrad=centres,
+        grid=(2, 3),
+        attributes=attributes,
+    )
+    results.save(old, tmp_path / f"old{suffix}")
+    new = results.open(tmp_path / f"old{suffix}")
+    assert new["angle_y"].values.tolist() == [[9.0, 0.0, -9.0]] * 2
+    assert new["angle_x"].values[:, 0].tolist() == [5.0, -5.0]
+    assert new["waveform"].values[..., 0].tolist() == [[4.0, 2.0, 0.0], [10.0, 8.0, 6.0]]
+    assert new["column"].values.tolist() == [0, 1, 2]
+    # A list over the pixels goes with them, one of another length does not.
+    assert new.attrs["gain"] == [2.0, 1.0, 0.0, 5.0, 4.0, 3.0]
+    assert (new.attrs["optical_density"], new.attrs["background_power_w"]) == (0.5, [1.0, 2.0])
+    xr.testing.assert_identical(picture_order(new), new)
+    part = picture_order(old.isel(column=slice(1, 3), row=slice(None, None, -1)))
+    assert part["waveform"].values[..., 0].tolist() == [[4.0, 2.0], [10.0, 8.0]]
+    assert part["column"].values.tolist() == [2, 1]  # columns of a part keep their numbers
 
 
 def test_build_does_not_share_memory_with_its_input():

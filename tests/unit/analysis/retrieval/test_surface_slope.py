@@ -22,7 +22,7 @@ from mitransient_lidar.physics.sea.surface_echoes import SeaShots
 C0 = 0.299792458  # m/ns
 THETA = math.radians(20)
 ANGLE_X = np.array([2.8e-3, 2.8e-3, -2.8e-3, -2.8e-3])
-ANGLE_Y = np.array([-2.8e-3, 2.8e-3, -2.8e-3, 2.8e-3])
+ANGLE_Y = np.array([2.8e-3, -2.8e-3, 2.8e-3, -2.8e-3])
 POINTS = PixelLight(ANGLE_X, ANGLE_Y, np.zeros(4))
 
 
@@ -56,8 +56,8 @@ def test_a_face_towards_the_lidar_gathers_the_echoes():
     """Published: far and near echoes come closer together, and red before green is a rise to the left."""
     level, towards = (plane_times(ANGLE_X, ANGLE_Y, slope, 0.0) for slope in (0.0, 0.2))
     assert towards[:2].mean() - towards[2:].mean() < level[:2].mean() - level[2:].mean()
-    # Green, on the left, looks down on higher water and is earlier there.
-    left = fit_plane(np.array([[1423.0, 1422.0, 1418.0, 1417.0]]), POINTS, THETA)
+    # Red, on the left, looks down on higher water and is earlier there.
+    left = fit_plane(np.array([[1422.0, 1423.0, 1417.0, 1418.0]]), POINTS, THETA)
     assert left.across[0] > 0
 
 
@@ -130,7 +130,7 @@ def test_faces_turned_away_are_known_worse(slope):
 
 # Centres and spread of the light in quarters and strips of a circle of 15 mrad, and in quarters of 30 mrad.
 QUARTERS, WIDE = (
-    PixelLight(x * np.array([1, 1, -1, -1]), x * np.array([-1, 1, -1, 1]), np.full(4, spread))
+    PixelLight(x * np.array([1, 1, -1, -1]), x * np.array([1, -1, 1, -1]), np.full(4, spread))
     for x, spread in ((2.822e-3, 1.874e-3), (3.916e-3, 2.898e-3))
 )
 STRIPS = PixelLight(

@@ -26,7 +26,7 @@ def make(gates=12, energy=None, pixels=False, attributes=()):
     shape, dims = ((3,), ("pixel",)) if pixels else ((ROWS, COLUMNS), ("row", "column"))
     if energy is None:
         energy = np.broadcast_to(1e-15 * (1 + np.arange(gates)), (*shape, gates)).copy()
-    angle_x, angle_y = np.meshgrid(6.0 - 4.0 * np.arange(ROWS), 3.0 * (np.arange(COLUMNS) - 2), indexing="ij")
+    angle_x, angle_y = np.meshgrid(6.0 - 4.0 * np.arange(ROWS), 3.0 * (2 - np.arange(COLUMNS)), indexing="ij")
     coords = {
         "gate": np.arange(gates),
         "gate_start": ("gate", start),
@@ -61,29 +61,30 @@ def test_contact_sheet_shows_every_gate_at_its_position():
     assert len(drawn) == 12
     for k, image in enumerate(drawn):
         np.testing.assert_allclose(image.get_array(), np.full((ROWS, COLUMNS), k + 1.0))  # fJ
-        assert image.get_extent() == [-7.5, 7.5, -8.0, 8.0]
+        assert image.get_extent() == [7.5, -7.5, -8.0, 8.0]
         assert image.norm is drawn[0].norm
     # Gate 5 opens 20 ns after the surface; its middle is 22.5 ns or 2.25 m below it.
     assert drawn[5].axes.get_title() == "#5  2.25 m\n1440.0 to 1445.0 ns"
     assert drawn[0].axes.get_title() == "#0  -0.25 m\n1415.0 to 1420.0 ns"
     assert figure.get_suptitle() == "sand: 12 gates of 5 ns, 20 pulses"
     assert (figure.get_supxlabel(), figure.get_supylabel()) == (
-        "across, angle_y (mrad)",
+        "to the left, angle_y (mrad)",
         "away from nadir, angle_x (mrad)",
     )
     assert figure.axes[-1].get_xlabel() == "energy in the gate (fJ)"  # of the colour bar
 
 
 @pytest.mark.slow
-def test_far_row_is_on_top_and_the_first_column_left():
+def test_far_row_is_on_top_and_left_is_left():
     energy = np.full((ROWS, COLUMNS, 4), 1e-18)
     energy[0, 0] = 1e-15
     figure = plot_gates(make(4, energy))
     ax = images(figure)[2].axes
-    assert colour_at(figure, ax, -6.0, 6.0).sum() > 600  # far, on the -angle_y side
-    for angle_x, angle_y in ((6.0, 6.0), (-6.0, 6.0), (-6.0, -6.0)):
+    assert colour_at(figure, ax, 6.0, 6.0).sum() > 600  # far, on the left
+    for angle_x, angle_y in ((6.0, -6.0), (-6.0, 6.0), (-6.0, -6.0)):
         assert colour_at(figure, ax, angle_y, angle_x).sum() < 30
     assert ax.transData.transform((0, 6.0))[1] > ax.transData.transform((0, -6.0))[1]
+    assert ax.transData.transform((6.0, 0))[0] < ax.transData.transform((-6.0, 0))[0]
 
 
 @pytest.mark.slow
@@ -128,7 +129,7 @@ def test_logarithmic_colours():
     assert norm.vmax / norm.vmin == pytest.approx(1000.0)
     # Zero is dark, not missing; NaN is grey.
     assert colour_at(figure, drawn[4].axes, 0.0, 2.0).sum() < 30
-    np.testing.assert_allclose(colour_at(figure, drawn[5].axes, -6.0, 6.0), 153, atol=1)
+    np.testing.assert_allclose(colour_at(figure, drawn[5].axes, 6.0, 6.0), 153, atol=1)
 
 
 @pytest.mark.slow
@@ -253,7 +254,7 @@ def test_depth_map_shows_the_depth_below_the_surface():
     assert confidence[inside].min() > 0.999
     assert confidence[3, 4] < 0.99
     np.testing.assert_array_equal(images(figure)[0].get_alpha(), confidence)
-    assert images(figure)[0].get_extent() == [-7.5, 7.5, -8.0, 8.0]
+    assert images(figure)[0].get_extent() == [7.5, -7.5, -8.0, 8.0]
     # The first gate that opens 7.5 ns after the surface or later is at 8 + 2.5 ns.
     assert figure.get_suptitle() == "sand: depth of the strongest echo, gates at 1.05 to 5.65 m on the axis"
     bar = next(ax for ax in figure.axes if ax.get_ylabel() == "depth (m)")

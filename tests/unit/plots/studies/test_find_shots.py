@@ -51,7 +51,9 @@ def test_footprints_lie_at_the_shots():
         assert middle[1] == pytest.approx(y, abs=0.05)
     assert middles[0][0] > 1.0 > middles[1][0]
     assert figure.get_suptitle() == "made"
-    assert sea.get_xlabel() == "x (m)"  # the lidar looks in another direction
+    assert (sea.get_xlabel(), sea.get_ylabel()) == ("x (m)", "y (m)")
+    assert sea.get_title() == "seen from above; the beam points to 28.6° from +x towards +y"  # 0.5 rad
+    assert np.all(np.diff([sea.get_xlim(), sea.get_ylim()]) > 0)
 
 
 def test_sea_is_periodic_around_the_shots():

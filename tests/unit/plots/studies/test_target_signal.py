@@ -63,6 +63,7 @@ def test_maps_have_a_panel_a_pixel_and_one_of_the_gain():
         np.testing.assert_allclose(image.get_array(), expected)
         assert image.get_clim() == ((1.0, 2.0) if i == 4 else (0.0, 100.0))
         assert (image.origin, image.get_extent()) == ("lower", [-4.0, 4.0, -1.5, 1.5])
+        assert ax.get_xlim() == (4.0, -4.0)  # seen from above with +x up, +y is on the left
         numbers = {text.get_position(): text.get_text() for text in ax.texts}
         # Along y is across the panel: the text at (2, -1) is that of target_x = -1, target_y = 2.
         assert numbers[2.0, -1.0] == (f"{expected[0, 1]:.2f}" if i == 4 else f"{expected[0, 1]:.0f}")
