@@ -130,7 +130,7 @@ def picture_order(dataset: xr.Dataset) -> xr.Dataset:
         numbered = dim in dataset.coords and np.array_equal(dataset[dim].values, numbers)
         dataset = dataset.isel({dim: slice(None, None, -1)}).assign_attrs(lists)
         if numbered:
-            dataset = dataset.assign_coords({dim: (dim, numbers, {"long_name": description})})
+            dataset = dataset.assign_coords({dim: (dim, numbers, {"units": "1", "long_name": description})})
     return dataset
 
 
