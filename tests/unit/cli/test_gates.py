@@ -27,7 +27,7 @@ def stored(tmp_path):
         0.05 * waveform,
         time=TimeAxis(1400.0, 0.5, waveform.shape[1]),
         pixel_names=[],
-        pixel_centres_mrad=np.stack(np.meshgrid([-2.0, -1, 0, 1], [1.0, 0, -1]), -1).reshape(-1, 2)[:, ::-1],
+        pixel_centres_mrad=np.stack(np.meshgrid([2.0, 1, 0, -1], [1.0, 0, -1]), -1).reshape(-1, 2)[:, ::-1],
         grid=(3, 4),
         attributes={
             "scene": "gated",

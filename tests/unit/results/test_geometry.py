@@ -100,7 +100,7 @@ def test_numbers_that_are_missing_or_invalid():
 
 def image(sights=True):
     """Return a result of 2 x 3 pixels, with lines of sight or without."""
-    angles = np.stack(np.meshgrid([5.0, -5.0], [-8.0, 0.0, 8.0], indexing="ij"), axis=-1).reshape(-1, 2)
+    angles = np.stack(np.meshgrid([5.0, -5.0], [8.0, 0.0, -8.0], indexing="ij"), axis=-1).reshape(-1, 2)
     values = np.ones((6, 100))
     built = results.build(
         *[values] * 4,
