@@ -19,10 +19,8 @@ _ITERATIONS = 60
 _FEWEST_BINS = 4  # on either side of a peak
 _SIGNIFICANT = 9.0  # decrease of the squared residuals by which a surface height is distinct from the column's onset
 _CLEAR = 10.0  # standard errors of a height above which it is not tested
-_OF_WAVES, _OF_FOCUSING = (
-    0.1,
-    0.8,
-)  # relative deviation of a column from the mean over waves, at its onset and behind it
+# Relative deviation of a column from the mean over waves, at its onset and behind it.
+_OF_WAVES, _OF_FOCUSING = 0.1, 0.8
 _FAINT = 0.1  # first guess of the height of a surface whose column is brighter, over the peak
 _RISE = 0.5  # level of the column that its rise crosses
 _BRIGHT = 10.0  # levels of the column beyond which a peak is that of the surface
