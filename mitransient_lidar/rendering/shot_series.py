@@ -153,6 +153,7 @@ def render_shots(
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
     from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
+    from mitransient_lidar.rendering.shot_poses import ShotPoses
 
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
@@ -188,7 +189,8 @@ def render_shots(
                     break
                 seconds = left * (part.stop - part.start) / (len(places) - part.start)
                 batch = batches.limited(int(most[part].max()), seconds)
-                records.append(batch.render(places[part], range(first_seed + part.start, first_seed + part.stop)))
+                seeds = range(first_seed + part.start, first_seed + part.stop)
+                records.append(batch.render(ShotPoses(places[part]), seeds))
                 errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
                 done = part.stop
                 if progress is not None:

@@ -143,8 +143,8 @@ def rendered(monkeypatch):
     """Replace renders by made-up waveforms; return places, seeds and time bins of all batches."""
     asked = []
 
-    def render(batches, places, seeds):
-        lidar = batches.at(places)(1).scene
+    def render(batches, poses, seeds):
+        places, lidar = poses.places, batches.at(poses)(1).scene
         asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
         power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
         power *= 1 + np.array(seeds)[:, None, None]
@@ -260,10 +260,10 @@ def test_target_keeps_its_place_relative_to_the_aim(rendered):
 def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     whole = shot_batches.ShotBatches.render
 
-    def interrupted(batches, places, seeds):
+    def interrupted(batches, poses, seeds):
         if seeds[0] == kept:
             raise KeyboardInterrupt
-        return whole(batches, places, seeds)
+        return whole(batches, poses, seeds)
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
     if kept == 0:
@@ -344,10 +344,10 @@ def test_the_first_batch_has_two_passes_in_any_time(clock, monkeypatch, tmp_path
 def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
     whole = shot_batches.ShotBatches.render
 
-    def interrupted(batches, places, seeds):
+    def interrupted(batches, poses, seeds):
         if seeds[0] == 1:
             raise KeyboardInterrupt
-        return whole(batches, places, seeds)
+        return whole(batches, poses, seeds)
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
     (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")
