@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.toml_files import parse_toml
+from mitransient_lidar.core.toml_files import check_keys, parse_toml
 from mitransient_lidar.core.validation import (
     FloatArray,
     finite,
@@ -60,7 +60,7 @@ class Range:
     @classmethod
     def of(cls, name: str, given: Mapping[str, Any]) -> Range:
         """Check a range of a file; raise `UserError` if it is empty, or not a range."""
-        _check_names(f"parameters.{name}", given, ("low", "high", "scale", "steps"))
+        check_keys(f"parameters.{name}", given, ("low", "high", "scale", "steps"))
         for end in ("low", "high"):
             if end not in given:
                 raise UserError(f"{name} = {shown(dict(given))} must have {end}, as in {{ low = 2.0, high = 20.0 }}")
@@ -146,7 +146,7 @@ class Campaign:
     def of(cls, given: Mapping[str, Any], folder: Path | None = None) -> Campaign:
         """Check a campaign given as a dict of the contents of its file; raise `UserError` if it is invalid."""
         own = [one.name for one in fields(cls) if one.name not in ("folder", "text")]
-        _check_names("", given, own)
+        check_keys("a campaign", given, own)
         scene = given.get("scene")
         if not isinstance(scene, (str, os.PathLike)):
             raise UserError(f"scene = {shown(scene)} must be the name of a shipped scene or the path of an XML file")
@@ -326,7 +326,7 @@ def _parameter(name: str, value: Any) -> Range | tuple[Any, ...] | Expression:
 
 def _design(given: Mapping[str, Any]) -> Design:
     """Check the design of a file."""
-    _check_names("design", given, [one.name for one in fields(Design)])
+    check_keys("design", given, [one.name for one in fields(Design)])
     kind = given.get("kind", "table" if "file" in given else "sobol")
     if kind not in KINDS:
         raise UserError(f"design.kind = {shown(kind)} must be one of {', '.join(KINDS)}")
@@ -362,14 +362,6 @@ def _section(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     if not isinstance(section, Mapping):
         raise UserError(f"{name} = {shown(section)} must be a table, as [{name}] begins")
     return section
-
-
-def _check_names(where: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raise `UserError` for an unknown key."""
-    for name in given:
-        if name not in known:
-            place = f" of {where}" if where else " of a campaign"
-            raise UserError(f"{shown(name)} is no key{place}: allowed are {', '.join(known)}")
 
 
 def _resolved(name: str, folder: Path) -> str:

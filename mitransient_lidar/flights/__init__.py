@@ -1,0 +1,1 @@
+"""Flights: trajectories of platforms, scanners and their mounting."""

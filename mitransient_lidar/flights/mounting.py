@@ -1,0 +1,118 @@
+"""Mounting of a scanner on a platform, and the lines of sight of all pulses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.toml_files import check_keys
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, shown
+from mitransient_lidar.flights.attitude import rotation_matrices
+from mitransient_lidar.flights.scanner import Scanner
+from mitransient_lidar.flights.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Position and attitude of a scanner on its platform.
+
+    Parameters
+    ----------
+    roll_deg, pitch_deg, yaw_deg
+        Angles of the scanner from the axes of the platform [deg], with the signs and the order ``aerospace`` of
+        `attitude.rotation_matrices`: a roll turns the nadir of the scanner to the left, a pitch turns it forward, and a
+        yaw turns its forward axis to the right.
+    lever_arm
+        Position of the scanner from the point whose positions the trajectory has, x to the right, y forward and z up
+        in the axes of the platform [m], shape (3,).
+
+    Raises
+    ------
+    UserError
+        For values that are not finite, or a lever arm of another shape.
+    """
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("roll_deg", "pitch_deg", "yaw_deg"):
+            object.__setattr__(self, name, finite(name, getattr(self, name)))
+        arm = finite_array("lever_arm", self.lever_arm)
+        if arm.shape != (3,):
+            raise UserError(f"lever_arm = {shown(self.lever_arm)} must be x, y and z in metres")
+        object.__setattr__(self, "lever_arm", tuple(arm.tolist()))
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Mounting:
+        """Return the mounting of the table ``[mounting]`` of a plan; raise `UserError` for what is not allowed."""
+        check_keys("[mounting]", given, [one.name for one in fields(cls)])
+        return cls(**given)
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Matrix from the axes of the scanner to those of the platform, shape (3, 3)."""
+        return rotation_matrices(self.roll_deg, self.pitch_deg, self.yaw_deg)
+
+
+@dataclass(frozen=True)
+class PulsePoses:
+    """Lines of sight of pulses in the frame of the scene, x east, y north and z up.
+
+    The direction of a pixel at tangent-plane angles (angle_x, angle_y) is the unit vector along
+    ``axis + angle_x * far + angle_y * left``.
+    """
+
+    time_s: FloatArray  #: Times [s], shape (shots,).
+    origin: FloatArray  #: Positions of the scanner [m], shape (shots, 3).
+    axis: FloatArray  #: Unit directions of the pulses, shape (shots, 3).
+    far: FloatArray  #: Unit directions of +angle_x, normal to the axis, shape (shots, 3).
+    left: FloatArray  #: Unit directions of +angle_y, far x axis, shape (shots, 3).
+    #: Angles of the pulses across the flight from the vertical [deg], positive to the right of the platform's forward
+    #: axis, so that a roll counts as in LAS files, shape (shots,).
+    scan_angle_deg: FloatArray
+    line: IntArray  #: Numbers of the flight lines, from 0, shape (shots,).
+
+
+def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, times: npt.ArrayLike) -> PulsePoses:
+    """Return the lines of sight of pulses.
+
+    With the rotations R of the platform and M of the mounting, a direction d of the scanner is R M d in the scene, and
+    the scanner is at the position of the trajectory plus R times the lever arm.
+
+    Parameters
+    ----------
+    trajectory, mounting, scanner
+        Motion of the platform, place of the scanner on it, and scan.
+    times
+        Times of the pulses [s], on the flight lines, shape (shots,).
+
+    Raises
+    ------
+    UserError
+        For a time that is not finite or on no flight line.
+    """
+    platform = trajectory.at(times)
+    scan = scanner.directions(platform.time_s)
+    turned = platform.rotation @ mounting.rotation
+    axis, far, left = (np.einsum("nij,nj->ni", turned, one) for one in scan)
+    # Horizontal part of the forward axis; a platform that points up or down has none, and its scan angle is 0.
+    ahead_x, ahead_y = platform.rotation[:, 0, 1], platform.rotation[:, 1, 1]
+    level = np.hypot(ahead_x, ahead_y)
+    right = (axis[:, 0] * ahead_y - axis[:, 1] * ahead_x) / np.where(level > 0, level, 1.0)
+    return PulsePoses(
+        time_s=platform.time_s,
+        origin=platform.position + platform.rotation @ np.array(mounting.lever_arm),
+        axis=axis,
+        far=far,
+        left=left,
+        scan_angle_deg=np.degrees(np.arctan2(right, -axis[:, 2])),
+        line=platform.line,
+    )

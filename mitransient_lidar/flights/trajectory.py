@@ -1,0 +1,195 @@
+"""Trajectories: position and attitude of a platform over time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.toml_files import check_keys, required
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
+from mitransient_lidar.flights.attitude import check_rotation_spec, rotation_matrices
+from mitransient_lidar.flights.records import Records, check_records
+from mitransient_lidar.flights.straight_lines import fixed_platform, straight_lines
+from mitransient_lidar.flights.trajectory_files import read_sbet_records, read_text_records
+
+#: Kinds of platforms of a plan.
+KINDS = ("lines", "mast", "csv", "sbet")
+
+#: Most pulses of a flight.
+_MOST_PULSES = 10**8
+
+#: Pulses later than the end of a line by less than this part of their interval belong to it.
+_LAST_PULSE = 1e-6
+
+
+class PlatformPoses(NamedTuple):
+    """Interpolated poses of a platform, and what they belong to."""
+
+    time_s: FloatArray  #: Times [s], shape (n,).
+    position: FloatArray  #: Positions x, y, z [m], shape (n, 3).
+    roll_deg: FloatArray  #: Roll [deg], -180 to 180, shape (n,).
+    pitch_deg: FloatArray  #: Pitch [deg], -180 to 180, shape (n,).
+    yaw_deg: FloatArray  #: Yaw [deg], 0 to 360, shape (n,).
+    rotation: FloatArray  #: Matrices from the axes of the platform to those of the scene, shape (n, 3, 3).
+    line: IntArray  #: Number of the flight line, from 0, shape (n,).
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Position and attitude of a platform over time, and its flight lines.
+
+    Axes of the platform are x to the right, y forward and z up. Between records, positions and angles are linear in
+    time, and angles take the shorter way round.
+
+    Parameters
+    ----------
+    time_s
+        Times [s], strictly increasing, shape (n,), n at least 2.
+    position
+        Positions x (east), y (north), z (up) [m], shape (n, 3).
+    roll_deg, pitch_deg, yaw_deg
+        Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
+    rotation_spec
+        Order of the rotations, as in `attitude.rotation_matrices`.
+    lines
+        First and last time [s] of each flight line, within the records and in order, shape (lines, 2); by default one
+        line from the first record to the last.
+
+    Raises
+    ------
+    UserError
+        For arrays of other shapes, and for the first record that is not finite or not later than the one before.
+    """
+
+    time_s: FloatArray
+    position: FloatArray
+    roll_deg: FloatArray
+    pitch_deg: FloatArray
+    yaw_deg: FloatArray
+    rotation_spec: str = "aerospace"
+    lines: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            if one.name != "rotation_spec":
+                object.__setattr__(self, one.name, np.array(getattr(self, one.name), dtype=np.float64))
+        check_rotation_spec(self.rotation_spec)
+        count = self.time_s.size
+        for name in Records._fields:
+            shape, wanted = getattr(self, name).shape, (count, 3) if name == "position" else (count,)
+            if shape != wanted:
+                raise UserError(f"{name} has the shape {shape}: it must be {wanted}")
+        check_records(self.records, "a trajectory", lambda row: f"record {row + 1} of a trajectory")
+        if self.lines.size == 0:
+            object.__setattr__(self, "lines", self.time_s[[0, -1]][None])
+        self._check_lines()
+
+    @property
+    def records(self) -> Records:
+        """Times, positions and attitudes of the records."""
+        return Records(self.time_s, self.position, self.roll_deg, self.pitch_deg, self.yaw_deg)
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any], folder: str | os.PathLike[str] = ".") -> Trajectory:
+        """Return the trajectory of the table ``[platform]`` of a plan.
+
+        Parameters
+        ----------
+        given
+            Table with ``kind``: ``lines`` and ``mast`` have the keys of `straight_lines.straight_lines` and
+            `straight_lines.fixed_platform`; ``csv`` has ``file`` and ``rotation_spec`` (``ARINC 705``, as HELIOS++),
+            ``sbet`` has ``file`` and ``epsg``. Files may also have ``origin``, the position of the origin of the scene
+            in the coordinates of the file [m], whose height is that of the mean sea level (0, 0, 0); and ``lines_s``, a
+            list of the first and last time of each flight line [s] (one line, of all records).
+        folder
+            Folder from which relative paths of files count.
+
+        Raises
+        ------
+        UserError
+            For a key or a value that is not allowed or is missing, and for a file that cannot be read.
+        """
+        kind = required("[platform]", given, "kind")
+        if kind not in KINDS:
+            raise UserError(f"kind = {shown(kind)} of a platform must be one of {', '.join(KINDS)}")
+        if kind == "lines":
+            records, lines = straight_lines(given)
+            return cls(*records, lines=lines)
+        if kind == "mast":
+            return cls(*fixed_platform(given))
+        where, own = f"a platform of kind {kind!r}", "rotation_spec" if kind == "csv" else "epsg"
+        check_keys(where, given, ("kind", "file", own, "origin", "lines_s"))
+        file = required(where, given, "file")
+        if not isinstance(file, str):
+            raise UserError(f"file = {shown(file)} must be the path of a trajectory")
+        origin = finite_array("origin", given.get("origin", (0.0, 0.0, 0.0)))
+        if origin.shape != (3,):
+            raise UserError(f"origin = {shown(given['origin'])} must be x, y and z in metres")
+        spec = check_rotation_spec(given.get("rotation_spec", "ARINC 705")) if kind == "csv" else "aerospace"
+        path = Path(folder) / file
+        records = read_text_records(path) if kind == "csv" else read_sbet_records(path, required(where, given, "epsg"))
+        records = records._replace(position=records.position - origin)
+        return cls(*records, rotation_spec=spec, lines=finite_array("lines_s", given.get("lines_s", ())))
+
+    def at(self, times: npt.ArrayLike) -> PlatformPoses:
+        """Return the poses at times [s], shape (n,); raise `UserError` for a time that is on no flight line."""
+        time = np.atleast_1d(finite_array("times", times))
+        line = np.searchsorted(self.lines[:, 0], time, side="right") - 1
+        outside = (line < 0) | (time > self.lines[line, 1])
+        for row in np.flatnonzero(outside)[:1]:
+            raise UserError(
+                f"time = {time[row]:g} s (number {row + 1}) is on no flight line: the lines are {self._lines_text()}"
+            )
+        position = np.column_stack([np.interp(time, self.time_s, one) for one in self.position.T])
+        roll, pitch, yaw = (
+            np.interp(time, self.time_s, np.unwrap(angle, period=360.0))
+            for angle in (self.roll_deg, self.pitch_deg, self.yaw_deg)
+        )
+        roll, pitch, yaw = 180 - (180 - roll) % 360, 180 - (180 - pitch) % 360, yaw % 360
+        rotation = rotation_matrices(roll, pitch, yaw, self.rotation_spec)
+        return PlatformPoses(time, position, roll, pitch, yaw, rotation, line)
+
+    def pulse_times(self, pulse_rate_hz: float) -> FloatArray:
+        """Return the times [s] of pulses on all flight lines, shape (pulses,); each line begins with a pulse.
+
+        Raises
+        ------
+        UserError
+            For a rate [Hz] that is not positive or gives more than 10^8 pulses.
+        """
+        rate = positive("pulse_rate_hz", pulse_rate_hz)
+        counts = np.floor((self.lines[:, 1] - self.lines[:, 0]) * rate + _LAST_PULSE) + 1
+        if counts.sum() > _MOST_PULSES:
+            raise UserError(
+                f"pulse_rate_hz = {rate:g} gives {counts.sum():.3g} pulses: at most {_MOST_PULSES:g} may be"
+            )
+        return np.concatenate(
+            [
+                np.minimum(first + np.arange(int(count)) / rate, last)
+                for (first, last), count in zip(self.lines, counts, strict=True)
+            ]
+        )
+
+    def _check_lines(self) -> None:
+        """Raise `UserError` for flight lines that are no intervals within the records, one after the other."""
+        lines, first, last = self.lines, self.time_s[0], self.time_s[-1]
+        if lines.ndim != 2 or lines.shape[1] != 2 or not np.isfinite(lines).all():
+            raise UserError(f"lines of shape {lines.shape} must be pairs of a first and a last time in seconds")
+        if (np.diff(lines.ravel()) <= 0).any():
+            raise UserError(f"the times of the flight lines, {self._lines_text()}, must increase")
+        if lines[0, 0] < first or lines[-1, 1] > last:
+            raise UserError(
+                f"the flight lines, {self._lines_text()}, must lie in the trajectory, {first:g} to {last:g} s"
+            )
+
+    def _lines_text(self) -> str:
+        """Return the times of the first flight lines, for messages."""
+        texts = [f"{first:.10g} to {last:.10g} s" for first, last in self.lines[:4]]
+        return ", ".join(texts) + (f" and {len(self.lines) - 4} more" if len(self.lines) > 4 else "")
