@@ -32,12 +32,15 @@ class ShotPoses:
         Cosine and sine of the azimuths against that of the lidar, shape (shots, 2); None without any difference.
     receiver, transmitter
         Poses in the frame of each shot; None where all are those of the lidar.
+    in_scene
+        Poses of the receiver in the scene; None where they follow from the places.
     """
 
     places: FloatArray
     turns: FloatArray | None = None
     receiver: Pose | None = None
     transmitter: Pose | None = None
+    in_scene: Pose | None = None
 
     @classmethod
     def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
@@ -56,8 +59,9 @@ class ShotPoses:
         origin = np.squeeze(to_frame @ (receiver.origin - places)[..., None], -1) + centre
         rotation = np.stack(sides, axis=-1) @ np.stack([own.axis, own.far, own.left])
         shift = origin - rotation @ own.origin
-        moved = [pose.moved(rotation, shift) for pose in (own, lidar.transmitter.pose)]
-        return cls(places[:, :2], np.stack([turns.real, turns.imag], axis=-1), *moved)
+        own_receiver, own_transmitter = (pose.moved(rotation, shift) for pose in (own, lidar.transmitter.pose))
+        cos_sin = np.stack([turns.real, turns.imag], axis=-1)
+        return cls(places[:, :2], cos_sin, own_receiver, own_transmitter, receiver)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -65,8 +69,10 @@ class ShotPoses:
     def part(self, rows: slice | IntArray) -> ShotPoses:
         """Return some of the shots."""
         turns = None if self.turns is None else self.turns[rows]
-        poses = (None if pose is None else _rows(pose, rows) for pose in (self.receiver, self.transmitter))
-        return ShotPoses(self.places[rows], turns, *poses)
+        receiver, transmitter, in_scene = (
+            None if pose is None else _rows(pose, rows) for pose in (self.receiver, self.transmitter, self.in_scene)
+        )
+        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene)
 
     def repeated(self, copies: int) -> ShotPoses:
         """Return each shot several times in turn."""
@@ -96,12 +102,6 @@ class ShotPoses:
         by = positions - np.stack([turned.real, turned.imag], axis=-1)
         cos, sin = (aligned(mi.Float, column.astype(np.float32)) for column in self.turns.T)
         return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
-
-    def in_scene(self, lidar: LidarScene, points: FloatArray, aim: FloatArray) -> FloatArray:
-        """Return points of the frames of the shots in the scene [m], both of shape (shots, 3)."""
-        turns = np.array([[1.0, 0.0]]) if self.turns is None else self.turns
-        turned = (turns[:, 0] + 1j * turns[:, 1]) * ((points[:, 0] - aim[0]) + 1j * (points[:, 1] - aim[1]))
-        return np.column_stack([turned.real + self.places[:, 0], turned.imag + self.places[:, 1], points[:, 2]])
 
     def extra_range(self, lidar: LidarScene) -> FloatArray:
         """Return the length from laser to receiver by the shared reference point beyond the lidar's own [m], (shots,).
