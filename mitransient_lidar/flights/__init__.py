@@ -1,0 +1,1 @@
+"""Flights: from the poses of pulses over a seabed to points with errors."""
