@@ -63,6 +63,11 @@ class RunRenderer:
     #: Name of one that is rendered, and of what a store of them is.
     unit, kind = "run", "campaign"
 
+    @staticmethod
+    def check(text: str) -> None:
+        """Raise `UserError` for a text that is no campaign."""
+        Campaign.from_json(text)
+
     @classmethod
     def restored(cls, text: str, scene: SceneRecord, axis: TimeAxis | None) -> RunRenderer:
         """Return the renderer of a stored campaign."""

@@ -146,9 +146,9 @@ class Store:
                 self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
             self.attributes: dict[str, Any] = dict(self._group.attrs)
             #: What the store is of, and that as JSON; stores of versions up to 0.1 are of campaigns.
-            self.kind = next(kind for kind in _RENDERERS if kind in self.attributes)
+            self.kind = "flight" if "flight" in self.attributes else "campaign"
             self.text = str(self.attributes[self.kind])
-            json.loads(self.text)
+            self._renderer_type().check(self.text)
             #: Number of runs, and of runs of a shard.
             self.count = integer("runs", self.attributes["runs"], 1, MOST_RUNS)
             self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, _LARGEST)
@@ -208,8 +208,7 @@ class Store:
         """Return the `Renderer` of the runs; warn if the store is of other versions."""
         compare_versions(self.attributes)
         axis = self.attributes["record"]
-        module, name, _ = _RENDERERS[self.kind]
-        return getattr(importlib.import_module(module), name).restored(
+        return self._renderer_type().restored(
             self.text,
             SceneRecord.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
@@ -229,6 +228,11 @@ class Store:
     def unit(self) -> str:
         """Name of a run."""
         return _RENDERERS[self.kind][2]
+
+    def _renderer_type(self) -> Any:
+        """Return the class of the renderer."""
+        module, name, _ = _RENDERERS[self.kind]
+        return getattr(importlib.import_module(module), name)
 
     def is_of(self, kind: str, text: str, columns: Mapping[str, Column], scene: Callable[[], SceneRecord]) -> bool:
         """Return whether it is the store of a campaign or flight with these columns, and of its scene as it is now."""

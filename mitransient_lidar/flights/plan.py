@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
 from mitransient_lidar.core.validation import finite_array, in_range, integer, non_negative, positive, shown
 from mitransient_lidar.flights.mounting import Mounting, PulsePoses, pulse_poses
-from mitransient_lidar.flights.positions import PoseErrors
+from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.flights.scanner import Scanner
 from mitransient_lidar.flights.trajectory import Trajectory
 
@@ -46,8 +44,8 @@ class FlightPlan:
     parameters
         Further parameters of the scene.
     rate_hz, most, every
-        Pulse repetition rate [Hz], number of pulses after which the flight ends, and pulses from one that is rendered to
-        the next.
+        Pulse repetition rate [Hz], number of pulses after which the flight ends, and number of the pulses of which one
+        is rendered.
     receiver
         Receiver as of `analysis.receiver.detect_waveforms`, None for that of the instrument; `gain`, `optical_density`
         and `background_power_w` are those of it.
@@ -134,10 +132,7 @@ class FlightPlan:
             text = json.dumps({**given, "receiver": receiver})
         except (TypeError, ValueError):
             raise UserError("the flight must hold numbers, texts, lists and tables only") from None
-        settings = {
-            name: None if name not in receiver else check(name, receiver[name])
-            for name, check in (("gain", positive), ("optical_density", lambda name, value: in_range(name, value, 0, 12)))
-        }
+        gain, density = receiver.get("gain"), receiver.get("optical_density")
         x, y, z = origin.tolist()
         plan = cls(
             scene=_path(scene, folder, ".xml"),
@@ -147,7 +142,8 @@ class FlightPlan:
             most=integer("most", pulses.get("most", MOST_PULSES), 1, MOST_PULSES),
             every=integer("every", pulses.get("every", 1), 1, 10**9),
             receiver=receiver.get("chain"),
-            **settings,
+            gain=None if gain is None else positive("gain", gain),
+            optical_density=None if density is None else in_range("optical_density", density, 0, 12),
             background_power_w=non_negative("background_power_w", receiver.get("background_power_w", 0.0)),
             estimator=estimator,
             corrections=_path(given.get("corrections", "none"), folder, ".nc"),
@@ -163,7 +159,9 @@ class FlightPlan:
         )
         for name in ("aim_x", "aim_y", "altitude", "off_nadir_deg"):
             if name in plan.parameters:
-                raise UserError(f"parameter {name!r} follows from the poses of the pulses: leave it out of [parameters]")
+                raise UserError(
+                    f"parameter {name!r} follows from the poses of the pulses: leave it out of [parameters]"
+                )
         return plan
 
     @classmethod
@@ -189,10 +187,6 @@ class FlightPlan:
             )
         mounting = Mounting.of(table("mounting", given.get("mounting", {})))
         return pulse_poses(trajectory, mounting, Scanner.of(scanner), times)
-
-    def geographic(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """Return coordinates of the scene in those of the points [m]."""
-        return tuple(np.asarray(values) + first for values, first in zip((x, y, z), self.origin, strict=True))
 
 
 def flights() -> list[str]:

@@ -83,6 +83,11 @@ class FlightRenderer:
     #: Name of one that is rendered, and of what a store of them is.
     unit, kind, shots = "shot", "flight", 1
 
+    @staticmethod
+    def check(text: str) -> None:
+        """Raise `UserError` for a text that is no flight."""
+        FlightPlan.from_json(text)
+
     @classmethod
     def restored(cls, text: str, scene: SceneRecord, axis: TimeAxis | None) -> FlightRenderer:
         """Return the renderer of a stored flight."""
@@ -173,7 +178,7 @@ class FlightRenderer:
         found = {
             "signal": _single(recorded["signal"]),
             "sample_start_ns": Array((), start, about),
-            "time_offset_ns": Array((), later, {"units": "ns", "long_name": "time of the shot after that of its group"}),
+            "time_offset_ns": Array((), later, {"units": "ns", "long_name": "time of the shot after its group's"}),
             "gain": _per_pixel(recorded.attrs["gain"], len(later), pixels, "factor of the amplifier's transimpedance"),
         }
         for name, values in series.coords.items():
@@ -267,7 +272,8 @@ def _shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
     from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.transport.pose import Pose
 
-    poses = ShotPoses.of_receiver(lidar, Pose(*(_vectors(inputs, name) for name in ("origin", "axis", "far", "left"))))
+    origin, axis, far, left = (_vectors(inputs, name) for name in ("origin", "axis", "far", "left"))
+    poses = ShotPoses.of_receiver(lidar, Pose(origin, axis, far, left))
     assert poses.receiver is not None
     cosine = poses.receiver.far @ lidar.receiver.pose.far
     turn = float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
@@ -377,7 +383,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
             f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "
             f"arrives at {arrival:.0f} ns, but the record of the scene ends at {film.axis.end_ns:.0f} ns"
         )
-    return film.axis
+    fixed: TimeAxis = film.axis
+    return fixed
 
 
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:

@@ -11,7 +11,6 @@ import pytest
 import xarray as xr
 import zarr
 
-from mitransient_lidar.campaigns import store as campaign_store
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import Array, RunRenderer
 from mitransient_lidar.campaigns.store import (
@@ -56,8 +55,7 @@ RECORD = SceneRecord("table1", "<scene/>", True, {"time": "0"}, {})
 
 
 @pytest.fixture
-def store(path, monkeypatch):
-    monkeypatch.setattr(campaign_store, "record_of", lambda _: RECORD)
+def store(path):
     renderer = RunRenderer(CAMPAIGN, RECORD, AXIS)
     return Store.create(path, renderer, CAMPAIGN.table(), ARRAYS, COORDINATES, shard_size=4)
 
@@ -85,19 +83,22 @@ def test_new_store_is_empty_and_complete(store, path):
     assert (data.attrs["time_start_ns"], data.attrs["bin_width_ns"]) == (1000, 0.5)
 
 
-def test_renderer_of_a_store_is_that_of_its_campaign(store, monkeypatch):
+def is_of(store, campaign, columns, scene=RECORD):
+    return store.is_of("campaign", campaign.text, columns, lambda: scene)
+
+
+def test_renderer_of_a_store_is_that_of_its_campaign(store):
     renderer = store.renderer()
     assert (renderer.campaign.text, renderer.axis) == (CAMPAIGN.text, AXIS)
     assert renderer.scene.parameters == {"time": "0"}
-    assert store.is_of(CAMPAIGN, CAMPAIGN.table())
+    assert is_of(store, CAMPAIGN, CAMPAIGN.table())
     other = Campaign.of({"scene": "table1", "parameters": {"time": [1, 2]}, "design": {"kind": "random", "count": 10}})
-    assert not store.is_of(other, other.table())
+    assert not is_of(store, other, other.table())
     edited = CAMPAIGN.table()
     edited["time"] = edited["time"] + 1e-9
-    assert not store.is_of(CAMPAIGN, edited)
+    assert not is_of(store, CAMPAIGN, edited)
     # The file of the scene has changed since.
-    monkeypatch.setattr(campaign_store, "record_of", lambda _: replace(RECORD, text="<scene></scene>"))
-    assert not store.is_of(CAMPAIGN, CAMPAIGN.table())
+    assert not is_of(store, CAMPAIGN, CAMPAIGN.table(), replace(RECORD, text="<scene></scene>"))
 
 
 def test_store_of_other_versions(store, caplog):
@@ -107,9 +108,8 @@ def test_store_of_other_versions(store, caplog):
 
 
 @pytest.mark.parametrize("image", [False, True])
-def test_campaign_of_an_earlier_version(image, path, monkeypatch):
+def test_campaign_of_an_earlier_version(image, path):
     """It had the right pixels before the left ones: it is read in the order of its angles, but not completed."""
-    monkeypatch.setattr(campaign_store, "record_of", lambda _: RECORD)
     dims, angles = (("column",), [-9.0, 0.0, 9.0]) if image else (("pixel",), [-5.0, 5.0])
     arrays = {"waveform": Array((*dims, "time"), np.zeros((len(angles), 4), dtype=np.float32), {"units": "W"})}
     coordinates = {"time": COORDINATES["time"], "angle_y": Array(dims, np.array(angles), {"units": "mrad"})}
@@ -130,8 +130,7 @@ def test_campaign_of_an_earlier_version(image, path, monkeypatch):
     assert found["waveform"].values[0, :, 0].tolist() == ([2.0, 1.0, 0.0] if image else [0.0, 1.0])
 
 
-def test_one_pixel_of_an_earlier_version_is_completed(path, monkeypatch):
-    monkeypatch.setattr(campaign_store, "record_of", lambda _: RECORD)
+def test_one_pixel_of_an_earlier_version_is_completed(path):
     coordinates = {**COORDINATES, "angle_y": Array(("pixel",), np.array([1e-9, 0.0]), {"units": "mrad"})}
     store = Store.create(path, RunRenderer(CAMPAIGN, RECORD, AXIS), CAMPAIGN.table(), ARRAYS, coordinates, shard_size=4)
     del store._group.attrs["pixel_order"]
