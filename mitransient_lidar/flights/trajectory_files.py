@@ -68,7 +68,7 @@ def read_text_records(path: str | os.PathLike[str]) -> Records:
             if key.strip() == "HEADER":
                 names = _cells(value)
             elif key.strip() == "TIME_COLUMN":
-                time_column = integer(f"{path}: TIME_COLUMN", int(value) if value.strip().isdigit() else value, 0, 6)
+                time_column = integer(f"{path}: TIME_COLUMN", int(value) if value.strip().isdecimal() else value, 0, 6)
         elif text:
             rows.append((number, _cells(text)))
     if not names and rows and not any(map(is_number, rows[0][1])):
@@ -131,7 +131,8 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
         return f"{path}, record {row + 1}"
 
     time, latitude, longitude, height = data[:, :4].T
-    roll, pitch, heading = np.degrees(data[:, 7]), np.degrees(data[:, 8]), np.degrees(data[:, 9] - data[:, 10])
+    with np.errstate(over="ignore", invalid="ignore"):
+        roll, pitch, heading = np.degrees([data[:, 7], data[:, 8], data[:, 9] - data[:, 10]])
     check_records(Records(time, data[:, [2, 1, 3]], roll, pitch, heading), str(path), place)
     wrong = (np.abs(latitude) > np.pi / 2) | (np.abs(longitude) > 2 * np.pi)
     for row in np.flatnonzero(wrong)[:1]:

@@ -108,6 +108,7 @@ def test_pixels_of_a_mirror_that_stay_turn_about_its_axis():
     ("given", "message"),
     [
         ({}, "has no kind"),
+        ({"kind": ["palmer"]}, r"kind = \['palmer'\] of a scanner must be one of"),
         ({"kind": "spiral"}, "kind = 'spiral' of a scanner must be one of palmer, semi_arc"),
         ({**PALMER, "speed": 3}, "'speed' is no key of a scanner of kind 'palmer': allowed are"),
         ({"kind": "palmer", "rate_hz": 3}, "a scanner of kind 'palmer' has no nadir_angle_deg"),

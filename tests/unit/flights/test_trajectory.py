@@ -123,8 +123,9 @@ def test_noise_follows_from_its_seed():
     [
         ([0, 1, 0.5, 2], None, r"record 3 of a trajectory: time = 0.5 s must be later than .* before, 1.0 s"),
         ([0, 1, 1], None, "record 3 of a trajectory"),
-        ([0, 1, 2], [0, np.nan, 0], "record 2 of a trajectory: yaw = nan must be a finite number"),
+        ([0, 1, 2], [0, np.nan, 0], "record 2 of a trajectory: yaw = nan must be a number from -1e\\+12 to 1e\\+12"),
         ([0, np.inf], None, "record 2 of a trajectory: time = inf"),
+        ([0, 1], ["north", "east"], r"yaw_deg = \['north', 'east'\] must hold numbers only"),
         ([0], None, "number of records of 1: it must be at least 2"),
         ([0, 1], [0, 1, 2], r"yaw_deg has the shape \(3,\): it must be \(2,\)"),
     ],
