@@ -255,15 +255,19 @@ class SeaPatches:
     """
 
     def __init__(self, surface: OceanSurface) -> None:
-        self._surface = surface
+        self._surface, self._sea = surface, surface.sea
         props = mi.Properties()
         props["bsdf"], props["face_normals"] = surface.bsdf(), True
         self.shape = mi.Mesh("sea_patches", 3, 1, props, has_vertex_texcoords=True)
         self.shapes: mi.Scene | None = None
 
+    def set_time(self, time_s: float) -> None:
+        """Let the waves of the patches move to a time [s]."""
+        self._sea = self._surface.sea.at(time_s)
+
     def move(self, places: FloatArray) -> FloatArray:
         """Fill the mesh with the patches about places [m], shape (n, 2); return where each lies, in the same way."""
-        mesh, positions = self._surface.sea.patches(places, self._surface.footprint_size)
+        mesh, positions = self._sea.patches(places, self._surface.footprint_size)
         fill_mesh(self.shape, mesh)
         if self.shapes is None:
             self.shapes = mi.load_dict({"type": "scene", "sea": self.shape}, parallel=False)

@@ -14,6 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
@@ -58,6 +59,24 @@ class RunRenderer:
     campaign: Campaign
     scene: SceneRecord
     axis: TimeAxis | None = None
+
+    #: Name of one that is rendered, and of what a store of them is.
+    unit, kind = "run", "campaign"
+
+    @classmethod
+    def restored(cls, text: str, scene: SceneRecord, axis: TimeAxis | None) -> RunRenderer:
+        """Return the renderer of a stored campaign."""
+        return cls(Campaign.from_json(text), scene, axis)
+
+    @property
+    def text(self) -> str:
+        """The campaign as JSON."""
+        return self.campaign.text
+
+    @property
+    def shots(self) -> int:
+        """Number of shots of a run."""
+        return self.campaign.design.shots
 
     @classmethod
     def of(cls, campaign: Campaign, columns: Mapping[str, Column]) -> RunRenderer:
@@ -130,6 +149,25 @@ class RunRenderer:
             done = f"ended after {series.sizes['shot']} of {planned} shots of the run"
             raise UserError(f"max_time = {self.campaign.max_time:g} s {done}: it must be longer")
         return self._stored(number, values, series)
+
+    def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
+        """Return the rows of runs that are rendered together: each on its own."""
+        return ([row] for row in range(len(next(iter(inputs.values())))))
+
+    def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
+        """Return `arrays` of runs that are rendered together, with the runs as first dimension."""
+        row = self.arrays(int(numbers[0]), {name: column[0].item() for name, column in inputs.items()})
+        return {name: array._replace(values=array.values[None]) for name, array in row.items()}
+
+    def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
+        """Return `inputs` of runs that are rendered together, those that fail too."""
+        return self.inputs(int(numbers[0]), {name: column[0].item() for name, column in inputs.items()})
+
+    def describe_input(self, name: str, column: Column) -> dict[str, Any]:
+        """Return the attributes of a parameter of the runs."""
+        text = {"long_name": f"parameter {name} of the scene"}
+        unit = unit_of(name) if column.dtype.kind in "iuf" else None
+        return text if unit is None else {"units": unit, **text}
 
     def sample(self, number: int, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return `arrays` of few paths, and the coordinates of their dimensions; raises as `series`."""

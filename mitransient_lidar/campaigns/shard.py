@@ -18,14 +18,15 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from mitransient_lidar.campaigns.runs import Array, RunRenderer
-from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
+from mitransient_lidar.campaigns.runs import Array
+from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Renderer, Store
 from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
 
 #: Time between two writes of a shard that is not finished [s].
@@ -104,7 +105,7 @@ def render_in_process(path: str, shard: int, retry: bool = False, report: Report
         elif deaths[None] < _MOST_STARTS:
             continue
         status = Store(path).status(Store(path).runs_of(shard))
-        done, failed = (int(np.count_nonzero(status == value)) for value in (DONE, FAILED))
+        done, failed = _counts(status)
         return Outcome(done, failed, next(iter(left.values()), f"shard {shard}: {ended.reason}"))
 
 
@@ -184,49 +185,54 @@ def render_shard(
     status, errors, arrays = store.read(shard)
     if retry:
         status[status == FAILED] = PLANNED
-    counts = [int(np.count_nonzero(status == value)) for value in (DONE, FAILED)]
     written = time.monotonic()
-    for place in np.flatnonzero(status == PLANNED):
-        number = runs.start + int(place)
-        if number in left:
+    for rows in renderer.batches(inputs):
+        first = runs.start + rows[0]
+        if first in left or not np.any(status[rows] == PLANNED):
             continue
-        values = {name: column[place].item() for name, column in inputs.items()}
-        tell(begin=number)
-        # The random sea, of runs that fail too.
-        for name, value in renderer.inputs(number, values).items():
+        tell(begin=first)
+        numbers, columns = runs.start + np.array(rows), {name: column[rows] for name, column in inputs.items()}
+        for name, value in renderer.own_inputs(numbers, columns).items():
             if name in arrays:
-                arrays[name][place] = value
+                arrays[name][rows] = value
         try:
-            if number in failed:
-                raise UserError(failed[number])
-            found = _arrays(renderer, number, values)
+            if first in failed:
+                raise UserError(failed[first])
+            found = _arrays(renderer, numbers, columns)
             for name, array in found.items():
-                if name not in arrays or array.values.shape != arrays[name].shape[1:]:
+                if name not in arrays or array.values.shape[1:] != arrays[name].shape[1:]:
                     raise UserError(
-                        f"{name} of the run has the shape {array.values.shape}, and that of the first run another one: "
-                        "all runs must have the same pixels and origins of light"
+                        f"{name} of the {renderer.unit} has the shape {array.values.shape[1:]}, and that of the first "
+                        f"{renderer.unit} another one: all must have the same pixels and origins of light"
                     )
             for name, array in found.items():
-                arrays[name][place] = array.values
-            status[place], errors[place] = DONE, ""
+                arrays[name][rows] = array.values
+            status[rows], errors[rows] = DONE, ""
         except UserError as error:
-            status[place], errors[place] = FAILED, " ".join(str(error).split())
+            status[rows], errors[rows] = FAILED, " ".join(str(error).split())
         except Exception:
             store.write(shard, status, errors, arrays)
             raise
-        counts[0 if status[place] == DONE else 1] += 1
-        tell(end=counts)
+        tell(end=_counts(status))
         if time.monotonic() - written > _INTERVAL_S:
             store.write(shard, status, errors, arrays)
             written = time.monotonic()
     store.write(shard, status, errors, arrays)
-    tell(done=counts[0], failed=counts[1])
+    done, without = _counts(status)
+    tell(done=done, failed=without)
 
 
-def _arrays(renderer: RunRenderer, number: int, values: dict[str, Any]) -> dict[str, Array]:
-    """Return the arrays of a run; raise `UserError` where memory runs out."""
+def _counts(status: npt.NDArray[np.uint8]) -> list[int]:
+    """Return the numbers of runs that are done and that have failed."""
+    return [int(np.count_nonzero(status == value)) for value in (DONE, FAILED)]
+
+
+def _arrays(
+    renderer: Renderer, numbers: npt.NDArray[np.int64], inputs: Mapping[str, npt.NDArray[Any]]
+) -> dict[str, Array]:
+    """Return the arrays of runs that are rendered together; raise `UserError` where memory runs out."""
     try:
-        return renderer.arrays(number, values)
+        return renderer.stacked(numbers, inputs)
     except (MemoryError, RuntimeError) as error:
         raise_if_out_of_memory(error)
         raise

@@ -1,4 +1,4 @@
-"""The Zarr store of a campaign: made whole at first, then filled shard by shard.
+"""The Zarr store of a campaign or a flight: made whole at first, then filled shard by shard.
 
 Every chunk ends in its CRC32C, and the attributes that a store is read by have a SHA-256, so that damage is found where
 it is read. Chunks of a shard are written even where all values are fill values: one that is missing is lost.
@@ -9,13 +9,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import importlib
 import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,11 +24,10 @@ import xarray as xr
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from mitransient_lidar.campaigns.design import MOST_RUNS, Campaign, Column
-from mitransient_lidar.campaigns.runs import Array, RunRenderer, record_of
+from mitransient_lidar.campaigns.design import MOST_RUNS, Column
+from mitransient_lidar.campaigns.runs import Array
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, sweep, temporary_beside
-from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
@@ -53,7 +53,7 @@ _LARGEST = 10**6
 _INPUT = "_input"
 
 #: Attributes that a store is read by, and that of their SHA-256.
-_SEALED, _SEAL = ("campaign", "scene", "record", "runs", "shard_size", "inputs", "variables"), "sha256"
+_SEALED, _SEAL = ("campaign", "flight", "scene", "record", "runs", "shard_size", "inputs", "variables"), "sha256"
 
 #: What zarr and its codecs raise for damaged files.
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError, MemoryError)
@@ -75,8 +75,55 @@ _STATUS = {
 }
 
 
+#: Module and class of the renderer, and name of a run, by the kind of a store.
+_RENDERERS = {
+    "campaign": ("mitransient_lidar.campaigns.runs", "RunRenderer", "run"),
+    "flight": ("mitransient_lidar.flights.renderer", "FlightRenderer", "shot"),
+}
+
+
+class Renderer(Protocol):
+    """What renders the runs of a store."""
+
+    @property
+    def unit(self) -> str:
+        """Name of a run."""
+
+    @property
+    def kind(self) -> str:
+        """What the store is of, one of `_RENDERERS`."""
+
+    @property
+    def text(self) -> str:
+        """What is rendered, as JSON."""
+
+    @property
+    def scene(self) -> SceneRecord:
+        """The scene."""
+
+    @property
+    def axis(self) -> TimeAxis | None:
+        """Time bins of all runs; None where each has its own."""
+
+    @property
+    def shots(self) -> int:
+        """Number of shots of a run, where they have a dimension."""
+
+    def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
+        """Return the rows of the runs of a shard, those that are rendered together in one list."""
+
+    def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
+        """Return arrays that are known of runs before they are rendered."""
+
+    def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
+        """Return the arrays of runs that are rendered together, which are the first dimension; raise `UserError`."""
+
+    def describe_input(self, name: str, column: Column) -> dict[str, Any]:
+        """Return the attributes of a parameter of the runs."""
+
+
 class Store:
-    """The store of a campaign.
+    """The store of a campaign or a flight.
 
     Arrays of a run have the dimension ``run`` first, in chunks of one shard. A shard is written by one process: its
     arrays, and last the ``status`` of its runs. Files replace former ones as a whole.
@@ -89,7 +136,7 @@ class Store:
     Raises
     ------
     UserError
-        If there is no store of a campaign.
+        If there is no such store.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -98,13 +145,16 @@ class Store:
             with zarr.config.set(_WRITING):
                 self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)
             self.attributes: dict[str, Any] = dict(self._group.attrs)
-            self.campaign = Campaign.from_json(self.attributes["campaign"])
+            #: What the store is of, and that as JSON; stores of versions up to 0.1 are of campaigns.
+            self.kind = next(kind for kind in _RENDERERS if kind in self.attributes)
+            self.text = str(self.attributes[self.kind])
+            json.loads(self.text)
             #: Number of runs, and of runs of a shard.
             self.count = integer("runs", self.attributes["runs"], 1, MOST_RUNS)
             self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, _LARGEST)
             self.variables = [str(name) for name in self.attributes["variables"]]
         except _DAMAGE as error:
-            raise UserError(f"{path} is no store of a campaign, or is damaged.") from error
+            raise UserError(f"{path} is no store of a campaign or a flight, or is damaged.") from error
         if self.attributes.get(_SEAL) != seal(self.attributes):
             reason = "its attributes have changed" if _SEAL in self.attributes else "an earlier release has made it"
             raise UserError(f"{path} cannot be used: {reason}.")
@@ -115,13 +165,14 @@ class Store:
     def create(
         cls,
         path: str | os.PathLike[str],
-        renderer: RunRenderer,
+        renderer: Renderer,
         columns: Mapping[str, Column],
         arrays: Mapping[str, Array],
         coordinates: Mapping[str, Array],
         shard_size: int | None = None,
+        attributes: Mapping[str, Any] | None = None,
     ) -> Store:
-        """Make the store of a campaign, for arrays like those of one run; nothing is left of it on a failure.
+        """Make a store, for arrays like those of one run, with more attributes; nothing is left of it on a failure.
 
         Where another process has just made one, that one is returned.
 
@@ -143,7 +194,7 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
             group = zarr.create_group(str(temporary), zarr_format=3)
             with zarr.config.set(_WRITING):
-                _fill(group, renderer, columns, arrays, coordinates, count, size)
+                _fill(group, renderer, columns, arrays, coordinates, count, size, attributes or {})
             os.rename(temporary, path)
         except OSError as error:
             if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
@@ -153,12 +204,13 @@ class Store:
             shutil.rmtree(temporary, ignore_errors=True)
         return cls(path)
 
-    def renderer(self) -> RunRenderer:
-        """Return the renderer of the runs; warn if the store is of other versions."""
+    def renderer(self) -> Any:
+        """Return the `Renderer` of the runs; warn if the store is of other versions."""
         compare_versions(self.attributes)
         axis = self.attributes["record"]
-        return RunRenderer(
-            self.campaign,
+        module, name, _ = _RENDERERS[self.kind]
+        return getattr(importlib.import_module(module), name).restored(
+            self.text,
             SceneRecord.from_attributes(self.attributes["scene"]),
             None if axis is None else TimeAxis(*axis),
         )
@@ -173,14 +225,19 @@ class Store:
                 "read but not completed; choose another place"
             )
 
-    def is_of(self, campaign: Campaign, columns: Mapping[str, Column]) -> bool:
-        """Return whether it is the store of a campaign with these columns, and of its scene as it is now."""
-        if json.loads(self.attributes["campaign"]) != json.loads(campaign.text):
+    @property
+    def unit(self) -> str:
+        """Name of a run."""
+        return _RENDERERS[self.kind][2]
+
+    def is_of(self, kind: str, text: str, columns: Mapping[str, Column], scene: Callable[[], SceneRecord]) -> bool:
+        """Return whether it is the store of a campaign or flight with these columns, and of its scene as it is now."""
+        if self.kind != kind or json.loads(self.text) != json.loads(text):
             return False
         own = self.inputs(slice(0, self.count))
         if own.keys() != columns.keys() or not all(np.array_equal(own[name], columns[name]) for name in own):
             return False
-        return record_of(campaign).attributes() == SceneRecord.from_attributes(self.attributes["scene"]).attributes()
+        return scene().attributes() == SceneRecord.from_attributes(self.attributes["scene"]).attributes()
 
     def inputs(self, runs: slice) -> dict[str, Column]:
         """Return the parameters of runs, by name."""
@@ -398,12 +455,13 @@ def describe_campaign(path: str | os.PathLike[str]) -> list[str]:
 
 def _fill(
     group: zarr.Group,
-    renderer: RunRenderer,
+    renderer: Renderer,
     columns: Mapping[str, Column],
     arrays: Mapping[str, Array],
     coordinates: Mapping[str, Array],
     count: int,
     size: int,
+    attributes: Mapping[str, Any],
 ) -> None:
     """Make the arrays of a store."""
     taken = {"run", "shot", "row", "column", "status", "error", *coordinates, *arrays}
@@ -430,11 +488,10 @@ def _fill(
     for name, found in coordinates.items():
         make(name, found, found.values, chunk=_LARGEST)
     numbers = np.arange(count)
-    make("run", Array(("run",), numbers, {"units": "1", "long_name": "number of the run"}), numbers, chunk=_LARGEST)
+    named = {"units": "1", "long_name": f"number of the {renderer.unit}"}
+    make("run", Array(("run",), numbers, named), numbers, chunk=_LARGEST)
     for name, column in columns.items():
-        text = {"long_name": f"parameter {name} of the scene"}
-        unit = unit_of(name) if column.dtype.kind in "iuf" else None
-        described = text if unit is None else {"units": unit, **text}
+        described = renderer.describe_input(name, column)
         make(inputs[name], Array(("run",), column, described), column, chunk=_LARGEST)
     make("status", Array((), np.zeros((), dtype=np.uint8), _STATUS))
     make("error", Array((), np.array("", dtype=object), {"long_name": "why the run failed"}))
@@ -442,15 +499,15 @@ def _fill(
         make(name, found)
     dims = {dim for found in arrays.values() for dim in found.dims}
     if "shot" in dims:
-        shots = np.arange(renderer.campaign.design.shots)
+        shots = np.arange(renderer.shots)
         number = {"units": "1", "long_name": "number of the shot over the sea of the run"}
         make("shot", Array(("shot",), shots, number), shots)
     axis, time = renderer.axis, coordinates["time"].values
     secondary = [name for name in (*coordinates, *inputs.values(), "surface_seed") if name not in dims]
     about: dict[str, Any] = {
         "Conventions": "CF-1.11",
-        "title": f"Campaign of {count} runs, scene {renderer.scene.name}",
-        "campaign": renderer.campaign.text,
+        "title": f"{renderer.kind.capitalize()} of {count} {renderer.unit}s, scene {renderer.scene.name}",
+        renderer.kind: renderer.text,
         "scene": {"scene": renderer.scene.name, **renderer.scene.attributes()},
         "record": None if axis is None else [axis.start_ns, axis.bin_width_ns, axis.bin_count],
         "bin_width_ns": (width := float(time[1] - time[0]) if len(time) > 1 else 1.0),
@@ -463,13 +520,16 @@ def _fill(
         "coordinates": " ".join(name for name in secondary if name in group),
         _ORDER[0]: _ORDER[1],
         **versions(),
+        **attributes,
     }
     group.attrs.update({**about, _SEAL: seal(about)})
 
 
 def seal(attributes: Mapping[str, Any]) -> str:
     """Return the SHA-256 of the attributes that a store is read by."""
-    text = json.dumps({name: attributes.get(name) for name in _SEALED}, sort_keys=True)
+    text = json.dumps(
+        {name: attributes.get(name) for name in _SEALED if name != "flight" or name in attributes}, sort_keys=True
+    )
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
-from mitransient_lidar.campaigns.runs import RunRenderer
+from mitransient_lidar.campaigns.runs import RunRenderer, record_of
 from mitransient_lidar.campaigns.shard import Outcome, log_path, render_in_process
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.core.errors import UserError
@@ -89,15 +89,17 @@ def sweep(
     KeyboardInterrupt
         After Ctrl-C; runs that are written stay.
     """
-    return _swept(
-        lambda: _prepare(_campaign(campaign), Path(store), shard_size), workers, scheduler, retry_failed, progress
+    return open_campaign(
+        complete(
+            lambda: _prepare(_campaign(campaign), Path(store), shard_size), workers, scheduler, retry_failed, progress
+        ).path
     )
 
 
 def resume(store: str | os.PathLike[str], **options: Any) -> xr.Dataset:
     """Render the runs that an interrupted campaign has left in its store; `options` as for `sweep`."""
     given = {"workers": None, "scheduler": None, "retry_failed": False, "progress": None, **options}
-    return _swept(lambda: Store(store), **given)
+    return open_campaign(complete(lambda: Store(store), **given).path)
 
 
 def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], row: int, **options: Any) -> xr.Dataset:
@@ -127,7 +129,8 @@ def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], 
         row = integer("row", row, 0, len(next(iter(table.values()))) - 1)
         renderer = RunRenderer.of(plan, table)
         values = {name: column[row].item() for name, column in table.items()}
-    return renderer.series(row, values, **options)
+    series: xr.Dataset = renderer.series(row, values, **options)
+    return series
 
 
 def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> Campaign:
@@ -142,7 +145,7 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
     columns = campaign.table()
     if path.exists():
         store = Store(path)
-        if not store.is_of(campaign, columns):
+        if not store.is_of("campaign", campaign.text, columns, lambda: record_of(campaign)):
             raise UserError(
                 f"{path} holds another campaign, or its scene has changed: choose another place, or remove it"
             )
@@ -161,19 +164,19 @@ def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
         else:
             made = Store.create(path, renderer, columns, arrays, coordinates, shard_size)
             # Another process may have made another store in the meantime, which is then refused.
-            is_wanted = made.campaign.text == campaign.text and shard_size in (None, made.shard_size)
+            is_wanted = made.text == campaign.text and shard_size in (None, made.shard_size)
             return made if is_wanted else _prepare(campaign, path, shard_size)
     raise UserError(f"the first {min(_TRIALS, count)} runs all fail, the first of them so: {first}")
 
 
-def _swept(
+def complete(
     prepare: Callable[[], Store],
     workers: int | None,
     scheduler: Client | str | None,
     retry_failed: bool,
     progress: ProgressCallback | None,
-) -> xr.Dataset:
-    """Render what is missing in a store."""
+) -> Store:
+    """Render what is missing in a store, and return it; options as for `sweep`."""
     if workers is not None and scheduler is not None:
         raise UserError(f"workers = {workers} are of this machine, and the scheduler has its own: give one of both")
     number = os.cpu_count() or 1 if workers is None else integer("workers", workers, 1, 1024)
@@ -194,9 +197,10 @@ def _swept(
                 _render(store, shards, client, retry_failed, progress)
             except KeyboardInterrupt as error:
                 done = int(np.count_nonzero(store.status() != PLANNED))
-                text = f"interrupted after {done} of {store.count} runs, which are kept; the same command goes on."
+                text = f"interrupted after {done} of {store.count} {store.unit}s, which are kept"
+                text += "; the same command goes on."
                 raise KeyboardInterrupt(text) from error
-    return open_campaign(store.path)
+    return store
 
 
 def _render(
@@ -318,8 +322,8 @@ class _Tally:
         self._shards[shard] = outcome.done, outcome.failed
         state = self._tell()
         _LOG.info(
-            "shard %d written: %d of %d runs, %d failed, %.3g a second, ends in %.0f s",
-            shard, state.done, state.planned, state.failed, state.rate or 0, state.remaining_s or 0,
+            "shard %d written: %d of %d %ss, %d failed, %.3g a second, ends in %.0f s",
+            shard, state.done, state.planned, state.unit, state.failed, state.rate or 0, state.remaining_s or 0,
         )  # fmt: skip
 
     def _tell(self) -> Progress:
@@ -330,7 +334,7 @@ class _Tally:
         state = Progress(
             done=done + failed,
             planned=planned,
-            unit="run",
+            unit=self._store.unit,
             elapsed_s=elapsed,
             remaining_s=remaining,
             failed=failed,

@@ -17,7 +17,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.echo_window import EchoProbe, lines_of_sight
-from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_point
+from mitransient_lidar.transport.opaque import aligned, is_one_of
+from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
@@ -179,7 +180,7 @@ def _is_near(scene: LidarScene, solid: mi.Shape) -> bool:
     return not (np.any(low[:2] > last + near) or np.any(high[:2] < first - near))
 
 
-def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),)) -> FloatArray:
+def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),), poses: Pose | None = None) -> FloatArray:
     """Return where the receiver's axis, refracted by a level sea, first meets a bottom.
 
     Parameters
@@ -188,29 +189,37 @@ def axis_on_bottom(scene: LidarScene, shifts: npt.ArrayLike = ((0.0, 0.0),)) -> 
         The scene; `WaterScene.bottoms` are its bottoms.
     shifts
         Horizontal displacements of the lidar, x and y [m], shape (places, 2).
+    poses
+        Poses of the receiver instead, with arrays of shape (places, 3).
 
     Returns
     -------
     ndarray
         Points x, y, z [m], shape (places, 3); NaN where the axis meets no bottom.
     """
-    moved, bottoms = np.pad(np.asarray(shifts, dtype=np.float64), ((0, 0), (0, 1))), scene.bottoms
-    pose, sea = scene.receiver.pose, scene.level_sea
-    found = np.full((len(moved), 3), np.nan)
-    if not bottoms or pose.axis[2] >= 0:
+    own, sea, bottoms = scene.receiver.pose, scene.level_sea, scene.bottoms
+    origins, axes = own.origin + np.pad(np.asarray(shifts, dtype=np.float64), ((0, 0), (0, 1))), own.axis
+    if poses is not None:
+        origins, axes = poses.origin, poses.axis
+    found = np.full((len(origins), 3), np.nan)
+    if not bottoms or np.any(axes[..., 2] >= 0):
         return found
     # Corners of the axis: receiver, sea level, boundaries of the index layers, and a point below everything.
     lowest = min(float(solid.bbox().min.z) for solid in bottoms) - 1.0
     heights = [0.0, *(-boundary for boundary in sea.boundaries if -boundary > lowest), min(lowest, -1.0)]
-    corners = [pose.origin, *(np.append(sea.at_height(pose.origin, pose.axis, z), z) for z in heights)]
-    active = aligned(mi.Bool, np.ones(len(moved), dtype=bool))
+    directions = np.broadcast_to(axes, origins.shape)
+    corners = [
+        origins,
+        *(np.column_stack([sea.at_height(origins, directions, z), np.full(len(origins), z)]) for z in heights),
+    ]
+    active = aligned(mi.Bool, np.ones(len(origins), dtype=bool))
     for start, end in itertools.pairwise(corners):
-        origin = mi.Point3f(*(aligned(mi.Float, column) for column in (moved + start).T))
-        ray = mi.Ray3f(origin, dr.normalize(opaque_point(end) - opaque_point(start)))
-        length, on_leg = opaque(float(np.linalg.norm(end - start))), mi.Bool(active)
+        origin, leg = (mi.Vector3f(*(aligned(mi.Float, column) for column in each.T)) for each in (start, end - start))
+        ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(leg))
+        length, on_leg = dr.norm(leg), mi.Bool(active)
         for _ in range(_MOST_HITS):
             hit = scene.ray_intersect(ray, on_leg)
-            on_leg &= hit.is_valid() & (dr.norm(hit.p - origin) <= length)
+            on_leg &= hit.is_valid() & (dr.norm(hit.p - mi.Point3f(origin)) <= length)
             ends = on_leg & is_one_of(hit.shape, bottoms)
             dr.eval(hit, ends)
             at_end = np.array(ends)

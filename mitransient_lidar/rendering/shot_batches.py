@@ -1,4 +1,4 @@
-"""Shots of one lidar at several places, rendered together in batches."""
+"""Shots of one lidar at several places, and in several poses, rendered together in batches."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -20,8 +19,7 @@ from mitransient_lidar.plugins.ocean_surface import SeaPatches
 from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
-from mitransient_lidar.transport.opaque import aligned
-from mitransient_lidar.transport.scene import ScenePart
+from mitransient_lidar.rendering.shot_poses import ShotPoses
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer
@@ -133,24 +131,38 @@ class ShotBatches:
         most = min(_PATHS // (paths * self.size), _BINS // (bins * self.size))
         self._together = 1 if has_plume else int(np.clip(most, 1, in_turn))
 
-    def at(self, places: FloatArray) -> Callable[[int], PassRenderer]:
-        """Return a function that returns the renderer of shots at places [m], shape (shots, 2), each several times."""
+    def at(self, shots: ShotPoses) -> Callable[[int], PassRenderer]:
+        """Return a function that returns the renderer of shots, each several times."""
         if (loaded_at := self._loaded_at) is not None:
-            return lambda _: loaded_at(*map(float, places[0])).scaled(self.share)
-        parts = [] if self._going is None else [(self._going, np.zeros_like(places))]
+            return lambda _: loaded_at(*map(float, shots.places[0])).scaled(self.share)
+        parts: list[tuple[mi.Scene, FloatArray | None]] = [] if self._going is None else [(self._going, None)]
         for sea in self._seas:
-            positions = sea.move(places)
-            parts.append((sea.shapes, positions - self._aim))
-        parts += [] if self._fixed is None else [(self._fixed, places - self._aim)]
+            positions = sea.move(shots.places)
+            parts.append((sea.shapes, positions))
+        parts += [] if self._fixed is None else [(self._fixed, shots.places)]
         lidar = self._renderer.scene
         surfaces = [*lidar.surfaces, *(sea.shape for sea in self._seas)]
 
         def several(copies: int) -> PassRenderer:
-            moved = tuple(ScenePart(shapes, _vectors(np.repeat(by, copies, axis=0))) for shapes, by in parts)
-            scene = replace(lidar, parts=moved, surfaces=surfaces)
-            return self._renderer.of_shots(scene, copies * len(places), copies)
+            all_shots = shots.repeated(copies)
+            moved = tuple(
+                all_shots.scene_part(
+                    shapes, None if positions is None else np.repeat(positions, copies, axis=0), self._aim
+                )
+                for shapes, positions in parts
+            )
+            receiver, transmitter = all_shots.receiver, all_shots.transmitter
+            scene = replace(
+                lidar, parts=moved, surfaces=surfaces, receiver_poses=receiver, transmitter_poses=transmitter
+            )
+            return self._renderer.of_shots(scene, len(all_shots), copies)
 
         return several
+
+    def set_time(self, time_s: float) -> None:
+        """Let the waves move to a time [s]."""
+        for sea in self._seas:
+            sea.set_time(time_s)
 
     def limited(self, passes: int, seconds: float) -> ShotBatches:
         """Return the same batches with fewer passes, at least 2, and a time after which no launch may end [s].
@@ -162,13 +174,13 @@ class ShotBatches:
         other.passes, other._seconds = passes, seconds
         return other
 
-    def render(self, places: FloatArray, seeds: Sequence[int]) -> ShotRecord:
+    def render(self, poses: ShotPoses, seeds: Sequence[int]) -> ShotRecord:
         """Render the shots of a batch, each with its own seed."""
-        shots, done, copies, lost, needed = len(places), 0, 0, 0.0, self._together
+        shots, done, copies, lost, needed = len(poses), 0, 0, 0.0, self._together
         ends = [time.perf_counter()]
         energy, power, parts = PassStatistics(), PassStatistics(), (PassStatistics(), PassStatistics())
         try:
-            several = self.at(places)
+            several = self.at(poses)
             while done < self.passes and needed > 0:
                 if (here := min(self._together, self.passes - done, needed)) != copies:
                     renderer, copies = several(here), here
@@ -250,9 +262,3 @@ def _scene_of(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
     for shape, own in zip(shapes, ids, strict=True):
         shape.set_id(own)
     return scene
-
-
-def _vectors(horizontal: FloatArray) -> mi.Vector3f:
-    """Return horizontal vectors, shape (n, 2)."""
-    x, y = (aligned(mi.Float, column.astype(np.float32)) for column in horizontal.T)
-    return mi.Vector3f(x, y, dr.zeros(mi.Float, len(horizontal)))

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError, is_interruption
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
@@ -23,31 +22,27 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
+from mitransient_lidar.rendering.session import Session, open_scene, warn_of_edge_loss
+from mitransient_lidar.rendering.shot_scene import AIM, TARGET, ShotScene
 from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.rendering.shot_batches import ShotBatches, ShotRecord
-    from mitransient_lidar.transport.passes import PassRenderer
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.rendering.shot_batches import ShotRecord
 
 _LOG = logging.getLogger(__name__)
 
 #: Farthest place [m]: single precision resolves a millimetre there.
-_FARTHEST = 1e4
+FARTHEST = 1e4
 
 _METRES = {"m": 1.0, "cm": 0.01, "km": 1000.0}
 _PLACE = Column("x", ("aim x",), _METRES), Column("y", ("aim y",), _METRES)
 
-#: Parameters of the scene that shots replace, and those that they replace to move the target.
-_AIM, _TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
-
 #: Coordinates in the table of a series.
 _LISTED = (
-    *(*_AIM, "true_slope_along", "true_slope_across", "true_surface_height"),
+    *(*AIM, "true_slope_along", "true_slope_across", "true_surface_height"),
     *("true_bottom_depth", "true_bottom_depth_below_surface"),
 )
 
@@ -153,6 +148,7 @@ def render_shots(
         If the scene is invalid, has no waves for random places, or lacks a parameter, or a number is out of range.
     """
     from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
+    from mitransient_lidar.rendering.shot_poses import ShotPoses
 
     options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
@@ -168,11 +164,11 @@ def render_shots(
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = _Series(scene, params, instrument, target, places, axis, bool(components))
+    series = ShotScene(scene, params, instrument, target, places, axis, bool(components))
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
-    replaced = (*_AIM, *(_TARGET if move_target else ()))
+    replaced = (*AIM, *(TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
-    truth = truth_coordinates(series.session, series.lidar, places)
+    truth = truth_coordinates(sea_of(series.session.scene), series.lidar, ShotPoses(places))
     if missed := np.count_nonzero(np.isnan(truth["true_bottom_depth"][1])):
         _LOG.warning("the axis of %d of %d shots misses the bottom: their true depth is unknown", missed, len(places))
     batches = series.batches(passes, share, wanted)
@@ -188,7 +184,8 @@ def render_shots(
                     break
                 seconds = left * (part.stop - part.start) / (len(places) - part.start)
                 batch = batches.limited(int(most[part].max()), seconds)
-                records.append(batch.render(places[part], range(first_seed + part.start, first_seed + part.stop)))
+                seeds = range(first_seed + part.start, first_seed + part.stop)
+                records.append(batch.render(ShotPoses(places[part]), seeds))
                 errors.append(relative_errors(records[-1].power, records[-1].power_stderr, series.window))
                 done = part.stop
                 if progress is not None:
@@ -234,119 +231,6 @@ def render_shots(
     return series.dataset(joined, by_origin, attributes).assign_coords(known)
 
 
-class _Series:
-    """The scene of a series of shots, at the place of the first one.
-
-    Attributes
-    ----------
-    session
-        The loaded scene.
-    lidar
-        Lidar of the first shot, with the time bins of all shots.
-    window
-        Bins whose errors count, in each pixel.
-    """
-
-    def __init__(
-        self,
-        scene: Any,
-        params: Mapping[str, Any] | None,
-        instrument: str | None,
-        target: tuple[float, float] | None,
-        places: FloatArray,
-        axis: TimeAxis | None,
-        components: bool,
-    ) -> None:
-        from mitransient_lidar.rendering.describe import describe_scene
-        from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
-        from mitransient_lidar.rendering.scene_checks import check_scene
-        from mitransient_lidar.rendering.shot_batches import check_size
-        from mitransient_lidar.transport.scene import LidarScene
-
-        self._scene, self._params, self._target, self._components = scene, params, target, components
-        self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
-        self.session = self._open(self._at(*self._place))
-        self._integrator = choose_integrator(self.session.scene, None)
-        shifts = [(float(x), float(y)) for x, y in places - places[0]]
-        own = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
-        self._axis = own if axis is None else _checked_axis(axis, own)
-        self.session.tell_record(self._axis)
-        self._renderer = self._prepare(self.session)
-        self.lidar: LidarScene = self._renderer.scene
-        self.companions = self._find_companions()
-        origins = self._renderer.classes.count if components else 0
-        check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count, origins)
-        probe = probe_echoes(self.lidar, self._renderer.sampler)
-        self.window = error_window(self.lidar, probe)
-        check_scene(self.lidar, self._renderer.sampler, probe)
-        self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
-
-    def _open(self, params: Mapping[str, Any]) -> Session:
-        """Load the scene with parameters."""
-        return open_scene(self._scene, params, instrument=self._instrument)
-
-    def _prepare(self, session: Session) -> PassRenderer:
-        """Return the renderer of a loaded scene, with the time bins of all shots."""
-        session.share_record(self._axis)
-        renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
-        return renderer.by_origin() if self._components else renderer
-
-    def _at(self, x: float, y: float) -> dict[str, Any]:
-        """Return the parameters of a shot at a place [m]."""
-        target = self._target
-        moved = {} if target is None else {"target_x": x + target[0], "target_y": y + target[1]}
-        return {**(self._params or {}), "aim_x": x, "aim_y": y, **moved}
-
-    def _find_companions(self) -> list[mi.Shape]:
-        """Return the shapes that move with the parameters of the target."""
-        if self._target is None:
-            return []
-        params = self._at(*self._place)
-        other = self._open({**params, "target_x": params["target_x"] + 1.0}).scene
-        pairs = zip(self.session.scene.shapes(), other.shapes(), strict=True)
-        return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
-
-    def _loaded_at(self, x: float, y: float) -> PassRenderer:
-        """Return the renderer of the scene loaded at a place [m]."""
-        return self._prepare(self._open(self._at(x, y)))
-
-    def batches(self, passes: int, share: float, target_error: float | None) -> ShotBatches:
-        """Return the shots in batches, for passes with a share of the paths of a full pass, or until an error."""
-        from mitransient_lidar.rendering.shot_batches import ShotBatches
-
-        goal = None if target_error is None else (target_error, self.window)
-        return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions, self._loaded_at)
-
-    def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
-        """Return the attributes of the series, with other ones."""
-        found = self.session.attributes(integrator=self._integrator, used=used, **self._described, **others)
-        replaced = (*_AIM, *(() if self._target is None else _TARGET))
-        return {
-            name: value
-            for name, value in found.items()
-            if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
-        }
-
-    def dataset(
-        self, arrays: Sequence[FloatArray], parts: Sequence[FloatArray], attributes: Mapping[str, Any]
-    ) -> xr.Dataset:
-        """Return the labelled result of arrays of shape (shots, pixels, bins), and (shots, pixels, origins, bins)."""
-        from mitransient_lidar.rendering.describe import with_lines_of_sight
-
-        pixels = self.lidar.receiver.pixels
-        dataset = results.build_series(
-            *arrays,
-            time=self.lidar.axis,
-            pixel_names=pixels.names,
-            pixel_centres_mrad=1e3 * pixels.centres(),
-            grid=pixels.grid,
-            attributes=attributes,
-        )
-        if parts:
-            dataset = results.add_components(dataset, self._renderer.classes.names, *parts).transpose("shot", ...)
-        return with_lines_of_sight(dataset, self.lidar)
-
-
 def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
     """Return the progress of a series, with the errors of its last batch."""
     median, p95 = np.quantile(errors, [0.5, 0.95], method="higher")
@@ -385,8 +269,8 @@ def _checked_places(places: npt.ArrayLike) -> FloatArray:
     pairs = finite_array("positions", places)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= 100_000:
         raise UserError(f"positions of shape {pairs.shape} must be 1 to 100000 pairs (x, y)")
-    if np.abs(pairs).max() > _FARTHEST:
-        raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {_FARTHEST:g} m")
+    if np.abs(pairs).max() > FARTHEST:
+        raise UserError(f"positions holds {pairs.flat[np.abs(pairs).argmax()]:g} m; it must lie within {FARTHEST:g} m")
     return pairs
 
 
@@ -407,17 +291,6 @@ def _warn_of_the_end(
         _LOG.warning("max_time = %g s ended after %d of %d shots", options.max_time, done, planned)
     if missed := sum(len(record.power) for record in records if record.missed):
         _LOG.warning("%d of %d shots ended before target_error = %g", missed, done, options.target_error)
-
-
-def _checked_axis(axis: TimeAxis, own: TimeAxis) -> TimeAxis:
-    """Return given time bins; raise `UserError` if they leave out light of the automatic ones."""
-    margin = 0.05 * (own.end_ns - own.start_ns)
-    if own.start_ns < axis.start_ns - margin or own.end_ns > axis.end_ns + margin:
-        raise UserError(
-            f"the record of {axis.start_ns:g} to {axis.end_ns:g} ns leaves out light: it must hold {own.start_ns:g} to "
-            f"{own.end_ns:g} ns"
-        )
-    return axis
 
 
 def _target_offset(session: Session) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from mitransient_lidar.physics.water.water_types import InherentProperties
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitransient_lidar.rendering.session import Session
+    from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
@@ -39,17 +39,19 @@ _DESCRIBED = {
 }
 
 
-def truth_coordinates(session: Session, lidar: LidarScene, places: FloatArray) -> dict[str, Any]:
-    """Return the coordinates over ``shot`` of shots at places [m], shape (shots, 2), with units and descriptions.
+def truth_coordinates(sea: Any, lidar: LidarScene, shots: ShotPoses) -> dict[str, Any]:
+    """Return the coordinates over ``shot`` of shots over a sea of an ``ocean_surface``, with units and descriptions.
 
     Places, slopes and depths as of `shot_series.render_shots`, and in scenes with water its coefficients
     (`water_means`).
     """
     from mitransient_lidar.rendering.describe import axis_on_bottom
 
-    sea = sea_of(session.scene)
-    along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y) for x, y in places]).T
-    found = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2])[:, 2]
+    places = shots.places
+    turns = np.zeros(len(places)) if shots.turns is None else np.arctan2(shots.turns[:, 1], shots.turns[:, 0])
+    rows = zip(places, turns, strict=True)
+    along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y, turn) for (x, y), turn in rows]).T
+    found = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2], shots.in_scene)[:, 2]
     # Rays in single precision are known to a tenth of a millimetre.
     depth = np.round(found, 4)
     values = {
@@ -102,10 +104,11 @@ def sea_of(scene: mi.Scene) -> Any:
     return next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
 
 
-def footprint_means(sea: Any, transmitter: Any, x: float, y: float) -> tuple[float, float, float]:
+def footprint_means(sea: Any, transmitter: Any, x: float, y: float, turn: float = 0.0) -> tuple[float, float, float]:
     """Return the slopes along the lidar's azimuth and to its left [1] and the height [m] at a place [m] of a sea.
 
-    They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves.
+    They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves. The lidar
+    may be turned about the vertical [rad].
     """
     if sea is None or not math.isfinite(sea.cell_size):
         return 0.0, 0.0, 0.0
@@ -113,6 +116,7 @@ def footprint_means(sea: Any, transmitter: Any, x: float, y: float) -> tuple[flo
     across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
     along = across / max(-float(pose.axis[2]), 1e-3)
     azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
+    azimuth += turn
     reach = max(math.ceil(_REACH * along / sea.cell_size), _FEWEST_CELLS)
     steps = np.arange(-reach, reach + 1)
     lines_x, lines_y = ((round(place / sea.cell_size) + steps) * sea.cell_size for place in (x, y))

@@ -1,8 +1,8 @@
-"""Position and axis of the transmitter or the receiver, and tangent-plane coordinates about the axis."""
+"""Positions and axes of the transmitter or the receiver, and tangent-plane coordinates about the axis."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
-from mitransient_lidar.transport.opaque import opaque, opaque_point, opaque_vector
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_vector
+from mitransient_lidar.transport.rng import Lanes
 
 #: Smallest distance of a pose from the mean sea level [m].
 _NEAREST = 0.1
@@ -29,24 +30,30 @@ _SMALLEST_DISTANCE = 1e-12
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and axis of a transmitter or receiver.
+    """Position and axis of a transmitter or receiver, or those of each of several shots.
 
     A point of the tangent plane about the axis is (angle_x, angle_y), in radians: its direction is the unit vector
     along ``axis + angle_x * far + angle_y * left``. +angle_x points away from nadir, and +angle_y along +y for the
-    default pose.
+    default pose. Poses of several shots serve paths alone: `direction`, `tangent`, `point` and `RelativePose`.
 
     Parameters
     ----------
     origin
-        Position [m], shape (3,).
+        Position [m], shape (3,) or (shots, 3).
     axis, far, left
         Orthonormal directions: the optical axis, the direction of +angle_x and the direction of +angle_y.
+    delay
+        Length that is added to relative lengths [m], of each shot.
+    lanes
+        Lanes of the paths that have the pose of their shot; none for one pose of all paths.
     """
 
     origin: NDArray[np.float64]
     axis: NDArray[np.float64]
     far: NDArray[np.float64]
     left: NDArray[np.float64]
+    delay: float | NDArray[np.float64] = 0.0
+    lanes: Lanes | None = None
 
     @classmethod
     def from_angles(cls, altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0) -> Pose:
@@ -102,14 +109,39 @@ class Pose:
             props.get("aim_y", 0.0),
         )
 
+    def of(self, lanes: Lanes) -> Pose:
+        """Return the poses with the lanes of paths."""
+        return replace(self, lanes=lanes)
+
+    def moved(self, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> Pose:
+        """Return the poses after rotations, shape (shots, 3, 3), and displacements [m], shape (shots, 3)."""
+        origin, axis, far, left = (rotation @ each for each in (self.origin, self.axis, self.far, self.left))
+        return Pose(origin + shift, axis, far, left)
+
+    def number(self, values: float | NDArray[np.float64]) -> mi.Float:
+        """Return a number of all paths, or that of the shot of each path of shape (shots,), as kernels read it."""
+        if np.ndim(values) == 0:
+            return opaque(float(values))
+        assert self.lanes is not None
+        return self.lanes.pick(aligned(mi.Float, np.asarray(values, np.float32)))
+
+    def vector(self, values: NDArray[np.float64]) -> mi.Vector3f:
+        """Return a vector of all paths, shape (3,), or of the shot of each path, shape (shots, 3)."""
+        return mi.Vector3f(*(self.number(values[..., axis]) for axis in range(3)))
+
+    @property
+    def point(self) -> mi.Point3f:
+        """Position, as kernels read it [m]."""
+        return mi.Point3f(self.vector(self.origin))
+
     def direction(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Vector3f:
         """Return the unit direction of the tangent-plane point (angle_x, angle_y)."""
-        far, left, axis = (opaque_vector(v) for v in (self.far, self.left, self.axis))
+        far, left, axis = (self.vector(v) for v in (self.far, self.left, self.axis))
         return dr.normalize(dr.fma(far, angle_x, dr.fma(left, angle_y, axis)))
 
     def tangent(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return (angle_x, angle_y) of a direction and its cosine with the axis, negative behind the tangent plane."""
-        x, y, cos_axis = (dr.dot(direction, opaque_vector(v)) for v in (self.far, self.left, self.axis))
+        x, y, cos_axis = (dr.dot(direction, self.vector(v)) for v in (self.far, self.left, self.axis))
         scale = dr.rcp(cos_axis)
         return x * scale, y * scale, cos_axis
 
@@ -121,7 +153,7 @@ class Pose:
     @property
     def submerged(self) -> bool:
         """Whether the pose is under water."""
-        return float(self.origin[2]) < 0
+        return bool(np.max(self.origin[..., 2]) < 0)
 
     def require_above_sea(self) -> None:
         """Raise UserError for a pose under water."""
@@ -167,18 +199,20 @@ class RelativePose:
 
     def __init__(self, pose: Pose, reference: NDArray[np.float64]) -> None:
         away = reference - pose.origin
-        #: Distance to the reference point [m], in double precision.
-        self.range = float(np.linalg.norm(away))
-        self._reference, self._away = opaque_point(reference), opaque_vector(away)
-        self._range = opaque(self.range)
+        #: Distance to the reference point less the delay of the pose [m], in double precision.
+        self.range = np.linalg.norm(away, axis=-1) - pose.delay
+        self._reference, self._away = mi.Point3f(opaque_vector(reference)), pose.vector(away)
+        self._range = pose.number(np.linalg.norm(away, axis=-1))
+        self._delay = None if pose.lanes is None else pose.number(pose.delay)
         sides = (pose.far, pose.left, pose.axis)
-        self._sides = [(opaque_vector(side), opaque(float(side @ away))) for side in sides]
+        self._sides = [(pose.vector(side), pose.number(np.sum(side * away, axis=-1))) for side in sides]
 
     def distance(self, point: mi.Point3f) -> mi.Float:
         """Return the relative distances to points [m], negative for those nearer than the reference point."""
         offset = point - self._reference
         total = dr.norm(offset + self._away) + self._range
-        return dr.dot(offset, offset + 2 * self._away) / dr.maximum(total, _SMALLEST_DISTANCE)
+        distance = dr.dot(offset, offset + 2 * self._away) / dr.maximum(total, _SMALLEST_DISTANCE)
+        return distance if self._delay is None else distance + self._delay
 
     def tangent(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return (angle_x, angle_y) of points and the cosine of their directions with the axis; see `Pose.tangent`."""

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.opaque import opaque, opaque_point
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.path_step import PathStep, Vertex
 from mitransient_lidar.transport.pose import Pose
@@ -129,7 +129,7 @@ class RandomWalk:
         self.scene, self._rates = scene, rates
         self._water, self._path_end = scene.water, opaque(path_end - scene.reference_length)
         self._step = PathStep(scene, scene.water.scattering_flight, mode)
-        self._destination, self._to_go = opaque_point(destination.origin), scene.relative(destination)
+        self._destination, self._to_go = destination.point, scene.relative(destination)
 
     def run(
         self,

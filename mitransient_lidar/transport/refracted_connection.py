@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
-from mitransient_lidar.transport.opaque import opaque, opaque_point
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.snell import refract
@@ -104,7 +104,7 @@ class RefractedLaserSampler(RefractedEmitterSampler):
 
     def __init__(self, scene: LidarScene) -> None:
         super().__init__(scene)
-        self.laser = opaque_point(scene.transmitter.pose.origin)
+        self.laser = scene.transmitter_pose.point
 
     def direction_from(self, point: mi.Point3f) -> EmitterDirection:
         """Return the laser's direction from points under water.
@@ -136,7 +136,7 @@ class SubmergedLaserSampler(RefractedEmitterSampler):
 
     def __init__(self, scene: LidarScene) -> None:
         super().__init__(scene)
-        self._laser = opaque_point(scene.transmitter.pose.origin)
+        self._laser = scene.transmitter_pose.point
 
     def direction_from(self, point: mi.Point3f) -> EmitterDirection:
         """Return the laser's direction from points under water."""
@@ -186,7 +186,7 @@ class ConnectedPath(Path):
     @classmethod
     def start(cls, scene: WaterScene, angles: mi.Point2f, active: mi.Bool) -> ConnectedPath:
         """Return paths that start at the receiver at tangent-plane angles."""
-        state = Path.initial(scene, scene.receiver.pose, angles, mi.Float(1), active)
+        state = Path.initial(scene, scene.receiver_pose, angles, mi.Float(1), active)
         return cls(
             **state,
             emitter_ratio=mi.Float(0),
@@ -265,8 +265,8 @@ class StraightConnection:
     @classmethod
     def to_laser(cls, scene: LidarScene, point: mi.Point3f) -> StraightConnection:
         """Return the connections of points."""
-        relative = scene.relative(scene.transmitter.pose)
-        offset = opaque_point(scene.transmitter.pose.origin) - point
+        relative = scene.relative(scene.transmitter_pose)
+        offset = scene.transmitter_pose.point - point
         distance = dr.norm(offset)
         direction = offset / distance
         irradiance = scene.transmitter.intensity_at(*relative.tangent(point)) / dr.square(distance)
@@ -306,7 +306,7 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
     line = StraightConnection.to_laser(scene, si.p)
     radiance = _bsdf_towards(scene, si, line.direction, active, wet=scene.submerged) * line.irradiance
     active &= radiance > 0
-    active &= ~scene.ray_test(si.spawn_ray_to(opaque_point(scene.transmitter.pose.origin)), active)
+    active &= ~scene.ray_test(si.spawn_ray_to(scene.transmitter_pose.point), active)
     return dr.select(active, radiance, 0), line.length
 
 

@@ -42,18 +42,33 @@ _BOTTOM_PER_LARGEST = 0.25
 
 
 SceneT = TypeVar("SceneT", bound="WaterScene")
+Vector = TypeVar("Vector", mi.Vector3f, mi.Point3f, mi.Normal3f)
 
 
 @dataclass(frozen=True)
 class ScenePart:
-    """Shapes that shots meet at a place of their own: points of the lidar's frame are displaced [m] to them."""
+    """Shapes that shots meet at a place of their own.
+
+    Points of the lidar's frame are turned about the vertical, by an angle whose cosine and sine are `turn`, and then
+    displaced [m] to the shapes. Without `turn` they are only displaced.
+    """
 
     shapes: mi.Scene
     displacement: mi.Vector3f
+    turn: mi.Vector2f | None = None
 
     def of(self, lanes: Lanes) -> ScenePart:
         """Return the part with the displacement of each lane."""
-        return ScenePart(self.shapes, lanes.pick(self.displacement))
+        turn = None if self.turn is None else lanes.pick(self.turn)
+        return ScenePart(self.shapes, lanes.pick(self.displacement), turn)
+
+    def ray(self, ray: mi.Ray3f) -> mi.Ray3f:
+        """Return rays of the lidar's frame among the shapes."""
+        moved = mi.Ray3f(ray)
+        if self.turn is not None:
+            moved.o, moved.d = (_turned(vector, self.turn) for vector in (ray.o, ray.d))
+        moved.o += self.displacement
+        return moved
 
 
 @dataclass(frozen=True)
@@ -74,6 +89,8 @@ class WaterScene:
         Total slope variance of the sea, for the sampling of surface connections.
     parts
         Parts of the scene at places that differ between shots, in place of `mitsuba_scene`; none for a single shot.
+    receiver_poses
+        Pose of the receiver in each shot, where they differ.
     """
 
     mitsuba_scene: mi.Scene
@@ -82,10 +99,19 @@ class WaterScene:
     surfaces: list[mi.Shape]
     slope_variance: float
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
+    receiver_poses: Pose | None = field(default=None, kw_only=True)
 
     def of(self: SceneT, lanes: Lanes) -> SceneT:
         """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
-        return replace(self, parts=tuple(part.of(lanes) for part in self.parts)) if self.parts else self
+        if not self.parts:
+            return self
+        poses = None if self.receiver_poses is None else self.receiver_poses.of(lanes)
+        return replace(self, parts=tuple(part.of(lanes) for part in self.parts), receiver_poses=poses)
+
+    @property
+    def receiver_pose(self) -> Pose:
+        """Pose of the receiver for paths."""
+        return self.receiver_poses or self.receiver.pose
 
     @property
     def solids(self) -> list[mi.Shape]:
@@ -176,9 +202,9 @@ class WaterScene:
         Paths from more than 10 km above the scene start 1 m above all shapes: traced from farther away in single
         precision, rays would pass between the triangles of the sea, 1.6 % of them from 500 km at 20 degrees.
         """
-        origin, relative = opaque_point(pose.origin), self.relative(pose)
+        origin, relative = pose.point, self.relative(pose)
         top = float(self.mitsuba_scene.bbox().max.z) + _CLEARANCE
-        if pose.origin[2] - top < _FAR:
+        if pose.lanes is not None or pose.origin[2] - top < _FAR:
             return origin, relative.distance(origin)
         on_axis = RelativePose(pose, pose.nearby_point())
         point = dr.select(direction.z < 0, on_axis.at_height(angles, direction, top), origin)
@@ -190,13 +216,24 @@ class WaterScene:
             return self.mitsuba_scene.ray_intersect(ray, active)
         nearest, shift = dr.zeros(mi.PreliminaryIntersection3f), mi.Vector3f(0)
         nearest.t = dr.inf
+        turn = mi.Vector2f(1, 0)
         for part in self.parts:
-            found = part.shapes.ray_intersect_preliminary(_moved(ray, part.displacement), active=active)
+            found = part.shapes.ray_intersect_preliminary(part.ray(ray), active=active)
             is_nearer = found.t < nearest.t
             nearest = dr.select(is_nearer, found, nearest)
             shift = dr.select(is_nearer, part.displacement, shift)
-        si = nearest.compute_surface_interaction(_moved(ray, shift), active=active)
+            if part.turn is not None:
+                turn = dr.select(is_nearer, part.turn, turn)
+        is_turned = any(part.turn is not None for part in self.parts)
+        moved = ScenePart(self.mitsuba_scene, shift, turn if is_turned else None).ray(ray)
+        si = nearest.compute_surface_interaction(moved, active=active)
         si.p -= shift
+        if is_turned:
+            back = mi.Vector2f(turn.x, -turn.y)
+            si.p, si.n, si.dp_du, si.dp_dv = (_turned(each, back) for each in (si.p, si.n, si.dp_du, si.dp_dv))
+            frame = si.sh_frame
+            frame.s, frame.t, frame.n = (_turned(each, back) for each in (frame.s, frame.t, frame.n))
+            si.sh_frame = frame
         return si
 
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
@@ -205,7 +242,7 @@ class WaterScene:
             return self.mitsuba_scene.ray_test(ray, active)
         blocked = mi.Bool(False)
         for part in self.parts:
-            blocked |= part.shapes.ray_test(_moved(ray, part.displacement), active & ~blocked)
+            blocked |= part.shapes.ray_test(part.ray(ray), active & ~blocked)
         return blocked
 
     def spawn_ray(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
@@ -254,11 +291,25 @@ class LidarScene(WaterScene):
         Time bins of the record.
     gates
         Gates of the ``time_gated_film``, or None.
+    transmitter_poses
+        Pose of the transmitter in each shot, where they differ.
     """
 
     transmitter: Any
     axis: TimeAxis
     gates: GatePlan | None
+    transmitter_poses: Pose | None = field(default=None, kw_only=True)
+
+    def of(self, lanes: Lanes) -> LidarScene:
+        """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
+        moved = super().of(lanes)
+        poses = self.transmitter_poses
+        return moved if poses is None else replace(moved, transmitter_poses=poses.of(lanes))
+
+    @property
+    def transmitter_pose(self) -> Pose:
+        """Pose of the transmitter for paths."""
+        return self.transmitter_poses or self.transmitter.pose
 
     @property
     def submerged(self) -> bool:
@@ -268,7 +319,7 @@ class LidarScene(WaterScene):
     @property
     def reference_length(self) -> float:
         """Length from laser to receiver by the reference point [m], which all lengths of paths leave out."""
-        return sum(self.relative(each.pose).range for each in (self.transmitter, self.receiver))
+        return float(sum(self.relative(each.pose).range for each in (self.transmitter, self.receiver)))
 
     @classmethod
     def from_scene(
@@ -314,11 +365,10 @@ class LidarScene(WaterScene):
         return cls(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
 
 
-def _moved(ray: mi.Ray3f, displacement: mi.Vector3f) -> mi.Ray3f:
-    """Return displaced rays."""
-    ray = mi.Ray3f(ray)
-    ray.o += displacement
-    return ray
+def _turned(vector: Vector, turn: mi.Vector2f) -> Vector:
+    """Return vectors or points turned about the vertical, by angles with this cosine and sine."""
+    (x, y, z), (cos, sin) = vector, turn
+    return type(vector)(dr.fma(cos, x, -sin * y), dr.fma(sin, x, cos * y), z)
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:

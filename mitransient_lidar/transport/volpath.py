@@ -13,7 +13,7 @@ import numpy as np
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.tabulated_phase import deflect, henyey_greenstein, sample_henyey_greenstein
-from mitransient_lidar.transport.opaque import opaque, opaque_point
+from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.path_step import PathStep, ScatteringEvent, Vertex
@@ -142,7 +142,7 @@ class LaserLight(PathLight):
         self.scene, self.record, self.pixel, self.weight = scene, record, pixel, weight
         self.submerged = scene.submerged
         self.sampler = SubmergedLaserSampler(scene) if scene.submerged else RefractedLaserSampler(scene)
-        self._to_laser = scene.relative(scene.transmitter.pose)
+        self._to_laser = scene.relative(scene.transmitter_pose)
         self._path_end = opaque(scene.axis.path_end - scene.reference_length)
 
     def connect(
@@ -168,15 +168,16 @@ class LaserLight(PathLight):
     ) -> None:
         """Add energy to the histogram."""
         # The connection to a laser above goes up: from a vertex that was reached downwards it is one more reversal.
-        upward = opaque(self.scene.transmitter.pose.origin[2]) - path.point.z
+        upward = self.scene.transmitter_pose.point.z - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
         echo = Echo(path.surface_length, on_solid | ~path.before_first_solid)
         self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add energy to the losses."""
-        offset = opaque_point(self.scene.transmitter.pose.origin) - crossing
-        intensity = self.scene.transmitter.intensity(-dr.normalize(offset))
+        pose = self.scene.transmitter_pose
+        offset = pose.point - crossing
+        intensity = self.scene.transmitter.intensity_at(*pose.tangent(-dr.normalize(offset)))
         missing = share * level_transmittance(self.scene, emitter) * intensity / dr.squared_norm(offset)
         self.record.lose(missing, missing > 0)
 

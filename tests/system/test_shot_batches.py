@@ -1,5 +1,7 @@
 """Shots that are rendered together, against the same shots on their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from few_paths import few_paths
@@ -10,7 +12,9 @@ from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.session import choose_integrator, open_scene
 from mitransient_lidar.rendering.shot_batches import ShotBatches
+from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.rendering.shot_series import render_shots
+from mitransient_lidar.transport.pose import Pose
 
 PLACES = np.array([[0.0, 0.0], [17.3, -42.1], [-250.4, 130.2]])
 RECORD = {"time_start_ns": 1380, "bin_count": 200}
@@ -42,7 +46,7 @@ def test_batches_give_what_single_shots_do(scene, integrator, passes, places):
     renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
-    several = batches.at(places)(passes)
+    several = batches.at(ShotPoses(places))(passes)
     seeds = [pass_seed(number, each) for number in range(len(places)) for each in range(passes)]
     bins = renderer.scene.axis.bin_count
     together = several.render_pass(seeds).histogram.energy().reshape(len(places), passes, -1, bins)
@@ -56,6 +60,56 @@ def test_batches_give_what_single_shots_do(scene, integrator, passes, places):
         edges = np.linspace(0, last - first, 12).astype(int)[:-1]
         # Cells of so few photons are up to twice as wide: 0.3 % of the water's signal.
         assert_same(*(np.add.reduceat(each, edges, axis=-1) for each in pair), error=0.05, bias=0.01)
+
+
+def looking(place, azimuth_deg, off_nadir_deg, height, roll_deg):
+    """Return a pose that looks at a place on the mean sea level, turned about its axis."""
+    azimuth, angle, roll = np.radians([azimuth_deg, off_nadir_deg, roll_deg])
+    ahead, side = np.array([np.cos(azimuth), np.sin(azimuth), 0]), np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+    up = np.array([0.0, 0.0, 1.0])
+    axis, far = np.sin(angle) * ahead - np.cos(angle) * up, np.cos(angle) * ahead + np.sin(angle) * up
+    turned = np.cos(roll) * far + np.sin(roll) * side, np.cos(roll) * side - np.sin(roll) * far
+    return Pose(np.array([*place, 0.0]) - axis * height / np.cos(angle), axis, *turned)
+
+
+@pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.long)])
+@pytest.mark.slow
+def test_poses_of_a_batch_give_what_single_shots_do(integrator):
+    """Azimuths all round, other angles, heights and turned pixels, over waves, ripples of a wind and a sloping bottom.
+
+    Alone, each shot is rendered with a laser and a receiver in its pose, and not displaced.
+    """
+    params = {"wind_speed": 6, "bottom_slope_deg": 4}
+    shots = [
+        ((0.0, 0.0), 0.0, 15.0, 300.0, 0.0),
+        ((17.3, -42.1), 130.0, 16.0, 290.0, 9.0),
+        ((-50.4, 30.2), -77.0, 13.8, 312.0, -8.0),
+    ]
+    given = [looking(*shot) for shot in shots]
+    passes = {"lidar_merging": 16, "lidar_volpath": 24}[integrator]
+    renderer = prepared("docs/survey_lidar.xml", params, integrator)
+    share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
+    batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
+    stacked = Pose(*(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left")))
+    poses = ShotPoses.of_receiver(renderer.scene, stacked)
+    np.testing.assert_allclose(poses.places, [shot[0] for shot in shots], atol=1e-9)
+    seeds = [pass_seed(number, each) for number in range(len(shots)) for each in range(passes)]
+    axis = renderer.scene.axis
+    together = batches.at(poses)(passes).render_pass(seeds).histogram.energy()
+    together = together.reshape(len(shots), passes, -1, axis.bin_count)
+    later = poses.extra_range(renderer.scene) / 0.299792458
+    for pose, delay, found in zip(given, later, together, strict=True):
+        session = open_scene(
+            "docs/survey_lidar.xml", params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]}
+        )
+        session.scene.emitters()[0].pose = pose
+        session.sensor.receiver = replace(session.sensor.receiver, pose=pose)
+        session.share_record(replace(axis, start_ns=axis.start_ns + delay))
+        alone = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scaled(share)
+        energy = np.array([alone.render_pass(1000 + seed).histogram.energy() for seed in range(passes)])
+        edges = np.linspace(0, axis.bin_count, 14).astype(int)[:-1]
+        pair = [np.add.reduceat(each, edges, axis=-1) for each in (found, energy)]
+        assert_same(*pair, error=0.06, bias=0.01)
 
 
 @pytest.mark.parametrize(

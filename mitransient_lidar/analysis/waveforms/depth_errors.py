@@ -92,11 +92,7 @@ class DepthErrors:
         widths = [optional_number(attributes, f"{name}_mrad") for name in ("divergence", "field_of_view")]
         width = 1e-3 * geometry.slant_range * min((one for one in widths if one is not None), default=0.0)
         lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
-        variance = optional_number(attributes, "surface_slope_variance")
-        level = highest - lowest < 1e-6
-        variance = _TYPICAL_SLOPE_VARIANCE if variance is None else variance
-        share = min(_MEAN_SLOPE * (max(width, 1e-3) / _WIDTH) ** _OF_WIDTH, 1.0)
-        slope = 0.0 if level else share * math.sqrt(0.5 * variance)
+        slope, variance = mean_slope(attributes, width), _slope_variance(attributes)
         height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
         gain = _column_gain(attributes, geometry)
@@ -203,6 +199,30 @@ class DepthErrors:
         mean = np.sum(weight * np.nan_to_num(time), axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
         farthest = _FARTHEST_NEIGHBOUR * self.pulse_ns
         return np.asarray(np.where(total > 0, np.clip(time - mean, -farthest, farthest), 0).reshape(time_ns.shape))
+
+
+def mean_slope(attributes: Attributes, width: float) -> float:
+    """Return the standard deviation, in each direction, of the sea's slopes averaged over a beam [1].
+
+    Parameters
+    ----------
+    attributes
+        Attributes of a result; those of the sea are ``surface_slope_variance`` [1], by default 0.04, and
+        ``surface_heights_m``, two equal numbers for a level sea, whose slopes are 0.
+    width
+        Diameter of the beam on the sea [m].
+    """
+    lowest, highest = attributes.get("surface_heights_m", (math.nan, math.nan))
+    if highest - lowest < 1e-6:
+        return 0.0
+    share = min(_MEAN_SLOPE * (max(width, 1e-3) / _WIDTH) ** _OF_WIDTH, 1.0)
+    return float(share * math.sqrt(0.5 * _slope_variance(attributes)))
+
+
+def _slope_variance(attributes: Attributes) -> float:
+    """Return the variance of all slopes of the sea [1]."""
+    variance = optional_number(attributes, "surface_slope_variance")
+    return _TYPICAL_SLOPE_VARIANCE if variance is None else variance
 
 
 def _column_gain(attributes: Attributes, geometry: LidarGeometry) -> float:

@@ -114,10 +114,10 @@ def extract(
         Over the dimensions of the waveforms without time, then ``estimator`` if `estimators` is a sequence, and
         ``echo`` (surface, column, target, bottom): ``time_ns``, ``depth_m``, ``amplitude``, ``energy`` and ``width_ns``
         with ``_stderr``, ``depth_m_method_error``, and ``flags``, sums of `echo_detection.EchoFlag`. Without ``echo``:
-        ``surface_time_ns``, the arrival of the surface in the pixel, with ``_stderr``. Over the dimensions of the
-        waveforms alone: ``attenuation`` [1/m] along the path, its ``_stderr`` and ``attenuation_chi2``; with `layers`,
-        over ``layer``: ``layer_depth_m``, ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and
-        ``_below``.
+        ``surface_time_ns``, the arrival of the surface in the pixel, with ``_stderr`` and ``_method_error``, which
+        ``depth_m_method_error`` includes. Over the dimensions of the waveforms alone: ``attenuation`` [1/m] along the
+        path, its ``_stderr`` and ``attenuation_chi2``; with `layers`, over ``layer``: ``layer_depth_m``,
+        ``layer_p_value``, ``layer_step``, ``layer_attenuation_above`` and ``_below``.
 
     Raises
     ------
@@ -343,7 +343,7 @@ def _with_depths(
         time[absent, number, 0] = error[absent, number, 0] = np.nan
         by_light[:, number] = found.method_ns.ravel()
         zero[:, number], zero_error[:, number] = found.time_ns.ravel(), found.stderr_ns.ravel()
-    table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error}
+    table |= {"surface_time_ns": zero, "surface_time_ns_stderr": zero_error, "surface_time_ns_method_error": by_light}
     if settings.depth_from == "echo":
         delay, spread = time - zero[..., np.newaxis], np.hypot(error, zero_error[..., np.newaxis])
         spread[..., 0] = np.where(np.isfinite(time[..., 0]), 0.0, np.nan)
@@ -387,7 +387,8 @@ def _label(
             data[name + suffix] = of_echoes(table[name + suffix], described)
     by_method = {"units": "m", "long_name": "typical error of the depth by scattering and the light's distribution"}
     data["depth_m_method_error"] = of_echoes(table["depth_m_method_error"], by_method)
-    for suffix, of in (("", ""), ("_stderr", "standard error of the ")):
+    by_places = "error by the few places that return light, of the "
+    for suffix, of in (("", ""), ("_stderr", "standard error of the "), ("_method_error", by_places)):
         values = table["surface_time_ns" + suffix]
         described = {"units": "ns", "long_name": f"{of}arrival of the surface"}
         inner = ("estimator",) if several else ()

@@ -33,12 +33,12 @@ class LevelSea:
     boundaries: tuple[float, ...] = ()
 
     def at_height(self, origin: FloatArray, directions: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
-        """Return where rays from a point in the air meet a height, in the air or in the water.
+        """Return where rays from points in the air meet a height, in the air or in the water.
 
         Parameters
         ----------
         origin
-            Point in the air, x, y, z [m].
+            Point in the air, x, y, z [m], or one for each ray, shape (..., 3).
         directions
             Directions of the rays in the air, of any length, shape (..., 3).
         z
@@ -54,11 +54,11 @@ class LevelSea:
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         sine = np.hypot(rays[..., 0], rays[..., 1])
         down = np.where(rays[..., 2] < -_SMALLEST_DESCENT, -rays[..., 2], np.nan)
-        distance = (origin[2] - np.maximum(level, 0)) / down
+        distance = (origin[..., 2] - np.maximum(level, 0)) / down
         for index, thickness in zip(self.refractive_index, self._thickness(-level), strict=True):
             # Horizontal distance over the sine in the air.
             distance = distance + thickness / np.sqrt(index**2 - sine**2)
-        return np.asarray(origin[:2] + rays[..., :2] * distance[..., None])
+        return np.asarray(origin[..., :2] + rays[..., :2] * distance[..., None])
 
     def crossing(self, origin: FloatArray, points: npt.ArrayLike) -> FloatArray:
         """Return where lines of sight from a point in the air to points cross the sea level.

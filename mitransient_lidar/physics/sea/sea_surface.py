@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,8 @@ class SeaSurface:
     slope_series: GramCharlierSeries | None = None  #: Series of the ripples' slopes, None for Gaussian ones.
     #: Spectrum of waves and ripples, which focus light; None without a spectrum that has both, or if they shall not.
     focusing_spectrum: SeaState | None = None
+    #: Elevations of the same waves at a time [s]; None for waves that do not move.
+    waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
 
     @classmethod
     def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
@@ -121,6 +123,7 @@ class SeaSurface:
 
         state, total = _with_total_variance(state, slope_variance, wind_speed, wind_direction)
         waves: PeriodicHeights | NestedHeights | HeightMap | None = None
+        waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
         resolved = (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
         if is_placeholder:
@@ -131,8 +134,10 @@ class SeaSurface:
                 drift = current * math.cos(current_direction), current * math.sin(current_direction)
                 motion = Motion(time, depth, drift)
                 _check_number_of_cells(refined_size, cell)
-                shortest = resolution.shortest_wave
-                waves, cell, resolved = realise_heights(state, period, cell, seed, motion, wind_direction, shortest)
+                given = state, period, cell, seed
+                axis_and_shortest = wind_direction, resolution.shortest_wave
+                waves, cell, resolved = realise_heights(*given, motion, *axis_and_shortest)
+                waves_at = partial(_waves_at, given, motion, axis_and_shortest)
             elif wake is None:
                 cell = math.inf
         elif spectrum == "height_map":
@@ -168,7 +173,12 @@ class SeaSurface:
         return cls(
             *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
+            waves_at,
         )
+
+    def at(self, time: float) -> SeaSurface:
+        """Return the sea at a time [s]; a wake, a height map and a sea without waves stay."""
+        return self if self.waves_at is None else replace(self, waves=self.waves_at(time))
 
     @property
     def slope_variance(self) -> float:
@@ -265,6 +275,13 @@ def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: floa
             raise UserError(f"swell_height = {swell_height:g} needs a spectrum of waves, not {spectrum!r}")
         components.append(SwellSpectrum(swell_height, swell_wavelength, swell_direction))
     return SeaState(tuple(components)) if components else None
+
+
+def _waves_at(
+    given: tuple[SeaState, float, float, int], motion: Motion, rest: tuple[float, float], time: float
+) -> PeriodicHeights | NestedHeights:
+    """Return the waves of `realise_heights`, whose parameters are given, at a time [s]."""
+    return realise_heights(*given, replace(motion, time=time), *rest)[0]
 
 
 def _read_series(get: Get, slope_variance: Any, wind_speed: float) -> GramCharlierSeries | None:

@@ -142,13 +142,15 @@ class WaterGrid:
         self._uppermost = opaque(uppermost)
         self.bits_z = int(np.clip(math.ceil(math.log2(layers + depth / thickness + 1)), 2, 8))
 
-    def of_shots(self, heights: SurfaceHeights, entries: FloatArray, wider: float, bits: int) -> WaterGrid:
-        """Return the grid of shots with heights and axes of their own.
+    def of_shots(
+        self, heights: SurfaceHeights, entries: FloatArray, axes: FloatArray | None, wider: float, bits: int
+    ) -> WaterGrid:
+        """Return the grid of shots with heights and axes of their own, see `BeamRings.of_entries`.
 
         Cells are wider by a factor, and there are buckets for each shot.
         """
         grid = copy.copy(self)
-        grid.heights, grid.rings = heights, self.rings.of_entries(entries)
+        grid.heights, grid.rings = heights, self.rings.of_entries(entries, axes)
         grid.width, grid.bits = self.width * opaque(wider), bits
         return grid
 

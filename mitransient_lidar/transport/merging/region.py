@@ -137,12 +137,17 @@ def beam_entries(scene: LidarScene, shots: int = 1, copies: int = 1) -> FloatArr
     places = shots // copies
     lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * _ENTRY_RAYS), places, _ENTRY_RAYS)
     moved = scene.of(Lanes(shots, lanes.shot * opaque_index(copies), lanes.number))
-    pose = scene.transmitter.pose
+    pose = moved.transmitter_pose
     angles = mi.Point2f(scene.transmitter.sample_tangent(unit_points(_ENTRY_RAYS, lanes.number)))
     direction = np.array(pose.direction(*angles), np.float64).T
     height = meet_sea(moved, pose, angles)[:, 2]
     offset = np.where(np.isfinite(height), height / direction[:, 2], 0.0)[:, None] * direction
-    return np.repeat(offset.reshape(places, _ENTRY_RAYS, 3).mean(axis=1), copies, axis=0)
+    found: FloatArray = np.repeat(offset.reshape(places, -1, 3).mean(axis=1), copies, axis=0)
+    if scene.transmitter_poses is None:
+        return found
+    origin, axis = scene.transmitter_poses.origin, scene.transmitter_poses.axis
+    spots = origin - axis * (origin[:, 2:] / axis[:, 2:])
+    return np.asarray(found + spots - scene.transmitter.pose.ground_point())
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,8 @@ class MergingLayout:
             entries = beam_entries(scene, shots, copies)
             heights = SurfaceHeights(scene, self.region, self.depth, entries[:, :2] - self.entry[:2], copies)
             buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, grid.bits_z + 2))
-            grid = grid.of_shots(heights, entries, max(wider, 1.0), buckets)
+            axes = None if scene.transmitter_poses is None else scene.transmitter_poses.axis
+            grid = grid.of_shots(heights, entries, axes, max(wider, 1.0), buckets)
             rings = grid.rings
         # A copy has capacities of its own.
         uneven = solids_of_several_levels(scene, self.region, shots)
@@ -320,8 +321,8 @@ class MergingRenderer(PassRenderer):
         hits = PhotonBuffer(int(layout.hits * count), self.photons, self.classes, shots.count)
         angles, energy = self._beam.sample(lanes.number, self.photons, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
-        path = RandomWalkPath.start(scene, scene.transmitter.pose, angles, energy, offset)
-        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, scene.axis.path_end, rates.of(lanes))
+        path = RandomWalkPath.start(scene, scene.transmitter_pose, angles, energy, offset)
+        walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates.of(lanes))
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
@@ -358,9 +359,9 @@ class MergingRenderer(PassRenderer):
         capacity = int(layout.sensor_segments * count)
         segments = SegmentBuffer(scene.water, self.classes, layout.spacing, paths, capacity, shots.count)
         offset = opaque(layout.spacing) * rng.next_float32()
-        path = RandomWalkPath.start(scene, scene.receiver.pose, start.angles, start.weight, offset)
+        path = RandomWalkPath.start(scene, scene.receiver_pose, start.angles, start.weight, offset)
         walk = RandomWalk(
-            scene, mi.TransportMode.Radiance, scene.transmitter.pose, scene.axis.path_end, rates.of(lanes)
+            scene, mi.TransportMode.Radiance, scene.transmitter_pose, scene.axis.path_end, rates.of(lanes)
         )
 
         def connect(path: RandomWalkPath, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:

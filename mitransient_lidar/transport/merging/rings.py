@@ -70,7 +70,7 @@ class BeamRings:
     """
 
     def __init__(self, pose: Pose, spread: float, index: float, growth: float = _CORE_PER_METRE) -> None:
-        self.spread, self._growth = opaque(spread), opaque(growth)
+        self.spread, self._growth, self._index = opaque(spread), opaque(growth), index
         self._entry = mi.Vector3f(opaque(0.0))
         horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
@@ -86,10 +86,19 @@ class BeamRings:
         #: Ratio of the axes of the ellipses.
         self.cosine = opaque(down)
 
-    def of_entries(self, entries: FloatArray) -> BeamRings:
-        """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3)."""
+    def of_entries(self, entries: FloatArray, axes: FloatArray | None = None) -> BeamRings:
+        """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3).
+
+        Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own.
+        """
         rings = copy.copy(self)
-        rings._entry = mi.Vector3f(*(aligned(mi.Float, column.astype(np.float32)) for column in entries.T))
+        rings._entry = mi.Vector3f(*_columns(entries))
+        if axes is not None:
+            sine = np.hypot(axes[:, 0], axes[:, 1])
+            cosine = np.maximum(np.sqrt(np.maximum(1 - (sine / self._index) ** 2, 0)), _SMALLEST_COSINE)
+            shear = axes[:, :2] / (self._index * cosine)[:, None]
+            is_steep = sine < _LARGEST_SLANT * self._index * cosine
+            rings.shear, rings.slant = _columns(shear), _columns(np.where(is_steep[:, None], shear, 0.0))
         return rings
 
     def of(self, lanes: Lanes) -> BeamRings:
@@ -98,6 +107,8 @@ class BeamRings:
             return self
         rings = copy.copy(self)
         rings._entry = lanes.pick(self._entry)
+        if any(dr.width(each) > 1 for each in self.shear):
+            rings.shear, rings.slant = ([lanes.pick(each) for each in sides] for sides in (self.shear, self.slant))
         return rings
 
     def depth_at(self, z: mi.Float) -> mi.Float:
@@ -147,3 +158,8 @@ class BeamRings:
         radius = dr.sqrt(dr.lerp(dr.square(sector.inner), dr.square(sector.outer), u))
         sin, cos = dr.sincos(dr.two_pi * ((mi.Float(sector.number) + v) * sector.share - shift.y))
         return radius * cos, radius * sin
+
+
+def _columns(values: FloatArray) -> list[mi.Float]:
+    """Return the columns of values of shots, shape (shots, n)."""
+    return [aligned(mi.Float, column.astype(np.float32)) for column in values.T]

@@ -15,7 +15,8 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
 from mitransient_lidar.rendering.render import render_again
-from mitransient_lidar.rendering.session import Session
+from mitransient_lidar.rendering.shot_poses import ShotPoses
+from mitransient_lidar.rendering.shot_scene import ShotScene
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -76,9 +77,8 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
     bottom = {"type": "rectangle", "to_world": turned, "bsdf": {"type": "diffuse"}}
     small = {"type": "sphere", "center": [0.0, 0.0, -4.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
     scene = lidar_scene(integrator={"type": "lidar_merging"}, bottom=None, extra={"floor": bottom, "target": small})
-    session = Session(scene, scene.sensors()[0], "made", {})
     lidar = LidarScene.from_scene(scene, scene.sensors()[0])
-    truth = shot_truth.truth_coordinates(session, lidar, np.array([*PLACES, (400.0, 0.0)]))
+    truth = shot_truth.truth_coordinates(shot_truth.sea_of(scene), lidar, ShotPoses(np.array([*PLACES, (400.0, 0.0)])))
     depth, below = (truth[f"true_bottom_depth{end}"][1] for end in ("", "_below_surface"))
     sine = math.sin(math.radians(20)) / 1.34
     tangent = sine / math.sqrt(1 - sine**2)
@@ -95,7 +95,7 @@ def test_depth_below_the_surface_of_a_wave(lidar_scene, monkeypatch):
     scene = lidar_scene(integrator={"type": "lidar_merging"})
     lidar = LidarScene.from_scene(scene, scene.sensors()[0])
     monkeypatch.setattr(shot_truth, "sea_of", lambda _: Wave(0.4, 0.0))
-    truth = shot_truth.truth_coordinates(Session(scene, scene.sensors()[0], "made", {}), lidar, np.array(PLACES))
+    truth = shot_truth.truth_coordinates(shot_truth.sea_of(scene), lidar, ShotPoses(np.array(PLACES)))
     along = lidar.transmitter.widest_angular_spread * 200 / math.cos(math.radians(20)) ** 2
     x = np.array(PLACES)[:, 0]
     heights = 0.3 * math.exp(-0.5 * (0.4 * along) ** 2) * np.cos(0.4 * x + 0.4)
@@ -143,8 +143,8 @@ def rendered(monkeypatch):
     """Replace renders by made-up waveforms; return places, seeds and time bins of all batches."""
     asked = []
 
-    def render(batches, places, seeds):
-        lidar = batches.at(places)(1).scene
+    def render(batches, poses, seeds):
+        places, lidar = poses.places, batches.at(poses)(1).scene
         asked.append({"places": places.tolist(), "seeds": list(seeds), "passes": batches.passes, "axis": lidar.axis})
         power = np.ones((len(places), lidar.receiver.pixels.count, lidar.axis.bin_count))
         power *= 1 + np.array(seeds)[:, None, None]
@@ -245,7 +245,7 @@ def test_random_places_are_those_of_the_seed(rendered):
 @pytest.mark.slow
 def test_target_keeps_its_place_relative_to_the_aim(rendered):
     params = {**FLAT, "target_x": 0.5, "aim_x": 0.2}
-    series = shot_series._Series("fig13_2x2", params, None, (0.3, 0.0), np.array(PLACES), None, False)
+    series = ShotScene("fig13_2x2", params, None, (0.3, 0.0), np.array(PLACES), None, False)
     (target,) = series.companions
     assert target.id() == "target"
     # In the frame of the first shot, with its aim at x = 1 m.
@@ -260,10 +260,10 @@ def test_target_keeps_its_place_relative_to_the_aim(rendered):
 def test_interruption_keeps_the_shots_so_far(rendered, monkeypatch, kept):
     whole = shot_batches.ShotBatches.render
 
-    def interrupted(batches, places, seeds):
+    def interrupted(batches, poses, seeds):
         if seeds[0] == kept:
             raise KeyboardInterrupt
-        return whole(batches, places, seeds)
+        return whole(batches, poses, seeds)
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
     if kept == 0:
@@ -344,10 +344,10 @@ def test_the_first_batch_has_two_passes_in_any_time(clock, monkeypatch, tmp_path
 def test_command_keeps_the_shots_before_an_interruption(rendered, monkeypatch, tmp_path):
     whole = shot_batches.ShotBatches.render
 
-    def interrupted(batches, places, seeds):
+    def interrupted(batches, poses, seeds):
         if seeds[0] == 1:
             raise KeyboardInterrupt
-        return whole(batches, places, seeds)
+        return whole(batches, poses, seeds)
 
     monkeypatch.setattr(shot_batches.ShotBatches, "render", interrupted)
     (tmp_path / "places.csv").write_text("x,y\n1,2\n3,4  # the last\n")

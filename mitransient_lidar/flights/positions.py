@@ -1,0 +1,313 @@
+"""Points of echoes: from poses of pulses and times of echoes to coordinates with standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.analysis.waveforms.echo_detection import has_echo
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range
+from mitransient_lidar.flights.refracted_paths import PoseErrors, RefractedPaths, Timing
+from mitransient_lidar.flights.sea_surface import SeaSurface
+from mitransient_lidar.results.geometry import optional_number
+
+_PER_NS = 0.5e-9 * C0  # distance in air per nanosecond of a two-way time [m/ns]
+_ORTHONORMAL = 1e-6  # largest error of lengths and products of the directions of a pose
+_SMALLEST_DESCENT = 1e-3  # least vertical component of a line of sight that meets the sea
+
+
+class PointClass(IntEnum):
+    """Class of a point, by the codes of LAS 1.4 for bathymetry."""
+
+    BOTTOM = 40
+    SURFACE = 41
+    OBJECT = 43
+    NO_ECHO = 45
+
+
+#: Echoes of `echo_table.extract` that are points, in the order of their arrival.
+_ECHOES = {"surface": PointClass.SURFACE, "target": PointClass.OBJECT, "bottom": PointClass.BOTTOM}
+
+_OF_ECHOES = ("depth_m", "depth_m_stderr", "depth_m_method_error", "time_ns_stderr", "amplitude", "flags")
+_OF_SURFACES = ("surface_time_ns", "surface_time_ns_stderr", "surface_time_ns_method_error")
+
+_DESCRIBED = {
+    "x": ("m", "easting"),
+    "y": ("m", "northing"),
+    "z": ("m", "height above the mean sea level of the scene"),
+    "kind": ("1", "class: 40 bottom, 41 water surface, 43 submerged object, 45 no echo"),
+    "depth": ("m", "depth below the local surface"),
+    "intensity": ("", "amplitude of the echo"),
+    "x_uncertainty": ("m", "standard deviation of x"),
+    "y_uncertainty": ("m", "standard deviation of y"),
+    "horizontal_uncertainty": ("m", "root of the sum of the variances of x and y"),
+    "vertical_uncertainty": ("m", "standard deviation of z"),
+    "depth_uncertainty": ("m", "standard deviation of the depth"),
+    "shot": ("1", "number of the pulse, from 0"),
+    "pixel": ("1", "number of the pixel, from 0"),
+    "return_number": ("1", "number of the point in its waveform, from 1"),
+    "number_of_returns": ("1", "points of the waveform"),
+    "flags": ("1", "problems of the echo, as of echo_table"),
+    "gps_time": ("s", "time of the pulse"),
+}
+
+
+def positions(
+    echoes: xr.Dataset,
+    origin: npt.ArrayLike,
+    axis: npt.ArrayLike,
+    far: npt.ArrayLike,
+    left: npt.ArrayLike,
+    angle_x: npt.ArrayLike,
+    angle_y: npt.ArrayLike,
+    *,
+    refractive_index: float,
+    group_index: float,
+    surface: SeaSurface | None = None,
+    errors: PoseErrors | None = None,
+    forward: npt.ArrayLike | None = None,
+    view_x: npt.ArrayLike = 0.0,
+    view_y: npt.ArrayLike = 0.0,
+    time_s: npt.ArrayLike | None = None,
+) -> xr.Dataset:
+    """Compute the points of echoes.
+
+    Parameters
+    ----------
+    echoes
+        Echoes of `echo_table.extract` with one estimator and depths from the surface echo, corrected by
+        `depth_correction.correct_depths` or not; over ``shot`` and ``pixel``, or ``row`` and ``column``.
+    origin, axis, far, left
+        Poses of the pulses, as of `transport.pose.Pose`: positions [m] and orthonormal directions, shape (shots, 3).
+    angle_x, angle_y
+        Tangent-plane angles of the pixels' lines of sight [rad], +angle_y to the left; they broadcast to (shots,
+        pixels). Those of results are ``sight_x`` and ``sight_y``.
+    refractive_index, group_index
+        Indices of the water, 1 to 2 and 1 to 3.
+    surface
+        The sea; by default, level at z = 0, with the slopes that the attributes of the echoes state.
+    errors
+        Standard deviations of the poses; by default those of `PoseErrors`.
+    forward
+        Forward axis of the platform, not vertical, shape (3,) or (shots, 3). Needed where roll and pitch have different
+        errors.
+    view_x, view_y
+        Standard deviations of the light in a pixel about its line of sight [rad], at least 0; they broadcast to (shots,
+        pixels).
+    time_s
+        Times of the pulses [s], shape (shots,). A surface with planes needs them.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``point``, ordered by shot, pixel and arrival: ``x``, ``y``, ``z`` [m], ``kind`` (`PointClass`), ``depth``
+        [m] below the local surface, ``intensity`` (amplitude, in the unit of the echoes), the standard deviations
+        ``x_uncertainty``, ``y_uncertainty``, ``vertical_uncertainty`` (of z), ``horizontal_uncertainty`` (root of the
+        sum of the variances of x and y) and ``depth_uncertainty`` [m], ``shot``, ``pixel``, ``return_number``,
+        ``number_of_returns``, ``flags`` and, with `time_s`, ``gps_time`` [s]. A waveform without an echo has one point
+        of the class 45, where its line of sight meets the sea, with NaN as depth and intensity.
+
+    Raises
+    ------
+    UserError
+        If shapes do not agree, a pose is not orthonormal, a line of sight does not descend to the sea, a value is out
+        of range, or the echoes lack a variable, have several estimators or depths from the mean sea level.
+
+    Notes
+    -----
+    A point is at o + R d + s w, as of `RefractedPaths`: R is the range of the surface's arrival in the pixel, from
+    which depths are counted, or with planes that of the plane. Over a level sea its z is that of the surface less the
+    depth.
+
+    Errors are propagated to first order and are independent of each other: position, attitude and range of the lidar;
+    arrivals of surface and echo; the method error of the depth; height and slopes of the surface; and the place in the
+    pixel from which the light comes. The method error of the depth includes what the arrival of the surface and its
+    slopes contribute, so that only the rest of it counts beside them.
+    """
+    table = _Table.of(echoes)
+    errors = PoseErrors() if errors is None else errors
+    angles = (_of_pixels(name, given, table.shape) for name, given in (("angle_x", angle_x), ("angle_y", angle_y)))
+    pulses = _Pulses.of({"origin": origin, "axis": axis, "far": far, "left": left}, *angles)
+    indices = in_range("refractive_index", refractive_index, 1, 2), in_range("group_index", group_index, 1, 3)
+    if surface is None:
+        surface = SeaSurface(slope_deviation=mean_slope(echoes.attrs, _beam_width(echoes, pulses)))
+    times = np.zeros(table.shape[0]) if time_s is None else finite_array("time_s", time_s)
+    if times.shape != table.shape[:1]:
+        raise UserError(f"time_s of shape {times.shape} must have one time for each of {table.shape[0]} pulses")
+    if time_s is None and surface.points is not None:
+        raise UserError("a surface with planes needs the times of the pulses: give time_s")
+    views = [_of_pixels(name, given, table.shape) for name, given in (("view_x", view_x), ("view_y", view_y))]
+    if (least := min(float(view.min()) for view in views)) < 0:
+        raise UserError(f"view_x and view_y must not be negative, but one is {least:g}")
+    rotations = errors.rotations(forward, table.shape[0])
+
+    shot, pixel, echo = table.points()
+    timing = table.timing(shot, pixel, echo)
+    paths = RefractedPaths.trace(
+        *(pulses.origin[shot], pulses.direction[shot, pixel], timing, (echo > 0, echo < 0)),
+        *(indices, surface, times[shot]),
+    )
+    sides = np.stack(
+        [view[shot, pixel, None] * side[shot] for view, side in zip(views, (pulses.far, pulses.left), strict=True)]
+    )
+    variance = paths.variance(errors, rotations[:, shot], sides, surface.slope_deviation)
+    x, y, z = paths.place.T
+    sigma_x, sigma_y, sigma_z = np.sqrt(variance).T
+    number, count = _returns(shot, pixel)
+    values = {
+        **{"x": x, "y": y, "z": z, "kind": np.array([*_ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8)},
+        **{
+            "depth": table.value("depth_m", shot, pixel, echo),
+            "intensity": table.value("amplitude", shot, pixel, echo),
+        },
+        **{"x_uncertainty": sigma_x, "y_uncertainty": sigma_y, "horizontal_uncertainty": np.hypot(sigma_x, sigma_y)},
+        "vertical_uncertainty": sigma_z,
+        "depth_uncertainty": np.hypot(
+            *(table.value(f"depth_m_{kind}", shot, pixel, echo) for kind in ("stderr", "method_error"))
+        ),
+        **{"shot": shot, "pixel": pixel, "return_number": number, "number_of_returns": count},
+        "flags": table.values["flags"][shot, pixel, np.maximum(echo, 0)].astype(np.int64),
+    }
+    if time_s is not None:
+        values["gps_time"] = times[shot]
+    units = {"intensity": echoes["amplitude"].attrs.get("units", "")}
+    data = {
+        name: ("point", value, {"units": units.get(name, _DESCRIBED[name][0]), "long_name": _DESCRIBED[name][1]})
+        for name, value in values.items()
+    }
+    return xr.Dataset(data, attrs={"surface_level_m": surface.level, "surface_level_error_m": surface.level_error})
+
+
+def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SeaSurface:
+    """Fit the sea to the surface points of a flight.
+
+    Parameters
+    ----------
+    points
+        Points of `positions`, of the whole flight; with planes they need ``gps_time``.
+    slope_deviation, radius
+        As for `SeaSurface.fit`.
+
+    Raises
+    ------
+    UserError
+        As `SeaSurface.fit`, or if ``gps_time`` is missing.
+    """
+    own = points.isel(point=points["kind"].values == PointClass.SURFACE)
+    if radius > 0 and "gps_time" not in own:
+        raise UserError(f"radius = {radius:g}: planes need the times of the pulses, gps_time")
+    place = np.stack([own[name].values for name in "xyz"], axis=-1)
+    time = own["gps_time"].values if "gps_time" in own else np.zeros(len(place))
+    error = own["vertical_uncertainty"].values
+    return SeaSurface.fit(place, error, time, slope_deviation=slope_deviation, radius=radius)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pulses:
+    """Poses of pulses, shape (shots, 3), and unit directions of the pixels' lines of sight, (shots, pixels, 3)."""
+
+    origin: FloatArray
+    far: FloatArray
+    left: FloatArray
+    direction: FloatArray
+
+    @classmethod
+    def of(cls, given: dict[str, npt.ArrayLike], x: FloatArray, y: FloatArray) -> _Pulses:
+        """Check poses, and compute the lines of sight at tangent-plane angles [rad], shape (shots, pixels)."""
+        vectors = {name: finite_array(name, value) for name, value in given.items()}
+        for name, value in vectors.items():
+            if value.shape != (len(x), 3):
+                raise UserError(f"{name} of shape {value.shape} must have the shape ({len(x)}, 3), a vector a pulse")
+        frame = np.stack([vectors[name] for name in ("axis", "far", "left")], axis=1)
+        skew = np.abs(frame @ frame.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ORTHONORMAL
+        if skew.any():
+            raise UserError(f"axis, far and left of pulse {int(np.argmax(skew))} must be orthonormal")
+        direction = frame[:, None, 0] + x[..., None] * frame[:, None, 1] + y[..., None] * frame[:, None, 2]
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        for shot, pixel in np.argwhere(direction[..., 2] > -_SMALLEST_DESCENT)[:1]:
+            raise UserError(f"the line of sight of pulse {shot}, pixel {pixel}, must descend to the sea")
+        return cls(vectors["origin"], frame[:, 1], frame[:, 2], direction)
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Echoes: values of surface, target and bottom, shape (shots, pixels, 3), or of the surface, (shots, pixels)."""
+
+    values: dict[str, FloatArray]
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, echoes: xr.Dataset) -> _Table:
+        """Read the echoes."""
+        missing = [name for name in (*_OF_ECHOES, *_OF_SURFACES) if name not in echoes]
+        if missing:
+            raise UserError(f"the echoes lack {missing[0]}: they must be those of echo_table.extract")
+        if "estimator" in echoes.dims:
+            raise UserError("the echoes have several estimators: select one")
+        if "mean sea level" in echoes["depth_m"].attrs.get("long_name", ""):
+            raise UserError("the depths are from the mean sea level: they must be from the surface echo")
+        pixels = ("row", "column") if "row" in echoes.dims else ("pixel",)
+        if set(echoes["depth_m"].dims) != {"shot", *pixels, "echo"}:
+            raise UserError(
+                f"the echoes have the dimensions {', '.join(map(str, echoes.dims))}: they need shot and pixel"
+            )
+        chosen = echoes.sel(echo=list(_ECHOES))
+        values = {name: chosen[name].transpose("shot", *pixels, "echo").values for name in _OF_ECHOES}
+        values |= {name: chosen[name].transpose("shot", *pixels).values for name in _OF_SURFACES}
+        shots = echoes.sizes["shot"]
+        shape = shots, values["surface_time_ns"].size // max(shots, 1)
+        last = {name: (len(_ECHOES),) if name in _OF_ECHOES else () for name in values}
+        return cls({name: value.reshape(*shape, *last[name]) for name, value in values.items()}, shape)
+
+    def points(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Return shot, pixel and echo of all points, in order; the echo of a waveform without one is -1."""
+        found = has_echo(self.values["flags"].astype(np.int64)) & np.isfinite(self.values["depth_m"])
+        found &= np.isfinite(self.values["surface_time_ns"])[..., None]
+        silent = ~found.any(axis=-1, keepdims=True)
+        shot, pixel, echo = np.nonzero(np.concatenate([silent, found], axis=-1))
+        return shot, pixel, echo - 1
+
+    def value(self, name: str, shot: IntArray, pixel: IntArray, echo: IntArray) -> FloatArray:
+        """Return a quantity of points, NaN without an echo."""
+        return np.where(echo >= 0, self.values[name][shot, pixel, echo], np.nan)
+
+    def timing(self, shot: IntArray, pixel: IntArray, echo: IntArray) -> Timing:
+        """Return what the times of points mean; errors that are not known count as 0."""
+        surface = [_PER_NS * self.values[name][shot, pixel] for name in _OF_SURFACES]
+        noise = _PER_NS * self.values["time_ns_stderr"][shot, pixel, echo]
+        depth, method = (self.values[name][shot, pixel, echo] for name in ("depth_m", "depth_m_method_error"))
+        wet = echo > 0
+        behind = [np.where(wet, np.nan_to_num(one), 0.0) for one in (noise, depth, method)]
+        return Timing(surface[0], *map(np.nan_to_num, surface[1:]), *behind)
+
+
+def _of_pixels(name: str, given: npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Return values for every pulse and pixel; an array of rows and columns counts as one of pixels."""
+    values = finite_array(name, given)
+    if values.size == shape[1]:
+        values = values.reshape(-1)
+    try:
+        return np.broadcast_to(values, shape)
+    except ValueError:
+        raise UserError(f"{name} of shape {np.shape(given)} must broadcast to {shape}, pulses and pixels") from None
+
+
+def _beam_width(echoes: xr.Dataset, pulses: _Pulses) -> float:
+    """Return the diameter of the beam, or of the view if that is smaller, on the sea [m]."""
+    widths = [optional_number(echoes.attrs, f"{name}_mrad") for name in ("divergence", "field_of_view")]
+    distance = float(np.median(pulses.origin[:, None, 2] / -pulses.direction[..., 2]))
+    return 1e-3 * distance * min((one for one in widths if one is not None), default=0.0)
+
+
+def _returns(shot: IntArray, pixel: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the number of each point in its waveform, from 1, and the number of points there."""
+    starts = np.flatnonzero(np.r_[True, (np.diff(shot) != 0) | (np.diff(pixel) != 0)][: shot.size])
+    counts = np.diff(np.r_[starts, shot.size])
+    return np.arange(shot.size) - np.repeat(starts, counts) + 1, np.repeat(counts, counts)

@@ -1,0 +1,401 @@
+"""Rendering of the pulses of a flight: shots of similar poses together, recorded by the receiver, with their echoes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
+from mitransient_lidar.campaigns.design import Column
+from mitransient_lidar.campaigns.runs import Array
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.flights.mounting import PulsePoses
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.rendering.shot_series import FARTHEST
+
+if TYPE_CHECKING:
+    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.rendering.shot_scene import ShotScene
+    from mitransient_lidar.transport.scene import LidarScene
+
+#: Largest range of angles from nadir [deg], and ratio of heights, of the pulses that share a lidar.
+_ANGLES, _HEIGHTS = 2.0, 1.1
+
+#: Largest angle by which pixels may be turned about their line of sight [deg].
+_LARGEST_TURN = 15.0
+
+#: Most shots that are rendered together, and longest time between them in which waves stand still [s].
+_BATCH, _STILL_S = 64, 0.05
+
+#: Places of a group of pulses that decide how long their record is.
+_PLACES = 48
+
+#: Margin of a record on both sides [ns], for waves and for poses that differ from that of the group.
+_MARGIN_NS = 15.0
+
+#: Inputs of each pulse: unit and description.
+_INPUTS = {
+    "pulse": ("1", "number of the pulse in the flight"),
+    "time_s": ("s", "time of the pulse"),
+    **{f"origin_{axis}": ("m", f"position of the scanner, {axis}") for axis in "xyz"},
+    **{f"{side}_{axis}": ("1", f"direction {side}, {axis}") for side in ("axis", "far", "left") for axis in "xyz"},
+    "scan_angle_deg": ("degree", "angle of the pulse across the flight from the vertical, positive to the right"),
+    "line": ("1", "number of the flight line"),
+    "group": ("1", "group of pulses of similar poses"),
+    "group_angle_deg": ("degree", "angle from nadir of the lidar of the group"),
+    "group_height": ("m", "height of the lidar of the group above the mean sea level"),
+    "group_x": ("m", "place of the lidar of the group, x"),
+    "group_y": ("m", "place of the lidar of the group, y"),
+    "record_start_ns": ("ns", "start of the record of the lidar of the group"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FlightRenderer:
+    """Renders the pulses of a flight, each with the same bits wherever and whenever.
+
+    Attributes
+    ----------
+    plan
+        The flight.
+    scene
+        Its scene, with its instrument.
+    axis
+        Width and number of the time bins of all records; each begins at the time of its group.
+    """
+
+    plan: FlightPlan
+    scene: SceneRecord
+    axis: TimeAxis | None
+
+    #: Name of one that is rendered, and of what a store of them is.
+    unit, kind, shots = "shot", "flight", 1
+
+    @classmethod
+    def restored(cls, text: str, scene: SceneRecord, axis: TimeAxis | None) -> FlightRenderer:
+        """Return the renderer of a stored flight."""
+        return cls(FlightPlan.from_json(text), scene, axis)
+
+    @property
+    def text(self) -> str:
+        """The flight as JSON."""
+        return self.plan.text
+
+    @classmethod
+    def of(cls, plan: FlightPlan) -> tuple[FlightRenderer, dict[str, Column]]:
+        """Return the renderer of a new flight, and the inputs of its pulses, in groups.
+
+        Raises
+        ------
+        UserError
+            If the flight or its scene is invalid, the bottom does not cover it, or its echo is outside the record.
+        """
+        poses = plan.poses()
+        record = scene_of(plan)
+        columns = _columns(poses)
+        longest, start = None, np.empty(len(poses.time_s))
+        for group in np.unique(columns["group"]):
+            rows = np.flatnonzero(columns["group"] == group)
+            own = _record_of(plan, record, {name: column[rows] for name, column in columns.items()})
+            start[rows] = own.start_ns
+            if longest is None or own.bin_count > longest.bin_count:
+                longest = own
+        return cls(plan, record, longest), {**columns, "record_start_ns": start}
+
+    def describe_input(self, name: str, column: Column) -> dict[str, Any]:
+        """Return the attributes of an input of the pulses."""
+        unit, text = _INPUTS[name]
+        return {"units": unit, "long_name": text}
+
+    def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
+        """Return nothing: all inputs are known before."""
+        return {}
+
+    def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
+        """Return the rows of pulses that are rendered together: successive ones of a group, over one sea."""
+        group, step = inputs["group"], np.floor(inputs["time_s"] / _STILL_S)
+        first = 0
+        for row in range(1, group.size + 1):
+            is_last = row == group.size or row - first == _BATCH
+            if is_last or group[row] != group[first] or (step[row] != step[first] and not self.plan.still_sea):
+                yield list(range(first, row))
+                first = row
+
+    def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
+        """Return the arrays of pulses of one group that are rendered together; raise `UserError` if that fails."""
+        arrays, _ = self._stacked(inputs, {})
+        return arrays
+
+    def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
+        """Return arrays of few paths, the coordinates of their dimensions, and the attributes of echoes."""
+        arrays, echoes = self._stacked(inputs, {"passes": 2, "share": 1 / 512, "target_error": None})
+        names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
+        found = {
+            name: Array(tuple(map(str, echoes[name].dims)), echoes[name].values, _plain(echoes[name].attrs))
+            for name in names
+        }
+        samples = arrays["signal"].values.shape[-1]
+        width = float(echoes.attrs["bin_width_ns"])
+        time = {"units": "ns", "long_name": "time from the start of the record of the shot, centres of samples"}
+        found["time"] = Array(("time",), (np.arange(samples) + 0.5) * width, time)
+        found["echo"] = Array(("echo",), np.array(ECHOES), {"long_name": "kind of echo"})
+        stacked = {name: array._replace(values=array.values[0]) for name, array in arrays.items()}
+        return stacked, found, {"echo_attributes": _plain(echoes.attrs)}
+
+    def _stacked(self, inputs: Mapping[str, Column], options: Mapping[str, Any]) -> tuple[dict[str, Array], xr.Dataset]:
+        """Return the arrays of pulses, stacked, and their echoes."""
+        series, later = self._render(inputs, **options)
+        plan = self.plan
+        recorded = detect_waveforms(
+            series,
+            plan.receiver,
+            seed=int(np.random.SeedSequence([plan.seed, int(inputs["pulse"][0]), 1]).generate_state(1)[0]),
+            background_power=plan.background_power_w,
+            gain=plan.gain,
+            optical_density=plan.optical_density,
+        )
+        echoes = extract(recorded, plan.estimator)
+        pixels = recorded.sizes["pixel"]
+        start = float(recorded.attrs["time_start_ns"]) + later
+        about = {"units": "ns", "long_name": "time of the start of the first sample after the pulse"}
+        found = {
+            "signal": _single(recorded["signal"]),
+            "sample_start_ns": Array((), start, about),
+            "time_offset_ns": Array((), later, {"units": "ns", "long_name": "time of the shot after that of its group"}),
+            "gain": _per_pixel(recorded.attrs["gain"], len(later), pixels, "factor of the amplifier's transimpedance"),
+        }
+        for name, values in series.coords.items():
+            if str(name).startswith("true_"):
+                found[str(name)] = _single(values)
+        for name, values in echoes.data_vars.items():
+            dtype = np.int16 if name == "flags" else np.float64 if str(name).endswith("time_ns") else np.float32
+            found[f"echo_{name}"] = _single(values, dtype)
+        return found, echoes
+
+    def _render(
+        self, inputs: Mapping[str, Column], passes: int | None = None, share: float | None = None, **goal: float | None
+    ) -> tuple[xr.Dataset, FloatArray]:
+        """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
+        from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, share_for_error
+        from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
+
+        plan, axis = self.plan, self.axis
+        assert axis is not None
+        target_error = goal.get("target_error", plan.target_error)
+        start = float(inputs["record_start_ns"][0])
+        scene = _shot_scene(self, *_lidar_of(inputs), TimeAxis(start, axis.bin_width_ns, axis.bin_count))
+        poses = _shot_poses(scene.lidar, inputs)
+        # Records start at whole bins after the pulse, as the clock of a digitizer that the pulse starts.
+        further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * axis.bin_width_ns
+        poses = poses.delayed(further % width)
+        batches = scene.batches(
+            passes or MOST_PASSES_FOR_ERROR,
+            share or share_for_error(plan.target_error),
+            target_error,
+        )
+        sea = sea_of(scene.session.scene)
+        if not plan.still_sea:
+            time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S) + 0.5)
+            batches.set_time(time_s)
+            sea = sea if sea is None else sea.at(time_s)
+        pulses = inputs["pulse"].astype(np.int64)
+        records = [
+            batches.render(poses.part(part), [plan.seed * 2**20 + int(pulse) for pulse in pulses[part]])
+            for part in batches.parts(len(poses))
+        ]
+        joined = [
+            np.concatenate([getattr(record, name) for record in records])
+            for name in ("energy", "energy_stderr", "power", "power_stderr")
+        ]
+        attributes = scene.attributes(used=batches.used_values, passes=max(record.passes for record in records))
+        series = scene.dataset(joined, [], attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
+        return series, 1e9 / C0 * (further - further % width)
+
+
+def scene_of(plan: FlightPlan) -> SceneRecord:
+    """Return the record of the scene of a flight, with its instrument.
+
+    Raises
+    ------
+    UserError
+        If it cannot be loaded, or lacks a parameter.
+    """
+    record = open_scene(plan.scene, None, instrument=plan.instrument).record
+    assert record is not None
+    for name in ("aim_x", "aim_y", "altitude", "off_nadir_deg", *plan.parameters):
+        if name not in record.parameters:
+            raise UserError(f"scene {plan.scene} has no parameter {name}, which the flight sets")
+    return record
+
+
+@functools.lru_cache(maxsize=2)
+def _shot_scene(
+    renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis
+) -> ShotScene:
+    """Return the loaded scene of the lidar of a group."""
+    from mitransient_lidar.rendering.shot_scene import ShotScene
+
+    params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
+    return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False)
+
+
+def _lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
+    """Return the angle from nadir [deg], the height, and the place of the lidar of pulses of one group [m]."""
+    angle, height, x, y = (float(inputs[f"group_{name}"][0]) for name in ("angle_deg", "height", "x", "y"))
+    return angle, height, x, y
+
+
+def _vectors(inputs: Mapping[str, Column], name: str) -> FloatArray:
+    """Return vectors of pulses, shape (pulses, 3)."""
+    return np.column_stack([inputs[f"{name}_{axis}"] for axis in "xyz"])
+
+
+def _shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
+    """Return the poses of pulses of one group; raise `UserError` for pixels that are turned too far."""
+    from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.transport.pose import Pose
+
+    poses = ShotPoses.of_receiver(lidar, Pose(*(_vectors(inputs, name) for name in ("origin", "axis", "far", "left"))))
+    assert poses.receiver is not None
+    cosine = poses.receiver.far @ lidar.receiver.pose.far
+    turn = float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
+    if turn > _LARGEST_TURN:
+        raise UserError(
+            f"the pixels are turned about their line of sight by up to {turn:.3g} degrees: at most {_LARGEST_TURN:g} "
+            "may be; let them turn with the scan, pixels = 'scan'"
+        )
+    return poses
+
+
+def _columns(poses: PulsePoses) -> dict[str, Column]:
+    """Return the inputs of pulses but the start of their record, in groups of similar angles from nadir and heights."""
+    if np.any(poses.axis[:, 2] >= -0.05):
+        row = int(np.argmax(poses.axis[:, 2]))
+        angle = np.degrees(np.arccos(-poses.axis[row, 2]))
+        raise UserError(
+            f"pulse {row} at {poses.time_s[row]:g} s looks {angle:.4g} degrees from nadir: at most 87 may be"
+        )
+    if np.any(poses.origin[:, 2] <= 1):
+        row = int(np.argmin(poses.origin[:, 2]))
+        raise UserError(
+            f"pulse {row} at {poses.time_s[row]:g} s is sent from a height of {poses.origin[row, 2]:g} m: the scanner "
+            "must be more than 1 m above the mean sea level"
+        )
+    places = (poses.origin - poses.axis * (poses.origin[:, 2:] / poses.axis[:, 2:]))[:, :2]
+    if (farthest := float(np.abs(places).max())) > FARTHEST:
+        raise UserError(
+            f"the flight reaches {farthest:g} m from the origin of the scene: at most {FARTHEST:g} m may be; give "
+            "the platform an origin near it"
+        )
+    angle, height = np.degrees(np.arccos(-poses.axis[:, 2])), np.log(poses.origin[:, 2])
+    bands = [_bands(values, step) for values, step in ((angle, _ANGLES), (height, float(np.log(_HEIGHTS))))]
+    _, group = np.unique(np.stack(bands), axis=1, return_inverse=True)
+    group = group.reshape(-1)
+    order = np.lexsort((np.arange(group.size), group))
+    columns: dict[str, Column] = {
+        "pulse": np.arange(group.size),
+        "time_s": poses.time_s,
+        **{
+            f"{name}_{axis}": getattr(poses, name)[:, number]
+            for name in ("origin", "axis", "far", "left")
+            for number, axis in enumerate("xyz")
+        },
+        "scan_angle_deg": poses.scan_angle_deg,
+        "line": poses.line.astype(np.int64),
+        "group": group.astype(np.int64),
+    }
+    # A level lidar in the middle of each group.
+    middle = np.empty((group.size, 2))
+    place = np.empty((group.size, 2))
+    for one in np.unique(group):
+        rows = np.flatnonzero(group == one)
+        middle[rows] = [0.5 * (np.min(each[rows]) + np.max(each[rows])) for each in (angle, poses.origin[:, 2])]
+        place[rows] = places[rows[0]]
+    columns |= {"group_angle_deg": middle[:, 0], "group_height": middle[:, 1]}
+    columns |= {"group_x": place[:, 0], "group_y": place[:, 1]}
+    return {name: column[order] for name, column in columns.items()}
+
+
+def _bands(values: FloatArray, step: float) -> IntArray:
+    """Return the numbers of bands of equal width, at most a step, into which values fall."""
+    low, high = float(values.min()), float(values.max())
+    count = max(int(np.ceil((high - low) / step)), 1)
+    return np.minimum(((values - low) / max((high - low) / count, 1e-12)).astype(np.int64), count - 1)
+
+
+def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Column]) -> TimeAxis:
+    """Return time bins that hold the light of pulses of one group, relative to the lidar of the group.
+
+    Raises
+    ------
+    UserError
+        If the bottom does not cover the places of the pulses, or its light arrives after the record.
+    """
+    from mitransient_lidar.rendering.describe import axis_on_bottom
+    from mitransient_lidar.transport.scene import LidarScene
+
+    angle, height, x, y = _lidar_of(inputs)
+    params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": x, "aim_y": y}
+    session = open_scene(record, params)
+    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    poses = _shot_poses(lidar, inputs)
+    bottom = axis_on_bottom(lidar, poses=poses.in_scene)[:, 2]
+    if not lidar.bottoms:
+        raise UserError(f"scene {plan.scene} has no bottom below the flight")
+    if missed := np.count_nonzero(np.isnan(bottom)):
+        row = int(np.argmax(np.isnan(bottom)))
+        raise UserError(
+            f"the bottom does not cover the flight: {missed} of {bottom.size} pulses miss it, the first one, pulse "
+            f"{inputs['pulse'][row]}, at x = {poses.places[row, 0]:.1f} m, y = {poses.places[row, 1]:.1f} m"
+        )
+    # The places of the extremes of depth, and others.
+    depths = np.argsort(bottom)
+    chosen = np.unique(np.concatenate([depths[:2], depths[-2:], depths[:: max(depths.size // _PLACES, 1)]]))
+    shifts = [(float(dx), float(dy)) for dx, dy in poses.places[chosen] - poses.places[0]]
+    film = session.sensor.film()
+    if not film.is_fixed:
+        own = LidarScene.from_scene(session.scene, session.sensor, shifts=shifts).axis
+        first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
+        return TimeAxis.covering(first, last, own.bin_width_ns)
+    sine = np.sin(np.radians(angle)) / lidar.refractive_index
+    way = -2e9 / C0 * lidar.group_index * float(bottom.min()) / np.sqrt(1 - sine**2)
+    arrival = 1e9 / C0 * lidar.reference_length + way
+    if arrival > film.axis.end_ns:
+        raise UserError(
+            f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "
+            f"arrives at {arrival:.0f} ns, but the record of the scene ends at {film.axis.end_ns:.0f} ns"
+        )
+    return film.axis
+
+
+def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:
+    """Return an array of shots, without the name of their dimension."""
+    ordered = values.transpose("shot", ...)
+    dims = tuple(str(dim) for dim in ordered.dims if dim != "shot")
+    return Array(dims, np.asarray(ordered, dtype=dtype), _plain(ordered.attrs))
+
+
+def _per_pixel(value: Any, shots: int, pixels: int, text: str) -> Array:
+    """Return a number, or one for each pixel, of all shots."""
+    values = np.broadcast_to(np.asarray(value, dtype=np.float64), (shots, pixels))
+    return Array(("pixel",), np.array(values), {"units": "1", "long_name": text})
+
+
+def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return attributes that JSON can hold."""
+    return {
+        str(name): value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
+        for name, value in attributes.items()
+    }

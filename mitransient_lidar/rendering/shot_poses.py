@@ -1,0 +1,143 @@
+"""Places and poses of shots in the frame of one lidar, in which they are rendered together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.scene import LidarScene, ScenePart
+
+#: Horizontal component of an axis below which its azimuth is that of the direction of +angle_x.
+_VERTICAL = 1e-6
+
+
+@dataclass(frozen=True)
+class ShotPoses:
+    """Places of shots, and poses that differ from that of the lidar.
+
+    The frame of a shot is turned about the vertical, so that its receiver looks towards the azimuth of the lidar, and
+    displaced, so that the receiver's axis meets the mean sea level where the lidar's does.
+
+    Attributes
+    ----------
+    places
+        Points (x, y) where the receiver's axes meet the mean sea level [m], shape (shots, 2).
+    turns
+        Cosine and sine of the azimuths against that of the lidar, shape (shots, 2); None without any difference.
+    receiver, transmitter
+        Poses in the frame of each shot; None where all are those of the lidar.
+    in_scene
+        Poses of the receiver in the scene; None where they follow from the places.
+    """
+
+    places: FloatArray
+    turns: FloatArray | None = None
+    receiver: Pose | None = None
+    transmitter: Pose | None = None
+    in_scene: Pose | None = None
+
+    @classmethod
+    def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
+        """Return the poses of shots of a lidar whose receiver has given ones, with arrays of shape (shots, 3).
+
+        The transmitter is fixed to the receiver. All axes must go down.
+        """
+        own = lidar.receiver.pose
+        places = receiver.origin - receiver.axis * (receiver.origin[:, 2:] / receiver.axis[:, 2:])
+        azimuth, level = _azimuths(receiver.axis, receiver.far), _azimuths(own.axis, own.far)
+        # Both are unit numbers of the complex plane.
+        turns = azimuth * np.conj(level)
+        to_frame = _rotations(np.conj(turns))
+        centre = own.ground_point()
+        sides = [np.squeeze(to_frame @ side[..., None], -1) for side in (receiver.axis, receiver.far, receiver.left)]
+        origin = np.squeeze(to_frame @ (receiver.origin - places)[..., None], -1) + centre
+        rotation = np.stack(sides, axis=-1) @ np.stack([own.axis, own.far, own.left])
+        shift = origin - rotation @ own.origin
+        own_receiver, own_transmitter = (pose.moved(rotation, shift) for pose in (own, lidar.transmitter.pose))
+        cos_sin = np.stack([turns.real, turns.imag], axis=-1)
+        return cls(places[:, :2], cos_sin, own_receiver, own_transmitter, receiver)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def part(self, rows: slice | IntArray) -> ShotPoses:
+        """Return some of the shots."""
+        turns = None if self.turns is None else self.turns[rows]
+        receiver, transmitter, in_scene = (
+            None if pose is None else _rows(pose, rows) for pose in (self.receiver, self.transmitter, self.in_scene)
+        )
+        return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene)
+
+    def repeated(self, copies: int) -> ShotPoses:
+        """Return each shot several times in turn."""
+        return self.part(np.repeat(np.arange(len(self)), copies))
+
+    def delayed(self, lengths: FloatArray) -> ShotPoses:
+        """Return the shots with a length added to their optical paths [m], shape (shots,)."""
+        return replace(self, receiver=None if self.receiver is None else replace(self.receiver, delay=lengths))
+
+    def scene_part(self, shapes: mi.Scene, positions: FloatArray | None, aim: FloatArray) -> ScenePart:
+        """Return shapes as the shots meet them.
+
+        Parameters
+        ----------
+        shapes
+            The shapes.
+        positions
+            Points (x, y) among them of the shots' places [m], shape (shots, 2); None for shapes that go with the lidar.
+        aim
+            Place (x, y) of the lidar [m], shape (2,).
+        """
+        if positions is None:
+            positions = np.broadcast_to(aim, (len(self), 2))
+        if self.turns is None:
+            return ScenePart(shapes, _vectors(positions - aim))
+        turned = (self.turns[:, 0] + 1j * self.turns[:, 1]) * complex(*aim)
+        by = positions - np.stack([turned.real, turned.imag], axis=-1)
+        cos, sin = (aligned(mi.Float, column.astype(np.float32)) for column in self.turns.T)
+        return ScenePart(shapes, _vectors(by), mi.Vector2f(cos, sin))
+
+    def extra_range(self, lidar: LidarScene) -> FloatArray:
+        """Return the length from laser to receiver by the shared reference point beyond the lidar's own [m], (shots,).
+
+        Times of arrival are relative to it: those of each shot begin later by this length over the speed of light.
+        """
+        if self.receiver is None or self.transmitter is None:
+            return np.zeros(len(self))
+        reference = lidar.receiver.pose.nearby_point()
+        ranges = [np.linalg.norm(pose.origin - reference, axis=1) for pose in (self.receiver, self.transmitter)]
+        return np.asarray(ranges[0] + ranges[1] - lidar.reference_length)
+
+
+def _azimuths(axis: FloatArray, far: FloatArray) -> FloatArray:
+    """Return the azimuths of axes as complex numbers of modulus 1."""
+    chosen = np.where(np.hypot(axis[..., :1], axis[..., 1:2]) > _VERTICAL, axis[..., :2], far[..., :2])
+    number = chosen[..., 0] + 1j * chosen[..., 1]
+    return np.asarray(number / np.abs(number))
+
+
+def _rotations(turns: FloatArray) -> FloatArray:
+    """Return rotations about the vertical by azimuths, shape (shots, 3, 3)."""
+    found = np.zeros((len(turns), 3, 3))
+    found[:, 0, 0] = found[:, 1, 1] = turns.real
+    found[:, 1, 0], found[:, 0, 1] = turns.imag, -turns.imag
+    found[:, 2, 2] = 1.0
+    return found
+
+
+def _rows(pose: Pose, rows: slice | IntArray) -> Pose:
+    """Return the poses of some of the shots."""
+    origin, axis, far, left = (each[rows] for each in (pose.origin, pose.axis, pose.far, pose.left))
+    return Pose(origin, axis, far, left, np.broadcast_to(pose.delay, len(pose.origin))[rows])
+
+
+def _vectors(horizontal: FloatArray) -> mi.Vector3f:
+    """Return horizontal vectors, shape (n, 2)."""
+    x, y = (aligned(mi.Float, column.astype(np.float32)) for column in horizontal.T)
+    return mi.Vector3f(x, y, dr.zeros(mi.Float, len(horizontal)))

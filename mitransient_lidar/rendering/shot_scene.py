@@ -1,0 +1,148 @@
+"""The loaded scene of a series of shots: lidar, time bins, batches, and labelled results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+    from mitransient_lidar.rendering.shot_batches import ShotBatches
+    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.scene import LidarScene
+
+#: Parameters of the scene that shots replace, and those that they replace to move the target.
+AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
+
+
+class ShotScene:
+    """The scene of a series of shots, at the place of the first one.
+
+    Attributes
+    ----------
+    session
+        The loaded scene.
+    lidar
+        Lidar of the first shot, with the time bins of all shots.
+    window
+        Bins whose errors count, in each pixel.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        params: Mapping[str, Any] | None,
+        instrument: str | None,
+        target: tuple[float, float] | None,
+        places: FloatArray,
+        axis: TimeAxis | None,
+        components: bool,
+    ) -> None:
+        from mitransient_lidar.rendering.describe import describe_scene
+        from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
+        from mitransient_lidar.rendering.scene_checks import check_scene
+        from mitransient_lidar.rendering.shot_batches import check_size
+        from mitransient_lidar.transport.scene import LidarScene
+
+        self._scene, self._params, self._target, self._components = scene, params, target, components
+        self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
+        self.session = self._open(self._at(*self._place))
+        self._integrator = choose_integrator(self.session.scene, None)
+        shifts = [(float(x), float(y)) for x, y in places - places[0]]
+        own = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
+        self._axis = own if axis is None else _checked_axis(axis, own)
+        self.session.tell_record(self._axis)
+        self._renderer = self._prepare(self.session)
+        self.lidar: LidarScene = self._renderer.scene
+        self.companions = self._find_companions()
+        origins = self._renderer.classes.count if components else 0
+        check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count, origins)
+        probe = probe_echoes(self.lidar, self._renderer.sampler)
+        self.window = error_window(self.lidar, probe)
+        check_scene(self.lidar, self._renderer.sampler, probe)
+        self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
+
+    def _open(self, params: Mapping[str, Any]) -> Session:
+        """Load the scene with parameters."""
+        return open_scene(self._scene, params, instrument=self._instrument)
+
+    def _prepare(self, session: Session) -> PassRenderer:
+        """Return the renderer of a loaded scene, with the time bins of all shots."""
+        session.share_record(self._axis)
+        renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
+        return renderer.by_origin() if self._components else renderer
+
+    def _at(self, x: float, y: float) -> dict[str, Any]:
+        """Return the parameters of a shot at a place [m]."""
+        target = self._target
+        moved = {} if target is None else {"target_x": x + target[0], "target_y": y + target[1]}
+        return {**(self._params or {}), "aim_x": x, "aim_y": y, **moved}
+
+    def _find_companions(self) -> list[mi.Shape]:
+        """Return the shapes that move with the parameters of the target."""
+        if self._target is None:
+            return []
+        params = self._at(*self._place)
+        other = self._open({**params, "target_x": params["target_x"] + 1.0}).scene
+        pairs = zip(self.session.scene.shapes(), other.shapes(), strict=True)
+        return [shape for shape, moved in pairs if shape.bbox().min.x != moved.bbox().min.x]
+
+    def _loaded_at(self, x: float, y: float) -> PassRenderer:
+        """Return the renderer of the scene loaded at a place [m]."""
+        return self._prepare(self._open(self._at(x, y)))
+
+    def batches(self, passes: int, share: float, target_error: float | None) -> ShotBatches:
+        """Return the shots in batches, for passes with a share of the paths of a full pass, or until an error."""
+        from mitransient_lidar.rendering.shot_batches import ShotBatches
+
+        goal = None if target_error is None else (target_error, self.window)
+        return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions, self._loaded_at)
+
+    def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:
+        """Return the attributes of the series, with other ones."""
+        found = self.session.attributes(integrator=self._integrator, used=used, **self._described, **others)
+        replaced = (*AIM, *(() if self._target is None else TARGET))
+        return {
+            name: value
+            for name, value in found.items()
+            if not name.endswith("_pose") and name not in {f"scene.{each}" for each in replaced}
+        }
+
+    def dataset(
+        self, arrays: Sequence[FloatArray], parts: Sequence[FloatArray], attributes: Mapping[str, Any]
+    ) -> xr.Dataset:
+        """Return the labelled result of arrays of shape (shots, pixels, bins), and (shots, pixels, origins, bins)."""
+        from mitransient_lidar.rendering.describe import with_lines_of_sight
+
+        pixels = self.lidar.receiver.pixels
+        dataset = results.build_series(
+            *arrays,
+            time=self.lidar.axis,
+            pixel_names=pixels.names,
+            pixel_centres_mrad=1e3 * pixels.centres(),
+            grid=pixels.grid,
+            attributes=attributes,
+        )
+        if parts:
+            dataset = results.add_components(dataset, self._renderer.classes.names, *parts).transpose("shot", ...)
+        return with_lines_of_sight(dataset, self.lidar)
+
+
+def _checked_axis(axis: TimeAxis, own: TimeAxis) -> TimeAxis:
+    """Return given time bins; raise `UserError` if they leave out light of the automatic ones."""
+    margin = 0.05 * (own.end_ns - own.start_ns)
+    if own.start_ns < axis.start_ns - margin or own.end_ns > axis.end_ns + margin:
+        raise UserError(
+            f"the record of {axis.start_ns:g} to {axis.end_ns:g} ns leaves out light: it must hold {own.start_ns:g} to "
+            f"{own.end_ns:g} ns"
+        )
+    return axis
