@@ -209,6 +209,73 @@ def read_store(path: Path) -> None:
     _each(lambda: describe_campaign(path), draw, lambda: Store(path).renderer(), lambda: Store(path).mend())
 
 
+_PLAN = """[platform]
+kind = "lines"
+start = [10.0, 20.0]
+heading_deg = 30.0
+speed = 60.0
+height = 300.0
+length = 120.0
+count = 3
+spacing = 20.0
+noise = { roll_deg = 0.8, pitch_deg = 0.5, correlation_s = 4.0, seed = 1 }
+[scanner]
+kind = "raster"
+along_deg = [-10.0, 10.0]
+across_deg = [-20.0, 20.0]
+lines = 5
+points = 7
+rate_hz = 2.0
+pixels = "platform"
+[mounting]
+pitch_deg = 3.0
+lever_arm = [0.3, 1.2, -0.5]
+"""
+
+
+def fly(path: Path) -> None:
+    """Work out the pulses of a flight."""
+    from mitransient_lidar.core.files import read_text
+    from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
+    from mitransient_lidar.flights.mounting import Mounting, pulse_poses
+    from mitransient_lidar.flights.scanner import Scanner
+    from mitransient_lidar.flights.trajectory import Trajectory
+
+    tables = ("platform", "scanner", "mounting")
+    given = parse_toml(read_text(path), path)
+    check_keys("a flight", given, tables)
+    platform, scanner, mounting = (table(name, required("a flight", given, name)) for name in tables)
+    trajectory = Trajectory.of(platform, path.parent)
+    times = trajectory.pulse_times(10.0)[:1000]
+    pulse_poses(trajectory, Mounting.of(mounting), Scanner.of(scanner), times)
+
+
+def sbet(folder: Path) -> Path:
+    """Write an SBET file."""
+    data = np.zeros((9, 17))
+    data[:, 0], data[:, 3] = 345600 + np.arange(9) / 200, 350.0
+    data[:, 1:3] = np.radians([60.0, 15.0]) + 1e-7 * np.arange(9)[:, None]
+    data[:, 9] = 0.3
+    data.astype("<f8").tofile(folder / "a.sbet")
+    return folder / "a.sbet"
+
+
+def follow(**platform: Any) -> Callable[[Path], None]:
+    """Return what reads a trajectory from a file, and interpolates it."""
+
+    def read(path: Path) -> None:
+        from mitransient_lidar.flights.trajectory import Trajectory
+
+        trajectory = Trajectory.of({"file": path.name, **platform}, path.parent)
+        trajectory.at(np.linspace(*trajectory.lines[0], 50))
+
+    return read
+
+
+_TRAJECTORY = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n' + "".join(
+    f"{0.5 * i}, {i % 3}, 2.5, {10 * i}, {30 * i}, 20, 300\n" for i in range(12)
+)
+
 _HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
 
 
@@ -307,6 +374,9 @@ KINDS = {
     "gates_exr": Kind(gates("a_gates.exr"), draw_gates),
     "gates_attributes": Kind(gates("a_gates.nc"), draw_gates, "attributes"),
     "campaign": Kind(written("a.toml", _CAMPAIGN), plan, "text"),
+    "flight": Kind(written("a.toml", _PLAN), fly, "text"),
+    "trajectory": Kind(written("a.trj", _TRAJECTORY), follow(kind="csv"), "text"),
+    "trajectory_sbet": Kind(sbet, follow(kind="sbet", epsg=32633)),
     "table_of_runs": Kind(table_of_runs, plan_table, "text"),
     "store": Kind(store, read_store),
     **{f"map{suffix}": Kind(height_map(suffix), load_map) for suffix in (".npy", ".npz", ".exr", ".nc")},

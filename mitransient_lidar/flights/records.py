@@ -10,6 +10,9 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 
+#: Largest number of a record: angles in double precision keep 0.1 millidegrees.
+_LARGEST = 1e12
+
 
 class Records(NamedTuple):
     """Positions and attitudes of a platform, one for each time."""
@@ -22,7 +25,7 @@ class Records(NamedTuple):
 
 
 def check_records(records: Records, source: str, place: Callable[[int], str]) -> None:
-    """Check that there are 2 records or more, of finite numbers, at times that increase.
+    """Check that there are 2 records or more, of numbers from -1e12 to 1e12, at times that increase.
 
     Parameters
     ----------
@@ -49,9 +52,9 @@ def check_records(records: Records, source: str, place: Callable[[int], str]) ->
         **dict(zip("xyz", records.position.T, strict=True)),
     }
     for name, values in columns.items():
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values)))
-            raise UserError(f"{place(row)}: {name} = {values[row]} must be a finite number")
+        if not (allowed := np.abs(values) <= _LARGEST).all():
+            row = int(np.argmin(allowed))
+            raise UserError(f"{place(row)}: {name} = {values[row]} must be a number from {-_LARGEST:g} to {_LARGEST:g}")
     if (backward := np.flatnonzero(np.diff(records.time_s) <= 0)).size:
         row = int(backward[0]) + 1
         before, after = records.time_s[row - 1 : row + 1].tolist()

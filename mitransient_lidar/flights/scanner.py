@@ -67,7 +67,7 @@ class Scanner(ABC):
             For a key or a value that is not allowed or is missing.
         """
         kind = required("[scanner]", given, "kind")
-        if kind not in KINDS:
+        if not isinstance(kind, str) or kind not in KINDS:
             raise UserError(f"kind = {shown(kind)} of a scanner must be one of {', '.join(KINDS)}")
         where, parameters = f"a scanner of kind {kind!r}", fields(KINDS[kind])
         values = {name: value for name, value in given.items() if name != "kind"}

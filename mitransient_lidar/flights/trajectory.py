@@ -79,7 +79,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         for one in fields(self):
             if one.name != "rotation_spec":
-                object.__setattr__(self, one.name, np.array(getattr(self, one.name), dtype=np.float64))
+                object.__setattr__(self, one.name, _array(one.name, getattr(self, one.name)))
         check_rotation_spec(self.rotation_spec)
         count = self.time_s.size
         for name in Records._fields:
@@ -193,3 +193,11 @@ class Trajectory:
         """Return the times of the first flight lines, for messages."""
         texts = [f"{first:.10g} to {last:.10g} s" for first, last in self.lines[:4]]
         return ", ".join(texts) + (f" and {len(self.lines) - 4} more" if len(self.lines) > 4 else "")
+
+
+def _array(name: str, values: npt.ArrayLike) -> FloatArray:
+    """Return a new array; raise `UserError` for values that are no numbers."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} = {shown(values)} must hold numbers only") from None

@@ -34,8 +34,14 @@ _SBET_NUMBERS = 17
 #: Largest code of a coordinate system.
 _LARGEST_EPSG = 10**6
 
-#: Step north and east that gives the direction of a meridian in a projection [deg], about a metre.
+#: Step that gives the direction of a meridian in a projection [deg], about a metre.
 _STEP = 1e-5
+
+#: Length of a degree of a meridian [m], within 0.6 %.
+_METRES_PER_DEGREE = 111_130.0
+
+#: Largest difference of the scale of a grid from 1: no UTM zone has it, but Mercator's projection beyond 18 degrees.
+_LARGEST_DISTORTION = 0.05
 
 
 def read_text_records(path: str | os.PathLike[str]) -> Records:
@@ -62,7 +68,7 @@ def read_text_records(path: str | os.PathLike[str]) -> Records:
             if key.strip() == "HEADER":
                 names = _cells(value)
             elif key.strip() == "TIME_COLUMN":
-                time_column = integer(f"{path}: TIME_COLUMN", int(value) if value.strip().isdigit() else value, 0, 6)
+                time_column = integer(f"{path}: TIME_COLUMN", int(value) if value.strip().isdecimal() else value, 0, 6)
         elif text:
             rows.append((number, _cells(text)))
     if not names and rows and not any(map(is_number, rows[0][1])):
@@ -101,13 +107,15 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
         SBET file.
     epsg
         EPSG code of projected coordinates in metres, such as 32633 for UTM zone 33 N. x is east and y north on the
-        grid; z is the ellipsoidal height [m]. The scale of the grid, of UTM 0.9996 to 1.001, is that of the positions.
+        grid; z is the ellipsoidal height [m]. Positions have the scale of the grid, within a zone of UTM 0.9996 to
+        1.001, which may differ from 1 by 5 %.
 
     Raises
     ------
     UserError
         If the file cannot be read, its size is no multiple of 136 bytes, a record is not finite, not on the Earth, or
-        not later than the one before; the coordinate system is unknown, or has no metres; or pyproj is missing.
+        not later than the one before; the coordinate system is unknown, has no metres, or has another scale there;
+        or pyproj is missing.
     """
     path = Path(path)
     width = 8 * _SBET_NUMBERS
@@ -123,7 +131,8 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
         return f"{path}, record {row + 1}"
 
     time, latitude, longitude, height = data[:, :4].T
-    roll, pitch, heading = np.degrees(data[:, 7]), np.degrees(data[:, 8]), np.degrees(data[:, 9] - data[:, 10])
+    with np.errstate(over="ignore", invalid="ignore"):
+        roll, pitch, heading = np.degrees([data[:, 7], data[:, 8], data[:, 9] - data[:, 10]])
     check_records(Records(time, data[:, [2, 1, 3]], roll, pitch, heading), str(path), place)
     wrong = (np.abs(latitude) > np.pi / 2) | (np.abs(longitude) > 2 * np.pi)
     for row in np.flatnonzero(wrong)[:1]:
@@ -131,22 +140,27 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
             f"{place(row)}: latitude = {latitude[row]:g} and longitude = {longitude[row]:g} must be radians, up to"
             " pi / 2 and 2 pi"
         )
-    x, y, north = _projected(np.degrees(longitude), np.degrees(latitude), epsg)
-    for row in np.flatnonzero(~np.isfinite(x + y + north))[:1]:
+    x, y, north, scale = _projected(np.degrees(longitude), np.degrees(latitude), epsg)
+    for row in np.flatnonzero(~(np.abs(scale - 1) < _LARGEST_DISTORTION))[:1]:
         raise UserError(
             f"{place(row)}: latitude = {np.degrees(latitude[row]):g} and longitude = {np.degrees(longitude[row]):g} deg"
-            f" must lie in the area of epsg = {epsg}"
+            f" must lie where a metre is a metre within 5 % in epsg = {epsg}; its scale there is {scale[row]:.3g}"
         )
     return Records(time.copy(), np.column_stack([x, y, height]), roll, pitch, heading + north)
 
 
-def _projected(longitude: FloatArray, latitude: FloatArray, epsg: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return x and y [m] of points [deg], and the azimuth of true north from grid north, clockwise [deg]."""
+def _projected(
+    longitude: FloatArray, latitude: FloatArray, epsg: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return x and y [m] of points [deg], the azimuth of true north from grid north [deg], and the scale."""
     project = _projection(epsg)
     x, y = project(longitude, latitude)
-    north_x, north_y = project(longitude, np.minimum(latitude + _STEP, 90.0))
-    south_x, south_y = project(longitude, np.maximum(latitude - _STEP, -90.0))
-    return x, y, np.degrees(np.arctan2(north_x - south_x, north_y - south_y))
+    north, south = np.minimum(latitude + _STEP, 90.0), np.maximum(latitude - _STEP, -90.0)
+    (north_x, north_y), (south_x, south_y) = project(longitude, north), project(longitude, south)
+    with np.errstate(invalid="ignore"):
+        along_x, along_y = north_x - south_x, north_y - south_y
+    scale = np.hypot(along_x, along_y) / (_METRES_PER_DEGREE * (north - south))
+    return x, y, np.degrees(np.arctan2(along_x, along_y)), scale
 
 
 def _projection(epsg: int) -> Any:

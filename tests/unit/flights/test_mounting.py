@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.mounting import Mounting, pulse_poses
+from mitransient_lidar.flights.scanner import Fixed, Oscillating, Palmer
+from mitransient_lidar.flights.trajectory import Trajectory
+
+
+def _level(heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height=200.0):
+    position = [(5, 7, height), (5, 7, height)]
+    return Trajectory([0, 1], position, [roll_deg] * 2, [pitch_deg] * 2, [heading_deg] * 2)
+
+
+def _ground(poses):
+    """Where pulses meet the mean sea level, from the point below the scanner [m]."""
+    return (poses.axis * (-poses.origin[:, 2] / poses.axis[:, 2])[:, None])[:, :2]
+
+
+def test_level_flight_has_circles_on_the_sea():
+    times = np.linspace(0, 0.1, 97)
+    poses = pulse_poses(_level(heading_deg=40), Mounting(), Palmer(nadir_angle_deg=20, rate_hz=50), times)
+    radius = 200 * np.tan(np.radians(20))
+    np.testing.assert_allclose(np.linalg.norm(_ground(poses), axis=1), radius, rtol=1e-13)
+    # The first pulse goes forward, at the azimuth 40.
+    azimuth = np.radians(40)
+    np.testing.assert_allclose(_ground(poses)[0], radius * np.array([np.sin(azimuth), np.cos(azimuth)]), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "mounting", "expected"),
+    # Nadir pulse of 200 m height, north: where it meets the sea, for angles whose tangent is 0.1.
+    [
+        (_level(roll_deg=np.degrees(np.arctan(0.1))), Mounting(), (-20, 0)),
+        (_level(pitch_deg=np.degrees(np.arctan(0.1))), Mounting(), (0, 20)),
+        (_level(), Mounting(roll_deg=np.degrees(np.arctan(0.1))), (-20, 0)),
+        (_level(), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (0, 20)),
+        # East: left is north.
+        (_level(heading_deg=90), Mounting(roll_deg=np.degrees(np.arctan(0.1))), (0, 20)),
+        (_level(heading_deg=90), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (20, 0)),
+        # The pitch of the mounting is turned by its yaw to the right.
+        (_level(), Mounting(pitch_deg=np.degrees(np.arctan(0.1)), yaw_deg=90), (20, 0)),
+        # Equal angles of platform and mounting add up: tan(2 arctan 0.1) = 0.2 / 0.99.
+        (_level(pitch_deg=np.degrees(np.arctan(0.1))), Mounting(pitch_deg=np.degrees(np.arctan(0.1))), (0, 40 / 0.99)),
+    ],
+)
+def test_signs_of_roll_pitch_and_yaw(trajectory, mounting, expected):
+    np.testing.assert_allclose(_ground(pulse_poses(trajectory, mounting, Fixed(), [0.5])), [expected], atol=1e-11)
+
+
+def test_lever_arm_turns_with_the_platform():
+    # 1 m right, 2 m forward, 3 m up. East: right is south. Right side down by 90 degrees: right is down, up is right.
+    mounting = Mounting(lever_arm=(1, 2, 3))
+    for trajectory, expected in (
+        (_level(), (6, 9, 203)),
+        (_level(heading_deg=90), (7, 6, 203)),
+        (_level(roll_deg=90), (8, 9, 199)),
+    ):
+        np.testing.assert_allclose(pulse_poses(trajectory, mounting, Fixed(), [0.5]).origin, [expected], atol=1e-12)
+
+
+def test_pixels_turn_with_the_platform():
+    # East, a pulse to the right (south): far is away from the nadir, south and up; left is east, along the flight.
+    poses = pulse_poses(_level(heading_deg=90), Mounting(), Fixed(nadir_angle_deg=30, azimuth_deg=90), [0.5])
+    sin, cos = 0.5, np.sqrt(0.75)
+    np.testing.assert_allclose(poses.axis, [(0, -sin, -cos)], atol=1e-15)
+    np.testing.assert_allclose(poses.far, [(0, -cos, sin)], atol=1e-15)
+    np.testing.assert_allclose(poses.left, [(1, 0, 0)], atol=1e-15)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 77.0, 300.0])
+def test_scan_angle_is_from_the_vertical_to_the_right(heading_deg):
+    # A mirror at 20 degrees to both sides; with the right side down by 3, all pulses go 3 degrees to the left.
+    scanner = Oscillating(half_angle_deg=20, rate_hz=1)
+    for trajectory, expected in (
+        (_level(heading_deg), [20, -20]),
+        (_level(heading_deg, roll_deg=3), [17, -23]),
+        # A pitch of 60 degrees halves the depth of a pulse, not its way to the side.
+        (_level(heading_deg, pitch_deg=60), np.degrees(np.arctan(np.tan(np.radians(20)) / 0.5)) * np.array([1, -1])),
+    ):
+        poses = pulse_poses(trajectory, Mounting(), scanner, [0.25, 0.75])
+        np.testing.assert_allclose(poses.scan_angle_deg, expected, atol=1e-11)
+
+
+def test_lines_of_pulses():
+    given = {"kind": "lines", "start": [0, 0], "speed": 50, "height": 100, "length": 50, "count": 2, "spacing": 5}
+    trajectory = Trajectory.of(given)
+    poses = pulse_poses(trajectory, Mounting(), Fixed(), trajectory.pulse_times(4))
+    np.testing.assert_array_equal(poses.line, [0] * 5 + [1] * 5)
+    np.testing.assert_allclose(poses.origin[:, 1], [0, 12.5, 25, 37.5, 50, 50, 37.5, 25, 12.5, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tilt_deg": 3}, r"'tilt_deg' is no key of \[mounting\]: allowed are roll_deg, pitch_deg, yaw_deg, lever_arm"),
+        ({"roll_deg": "left"}, "roll_deg = 'left' must be a number"),
+        ({"lever_arm": [1, 2]}, r"lever_arm = \[1, 2\] must be x, y and z in metres"),
+        ({"lever_arm": [1, 2, float("inf")]}, "lever_arm holds inf"),
+    ],
+)
+def test_invalid_mountings(given, message):
+    with pytest.raises(UserError, match=message):
+        Mounting.of(given)
+
+
+def test_mounting_of_a_plan():
+    mounting = Mounting.of({"pitch_deg": 5, "lever_arm": [0.5, 1, -0.2]})
+    assert mounting == Mounting(0.0, 5.0, 0.0, (0.5, 1.0, -0.2))

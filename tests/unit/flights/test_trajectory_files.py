@@ -1,0 +1,213 @@
+import sys
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.trajectory import Trajectory
+from mitransient_lidar.flights.trajectory_files import read_sbet_records, read_text_records
+
+ROWS = np.array([(0, 1, 2, 350, 10, 20, 400), (0.5, 1.5, 2, 355, 12, 30, 401), (1.25, 2, -2, 5, 14, 40, 402)])
+NAMES = ("t", "roll", "pitch", "yaw", "x", "y", "z")
+
+
+def _write(path, heading, order, separator=","):
+    lines = [separator.join(f"{row[NAMES.index(name)]!r}" for name in order) for row in ROWS.tolist()]
+    path.write_text("\n".join([*heading, *lines, ""]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("heading", "order", "separator"),
+    [
+        ([], NAMES, ","),
+        (['#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"'], NAMES, ", "),
+        (["# a comment", "#TIME_COLUMN: 0", '#HEADER: "t", "x", "y", "z", "yaw", "roll", "pitch"'],
+         ("t", "x", "y", "z", "yaw", "roll", "pitch"), ","),
+        (["#TIME_COLUMN: 6"], (*NAMES[1:], "t"), ","),
+        (["#TIME_COLUMN: 3", '#HEADER: "x","y","z","when","roll","pitch","yaw"'],
+         ("x", "y", "z", "t", "roll", "pitch", "yaw"), ","),
+        (["time_s;x_m;y_m;z_m;roll_deg;pitch_deg;heading_deg"],
+         ("t", "x", "y", "z", "roll", "pitch", "yaw"), ";"),
+        (["t x y z yaw roll pitch"], ("t", "x", "y", "z", "yaw", "roll", "pitch"), " "),
+    ],
+)  # fmt: skip
+def test_text_in_any_order(tmp_path, heading, order, separator):
+    records = read_text_records(_write(tmp_path / "flight.trj", heading, order, separator))
+    found = np.column_stack([records.time_s, records.roll_deg, records.pitch_deg, records.yaw_deg, records.position])
+    np.testing.assert_array_equal(found, ROWS)
+
+
+def test_files_of_a_plan_have_an_origin_and_lines(tmp_path):
+    _write(tmp_path / "flight.trj", [], NAMES)
+    given = {"kind": "csv", "file": "flight.trj", "origin": [10, 20, 100], "lines_s": [[0, 0.5], [1, 1.25]]}
+    trajectory = Trajectory.of(given, tmp_path)
+    np.testing.assert_array_equal(trajectory.position, ROWS[:, 4:] - (10, 20, 100))
+    assert trajectory.rotation_spec == "ARINC 705"
+    np.testing.assert_array_equal(trajectory.at([0.25, 1.25]).line, [0, 1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0,0,0,0,0,0,0\n\n1,0,0,0,0,0,0\n0.5,0,0,0,0,0,0\n", r"line 4: time = 0.5 s must be later .* before, 1.0 s"),
+        ("0,0,0,0,0,0,0\n1,0,0,nan,0,0,0\n", "line 2: yaw = nan must be a number from -1e\\+12 to 1e\\+12"),
+        ("0,0,0,0,0,0,0\n1,0,0,0,0,0\n", "line 2: '1, 0, 0, 0, 0, 0' must be 7 numbers, t, roll, pitch"),
+        ("0,0,0,0,0,0,0\n1,0,0,east,0,0,0\n", "line 2: .* must be 7 numbers"),
+        ("t,roll,pitch,course,x,y,z\n0,0,0,0,0,0,0\n", "unknown column 'course': allowed are t, roll, pitch, yaw"),
+        ("t,roll,pitch,x,y,z\n0,0,0,0,0,0\n", "columns t, roll, pitch, x, y, z: it must have each of"),
+        ("#TIME_COLUMN: first\n0,0,0,0,0,0,0\n", "TIME_COLUMN = ' first' must be an integer"),
+        ("0,0,0,0,0,0,0\n", "number of records of 1: it must be at least 2"),
+        ("", "number of records of 0"),
+    ],
+)
+def test_invalid_text(tmp_path, text, message):
+    path = tmp_path / "flight.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_text_records(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"kind": "csv"}, "has no file"),
+        ({"kind": "csv", "file": "none.csv"}, "cannot read .*none.csv"),
+        ({"kind": "csv", "file": "flight.trj", "epsg": 3}, "'epsg' is no key of a platform of kind 'csv'"),
+        (
+            {"kind": "csv", "file": "flight.trj", "rotation_spec": "ZYX"},
+            "rotation_spec = 'ZYX' must be one of aerospace",
+        ),
+        ({"kind": "csv", "file": "flight.trj", "origin": [1, 2]}, "must be x, y and z in metres"),
+        ({"kind": "sbet", "file": "flight.trj"}, "has no epsg"),
+    ],
+)
+def test_invalid_tables(tmp_path, given, message):
+    _write(tmp_path / "flight.trj", [], NAMES)
+    with pytest.raises(UserError, match=message):
+        Trajectory.of(given, tmp_path)
+
+
+def _sbet(path, longitude_deg, latitude_deg, heading_deg=0.0, wander_deg=0.0):
+    """Write records of an SBET file 5 ms apart."""
+    data = np.zeros((len(longitude_deg), 17))
+    data[:, 0] = 345600 + 0.005 * np.arange(len(data))
+    data[:, 1], data[:, 2], data[:, 3] = np.radians(latitude_deg), np.radians(longitude_deg), 400.5
+    data[:, 7], data[:, 8] = np.radians(1.5), np.radians(-2.5)
+    data[:, 9], data[:, 10] = np.radians(heading_deg + wander_deg), np.radians(wander_deg)
+    data.astype("<f8").tofile(path)
+    return data
+
+
+def test_sbet_positions_and_attitudes(tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    longitude, latitude = np.array([15.0, 15.5, 16.0]), np.array([60.0, 60.1, 60.2])
+    data = _sbet(tmp_path / "flight.sbet", longitude, latitude, heading_deg=70.0, wander_deg=25.0)
+    trajectory = Trajectory.of(
+        {"kind": "sbet", "file": "flight.sbet", "epsg": 32633, "origin": [5e5, 6e6, 30]}, tmp_path
+    )
+    x, y = pyproj.Proj(32633)(longitude, latitude)
+    np.testing.assert_allclose(trajectory.position, np.column_stack([x - 5e5, y - 6e6, np.full(3, 370.5)]), atol=1e-6)
+    np.testing.assert_array_equal(trajectory.time_s, data[:, 0])
+    np.testing.assert_allclose(trajectory.roll_deg, 1.5)
+    np.testing.assert_allclose(trajectory.pitch_deg, -2.5)
+    # On the central meridian of the zone, 15 degrees, grid north is true north.
+    assert trajectory.yaw_deg[0] == pytest.approx(70.0, abs=1e-9)
+    assert trajectory.rotation_spec == "aerospace"
+
+
+@pytest.mark.parametrize("epsg", [32633, 3006, 3035, 3413, 2180])
+def test_sbet_headings_are_those_of_the_grid(tmp_path, epsg):
+    """A metre along a geodesic with the true heading goes along the heading of the grid."""
+    pyproj = pytest.importorskip("pyproj")
+    longitude, latitude, heading = (
+        np.array([14.0, 17.0, 19.5]),
+        np.array([60.0, 62.0, 65.0]),
+        np.array([10.0, 130, 275]),
+    )
+    _sbet(tmp_path / "flight.sbet", longitude, latitude, heading)
+    yaw = read_sbet_records(tmp_path / "flight.sbet", epsg).yaw_deg
+    to_grid = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform
+    ahead_longitude, ahead_latitude, _ = pyproj.Geod(ellps="WGS84").fwd(longitude, latitude, heading, np.ones(3))
+    (x, y), (ahead_x, ahead_y) = to_grid(longitude, latitude), to_grid(ahead_longitude, ahead_latitude)
+    expected = np.degrees(np.arctan2(ahead_x - x, ahead_y - y))
+    # Conformal projections keep the angle; the Lambert projection 3035 of equal areas distorts it by up to a degree.
+    difference = (yaw - expected + 180) % 360 - 180
+    np.testing.assert_allclose(difference, 0, atol=1.0 if epsg == 3035 else 1e-5)
+
+
+def test_meridian_convergence_of_utm(tmp_path):
+    """Closed form on a sphere, tan(convergence) = tan(longitude from the meridian) sin(latitude).
+
+    On the ellipsoid the terms differ from the third order on, by eta^2 = 0.0067 cos^2(latitude) times the cube of the
+    difference in longitude: 3e-7 rad at 2 degrees.
+    """
+    pytest.importorskip("pyproj")
+    longitude, latitude = np.array([13.0, 15.0, 17.0]), np.array([60.0, 60.0, -35.0])
+    _sbet(tmp_path / "flight.sbet", longitude, latitude, heading_deg=90.0)
+    yaw = read_sbet_records(tmp_path / "flight.sbet", 32633).yaw_deg
+    convergence = np.arctan(np.tan(np.radians(longitude - 15)) * np.sin(np.radians(latitude)))
+    np.testing.assert_allclose(np.radians(90 - yaw), convergence, atol=3e-7)
+
+
+def test_truncated_sbet(tmp_path):
+    _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
+    data = (tmp_path / "flight.sbet").read_bytes()
+    (tmp_path / "flight.sbet").write_bytes(data[:-8])
+    with pytest.raises(UserError, match="has 400 bytes, but an SBET file must have a multiple of 136"):
+        read_sbet_records(tmp_path / "flight.sbet", 32633)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "message"),
+    [
+        (1, 0, 0.0, "record 2: time = 0.0 s must be later than that of the record before, 345600.0 s"),
+        (2, 8, np.nan, "record 3: pitch = nan must be a number from -1e\\+12 to 1e\\+12"),
+        (1, 1, 60.0, "record 2: latitude = 60 and longitude = 0.261799 must be radians"),
+    ],
+)
+def test_invalid_sbet(tmp_path, row, column, value, message):
+    data = _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
+    data[row, column] = value
+    data.tofile(tmp_path / "flight.sbet")
+    with pytest.raises(UserError, match=message):
+        read_sbet_records(tmp_path / "flight.sbet", 32633)
+
+
+@pytest.mark.parametrize(
+    ("epsg", "message"),
+    [
+        (999999, "epsg = 999999 is no coordinate system that pyproj knows"),
+        (4326, r"epsg = 4326 \(WGS 84\) must be projected coordinates in metres, east and north"),
+        (2263, "epsg = 2263 .* must be projected coordinates in metres"),
+        (2053, "epsg = 2053 .* must be projected coordinates in metres, east and north"),
+        ("UTM", "epsg = 'UTM' must be an integer"),
+    ],
+)
+def test_invalid_coordinate_systems(tmp_path, epsg, message):
+    pytest.importorskip("pyproj")
+    _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
+    with pytest.raises(UserError, match=message):
+        read_sbet_records(tmp_path / "flight.sbet", epsg)
+
+
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "epsg", "scale"),
+    # Spherical Mercator, 1 / cos(60 deg) but for the ellipsoid; the antipode of Lambert's projection.
+    [(15.0, 60.0, 3857, "2"), (-170.0, -52.0, 3035, "nan")],
+)
+def test_sbet_where_the_projection_has_another_scale(tmp_path, longitude, latitude, epsg, scale):
+    pytest.importorskip("pyproj")
+    _sbet(tmp_path / "flight.sbet", np.full(3, longitude), np.full(3, latitude))
+    message = (
+        rf"record 1: latitude = {latitude:g} and longitude = {longitude:g} deg must .*; its scale there is {scale}"
+    )
+    with pytest.raises(UserError, match=message):
+        read_sbet_records(tmp_path / "flight.sbet", epsg)
+
+
+def test_pyproj_is_named_where_it_is_missing(tmp_path, monkeypatch):
+    _sbet(tmp_path / "flight.sbet", np.full(3, 15.0), np.full(3, 60.0))
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(UserError, match=r"need pyproj: install it by pip install 'mitransient-lidar\[geo\]'"):
+        read_sbet_records(tmp_path / "flight.sbet", 32633)
