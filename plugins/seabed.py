@@ -176,17 +176,17 @@ class Bottom:
 def _read_terrain(get: Get) -> HeightMap | None:
     """Read the height map, if there is one."""
     path = get("filename", "")
-    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes")
-    size, x, y, values, holes = (get(name, None) for name in names)
+    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell")
+    size, x, y, values, holes, cell = (get(name, None) for name in names)
     if not path:
-        for name, value in zip(names, (size, x, y, values, holes), strict=True):
+        for name, value in zip(names, (size, x, y, values, holes, cell), strict=True):
             if value is not None:
                 raise UserError(f"{name} = {value} needs a height map: give its filename")
         return None
     if (x is None) != (y is None):
         raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
     origin = None if x is None else (finite("origin_x", x), finite("origin_y", y))
-    return read_height_map(path, size, origin, values or "heights", holes or "refuse")
+    return read_height_map(path, size, origin, values or "heights", holes or "refuse", cell)
 
 
 def _read_patches(text: str) -> tuple[Patch, ...]:
@@ -227,15 +227,19 @@ class Seabed(mi.Mesh):
                                       none. Default: 0
     ripple_length             float   Distance of their crests [m]. Default: 0.2
     ripple_bearing_deg        float   Direction across the crests, from +x to +y [deg]. Default: 0
-    filename                  string  Height map that is added: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), or a
-                                      GeoTIFF (.tif) with the extra ``geo``. Where its heights are those above the mean
-                                      sea level, give ``depth`` 0
+    filename                  string  Height map that is added: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), a
+                                      GeoTIFF (.tif) with the extra ``geo``, a Bathymetric Attributed Grid (.bag), or
+                                      points (.xyz, .csv, .txt). Where its heights are those above the mean sea level,
+                                      give ``depth`` 0
     map_size                  float   Side along x of a height map that carries no positions [m]
     map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: ``heights``
     map_holes                 string  ``refuse`` or ``fill`` cells without a value, with that of the nearest cell.
                                       Default: ``refuse``
+    map_cell                  float   Cell of the grid on which points are interpolated [m]. Default: their own grid,
+                                      or their mean spacing
     origin_x, origin_y        float   Point of the map, in its coordinates, that lies at x = y = 0 [m]. Default: the
-                                      centre of an .asc or .tif; positions in other files are those of the scene
+                                      centre of an .asc, .tif or .bag, or of points; positions in other files are those
+                                      of the scene
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none
@@ -255,6 +259,12 @@ class Seabed(mi.Mesh):
 
     .. math:: z = -d + x \tan\alpha_x + y \tan\alpha_y + \tfrac{1}{2} C r^2
               + \tfrac{1}{2} h \cos(2\pi (x \cos\beta + y \sin\beta) / L) + z_\text{map}(x, y).
+
+    Points x, y, z [m] are columns of these names or the first three. Points on an even grid, of which at least a
+    quarter of the cells have one, are its cells. Others are triangulated (Delaunay), and the height at a place in a
+    triangle is linear in it, :math:`z_\text{map} = \sum_i \lambda_i z_i` with the barycentric coordinates
+    :math:`\lambda_i`, on a grid with the cell :math:`\sqrt{A/N}` for N points in a convex hull of the area A. Cells
+    outside the hull are holes; inside it, triangles also cross gaps between lines of points.
 
     A bottom without curvature, ripples, map and patches is two triangles. A patch's edge is blurred over one cell.
     The reflectance is a mesh attribute, ``vertex_reflectance``, which a nested BSDF may use through Mitsuba's

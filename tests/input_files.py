@@ -279,6 +279,32 @@ _TRAJECTORY = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n' + "".join(
 _HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
 
 
+def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[float, float], **changes: Any) -> Path:
+    """Write a Bathymetric Attributed Grid from its south-western cell on; `changes` are parts of its metadata."""
+    import h5py
+
+    rows, columns = np.shape(heights)
+    last = (first[0] + (columns - 1) * cell[0], first[1] + (rows - 1) * cell[1])
+    corners = changes.get("corners", f"{first[0]!r},{first[1]!r} {last[0]!r},{last[1]!r}")
+    axes = "".join(
+        f'<gmd:MD_Dimension><gmd:dimensionName><gmd:MD_DimensionNameTypeCode codeListValue="{name}"/>'
+        f'</gmd:dimensionName><gmd:resolution><gco:Measure uom="m">{size!r}</gco:Measure></gmd:resolution>'
+        "</gmd:MD_Dimension>"
+        for name, size in (("row", cell[1]), ("column", cell[0]))
+    )
+    text = (
+        f'<gmi:MI_Metadata xmlns:gmi="gmi" xmlns:gmd="gmd" xmlns:gco="gco" xmlns:gml="gml">{axes}'
+        f"<gmd:cornerPoints><gml:Point><gml:coordinates>{corners}</gml:coordinates></gml:Point></gmd:cornerPoints>"
+        f"<system>{changes.get('system', 'PROJCS[GEOGCS[]]')}</system></gmi:MI_Metadata>"
+    )
+    text = changes.get("head", "") + text
+    with h5py.File(path, "w") as file:
+        root = file.create_group("BAG_root")
+        root["elevation"] = np.asarray(heights, dtype=np.float32)
+        root["metadata"] = np.array([one.encode() for one in text], dtype="S1")
+    return path
+
+
 def height_map(suffix: str) -> Callable[[Path], Path]:
     """Return what writes a height map."""
 
@@ -298,6 +324,12 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
                 file.write(str(path))
         elif suffix == ".nc":
             xr.Dataset({"height": (("y", "x"), _HEIGHTS)}, positions).to_netcdf(path, engine="h5netcdf")
+        elif suffix == ".bag":
+            write_bag(path, _HEIGHTS, (500000.0, 6000000.0), (1.0, 1.0))
+        elif suffix == ".xyz":
+            places = np.random.default_rng(0).uniform(0, 20, (200, 2))
+            rows = (f"{x:.2f} {y:.2f} {0.1 * np.sin(y):.3f}" for x, y in places)
+            path.write_text("\n".join(("x y z", *rows)))
         else:
             head = "ncols 20\nnrows 24\nxllcorner 0\nyllcorner 0\ncellsize 1\nnodata_value -9999\n"
             path.write_text(head + "\n".join(" ".join(f"{one:.4f}" for one in row) for row in _HEIGHTS))
@@ -310,7 +342,8 @@ def load_map(path: Path) -> None:
     """Read a height map."""
     from mitransient_lidar.physics.sea.height_maps import read_height_map
 
-    read_height_map(path, size=20.0 if path.suffix in (".npy", ".exr") else None)
+    holes = "fill" if path.suffix == ".xyz" else "refuse"
+    read_height_map(path, size=20.0 if path.suffix in (".npy", ".exr") else None, holes=holes)
 
 
 _PROFILE = """depth (m),attenuation (1/m),scattering (1/m)
@@ -379,7 +412,8 @@ KINDS = {
     "trajectory_sbet": Kind(sbet, follow(kind="sbet", epsg=32633)),
     "table_of_runs": Kind(table_of_runs, plan_table, "text"),
     "store": Kind(store, read_store),
-    **{f"map{suffix}": Kind(height_map(suffix), load_map) for suffix in (".npy", ".npz", ".exr", ".nc")},
+    **{f"map{suffix}": Kind(height_map(suffix), load_map) for suffix in (".npy", ".npz", ".exr", ".nc", ".bag")},
+    "map.xyz": Kind(height_map(".xyz"), load_map, "text"),
     "map.asc": Kind(height_map(".asc"), load_map, "text"),
     "profile": Kind(written("a.csv", _PROFILE), load_plugin(type="layered_water", profile="FILE"), "text"),
     "phase_function": Kind(written("a.csv", _PHASE), load_plugin(type="measured_phase", filename="FILE"), "text"),

@@ -12,6 +12,8 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.array_files import (
     Array,
+    Grid,
+    check_size,
     read_ascii_grid,
     read_exr,
     read_geotiff,
@@ -21,6 +23,7 @@ from mitransient_lidar.core.array_files import (
     readable_suffix,
 )
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.survey_files import read_bag, read_points
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, positive
 from mitransient_lidar.physics.piecewise_linear import locate
 
@@ -28,6 +31,12 @@ logger = logging.getLogger(__name__)
 
 #: Relative tolerance of even spacing, for 32-bit numbers and rounded decimals.
 _UNEVENNESS = 1e-3
+
+#: Most scattered points, whose triangulation takes a kilobyte and 10 microseconds each.
+_MOST_SCATTERED = 2 * 10**6
+
+#: Least share of the cells of a grid that have a point, if points are taken as one.
+_LEAST_SHARE = 0.25
 
 _Contents = tuple[Array, dict[str, Array]]
 """Heights, and positions by the names x and y as far as the file has them."""
@@ -41,6 +50,18 @@ class HeightMap:
     x: FloatArray  #: Positions of the columns [m], increasing, at least 2.
     y: FloatArray  #: Positions of the rows [m], increasing, at least 2.
     origin: tuple[float, float] | None = None  #: Point of the map at x = y = 0 [m], if it is in map coordinates.
+    filled: npt.NDArray[np.bool_] | None = None  #: Cells without a value of their own, shape of the heights.
+
+    def covers(self, x: npt.ArrayLike, y: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return whether places x, y [m] of one shape are in cells of the map that have a value of their own."""
+        inside, nearest = [], []
+        for wanted, positions in ((x, self.x), (y, self.y)):
+            cell = (positions[-1] - positions[0]) / (positions.size - 1)
+            index = (np.asarray(wanted, dtype=np.float64) - positions[0]) / cell
+            inside.append((index >= -0.5) & (index <= positions.size - 0.5))
+            nearest.append(np.clip(np.nan_to_num(np.rint(index)), 0, positions.size - 1).astype(np.intp))
+        known = True if self.filled is None else ~self.filled[nearest[1], nearest[0]]
+        return np.asarray(inside[0] & inside[1] & known)
 
     def sample(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return the elevation on grid lines by bilinear interpolation.
@@ -66,6 +87,7 @@ def read_height_map(
     origin: tuple[float, float] | None = None,
     values: str = "heights",
     holes: str = "refuse",
+    cell: float | None = None,
 ) -> HeightMap:
     """Read a height map from a file.
 
@@ -86,35 +108,50 @@ def read_height_map(
         ``.asc``
             an ESRI ASCII grid in metres;
         ``.tif``, ``.tiff``
-            a GeoTIFF of one band in projected coordinates [m], with the optional package rasterio.
+            a GeoTIFF of one band in projected coordinates [m], with the optional package rasterio;
+        ``.bag``
+            a Bathymetric Attributed Grid of one resolution in projected coordinates [m];
+        ``.xyz``, ``.csv``, ``.txt``
+            a table of points x, y, z [m], with or without a heading; see `survey_files.read_points`.
     size : float, optional
         Distance from the first to the last column [m], positive. The map is centred on the origin and its cells are
         squares. Required if the file has no positions, not allowed if it has.
     origin : (float, float), optional
-        Point (x, y) of the map [m], within it, that lies at x = y = 0 of the result. Default: the centre of an .asc or
-        .tif; other positions are kept.
+        Point (x, y) of the map [m], within it, that lies at x = y = 0 of the result. Default: the centre of an .asc,
+        .tif, .bag or of points; other positions are kept.
     values : {'heights', 'depths'}
         Whether the values are positive up or down.
     holes : {'refuse', 'fill'}
         Whether cells without a finite value are refused, or filled with the value of the nearest cell that has one,
         with a warning in the log.
+    cell : float, optional
+        Cell of the grid on which scattered points are interpolated [m], positive. Default: the square root of the area
+        of their convex hull over their number. Only for points; those of an even grid keep it by default.
 
     Raises
     ------
     UserError
         If the file is missing, damaged or of another format; the map not two-dimensional, of fewer than 2 rows or
         columns, or with holes; positions not increasing or not evenly spaced, in degrees or rotated; `size` not
-        positive, missing or superfluous; or `origin` outside the map, or given for a file without positions.
+        positive, missing or superfluous; `origin` outside the map, or given for a file without positions; `cell` for
+        another file than points, or more than half of their extent; or points on a line, or too many.
+
+    Notes
+    -----
+    Scattered points are triangulated (Delaunay), and heights are linear in each triangle; cells outside the convex hull
+    are holes. Points on an even grid, at a quarter of its places or more, are its cells, and other cells are holes.
     """
     path = Path(path)
     for name, given, allowed in (("values", values, ("heights", "depths")), ("holes", holes, ("refuse", "fill"))):
         if given not in allowed:
             raise UserError(f"map_{name} = {given!r} must be {' or '.join(allowed)}")
-    kind = readable_suffix(path, (*_READERS, *_GRID_READERS), "height map")
-    if kind in _GRID_READERS:
+    kind = readable_suffix(path, (*_READERS, *_GRID_READERS, *_POINTS), "height map")
+    if cell is not None and kind not in _POINTS:
+        raise UserError(f"map_cell = {cell} must not be given: {path} is not a table of points.")
+    if kind not in _READERS:
         if size is not None:
             raise UserError(f"size = {size} must not be given: {path} has positions of its own.")
-        grid = _GRID_READERS[kind](path)
+        grid = _grid_of_points(path, cell) if kind in _POINTS else _GRID_READERS[kind](path)
         heights = _checked_heights(path, grid.values)
         x, y = ((np.arange(n) - (n - 1) / 2) * cell for n, cell in zip(heights.shape[::-1], grid.cell, strict=True))
         # Map coordinates have up to eight digits: the shift is added to exact positions about the centre.
@@ -128,8 +165,67 @@ def read_height_map(
             raise UserError(f"origin_x and origin_y must not be given: {path} has no positions.")
     if values == "depths":
         heights = -heights
-    heights = _without_holes(path, heights, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
-    return _moved(path, HeightMap(heights, x, y), centre, origin)
+    heights, filled = _without_holes(path, heights, (float(y[1] - y[0]), float(x[1] - x[0])), holes)
+    return _moved(path, HeightMap(heights, x, y, None, filled), centre, origin)
+
+
+def _grid_of_points(path: Path, cell: float | None) -> Grid:
+    """Return the points of a table on a grid: their own, if they have one, or else interpolated."""
+    points = read_points(path)
+    if len(points) < 3:
+        raise UserError(f"{path} has {len(points)} points: a height map needs at least 3.")
+    # Map coordinates have up to eight digits: distances are exact about the lower corner.
+    corner = points[:, :2].min(axis=0)
+    places, extent = points[:, :2] - corner, np.ptp(points[:, :2], axis=0)
+    if cell is None and (grid := _own_grid(places, points[:, 2])) is not None:
+        return grid._replace(first=(float(corner[0]), float(corner[1])))
+    if len(points) > _MOST_SCATTERED:
+        raise UserError(
+            f"{path} has {len(points)} scattered points: {_MOST_SCATTERED} are the most, thin them or grid them."
+        )
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import ConvexHull, Delaunay, QhullError
+
+    try:
+        area, triangles = ConvexHull(places).volume, Delaunay(places)
+    except (QhullError, ValueError) as error:
+        raise UserError(f"{path} has points on a line: a height map needs an area.") from error
+    size = float(np.sqrt(area / len(points))) if cell is None else positive("map_cell", cell)
+    if size > 0.5 * extent.min():
+        raise UserError(f"map_cell = {size:g} must be at most half of {extent.min():g} m, the extent of {path}.")
+    columns, rows = np.floor(extent / size * (1 + 1e-9)) + 1
+    check_size(path, 8 * columns * rows)
+    x, y = (
+        0.5 * (one - (count - 1) * size) + size * np.arange(count)
+        for one, count in zip(extent, (columns, rows), strict=True)
+    )
+    values = LinearNDInterpolator(triangles, points[:, 2])(*np.meshgrid(x, y))
+    return Grid(np.asarray(values), (float(corner[0] + x[0]), float(corner[1] + y[0])), (size, size))
+
+
+def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
+    """Return the even grid that places from its corner are on, shape (n, 2), and None if there is none."""
+    index, cells = [], []
+    for axis in range(2):
+        gaps = np.diff(np.unique(places[:, axis]))
+        # Positions are rounded: equal ones may differ by a thousandth of a cell.
+        gaps = gaps[gaps > 2 * _UNEVENNESS * gaps.max(initial=0.0)]
+        if not gaps.size:
+            return None
+        cell = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+        steps = np.rint(places[:, axis] / cell)
+        # The last place gives the cell precisely.
+        cell = float(places[:, axis].max() / max(steps.max(), 1))
+        if np.abs(places[:, axis] / cell - steps).max() > 0.05:
+            return None
+        index.append(steps.astype(np.int64))
+        cells.append(cell)
+    columns, rows = (int(one.max()) + 1 for one in index)
+    if len(heights) < _LEAST_SHARE * columns * rows:
+        return None
+    values = np.full((rows, columns), np.nan)
+    values[index[1], index[0]] = heights
+    return Grid(values, (0.0, 0.0), (cells[0], cells[1]))
 
 
 def _checked_heights(path: Path, values: Array) -> FloatArray:
@@ -158,12 +254,14 @@ def _positions(
     return x, y
 
 
-def _without_holes(path: Path, heights: FloatArray, spacing: tuple[float, float], treatment: str) -> FloatArray:
-    """Return the heights with holes filled from the nearest cell; refuse them if they are not to be filled."""
+def _without_holes(
+    path: Path, heights: FloatArray, spacing: tuple[float, float], treatment: str
+) -> tuple[FloatArray, npt.NDArray[np.bool_] | None]:
+    """Return the heights with holes filled from the nearest cell, and where; refuse holes that are not to be filled."""
     empty = ~np.isfinite(heights)
     count = int(empty.sum())
     if count == 0:
-        return heights
+        return heights, None
     row, column = np.argwhere(empty)[0]
     if treatment == "refuse" or count == heights.size:
         raise UserError(
@@ -174,7 +272,7 @@ def _without_holes(path: Path, heights: FloatArray, spacing: tuple[float, float]
 
     nearest = distance_transform_edt(empty, sampling=spacing, return_distances=False, return_indices=True)
     logger.warning("%s: %d of %d heights are missing, filled from the nearest cells", path, count, heights.size)
-    return np.asarray(heights[tuple(nearest)])
+    return np.asarray(heights[tuple(nearest)]), empty
 
 
 def _moved(
@@ -205,7 +303,7 @@ def _moved(
         *(path, x.size, y.size, x[-1] - x[0], y[-1] - y[0], heights.min(), heights.max(), *point),
         ", the centre" if origin is None else "",
     )
-    return HeightMap(heights, x, y, point)
+    return HeightMap(heights, x, y, point, terrain.filled)
 
 
 def _even_positions(path: Path, name: str, values: Array, count: int) -> FloatArray:
@@ -280,4 +378,5 @@ def _read_netcdf(path: Path) -> _Contents:
 
 
 _READERS = {".npy": _read_npy, ".npz": _read_npz, ".exr": _read_exr, ".nc": _read_netcdf}
-_GRID_READERS = {".asc": read_ascii_grid, ".tif": read_geotiff, ".tiff": read_geotiff}
+_GRID_READERS = {".asc": read_ascii_grid, ".tif": read_geotiff, ".tiff": read_geotiff, ".bag": read_bag}
+_POINTS = (".xyz", ".csv", ".txt")

@@ -335,6 +335,32 @@ def test_planes_follow_long_waves_and_state_their_errors(spacing, error, largest
     assert off.std() < error
 
 
+def test_planes_bring_bottom_points_nearer_and_state_how_near():
+    """Lines of sight straight down, through the true slopes of linear waves, to 10 m below the surface."""
+    spots, height, slope = linear_waves(11, 0.5, 0.0)
+    count, noise, length = len(spots), 0.03, 10.0
+    down = np.tile([0.0, 0.0, -1.0], (count, 1))
+    given = {"origin": spots * [1, 1, 0] + [0, 0, 300.0], "axis": down, "far": [[1.0, 0, 0]] * count}
+    given["left"] = np.cross(given["far"], down)
+    normal = np.column_stack([-slope, np.ones(count)])
+    truth = np.column_stack([spots[:, :2], height]) + length * refracted(down + 1e-12 * normal, normal)
+    late = noise * np.random.default_rng(12).normal(size=count)
+    # A late surface echo takes from the path in the water.
+    made = echoes((300 - height + late)[:, None], (length - late / GROUP)[:, None], surface_ns=noise / (0.5e-9 * C0))
+    options = {**given, "angle_x": 0.0, "angle_y": 0.0, **INDICES, "errors": NO_ERRORS, "time_s": np.zeros(count)}
+    first = SeaSurface(slope_deviation=slope.std())
+    sea = fit_surface(positions(made, **options, surface=first), slope.std())
+    inner = np.all((spots[:, :2] > 3) & (spots[:, :2] < 57), axis=1)
+    wrong = []
+    for surface in (first, sea):
+        points = positions(made, **options, surface=surface)
+        own = points.isel(point=points["kind"].values == PointClass.BOTTOM).isel(point=inner)
+        beside = np.stack([own["x"].values, own["y"].values], axis=-1) - truth[inner, :2]
+        wrong.append(np.sqrt((beside**2).sum(axis=1).mean()))
+        assert 0.6 < wrong[-1] / np.sqrt(np.mean(own["horizontal_uncertainty"].values ** 2)) < 1.5
+    assert wrong[1] < 0.5 * wrong[0], wrong
+
+
 def test_planes_forget_waves_of_another_time():
     spots, _, slope = linear_waves(8, 0.5, 0.01)
     sea = SeaSurface.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())

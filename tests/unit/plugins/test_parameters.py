@@ -18,7 +18,7 @@ WITHOUT_VALUE = {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
         *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
     },
-    "seabed": {"filename", "map_size", "map_values", "map_holes", "origin_x", "origin_y", "patches"},
+    "seabed": {"filename", "map_size", "map_values", "map_holes", "map_cell", "origin_x", "origin_y", "patches"},
     "lidar_transmitter": {
         *("to_world", "divergence_fwhm_mrad", "divergence_1e2_mrad", "divergence_across_mrad"),
         *("profile_file", "profile_mrad", "pulse_file"),

@@ -221,8 +221,8 @@ def test_pickled_objects_are_never_loaded(tmp_path):
 
 
 def test_other_suffixes_are_rejected(tmp_path):
-    with pytest.raises(ValueError, match=r"map.xyz: the name of a height map must end in .npy, .npz, .exr, .nc, .asc"):
-        read_height_map(tmp_path / "map.xyz")
+    with pytest.raises(ValueError, match=r"map.stl: the name of a height map must end in .npy, .npz, .exr, .nc, .asc"):
+        read_height_map(tmp_path / "map.stl")
 
 
 HEADER = {"ncols": 4, "nrows": 3, "xllcorner": 499997, "yllcorner": 6000004.5, "cellsize": 2, "NODATA_value": -9999}
