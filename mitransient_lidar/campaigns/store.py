@@ -218,7 +218,7 @@ class Store:
         """Raise `UserError` if runs that are rendered now would have their pixels in another order than the store."""
         if _ORDER[0] in self.attributes or "angle_y" not in self._group:
             return
-        if np.any(np.abs(self._read("angle_y", slice(None))) > _ON_AXIS):
+        if np.any(np.abs(self.stored("angle_y", slice(None))) > _ON_AXIS):
             raise UserError(
                 f"{self.path} was begun by an earlier version, whose pixels are in order from right to left: it can be "
                 "read but not completed; choose another place"
@@ -259,7 +259,7 @@ class Store:
 
     def status(self, runs: slice = slice(None)) -> npt.NDArray[np.uint8]:
         """Return the status of runs; those of a shard that has lost an array are planned."""
-        status = np.array(self._read("status", runs))
+        status = np.array(self.stored("status", runs))
         first = runs.start or 0
         for shard in np.unique((first + np.flatnonzero(status != PLANNED)) // self.shard_size):
             if self._lost(int(shard)):
@@ -276,10 +276,10 @@ class Store:
         runs = self.runs_of(shard)
         names = ("error", *self.variables)
         try:
-            arrays = {name: np.array(self._read(name, runs)) for name in names}
+            arrays = {name: np.array(self.stored(name, runs)) for name in names}
             status = self.status(runs)
         except UserError:
-            fill = {name: self._array(name) for name in names}
+            fill = {name: self.array(name) for name in names}
             shapes = {name: (runs.stop - runs.start, *array.shape[1:]) for name, array in fill.items()}
             arrays = {name: np.full(shapes[name], array.fill_value, dtype=array.dtype) for name, array in fill.items()}
             status = np.full(runs.stop - runs.start, PLANNED, dtype=np.uint8)
@@ -299,13 +299,13 @@ class Store:
             damage = self._lost(shard) if self._is_begun(runs) else None
             for name in ("status", "error", *self.variables):
                 try:
-                    self._read(name, runs)
+                    self.stored(name, runs)
                 except UserError as error:
                     damage = str(error)
             if damage:
                 _LOG.warning("%s: runs %d to %d are rendered again", damage, runs.start, runs.stop - 1)
                 with _writing(self.path):
-                    self._array("status")[runs] = np.full(runs.stop - runs.start, PLANNED, dtype=np.uint8)
+                    self.array("status")[runs] = np.full(runs.stop - runs.start, PLANNED, dtype=np.uint8)
 
     def _check_arrays(self) -> None:
         """Raise `UserError` if an array has another shape than the attributes say, or one of all runs is lost."""
@@ -315,7 +315,7 @@ class Store:
         for name in sorted({*self.attributes.get("arrays", ()), "run"} - {*names, *of_runs}):
             raise UserError(f"{self.path} is damaged: it has lost {name}.")
         for name in {*names, *of_runs}:
-            array = self._array(name)
+            array = self.array(name)
             if name not in of_runs:
                 lost = [one for one in range(-(-[*array.shape, 1][0] // _LARGEST)) if not self._has(name, one)]
                 if lost and array.size:
@@ -325,14 +325,14 @@ class Store:
 
     def _has(self, name: str, chunk: int) -> bool:
         """Return whether a chunk of an array is there."""
-        array = self._array(name)
+        array = self.array(name)
         key = array.metadata.encode_chunk_key((chunk, *[0] * (array.ndim - 1)) if array.ndim else ())
         return (self.path / name / key).is_file()
 
     def _is_begun(self, runs: slice) -> bool:
         """Return whether a run is done or failed, or it is not known."""
         try:
-            return bool(np.any(self._read("status", runs) != PLANNED))
+            return bool(np.any(self.stored("status", runs) != PLANNED))
         except UserError:
             return True
 
@@ -362,22 +362,23 @@ class Store:
             return
         with _writing(self.path):
             for name, values in arrays.items():
-                self._array(name)[runs] = values
-            self._array("error")[runs] = errors.astype(str)
-            self._array("status")[runs] = status
+                self.array(name)[runs] = values
+            self.array("error")[runs] = errors.astype(str)
+            self.array("status")[runs] = status
 
     def _values(self, name: str, runs: slice) -> Column:
         """Return values of runs."""
-        values = self._read(name, runs)
+        values = self.stored(name, runs)
         return values if values.dtype.kind in "biuf" else _texts(values)
 
-    def _read(self, name: str, runs: slice) -> npt.NDArray[Any]:
+    def stored(self, name: str, runs: slice = slice(None)) -> npt.NDArray[Any]:
         """Return values of runs as they are stored; raise `UserError` where they are damaged."""
-        array = self._array(name)
+        array = self.array(name)
         with _reading(self.path, name):
             return np.asarray(array[runs])
 
-    def _array(self, name: str) -> zarr.Array[Any]:
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Return an array; raise `UserError` if it is damaged."""
         # Once: a store has an array for each variable, and thousands of shards.
         if name in self._arrays:
             return self._arrays[name]

@@ -1,0 +1,88 @@
+"""Flights on Dask: pulses into a Zarr store, and points and waveforms from it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from mitransient_lidar.campaigns.store import Store
+from mitransient_lidar.campaigns.sweep import complete
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.products import Flown, points_of, write_files
+from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
+from mitransient_lidar.rendering.passes import ProgressCallback
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+#: Name of the store in the folder of a flight.
+STORE = "flight.zarr"
+
+#: Pulses whose arrays show those of the store.
+_SAMPLE = 2
+
+
+def fly(
+    flight: FlightPlan | Mapping[str, Any] | str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    workers: int | None = None,
+    scheduler: Client | str | None = None,
+    shard_size: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Render the pulses of a flight, or those that an interrupted one has left, and write its points and waveforms.
+
+    Scripts call it below ``if __name__ == "__main__":``, since new processes import the script.
+
+    Parameters
+    ----------
+    flight
+        A TOML file, the name of a shipped flight, or a dict of its contents; see docs/flights.md.
+    folder
+        Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``.
+    workers, scheduler, shard_size
+        As for `campaigns.sweep.sweep`, of pulses.
+    progress
+        Called with a `rendering.passes.Progress` about every second.
+
+    Returns
+    -------
+    xarray.Dataset
+        The points, as of `products.points_of`.
+
+    Raises
+    ------
+    UserError
+        If the flight is invalid, its bottom does not cover it, or the folder holds another one or cannot be written.
+    KeyboardInterrupt
+        After Ctrl-C; pulses that are written stay, and the same call goes on.
+    """
+    if isinstance(flight, Mapping):
+        plan = FlightPlan.of(flight)
+    else:
+        plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(flight)
+    folder = Path(folder)
+    store = complete(lambda: _prepare(plan, folder / STORE, shard_size), workers, scheduler, False, progress)
+    flown = Flown.of(store)
+    points = points_of(flown, plan)
+    write_files(flown, plan, points, folder)
+    return points
+
+
+def _prepare(plan: FlightPlan, path: Path, shard_size: int | None) -> Store:
+    """Return the store of a flight, a new one if there is none."""
+    if path.exists():
+        store = Store(path)
+        columns = store.inputs(slice(0, store.count))
+        if not store.is_of("flight", plan.text, columns, lambda: scene_of(plan)):
+            raise UserError(f"{path} holds another flight, or its scene has changed: choose another folder")
+        return store
+    renderer, columns = FlightRenderer.of(plan)
+    arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})
+    return Store.create(path, renderer, columns, arrays, coordinates, shard_size, attributes)

@@ -1,0 +1,243 @@
+"""Points and waveforms of a flight whose pulses are rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths, corrections_for
+from mitransient_lidar.analysis.waveforms.depth_errors import mean_slope
+from mitransient_lidar.campaigns.store import PLANNED, Store
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.flights.las import write_points, write_waveforms
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
+from mitransient_lidar.physics.lidar.refraction import snell
+
+#: Pulses of a chunk of a file.
+_CHUNK = 4096
+
+#: Counts of the range of all samples.
+_COUNTS = 65000
+
+#: Variables of the store that tell the truth of a shot, and their names among those of points.
+_TRUTH = ("true_surface_height", "true_bottom_depth", "true_bottom_depth_below_surface")
+
+
+@dataclass(frozen=True)
+class Flown:
+    """Pulses of a store that are rendered, in the order of their times.
+
+    Attributes
+    ----------
+    store
+        The store.
+    rows
+        Their rows in it.
+    """
+
+    store: Store
+    rows: IntArray
+
+    @classmethod
+    def of(cls, store: Store) -> Flown:
+        """Return the pulses of a store; raise `UserError` if none is rendered, or it is no flight."""
+        if store.kind != "flight":
+            raise UserError(f"{store.path} is the store of a {store.kind}, not of a flight")
+        pulse = store.inputs(slice(0, store.count))["pulse"]
+        order = np.argsort(pulse)
+        rows = order[store.status()[order] != PLANNED]
+        if not rows.size:
+            raise UserError(f"{store.path} has no pulse that is rendered")
+        return cls(store, rows)
+
+    def values(self, name: str) -> Any:
+        """Return a variable of all pulses."""
+        store = self.store
+        inputs: dict[str, str] = store.attributes["inputs"]
+        return store.stored(inputs.get(name, name))[self.rows]
+
+    def vectors(self, name: str) -> FloatArray:
+        """Return vectors of all pulses, shape (pulses, 3)."""
+        return np.column_stack([self.values(f"{name}_{axis}") for axis in "xyz"])
+
+    def coordinate(self, name: str) -> Any:
+        """Return a coordinate of the pixels, times or echoes."""
+        return self.store.stored(name)
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of the echoes."""
+        return dict(self.store.attributes["echo_attributes"])
+
+
+def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
+    """Return the echoes of all pulses, with times after their pulse, and depths for the angle of each.
+
+    Parameters
+    ----------
+    flown
+        The pulses.
+    corrections
+        ``none``, ``auto`` or a file, as of `depth_correction.corrections_for`.
+    """
+    attributes, store = flown.attributes, flown.store
+    later = flown.values("time_offset_ns")
+    data: dict[str, Any] = {}
+    for name in store.variables:
+        if name.startswith("echo_"):
+            array: Any = store.array(name)
+            dims = array.metadata.dimension_names
+            values: Any = store.stored(name)[flown.rows]
+            if name.endswith("time_ns"):
+                values = values + later.reshape(-1, *[1] * (values.ndim - 1))
+            data[name.removeprefix("echo_")] = (("shot", *dims[1:]), values, dict(array.attrs))
+    echoes = xr.Dataset(
+        data,
+        {"shot": flown.values("pulse"), "pixel": flown.coordinate("pixel"), "echo": flown.coordinate("echo")},
+        attributes,
+    )
+    group, angle = flown.values("group"), flown.values("group_angle_deg")
+    table = None if corrections == "none" else corrections_for(str(attributes.get("instrument", "")), corrections)
+    if table is not None:
+        parts, places = [], []
+        for one in np.unique(group):
+            place = np.flatnonzero(group == one)
+            part = echoes.isel(shot=place).assign_attrs(off_nadir_deg=float(angle[place[0]]))
+            parts.append(correct_depths(part, table))
+            places.append(place)
+        order = np.argsort(np.concatenate(places))
+        echoes = xr.concat(parts, "shot", combine_attrs="override").isel(shot=order)
+    # Depths were measured along the line of sight of the group's lidar.
+    index = float(attributes["refractive_index"])
+    own = np.arccos(np.clip(-flown.values("axis_z"), -1, 1))
+    ratio = np.cos(snell(own, index)) / np.cos(snell(np.radians(angle), index))
+    for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"):
+        echoes[name] = echoes[name] * xr.DataArray(ratio, dims="shot")
+    return echoes
+
+
+def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
+    """Return the points of all echoes, in coordinates of the scene.
+
+    Returns
+    -------
+    xarray.Dataset
+        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, and of the pulse ``true_surface_height``,
+        ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
+    """
+    echoes = echoes_of(flown, plan.corrections)
+    attributes = flown.attributes
+    angles = [1e-3 * flown.coordinate(name) for name in ("sight_x", "sight_y")]
+    poses = {name: flown.vectors(name) for name in ("origin", "axis", "far", "left")}
+    time_s = flown.values("time_s")
+    options: dict[str, Any] = {
+        "refractive_index": float(attributes["refractive_index"]),
+        "group_index": float(attributes["group_index"]),
+        "errors": plan.errors,
+        "forward": _forward(poses["origin"], time_s),
+        "time_s": time_s,
+    }
+    points = positions(echoes, *poses.values(), *angles, **options)
+    if np.any(points["kind"].values == PointClass.SURFACE):
+        width = float(attributes.get("divergence_mrad", 1.0)) * 1e-3 * float(np.mean(poses["origin"][:, 2]))
+        surface = fit_surface(points, mean_slope(attributes, width), plan.surface_radius)
+        points = positions(echoes, *poses.values(), *angles, surface=surface, **options)
+    shot = points["shot"].values
+    points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot], {"units": "degree"})
+    points["line"] = ("point", flown.values("line")[shot], {"units": "1"})
+    for name in _TRUTH:
+        points[name] = ("point", flown.values(name)[shot], dict(flown.store.array(name).attrs))
+    return points
+
+
+def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path) -> list[Path]:
+    """Write points.laz, waveforms.las and waveforms.wdp of all pulses; return their paths."""
+    placed = points.copy()
+    for name, first in zip("xyz", plan.origin, strict=True):
+        placed[name] = placed[name] + first
+    placed["number_of_returns"] = placed["number_of_returns"].clip(min=1)
+    placed["return_number"] = placed["return_number"].clip(min=1)
+    brightest = float(np.nanmax(placed["intensity"].values, initial=0.0))
+    placed["intensity"].attrs["full_scale"] = brightest or 1.0
+    paths = [folder / "points.laz", folder / "waveforms.las", folder / "waveforms.wdp"]
+    write_points(paths[0], placed, plan.crs)
+    write_waveforms(paths[1], _with_packets(flown, placed), _packets(flown), plan.crs)
+    return paths
+
+
+def _chunks(flown: Flown) -> Iterator[slice]:
+    """Return the pulses of each chunk."""
+    for first in range(0, len(flown.rows), _CHUNK):
+        yield slice(first, min(first + _CHUNK, len(flown.rows)))
+
+
+def _packets(flown: Flown) -> Iterator[xr.Dataset]:
+    """Return the samples of the pulses of each chunk, one packet a pixel."""
+    signal = flown.values("signal")
+    low, high = float(np.nanmin(signal)), float(np.nanmax(signal))
+    width = float(flown.store.attributes["bin_width_ns"])
+    about = {"gain": max(high - low, 1e-12) / _COUNTS, "offset": low, "sampling_ns": width}
+    for chunk in _chunks(flown):
+        samples = signal[chunk].reshape(-1, signal.shape[-1])
+        yield xr.Dataset({"waveform": (("packet", "sample"), samples, about)})
+
+
+def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
+    """Return the points of each chunk, with their packets, the times in them, and the directions of light."""
+    attributes, echoes = flown.attributes, echoes_of(flown)
+    width = float(flown.store.attributes["bin_width_ns"])
+    time = echoes["time_ns"].transpose("shot", "pixel", "echo").values
+    surface = echoes["surface_time_ns"].transpose("shot", "pixel").values
+    shot, pixel, kind = (points[name].values for name in ("shot", "pixel", "kind"))
+    names = [str(name) for name in flown.coordinate("echo")]
+    arrival = np.array(surface[shot, pixel])
+    for code, name in ((PointClass.BOTTOM, "bottom"), (PointClass.OBJECT, "target"), (PointClass.SURFACE, "surface")):
+        own = kind == code
+        found = time[shot[own], pixel[own], names.index(name)]
+        arrival[own] = np.where(np.isfinite(found), found, arrival[own])
+    start = flown.values("sample_start_ns")[shot] + 0.5 * width
+    wet = (kind == PointClass.BOTTOM) | (kind == PointClass.OBJECT)
+    within = np.nan_to_num(arrival - start, nan=0.0)
+    direction = _directions(flown, shot, pixel)
+    index = float(attributes["refractive_index"])
+    bent = direction / index
+    bent[:, 2] = -np.sqrt(1 - np.sum(bent[:, :2] ** 2, axis=1))
+    pixels = len(flown.coordinate("pixel"))
+    extra = {
+        "time_in_packet_ns": ("point", within),
+        "direction": (("point", "axis"), np.where(wet[:, None], bent, direction)),
+        "group_speed": ("point", np.where(wet, C0 / float(attributes["group_index"]), C0)),
+    }
+    whole = points.assign(extra)
+    bounds = np.searchsorted(shot, [chunk.start for chunk in _chunks(flown)] + [len(flown.rows)])
+    for chunk, first, last in zip(_chunks(flown), bounds[:-1], bounds[1:], strict=True):
+        part = whole.isel(point=slice(int(first), int(last)))
+        packet = (part["shot"].values - chunk.start) * pixels + part["pixel"].values
+        yield part.assign(packet=("point", packet))
+
+
+def _directions(flown: Flown, shot: IntArray, pixel: IntArray) -> FloatArray:
+    """Return the unit lines of sight of points, shape (points, 3)."""
+    axis, far, left = (flown.vectors(name)[shot] for name in ("axis", "far", "left"))
+    x, y = (1e-3 * flown.coordinate(name)[pixel][:, None] for name in ("sight_x", "sight_y"))
+    line = axis + x * far + y * left
+    return np.asarray(line / np.linalg.norm(line, axis=1, keepdims=True))
+
+
+def _forward(origin: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Return the horizontal direction of flight at each pulse, +x where the platform rests, shape (shots, 3)."""
+    if len(origin) < 2:
+        return np.array([[1.0, 0.0, 0.0]] * len(origin))
+    velocity = np.gradient(origin, time_s, axis=0)
+    velocity[:, 2] = 0.0
+    still = np.linalg.norm(velocity, axis=1) < 1e-6
+    velocity[still] = [1.0, 0.0, 0.0]
+    return np.asarray(velocity)
