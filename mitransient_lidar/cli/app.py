@@ -16,13 +16,24 @@ import typer
 from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
-from mitransient_lidar.cli import campaigns, depth_bias, gates, render, results, retrieve, scenes, studies, waveforms
+from mitransient_lidar.cli import (
+    campaigns,
+    depth_bias,
+    flights,
+    gates,
+    render,
+    results,
+    retrieve,
+    scenes,
+    studies,
+    waveforms,
+)
 from mitransient_lidar.cli.messages import exit_on_error
 from mitransient_lidar.core.errors import UserError
 
 #: Commands by the headings of the help.
 _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Render": (render.render, studies.shots, campaigns.sweep, render.passive),
+    "Render": (render.render, studies.shots, campaigns.sweep, flights.fly, render.passive),
     "Study": (
         studies.find_shots,
         studies.shot_statistics,

@@ -11,6 +11,7 @@ from mitransient_lidar.core.errors import UserError
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 
 def finite(name: str, value: object) -> float:

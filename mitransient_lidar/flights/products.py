@@ -130,7 +130,9 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, and of the pulse ``true_surface_height``,
+        Points of `positions.positions`, with ``scan_angle_deg``, ``line``, and the truth: ``true_z`` [m], the mean
+        height of the surface in the beam or, for points below it, that of the highest solid at x and y;
+        ``true_target``, whether that solid is a target; and of the pulse ``true_surface_height``,
         ``true_bottom_depth`` and ``true_bottom_depth_below_surface`` [m].
     """
     echoes = echoes_of(flown, plan.corrections)
@@ -153,9 +155,56 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot], {"units": "degree"})
     points["line"] = ("point", flown.values("line")[shot], {"units": "1"})
-    for name in _TRUTH:
-        points[name] = ("point", flown.values(name)[shot], dict(flown.store.array(name).attrs))
-    return points
+    return points.assign(_truth(flown, plan, points))
+
+
+def describe_points(points: xr.Dataset) -> list[str]:
+    """Return the lines of a table of points by class: numbers, and errors of their heights against the truth [cm]."""
+    lines = [f"{'class':<22}{'points':>9}{'bias':>8}{'spread':>8}{'rms':>8}{'stated':>8}{'z':>7}{'> 0.5 m':>9}"]
+    error = points["z"].values - points["true_z"].values
+    stated = points["vertical_uncertainty"].values
+    target = points["true_target"].values.astype(bool)
+    kind = points["kind"].values
+    wet = np.isin(kind, (PointClass.BOTTOM, PointClass.OBJECT))
+    rows = {
+        "water surface": kind == PointClass.SURFACE,
+        "bottom": wet & ~target,
+        "above a target": wet & target,
+        "no echo": kind == PointClass.NO_ECHO,
+    }
+    for name, chosen in rows.items():
+        own = chosen & np.isfinite(error)
+        line = f"{name:<22}{np.count_nonzero(chosen):>9}"
+        if np.any(own) and name != "no echo":
+            values = error[own]
+            numbers = (values.mean(), values.std(), np.sqrt(np.mean(values**2)), np.median(stated[own]))
+            line += "".join(f"{100 * number:>8.1f}" for number in numbers)
+            line += f"{np.sqrt(np.mean((values / stated[own]) ** 2)):>7.2f}{np.mean(np.abs(values) > 0.5):>9.2%}"
+        lines.append(line)
+    return lines
+
+
+def _truth(flown: Flown, plan: FlightPlan, points: xr.Dataset) -> dict[str, Any]:
+    """Return what is known of points: height of the sea in the beam or of the highest solid there, and of the pulse."""
+    from mitransient_lidar.rendering.session import open_scene
+    from mitransient_lidar.rendering.shot_truth import solids_below
+    from mitransient_lidar.transport.scene import LidarScene
+
+    session = open_scene(flown.store.renderer().scene, dict(plan.parameters))
+    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    height, target = solids_below(lidar, points["x"].values, points["y"].values)
+    shot, dry = points["shot"].values, points["kind"].values == PointClass.SURFACE
+    known = {name: flown.values(name)[shot] for name in _TRUTH}
+    true_z = np.where(dry, known["true_surface_height"], height)
+    found: dict[str, Any] = {
+        "true_z": (
+            "point",
+            true_z,
+            {"units": "m", "long_name": "height of the surface in the beam or of a solid"},
+        ),
+        "true_target": ("point", target & ~dry, {"units": "1", "long_name": "whether the highest solid is a target"}),
+    }
+    return found | {name: ("point", values, dict(flown.store.array(name).attrs)) for name, values in known.items()}
 
 
 def write_files(flown: Flown, plan: FlightPlan, points: xr.Dataset, folder: Path) -> list[Path]:

@@ -40,7 +40,7 @@ _LARGEST_TURN = 15.0
 _BATCH, _STILL_S = 64, 0.05
 
 #: Places of a group of pulses that decide how long their record is.
-_PLACES = 48
+_PLACES = 6
 
 #: Margin of a record on both sides [ns], for waves and for poses that differ from that of the group.
 _MARGIN_NS = 15.0
@@ -368,7 +368,7 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
         )
     # The places of the extremes of depth, and others.
     depths = np.argsort(bottom)
-    chosen = np.unique(np.concatenate([depths[:2], depths[-2:], depths[:: max(depths.size // _PLACES, 1)]]))
+    chosen = np.unique(np.concatenate([depths[[0, -1]], depths[:: max(depths.size // _PLACES, 1)]]))
     shifts = [(float(dx), float(dy)) for dx, dy in poses.places[chosen] - poses.places[0]]
     film = session.sensor.film()
     if not film.is_fixed:

@@ -121,7 +121,7 @@ class ShotBatches:
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
         self._seas = [SeaPatches(shape) for shape in waves]
-        self._going, self._fixed = _scene_of(going), _scene_of(fixed)
+        self._going, self._fixed = scene_of_shapes(going), scene_of_shapes(fixed)
         paths = max(self._renderer.path_count // 2, 1)
         self._origins = renderer.classes.count
         bins = lidar.receiver.pixels.count * lidar.axis.bin_count * self._origins
@@ -251,7 +251,7 @@ def check_size(shots: int, pixels: int, bins: int, origins: int = 0) -> None:
         )
 
 
-def _scene_of(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
+def scene_of_shapes(shapes: Sequence[mi.Shape]) -> mi.Scene | None:
     """Return a scene of shapes, None without any."""
     if not shapes:
         return None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.water.water_types import InherentProperties
 
 if TYPE_CHECKING:
@@ -97,6 +97,26 @@ def water_means(water: Any, depth: FloatArray) -> dict[str, FloatArray]:
     }
     shares = column.layer_shares(depth)
     return {name: np.asarray(shares @ values) for name, values in layers.items()}
+
+
+def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the height of the highest solid at places [m], NaN without one, and whether it is a target.
+
+    Places have the shape (n,); targets are `WaterScene.targets`.
+    """
+    import mitsuba as mi
+
+    from mitransient_lidar.rendering.shot_batches import scene_of_shapes
+    from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque
+
+    solids = scene_of_shapes(lidar.solids)
+    if solids is None:
+        return np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
+    top = opaque(float(solids.bbox().max.z) + 1.0)
+    place = mi.Point3f(*(aligned(mi.Float, values.astype(np.float32)) for values in (x, y)), top)
+    si = solids.ray_intersect(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
+    valid, target = np.array(si.is_valid()), np.array(is_one_of(si.shape, lidar.targets) & mi.Bool(si.is_valid()))
+    return np.where(valid, np.array(si.p.z, dtype=np.float64), np.nan), target
 
 
 def sea_of(scene: mi.Scene) -> Any:

@@ -1,0 +1,54 @@
+"""The command that flies a lidar along a trajectory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitransient_lidar.cli.files import check_writable
+from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.options import Quiet
+
+
+def fly(
+    flight: Annotated[
+        str, typer.Argument(metavar="FLIGHT", help="TOML file of a flight, or the name of a shipped one.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; that of FLIGHT's name.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes on this machine, by default one for each core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
+    ] = None,
+    shard_size: Annotated[int | None, typer.Option(help="Pulses that one process renders and writes.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
+
+    Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr of all pulses, and prints
+    the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on.
+    docs/flights.md describes the file.
+    """
+    folder = output or Path(Path(flight).stem)
+    check_writable(folder, [])
+    from mitransient_lidar.campaigns.store import Store
+    from mitransient_lidar.flights.fly import STORE
+    from mitransient_lidar.flights.fly import fly as render_flight
+    from mitransient_lidar.flights.products import Flown, describe_points
+    from mitransient_lidar.plots.point_clouds import plot_flight
+
+    with reporting(quiet) as progress:
+        points = render_flight(
+            flight, folder, workers=workers, scheduler=scheduler, shard_size=shard_size, progress=progress
+        )
+    flown = Flown.of(Store(folder / STORE))
+    for name in ("points.laz", "waveforms.las", "waveforms.wdp"):
+        typer.echo(folder / name)
+    for path in plot_flight(flown, points, folder):
+        typer.echo(path)
+    typer.echo("\n".join(describe_points(points)))

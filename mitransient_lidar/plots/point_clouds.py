@@ -1,0 +1,145 @@
+"""Pictures of flights: pulses, points by class, a profile with its waveforms, and errors of heights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+
+from mitransient_lidar.flights.positions import PointClass
+from mitransient_lidar.flights.products import Flown
+from mitransient_lidar.plots import drawing
+
+#: Colour and name of the points of a class.
+_CLASSES = {
+    PointClass.SURFACE: ("#1f77b4", "water surface"),
+    PointClass.BOTTOM: ("#8c564b", "bottom"),
+    PointClass.OBJECT: ("#d62728", "object"),
+    PointClass.NO_ECHO: ("#999999", "no echo"),
+}
+
+#: Half of the width of the strip of a profile [m], and most waveforms in it.
+_STRIP, _MOST_WAVEFORMS = 1.5, 2000
+
+#: Heights in a profile above the sea and below the deepest point [m], and cells of its picture.
+_ABOVE, _BELOW, _CELLS = 1.0, 1.5, (300, 160)
+
+#: Orders of magnitude of the signals in a profile.
+_DECADES = 3.0
+
+
+def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
+    """Draw a flight into the files flight.png and profile.png of a folder.
+
+    The first one has the places of the pulses, all points in a side view by class, and maps of the heights of the
+    bottom and of their errors. The second one has the waveforms and points of a strip, through a target if points lie
+    on one.
+
+    Parameters
+    ----------
+    flown
+        The pulses.
+    points
+        Their points, as of `flights.products.points_of`.
+    folder
+        Folder of the files.
+
+    Returns
+    -------
+    list of Path
+        The files.
+    """
+    paths = [folder / "flight.png", folder / "profile.png"]
+    figure = drawing.new_figure(paths[0], 11, 8.5)
+    track, side, heights, errors = figure.subplots(2, 2).ravel()
+    _draw_track(track, flown, points)
+    _draw_side(side, points)
+    wet = points.isel(point=np.isin(points["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT)))
+    error = wet["z"].values - wet["true_z"].values
+    limit = float(np.nanquantile(np.abs(error), 0.98)) if error.size else 1.0
+    for ax, values, label, style in (
+        (heights, wet["z"].values, "height of the bottom (m)", {"cmap": "viridis"}),
+        (errors, error, "error of the height (m)", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
+    ):
+        drawn = ax.scatter(wet["x"].values, wet["y"].values, c=values, s=3, linewidths=0, **style)
+        ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+        figure.colorbar(drawn, ax=ax, label=label)
+    heights.set_title("Bottom")
+    errors.set_title("Errors against the true height there")
+    drawing.save(figure, paths[0])
+    figure = drawing.new_figure(paths[1], 10, 5)
+    _draw_profile(figure.subplots(), flown, points)
+    drawing.save(figure, paths[1])
+    return paths
+
+
+def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
+    """Draw the track of the scanner, and where the axes of its pulses meet the sea level."""
+    origin, axis = flown.vectors("origin"), flown.vectors("axis")
+    place = origin - axis * (origin[:, 2:] / axis[:, 2:])
+    ax.plot(*place[:, :2].T, ".", color="#1f77b4", markersize=1.5, label="pulses at the sea level")
+    ax.plot(*origin[:, :2].T, color="black", linewidth=1.5, label="scanner")
+    if np.any(chosen := points["true_target"].values.astype(bool)):
+        ax.plot(points["x"].values[chosen], points["y"].values[chosen], ".", color="#d62728", label="above a target")
+    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"{len(origin)} pulses")
+    ax.legend(loc="best", fontsize="small")
+
+
+def _draw_side(ax: Axes, points: xr.Dataset) -> None:
+    """Draw all points from the side, by class."""
+    for kind, (colour, name) in _CLASSES.items():
+        chosen = points["kind"].values == kind
+        if np.any(chosen):
+            label = f"{name} ({np.count_nonzero(chosen)})"
+            ax.plot(points["x"].values[chosen], points["z"].values[chosen], ".", color=colour, ms=1.5, label=label)
+    ax.set(xlabel="x (m)", ylabel="z (m)", title="Points by class, from the side")
+    drawing.add_grid(ax)
+    ax.legend(loc="best", fontsize="small", markerscale=5)
+
+
+def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
+    """Draw the waveforms and points of a strip along x, about the points above targets or the middle."""
+    target = points["true_target"].values.astype(bool)
+    y = points["y"].values
+    middle = float(np.median(y[target])) if np.any(target) else float(np.median(y))
+    strip = points.isel(point=np.abs(y - middle) < _STRIP)
+    wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
+    surface = strip["kind"].values == PointClass.SURFACE
+    depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
+    edges = (
+        np.linspace(*(np.quantile(strip["x"].values, [0, 1])), _CELLS[0] + 1),
+        np.linspace(-depth, _ABOVE, _CELLS[1] + 1),
+    )
+    total, number = np.zeros(_CELLS), np.zeros(_CELLS)
+    width = float(flown.store.attributes["bin_width_ns"])
+    group, index = (float(flown.attributes[name]) for name in ("group_index", "refractive_index"))
+    signal, start = flown.values("signal"), flown.values("sample_start_ns")
+    origin, axis = flown.vectors("origin"), flown.vectors("axis")
+    seen = np.unique(strip["shot"].values)
+    for shot in seen[:: max(len(seen) // _MOST_WAVEFORMS, 1)]:
+        way = 0.299792458 / 2 * (start[shot] + (np.arange(signal.shape[-1]) + 0.5) * width)
+        to_sea = -origin[shot, 2] / axis[shot, 2]
+        down = axis[shot] / index
+        down[2] = -np.sqrt(1 - down[:2] @ down[:2])
+        # In the air up to the sea level, below it at the group velocity of the water.
+        wet_way = np.maximum(way - to_sea, 0) / group
+        place = origin[shot] + np.minimum(way, to_sea)[:, None] * axis[shot] + wet_way[:, None] * down
+        values = np.abs(signal[shot]).mean(axis=0)
+        for grid, weight in ((total, values), (number, np.ones_like(values))):
+            grid += np.histogram2d(place[:, 0], place[:, 2], bins=edges, weights=weight)[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = np.log10(total / number).T
+    highest = float(np.nanmax(image[np.isfinite(image)], initial=-np.inf))
+    shown = np.where(np.isfinite(image), image, np.nan)
+    drawn = ax.pcolormesh(*edges, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
+    ax.figure.colorbar(drawn, ax=ax, label="log10 of the mean signal")
+    for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "bottom or object")):
+        ax.plot(strip["x"].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
+    order = np.argsort(strip["x"].values[wet])
+    ax.plot(
+        *(strip[name].values[wet][order] for name in ("x", "true_z")), "-", color="white", linewidth=0.8, label="truth"
+    )
+    ax.set(xlabel="x (m)", ylabel="z (m)", title=f"Waveforms and points within {_STRIP:g} m of y = {middle:.1f} m")
+    ax.legend(loc="lower right", fontsize="small")
