@@ -1,0 +1,1 @@
+"""Flights: points and waveforms of a flight as LAS files."""

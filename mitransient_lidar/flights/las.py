@@ -1,0 +1,250 @@
+"""LAS files of a flight that other programs open: points, and points with their waveforms.
+
+Both are LAS 1.4 (R15). They are made from the points of a whole flight, chunk by chunk, and replace former files when
+they are complete.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing, together
+from mitransient_lidar.core.validation import finite_array, integer, positive
+from mitransient_lidar.flights.las_header import EXTRA_BYTES, SCALE_M, coordinate_system_wkt, las_header
+from mitransient_lidar.flights.waveform_packets import PacketWriter
+
+if TYPE_CHECKING:
+    import laspy
+
+#: Classes of points, of the topo-bathymetric domain profile of LAS.
+BOTTOM, WATER_SURFACE, SUBMERGED_OBJECT, NO_BOTTOM = 40, 41, 43, 45
+
+_MOST_POINTS = 2**32 - 1  # what programs with 32-bit counters open
+_MOST_RETURNS = 15
+_SCAN_ANGLE_DEG = 0.006
+_LAST_INTENSITY = 2**16 - 1
+
+Chunks = xr.Dataset | Iterable[xr.Dataset]
+
+
+def write_points(path: str | os.PathLike[str], points: Chunks, crs: str | None = None) -> int:
+    """Write points in format 6 of LAS 1.4; compressed (LAZ) if the suffix is .laz.
+
+    Parameters
+    ----------
+    path : path-like
+        File, .las or .laz.
+    points : xr.Dataset or iterable of xr.Dataset
+        Points of the flight, or chunks of them, of which one is in memory at a time. Variables over ``point``:
+
+        - ``x``, ``y``, ``z``: coordinates [m] in `crs`;
+        - ``gps_time``: time of the pulse [s], from the beginning of the flight;
+        - ``kind``: class, 0 to 255: 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found. The last is
+          flagged as synthetic, since no echo is there;
+        - ``intensity``: amplitude, with the attributes ``full_scale``, which becomes 65535, and ``units``; larger ones
+          are clipped, negative and missing ones are 0. The scale is that of the first chunk;
+        - ``return_number``, ``number_of_returns``: 1 to 15, of a pulse in a pixel;
+        - ``scan_angle_deg``: angle of the pulse from nadir, -180 to 180, positive to the right of the heading;
+        - ``line``: number of the flight line, 0 to 65535;
+        - ``pixel``, 0 to 65535, and ``shot``, 0 to 2^32 - 1;
+        - ``depth``, ``depth_uncertainty``, ``horizontal_uncertainty``, ``vertical_uncertainty`` [m]; NaN if unknown.
+    crs : str, optional
+        Projected coordinate system in metres, such as 'EPSG:32633' or 'EPSG:32633+5773'; otherwise the scene's frame.
+
+    Returns
+    -------
+    int
+        Number of points.
+
+    Raises
+    ------
+    UserError
+        If the suffix or the coordinate system is unknown, pyproj is missing, there is no point or more than 2^32 - 1, a
+        coordinate is not finite or farther than 2147 km from the first point, or another value is out of range.
+    WriteError
+        If the operating system reports an error.
+    """
+    path = _checked(path, ".las", ".laz")
+    wkt = coordinate_system_wkt(crs)
+    first, chunks = _first(points)
+    with replacing(path) as temporary:
+        return _write(temporary, las_header(6, _place(first), wkt, _notes(first)), ((chunk, {}) for chunk in chunks))
+
+
+def write_waveforms(path: str | os.PathLike[str], points: Chunks, waveforms: Chunks, crs: str | None = None) -> int:
+    """Write points in format 9 of LAS 1.4, uncompressed, and beside it their waveforms in a file of suffix .wdp.
+
+    Parameters
+    ----------
+    path : path-like
+        File, .las.
+    points : xr.Dataset or iterable of xr.Dataset
+        As in `write_points`, with ``packet``, ``time_in_packet_ns``, ``direction`` and optionally ``group_speed``
+        (`PacketWriter.append`).
+    waveforms : xr.Dataset or iterable of xr.Dataset
+        Waveforms (`PacketWriter.append`) that `points` refer to; a chunk for each chunk of points, which counts its
+        packets from 0.
+    crs : str, optional
+        As in `write_points`.
+
+    Returns
+    -------
+    int
+        Number of points.
+
+    Raises
+    ------
+    UserError
+        As in `write_points`, and if waveforms differ in gain, offset or spacing, are out of range, or longer than those
+        of the first chunk.
+    WriteError
+        If the operating system reports an error.
+    """
+    path = _checked(path, ".las")
+    wkt = coordinate_system_wkt(crs)
+    (first, chunks), (first_waveforms, packets) = _first(points), _first(waveforms)
+    with together(), replacing(path) as las, replacing(path.with_suffix(".wdp")) as wdp, open(wdp, "wb") as file:
+        writer = PacketWriter(file, first_waveforms)
+        header = las_header(9, _place(first), wkt, _notes(first), writer.descriptor)
+        pairs = zip(chunks, packets, strict=True)
+        count = _write(las, header, ((chunk, writer.append(packet, chunk)) for chunk, packet in pairs))
+        writer.finish()
+    return count
+
+
+def _checked(path: str | os.PathLike[str], *suffixes: str) -> Path:
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"cannot write {path}: its suffix must be {' or '.join(suffixes)}")
+    return path
+
+
+def _first(given: Chunks) -> tuple[xr.Dataset, Iterator[xr.Dataset]]:
+    """Return the first chunk, and all chunks from it on."""
+    chunks = iter([given] if isinstance(given, xr.Dataset) else given)
+    first = next(chunks, None)
+    if first is None or not all(first.sizes.values()):
+        raise UserError("there is no point to write, or the first chunk of points or waveforms is empty")
+    return first, chain([first], chunks)
+
+
+def _place(first: xr.Dataset) -> tuple[float, float]:
+    """Return x and y of the first point."""
+    x, y = (float(finite_array(name, first[name].values[:1])[0]) for name in ("x", "y"))
+    return x, y
+
+
+def _notes(first: xr.Dataset) -> str:
+    intensity = first["intensity"].attrs
+    step = positive("full_scale", intensity["full_scale"]) / _LAST_INTENSITY
+    return (
+        f"Simulated by mitransient-lidar. Intensity: 1 is {step:.9g} {intensity['units']}. "
+        "GPS time: seconds from the beginning of the flight, not of a GPS week. "
+        "Class 40 bottom, 41 water surface, 43 submerged object, 45 no bottom found (flagged synthetic: "
+        "no echo is there). Return numbers count the echoes of a pulse in one pixel. Depths and uncertainties "
+        "(1 sigma) are NaN where unknown."
+    )
+
+
+def _write(path: Path, header: laspy.LasHeader, chunks: Iterable[tuple[xr.Dataset, dict[str, Any]]]) -> int:
+    """Write chunks of points with their fields of waveforms."""
+    import laspy
+
+    compression = {"do_compress": path.suffix.lower() == ".laz", "laz_backend": laspy.LazBackend.Lazrs}
+    count, full_scale = 0, None
+    with _written(path) as file, laspy.LasWriter(file, header, closefd=False, **compression) as writer:
+        for points, fields in chunks:
+            count += points.sizes["point"]
+            if count > _MOST_POINTS:
+                raise UserError(f"more than {_MOST_POINTS} points are too many for one file: split the flight")
+            full_scale = full_scale or float(points["intensity"].attrs["full_scale"])
+            record = laspy.ScaleAwarePointRecord.zeros(points.sizes["point"], header=header)
+            for name, values in (_attributes(points, header.offsets, full_scale) | fields).items():
+                record[name] = values
+            writer.write_points(record)
+    return count
+
+
+class _RawFile(io.FileIO):
+    """File that keeps the error of a write."""
+
+    failure: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Write bytes, as many as fit."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.failure = error
+            raise
+
+
+@contextlib.contextmanager
+def _written(path: Path) -> Iterator[IO[bytes]]:
+    """Open a new file; an error of a write is raised as it was, of which lazrs would say only that there was one."""
+    raw = _RawFile(path, "wb")
+    try:
+        with io.BufferedWriter(raw) as file:
+            yield file
+    except RuntimeError as error:
+        raise raw.failure or error from None
+
+
+def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float) -> dict[str, npt.NDArray[Any]]:
+    """Return the values of a chunk by laspy's names of fields."""
+    returns = _whole(points, "number_of_returns", 1, _MOST_RETURNS)
+    number = _whole(points, "return_number", 1, _MOST_RETURNS)
+    if np.any(number > returns):
+        bad = np.argmax(number > returns)
+        raise UserError(f"return_number = {number[bad]} must be at most number_of_returns, {returns[bad]}")
+    kind = _whole(points, "kind", 0, 255)
+    angle = finite_array("scan_angle_deg", points["scan_angle_deg"].values)
+    if np.any(np.abs(angle) > 180):
+        raise UserError(f"scan_angle_deg = {angle[np.argmax(np.abs(angle))]:g} must lie between -180 and 180")
+    scaled = np.nan_to_num(points["intensity"].values / full_scale, nan=0.0)
+    extra = {item.name: points[item.name].values for item in EXTRA_BYTES if item.dtype == "f4"}
+    return {
+        **{name: _coordinate(points, name.lower(), offset) for name, offset in zip("XYZ", offsets, strict=True)},
+        "gps_time": finite_array("gps_time", points["gps_time"].values),
+        "classification": kind,
+        "synthetic": kind == NO_BOTTOM,
+        "intensity": np.round(np.clip(scaled, 0, 1) * _LAST_INTENSITY),
+        "return_number": number,
+        "number_of_returns": returns,
+        "scan_angle": np.round(angle / _SCAN_ANGLE_DEG),
+        "point_source_id": _whole(points, "line", 0, 2**16 - 1),
+        "pixel": _whole(points, "pixel", 0, 2**16 - 1),
+        "shot": _whole(points, "shot", 0, 2**32 - 1),
+        **extra,
+    }
+
+
+def _coordinate(points: xr.Dataset, name: str, offset: float) -> npt.NDArray[np.int32]:
+    values = finite_array(name, points[name].values)
+    steps = np.round((values - offset) / SCALE_M)
+    outside = np.abs(steps) > 2**31 - 1
+    if np.any(outside):
+        raise UserError(
+            f"{name} = {values[outside][0]:g} m must be within 2147 km of {offset:g} m: LAS has 32 bits for millimetres"
+        )
+    return steps.astype(np.int32)
+
+
+def _whole(points: xr.Dataset, name: str, low: int, high: int) -> npt.NDArray[Any]:
+    """Return integers in [low, high]."""
+    values = points[name].values
+    suspects = [*values[np.mod(values, 1) != 0][:1], values.min(), values.max()] if values.size else []
+    for value in suspects:
+        integer(name, value, low, high)
+    return values

@@ -1,0 +1,122 @@
+"""Header of a LAS 1.4 file: coordinate system, extra bytes and notes, as records of the specification."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+from mitransient_lidar._version import __version__
+from mitransient_lidar.core.errors import UserError
+
+if TYPE_CHECKING:
+    import laspy
+
+SCALE_M = 0.001  #: Unit of the integer coordinates [m].
+
+#: Coordinate system of the scene, for a flight without one on the Earth.
+SCENE_WKT = (
+    'LOCAL_CS["mitransient-lidar scene",LOCAL_DATUM["mean sea level",0],UNIT["metre",1],'
+    'AXIS["x",EAST],AXIS["y",NORTH],AXIS["z",UP]]'
+)
+
+_DESCRIPTOR = struct.Struct("<2xBB32s4xd16x8x16x8x16x8x16x8x16x32s")
+_NO_DATA = 1  # bit of the options: the value for missing data is relevant
+
+
+class ExtraBytes(NamedTuple):
+    """One attribute of a point beyond those of its format."""
+
+    name: str
+    dtype: str  #: Type in NumPy's notation.
+    data_type: int  #: Its number in the specification.
+    description: str  #: At most 32 characters.
+
+
+EXTRA_BYTES = (
+    ExtraBytes("pixel", "u2", 3, "index of the receiver's pixel"),
+    ExtraBytes("shot", "u4", 5, "number of the laser pulse"),
+    ExtraBytes("depth", "f4", 9, "water depth, positive down [m]"),
+    ExtraBytes("depth_uncertainty", "f4", 9, "depth, 1 sigma [m]"),
+    ExtraBytes("horizontal_uncertainty", "f4", 9, "horizontal position, 1 sigma [m]"),
+    ExtraBytes("vertical_uncertainty", "f4", 9, "z, 1 sigma [m]"),
+)
+
+
+def coordinate_system_wkt(crs: str | None) -> str:
+    """Return a coordinate system as the WKT of OGC's specification of 2001, which LAS 1.4 asks for.
+
+    Parameters
+    ----------
+    crs : str or None
+        What pyproj understands: a code such as 'EPSG:32633' or 'EPSG:32633+5773' (with heights), a WKT. None: the frame
+        of the scene, an engineering system in metres with x east, y north, z up.
+
+    Raises
+    ------
+    UserError
+        If pyproj is missing, the system is unknown, has no such WKT, or is not a projected one in metres.
+    """
+    if crs is None:
+        return SCENE_WKT
+    try:
+        import pyproj
+    except ImportError:
+        raise UserError(f"crs = {crs!r} needs pyproj: install it by pip install 'mitransient-lidar[geo]'") from None
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+        wkt = str(system.to_wkt("WKT1_GDAL") or "")
+    except pyproj.exceptions.CRSError:
+        raise UserError(f"crs = {crs!r} is no coordinate system that pyproj knows, such as EPSG:32633") from None
+    if not system.is_projected or any(axis.unit_name != "metre" for axis in system.axis_info) or not wkt:
+        raise UserError(f"crs = {crs!r} must be a projected coordinate system in metres, such as EPSG:32633")
+    return wkt
+
+
+def las_header(
+    point_format: int, first: tuple[float, float], wkt: str, notes: str, descriptor: bytes = b""
+) -> laspy.LasHeader:
+    """Return the header of a file of LAS 1.4.
+
+    Parameters
+    ----------
+    point_format : int
+        6, or 9 with waveforms in an external file.
+    first : tuple of float
+        Coordinates x, y of the first point [m]; offsets are whole kilometres near it, and 0 for z.
+    wkt : str
+        Coordinate system.
+    notes : str
+        Text for the reader, as Text Area Description.
+    descriptor : bytes
+        Waveform Packet Descriptor of format 9.
+    """
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.generating_software = f"mitransient-lidar {__version__}"[:32]
+    header.system_identifier = "SIMULATION"
+    header.scales = [SCALE_M] * 3
+    header.offsets = [*(1000.0 * math.floor(value / 1000) for value in first), 0.0]
+    header.global_encoding.wkt = True
+    if descriptor:  # setting False sets the bit before laspy 2.7
+        header.global_encoding.waveform_data_packets_external = True
+    header.add_extra_dims([laspy.ExtraBytesParams(name=extra.name, type=extra.dtype) for extra in EXTRA_BYTES])
+    # laspy's own record holds minima and maxima, which NaN spoils.
+    header.vlrs.extract("ExtraBytesVlr")
+    records = [
+        ("LASF_Projection", 2112, "OGC coordinate system WKT", wkt.encode() + b"\0"),
+        ("LASF_Spec", 3, "Text area description", notes.encode() + b"\0"),
+        ("LASF_Spec", 4, "Extra bytes", b"".join(_descriptor(extra) for extra in EXTRA_BYTES)),
+    ]
+    if descriptor:
+        records.append(("LASF_Spec", 100, "Waveform packet descriptor", descriptor))
+    header.vlrs.extend(laspy.VLR(*record) for record in records)
+    return header
+
+
+def _descriptor(extra: ExtraBytes) -> bytes:
+    """Return the 192 bytes that describe an attribute; numbers that may be missing are NaN then."""
+    missing = extra.dtype == "f4"
+    options, no_data = (_NO_DATA, math.nan) if missing else (0, 0.0)
+    return _DESCRIPTOR.pack(extra.data_type, options, extra.name.encode(), no_data, extra.description.encode())
