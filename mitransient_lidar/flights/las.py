@@ -6,11 +6,13 @@ they are complete.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -159,9 +161,9 @@ def _write(path: Path, header: laspy.LasHeader, chunks: Iterable[tuple[xr.Datase
     """Write chunks of points with their fields of waveforms."""
     import laspy
 
-    compress, backend = path.suffix.lower() == ".laz", laspy.LazBackend.Lazrs
+    compression = {"do_compress": path.suffix.lower() == ".laz", "laz_backend": laspy.LazBackend.Lazrs}
     count, full_scale = 0, None
-    with laspy.open(path, mode="w", header=header, do_compress=compress, laz_backend=backend) as writer:
+    with _written(path) as file, laspy.LasWriter(file, header, closefd=False, **compression) as writer:
         for points, fields in chunks:
             count += points.sizes["point"]
             if count > _MOST_POINTS:
@@ -172,6 +174,31 @@ def _write(path: Path, header: laspy.LasHeader, chunks: Iterable[tuple[xr.Datase
                 record[name] = values
             writer.write_points(record)
     return count
+
+
+class _RawFile(io.FileIO):
+    """File that keeps the error of a write."""
+
+    failure: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Write bytes, as many as fit."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.failure = error
+            raise
+
+
+@contextlib.contextmanager
+def _written(path: Path) -> Iterator[IO[bytes]]:
+    """Open a new file; an error of a write is raised as it was, of which lazrs would say only that there was one."""
+    raw = _RawFile(path, "wb")
+    try:
+        with io.BufferedWriter(raw) as file:
+            yield file
+    except RuntimeError as error:
+        raise raw.failure or error from None
 
 
 def _attributes(points: xr.Dataset, offsets: Iterable[float], full_scale: float) -> dict[str, npt.NDArray[Any]]:

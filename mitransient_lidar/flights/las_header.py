@@ -99,7 +99,8 @@ def las_header(
     header.scales = [SCALE_M] * 3
     header.offsets = [*(1000.0 * math.floor(value / 1000) for value in first), 0.0]
     header.global_encoding.wkt = True
-    header.global_encoding.waveform_data_packets_external = bool(descriptor)
+    if descriptor:  # setting False sets the bit before laspy 2.7
+        header.global_encoding.waveform_data_packets_external = True
     header.add_extra_dims([laspy.ExtraBytesParams(name=extra.name, type=extra.dtype) for extra in EXTRA_BYTES])
     # laspy's own record holds minima and maxima, which NaN spoils.
     header.vlrs.extract("ExtraBytesVlr")

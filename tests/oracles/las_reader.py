@@ -29,6 +29,10 @@ class Descriptor(NamedTuple):
     gain: float
     offset: float
 
+    @classmethod
+    def of(cls, record: bytes) -> Descriptor:
+        return cls(*_DESCRIPTOR.unpack(record))
+
 
 class Packet(NamedTuple):
     descriptor: int
@@ -83,7 +87,7 @@ class LasFile:
     points: list[Point]
 
     def descriptor(self, packet: Packet) -> Descriptor:
-        return Descriptor(*_DESCRIPTOR.unpack(self.records["LASF_Spec", 99 + packet.descriptor]))
+        return Descriptor.of(self.records["LASF_Spec", 99 + packet.descriptor])
 
 
 def read(path: Path) -> LasFile:

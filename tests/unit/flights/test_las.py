@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ import xarray as xr
 from oracles import las_reader
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.flights import las
 from mitransient_lidar.flights.las import write_points, write_waveforms
 
@@ -231,8 +232,8 @@ def test_packets(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> N
 def test_laspy_reads_fields_of_waveforms(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset) -> None:
     write_waveforms(tmp_path / "waveforms.las", points, waveforms)
     read = laspy.read(tmp_path / "waveforms.las")
-    descriptor = read.header.vlrs.get("WaveformPacketVlr")[0].parsed_record
-    assert (descriptor.number_of_samples, descriptor.temporal_sample_spacing) == (SAMPLES, 500)
+    (descriptor,) = (record for record in read.header.vlrs if record.record_id == 100)
+    assert las_reader.Descriptor.of(descriptor.record_data_bytes()) == (16, 0, SAMPLES, 500, GAIN, OFFSET)
     has = points["packet"].values >= 0
     np.testing.assert_array_equal(read.wavepacket_index, has)
     np.testing.assert_array_equal(read.wavepacket_offset[has], 60 + 2 * SAMPLES * points["packet"].values[has])
@@ -393,6 +394,21 @@ def test_suffixes_and_numbers_of_points(
     with pytest.raises(UserError, match="more than 100 points are too many for one file"):
         write_points(tmp_path / "points.laz", points)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["points.las", "points.laz", "waveforms.las"])
+def test_files_that_cannot_be_completed(tmp_path: Path, points: xr.Dataset, waveforms: xr.Dataset, name: str) -> None:
+    many = xr.concat([points] * 20, "point").assign(packet=("point", np.full(20 * points.sizes["point"], -1)))
+    (tmp_path / name).write_text("former")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(WriteError, match=rf"^cannot write .*{name[:-4]}\.\w+: File too large\.$"):
+            write_waveforms(tmp_path / name, many, waveforms) if "wave" in name else write_points(tmp_path / name, many)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (tmp_path / name).read_text() == "former"
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.slow
