@@ -124,7 +124,7 @@ def main() -> None:
     """Run the command line."""
     # Commands draw to files only: Matplotlib refuses to be imported with an unknown backend.
     os.environ["MPLBACKEND"] = "agg"
-    if sys.argv[1:2] != ["sweep"] and not {"dask", "xarray"} & sys.modules.keys():
+    if sys.argv[1:2] not in (["sweep"], ["fly"]) and not {"dask", "xarray"} & sys.modules.keys():
         # xarray imports Dask wherever it is installed, which takes a third of a second. Campaigns alone need it. An
         # xarray that a script has imported before remembers where Dask is, and goes on with it.
         sys.modules["dask"] = None  # type: ignore[assignment]
