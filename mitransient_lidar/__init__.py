@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.analysis.waveforms.depth_correction import correct_depths
     from mitransient_lidar.analysis.waveforms.echo_table import extract as waveforms
     from mitransient_lidar.campaigns.sweep import sweep
+    from mitransient_lidar.flights.fly import fly
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
     from mitransient_lidar.rendering.render import render
@@ -72,6 +73,7 @@ _FUNCTIONS = {
     "depth_bias": ("studies.depth_bias", "depth_bias"),
     "detect": ("studies.detection", "detect"),
     "estimate": ("studies.estimate", "estimate"),
+    "fly": ("flights.fly", "fly"),
     "instrument_names": ("loading.instruments", "instrument_names"),
     "read_instrument": ("loading.instruments", "read_instrument"),
     "record": ("analysis.receiver", "detect_waveforms"),
@@ -91,6 +93,7 @@ __all__ = [
     "depth_bias",
     "detect",
     "estimate",
+    "fly",
     "instrument_names",
     "open",
     "read_instrument",

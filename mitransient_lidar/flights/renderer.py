@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.shot_scene import ShotScene
     from mitransient_lidar.transport.scene import LidarScene
 
-#: Largest range of angles from nadir [deg], and ratio of heights, of the pulses that share a lidar.
+#: Largest range of angles from nadir [deg], and ratio of heights and of ranges, of the pulses that share a lidar.
 _ANGLES, _HEIGHTS = 2.0, 1.1
 
 #: Largest angle by which pixels may be turned about their line of sight [deg].
@@ -38,6 +38,9 @@ _LARGEST_TURN = 15.0
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
 _BATCH, _STILL_S = 64, 0.05
+
+#: Rounding of times over the time in which waves stand still.
+_ROUNDING = 1e-6
 
 #: Places of a group of pulses that decide how long their record is.
 _PLACES = 6
@@ -130,7 +133,7 @@ class FlightRenderer:
 
     def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
         """Return the rows of pulses that are rendered together: successive ones of a group, over one sea."""
-        group, step = inputs["group"], np.floor(inputs["time_s"] / _STILL_S)
+        group, step = inputs["group"], np.floor(inputs["time_s"] / _STILL_S + _ROUNDING)
         first = 0
         for row in range(1, group.size + 1):
             is_last = row == group.size or row - first == _BATCH
@@ -212,7 +215,7 @@ class FlightRenderer:
         )
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
-            time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S) + 0.5)
+            time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)
             batches.set_time(time_s)
             sea = sea if sea is None else sea.at(time_s)
         pulses = inputs["pulse"].astype(np.int64)
@@ -253,7 +256,7 @@ def _shot_scene(
     from mitransient_lidar.rendering.shot_scene import ShotScene
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
-    return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False)
+    return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)
 
 
 def _lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
@@ -306,7 +309,9 @@ def _columns(poses: PulsePoses) -> dict[str, Column]:
             "the platform an origin near it"
         )
     angle, height = np.degrees(np.arccos(-poses.axis[:, 2])), np.log(poses.origin[:, 2])
-    bands = [_bands(values, step) for values, step in ((angle, _ANGLES), (height, float(np.log(_HEIGHTS))))]
+    # Near the horizon, ranges change more than angles.
+    ratio, range_per_height = float(np.log(_HEIGHTS)), -np.log(-poses.axis[:, 2])
+    bands = [_bands(*pair) for pair in ((angle, _ANGLES), (height, ratio), (range_per_height, ratio))]
     _, group = np.unique(np.stack(bands), axis=1, return_inverse=True)
     group = group.reshape(-1)
     order = np.lexsort((np.arange(group.size), group))

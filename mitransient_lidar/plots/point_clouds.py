@@ -108,10 +108,8 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
     surface = strip["kind"].values == PointClass.SURFACE
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
-    edges = (
-        np.linspace(*(np.quantile(strip["x"].values, [0, 1])), _CELLS[0] + 1),
-        np.linspace(-depth, _ABOVE, _CELLS[1] + 1),
-    )
+    first, last = np.quantile(strip["x"].values, [0.0, 1.0])
+    edges = np.linspace(first, last, _CELLS[0] + 1), np.linspace(-depth, _ABOVE, _CELLS[1] + 1)
     total, number = np.zeros(_CELLS), np.zeros(_CELLS)
     width = float(flown.store.attributes["bin_width_ns"])
     group, index = (float(flown.attributes[name]) for name in ("group_index", "refractive_index"))

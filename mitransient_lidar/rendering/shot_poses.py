@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 
-#: Horizontal component of an axis below which its azimuth is that of the direction of +angle_x.
-_VERTICAL = 1e-6
+#: Angle from nadir of a lidar [deg] below which azimuths are those of the direction of +angle_x.
+_NADIR_DEG = 3.0
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,9 @@ class ShotPoses:
         """
         own = lidar.receiver.pose
         places = receiver.origin - receiver.axis * (receiver.origin[:, 2:] / receiver.axis[:, 2:])
-        azimuth, level = _azimuths(receiver.axis, receiver.far), _azimuths(own.axis, own.far)
-        # Both are unit numbers of the complex plane.
-        turns = azimuth * np.conj(level)
+        # Near nadir, small changes of attitude turn the axis to any azimuth.
+        ahead = [pose.far if own.off_nadir_deg < _NADIR_DEG else pose.axis for pose in (receiver, own)]
+        turns = _azimuths(ahead[0]) * np.conj(_azimuths(ahead[1]))
         to_frame = _rotations(np.conj(turns))
         centre = own.ground_point()
         sides = [np.squeeze(to_frame @ side[..., None], -1) for side in (receiver.axis, receiver.far, receiver.left)]
@@ -115,14 +116,13 @@ class ShotPoses:
         return np.asarray(ranges[0] + ranges[1] - lidar.reference_length)
 
 
-def _azimuths(axis: FloatArray, far: FloatArray) -> FloatArray:
-    """Return the azimuths of axes as complex numbers of modulus 1."""
-    chosen = np.where(np.hypot(axis[..., :1], axis[..., 1:2]) > _VERTICAL, axis[..., :2], far[..., :2])
-    number = chosen[..., 0] + 1j * chosen[..., 1]
+def _azimuths(directions: FloatArray) -> npt.NDArray[np.complex128]:
+    """Return the azimuths of directions as complex numbers of modulus 1."""
+    number = directions[..., 0] + 1j * directions[..., 1]
     return np.asarray(number / np.abs(number))
 
 
-def _rotations(turns: FloatArray) -> FloatArray:
+def _rotations(turns: npt.NDArray[np.complex128]) -> FloatArray:
     """Return rotations about the vertical by azimuths, shape (shots, 3, 3)."""
     found = np.zeros((len(turns), 3, 3))
     found[:, 0, 0] = found[:, 1, 1] = turns.real

@@ -25,7 +25,7 @@ AIM, TARGET = ("aim_x", "aim_y"), ("target_x", "target_y")
 
 
 class ShotScene:
-    """The scene of a series of shots, at the place of the first one.
+    """The scene of a series of shots, at the place of the first one; its record is told, and it is checked, if wanted.
 
     Attributes
     ----------
@@ -46,6 +46,7 @@ class ShotScene:
         places: FloatArray,
         axis: TimeAxis | None,
         components: bool,
+        check: bool = True,
     ) -> None:
         from mitransient_lidar.rendering.describe import describe_scene
         from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
@@ -60,7 +61,8 @@ class ShotScene:
         shifts = [(float(x), float(y)) for x, y in places - places[0]]
         own = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
         self._axis = own if axis is None else _checked_axis(axis, own)
-        self.session.tell_record(self._axis)
+        if check:
+            self.session.tell_record(self._axis)
         self._renderer = self._prepare(self.session)
         self.lidar: LidarScene = self._renderer.scene
         self.companions = self._find_companions()
@@ -68,7 +70,8 @@ class ShotScene:
         check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count, origins)
         probe = probe_echoes(self.lidar, self._renderer.sampler)
         self.window = error_window(self.lidar, probe)
-        check_scene(self.lidar, self._renderer.sampler, probe)
+        if check:
+            check_scene(self.lidar, self._renderer.sampler, probe)
         self._described = describe_scene(self.lidar, probe, self.window, self._renderer.focusing)
 
     def _open(self, params: Mapping[str, Any]) -> Session:

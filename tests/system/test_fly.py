@@ -1,0 +1,159 @@
+"""Flights from their files to points: places against the truth, files, interruption, and refusals."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import laspy
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+from oracles import las_reader
+from significance import largest_z
+
+from mitransient_lidar.campaigns.store import DONE, Store
+from mitransient_lidar.flights.fly import STORE, fly
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.products import Flown, describe_points
+from mitransient_lidar.flights.renderer import FlightRenderer
+
+#: A short flight round a cube, over a level sea with the ripples of a wind and a bottom that slopes.
+FLIGHT = {
+    "scene": "flight",
+    "instrument": "published_airborne",
+    "target_error": 0.1,
+    "still_sea": True,
+    "parameters": {
+        **{"spectrum": "flat", "bottom_ripple_height": 0, "bottom_slope_x_deg": 2, "bottom_slope_y_deg": -1},
+        **{"bottom_size": 400, "cube_size": 2, "cube_x": 3, "cube_depth": 5},
+    },
+    "platform": {
+        **{"kind": "lines", "start": [0.0, -2.0], "heading_deg": 90.0, "speed": 40.0, "height": 200.0},
+        **{"duration_s": 0.1, "noise": {"roll_deg": 0.3, "pitch_deg": 0.3, "yaw_deg": 0.3, "correlation_s": 0.02}},
+    },
+    "scanner": {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 10.0},
+    "pulses": {"rate_hz": 240.0, "most": 24},
+}
+
+TOML = """
+scene = "flight"
+instrument = "published_airborne"
+target_error = 0.3
+still_sea = true
+parameters = { spectrum = "flat", bottom_ripple_height = 0, cube_size = 0.5 }
+scanner = { kind = "palmer", nadir_angle_deg = 20.0, rate_hz = 10.0 }
+pulses = { rate_hz = 320.0, most = 32 }
+
+[platform]
+kind = "lines"
+start = [0.0, 0.0]
+heading_deg = 90.0
+speed = 40.0
+height = 200.0
+duration_s = 0.1
+"""
+
+
+@pytest.mark.slow
+def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path):
+    """All round the compass, with a rolling platform, over a slope: a wrong azimuth, sign or index is metres off."""
+    points = fly(FLIGHT, tmp_path, workers=1)
+    kind, pixels = points["kind"].values, 4
+    assert np.count_nonzero(kind == 41) == np.count_nonzero(kind == 40) == 24 * pixels
+    error = points["z"].values - points["true_z"].values
+    stated = points["vertical_uncertainty"].values
+    bottom = (kind == 40) & ~points["true_target"].values
+    for own in (kind == 41, bottom):
+        assert np.all(np.abs(error[own]) < 6 * stated[own])
+        assert np.abs(np.mean(error[own])) < 0.25
+        assert 0.01 < np.median(stated[own]) < 0.4
+    # The bottom falls to -y and rises to +x: its height is that of the place that was found.
+    x, y, z = (points[name].values[bottom] for name in "xyz")
+    design = np.column_stack([x, y, np.ones_like(x)])
+    slopes, residual, *_ = np.linalg.lstsq(design, z, rcond=None)
+    covariance = residual[0] / (len(x) - 3) * np.linalg.inv(design.T @ design)
+    true = np.tan(np.radians([2.0, -1.0]))
+    for axis in (0, 1):
+        # Neighbouring pixels of a pulse share their errors: as many independent ones as pulses.
+        z_score = (slopes[axis] - true[axis]) / (2 * np.sqrt(covariance[axis, axis]))
+        assert abs(z_score) < largest_z(24)
+    assert np.ptp(x) > 100
+    assert np.ptp(y) > 100
+    store = Store(tmp_path / STORE)
+    assert np.all(store.status() == DONE)
+    lines = describe_points(points)
+    assert lines[1].startswith("water surface")
+    assert_files(tmp_path, points, Flown.of(store))
+
+
+def assert_files(folder, points, flown):
+    """Points as laspy reads them, and packets as a reader written from the specification does."""
+    with laspy.open(folder / "points.laz") as file:
+        cloud = file.read()
+    assert len(cloud) == points.sizes["point"]
+    np.testing.assert_allclose(cloud.z, points["z"], atol=6e-4)
+    np.testing.assert_array_equal(cloud.classification, points["kind"])
+    found = las_reader.read(folder / "waveforms.las")
+    signal = flown.values("signal")
+    shot, pixel = points["shot"].values, points["pixel"].values
+    for number in (0, len(shot) // 2, len(shot) - 1):
+        packet = found.points[number].packet
+        samples = las_reader.volts(folder / "waveforms.wdp", packet, found.descriptor(packet))
+        np.testing.assert_allclose(samples, signal[shot[number], pixel[number]], atol=np.ptp(signal) / 30_000)
+    assert (folder / "waveforms.wdp").stat().st_size == 60 + 2 * signal.size
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
+    path = tmp_path / "short.toml"
+    path.write_text(TOML)
+    whole = fly(path, tmp_path / "whole", workers=1, shard_size=16)
+    command = [sys.executable, "-m", "mitransient_lidar", "fly", str(path), "-o", str(tmp_path / "killed")]
+    process = subprocess.Popen(
+        [*command, "--workers", "1", "--shard-size", "16"], start_new_session=True, stdout=subprocess.DEVNULL
+    )
+    store = tmp_path / "killed" / STORE
+    until = time.monotonic() + 300
+    while time.monotonic() < until and process.poll() is None:
+        if store.is_dir() and np.count_nonzero(Store(store).status() == DONE) == 16:
+            os.killpg(process.pid, signal.SIGKILL)
+            break
+        time.sleep(0.2)
+    process.wait()
+    assert np.count_nonzero(Store(store).status() == DONE) == 16
+    assert not (tmp_path / "killed" / "points.laz").exists()
+    again = fly(path, tmp_path / "killed", workers=1)
+    for name in whole.data_vars:
+        np.testing.assert_array_equal(again[name], whole[name])
+    for name in ("points.laz", "waveforms.wdp"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    other = FlightPlan.of({**FLIGHT, "seed": 2})
+    with pytest.raises(Exception, match="holds another flight"):
+        fly(other, tmp_path / "killed", workers=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parameters": {**FLIGHT["parameters"], "bottom_size": 60}}, "the bottom does not cover the flight"),
+        ({"parameters": {"bottom_dept": 3}}, "has no parameter bottom_dept"),
+        (
+            {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},
+            "no bottom within the record",
+        ),
+        ({"scanner": {**FLIGHT["scanner"], "pixels": "platform"}}, "the pixels are turned about their line of sight"),
+    ],
+)
+def test_flights_that_cannot_be_rendered(change, message):
+    with pytest.raises(Exception, match=message):
+        FlightRenderer.of(FlightPlan.of({**FLIGHT, **change}))
+
+
+def test_command_refuses_bad_flights(tmp_path):
+    path = tmp_path / "flight.toml"
+    path.write_text(TOML.replace("rate_hz = 320.0", "rate_hz = -1"))
+    assert_refused(run("fly", path, "-o", tmp_path / "out"), "rate_hz = -1")
+    assert not (tmp_path / "out").exists()

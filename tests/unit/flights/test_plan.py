@@ -1,0 +1,100 @@
+"""Plans of flights: what a file may hold, and the groups and batches of pulses."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.flights.plan import FlightPlan, flights
+from mitransient_lidar.flights.renderer import FlightRenderer, _columns
+
+LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
+PALMER = {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 10.0}
+FLIGHT = {"scene": "flight", "platform": LINE, "scanner": PALMER, "pulses": {"rate_hz": 100}}
+
+
+@pytest.mark.parametrize("name", flights())
+def test_shipped_flights_have_poses(name):
+    plan = FlightPlan.read(name)
+    poses = plan.poses()
+    assert 100 <= len(poses.time_s) <= 20_000
+    assert np.all(poses.axis[:, 2] < 0)
+    assert FlightPlan.from_json(plan.text).text == plan.text
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sence": "flight"}, "'sence' is no key of a flight"),
+        ({"scene": 3}, "scene = 3 must be a name"),
+        ({"pulses": {}}, r"\[pulses\] has no rate_hz"),
+        ({"pulses": {"rate_hz": -1}}, "rate_hz"),
+        ({"pulses": {"rate_hz": 100, "most": 0}}, "most = 0 must"),
+        ({"receiver": {"gian": 1}}, "'gian' is no key of"),
+        ({"receiver": {"gain": "auto"}}, "gain"),
+        ({"receiver": {"optical_density": 20}}, "optical_density = 20"),
+        ({"estimator": "best"}, "estimator = 'best' must be one of"),
+        ({"errors": {"rol_deg": 1}}, "rol_deg"),
+        ({"origin": [0, 0]}, r"origin = \[0, 0\] must be x, y and z"),
+        ({"still_sea": 1}, "still_sea = 1 must be true or false"),
+        ({"parameters": {"altitude": 200}}, "'altitude' follows from the poses"),
+        ({"seed": -1}, "seed = -1 must"),
+        ({"surface_radius": -1}, "surface_radius = -1"),
+    ],
+)
+def test_bad_flights_are_one_sentence(change, message):
+    with pytest.raises(UserError, match=message):
+        FlightPlan.of({**FLIGHT, **change})
+
+
+def test_a_name_that_is_not_shipped():
+    with pytest.raises(UserError, match=r"flight 'semiarc' must be a TOML file or one of .*semi_arc"):
+        FlightPlan.read("semiarc")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"platform": {**LINE, "height": 0.5}}, "from a height of 0.5 m"),
+        ({"scanner": {"kind": "fixed", "nadir_angle_deg": 89.0}}, "looks 89 degrees from nadir"),
+        ({"platform": {**LINE, "start": [0.0, 20_000.0]}}, r"reaches 200[\d.]+ m from the origin"),
+    ],
+)
+def test_poses_that_cannot_be_rendered(change, message):
+    with pytest.raises(UserError, match=message):
+        _columns(FlightPlan.of({**FLIGHT, **change}).poses())
+
+
+def test_pulses_of_one_group_have_similar_poses():
+    scanner = {"kind": "oscillating", "half_angle_deg": 15.0, "rate_hz": 5.3}
+    plan = FlightPlan.of({**FLIGHT, "scanner": scanner})
+    columns = _columns(plan.poses())
+    angle = np.degrees(np.arccos(-columns["axis_z"]))
+    assert np.all(np.abs(angle - columns["group_angle_deg"]) <= 1.0)
+    assert np.array_equal(np.sort(columns["pulse"]), np.arange(len(angle)))
+    assert np.all(np.diff(columns["group"]) >= 0)
+    assert 8 <= len(np.unique(columns["group"])) <= 9
+    for group in np.unique(columns["group"]):
+        assert np.all(np.diff(columns["pulse"][columns["group"] == group]) > 0)
+
+
+@pytest.mark.parametrize(("still", "longest"), [(False, 0.05), (True, 0.64)])
+def test_batches_are_of_one_group_and_one_sea(still, longest):
+    plan = FlightPlan.of({**FLIGHT, "still_sea": still})
+    columns = _columns(plan.poses())
+    batches = list(FlightRenderer(plan, None, None).batches(columns))
+    assert [row for batch in batches for row in batch] == list(range(len(columns["pulse"])))
+    for batch in batches:
+        assert len(np.unique(columns["group"][batch])) == 1
+        assert np.ptp(columns["time_s"][batch]) < longest
+    assert max(len(batch) for batch in batches) == (64 if still else 5)
+
+
+def test_paths_are_those_of_the_folder(tmp_path):
+    given = {**FLIGHT, "receiver": {"chain": "own.toml"}, "corrections": "table.nc"}
+    plan = FlightPlan.of(given, tmp_path)
+    assert plan.receiver == str(tmp_path / "own.toml")
+    assert plan.corrections == str(tmp_path / "table.nc")
+    # Workers read the stored text elsewhere.
+    assert json.loads(plan.text)["receiver"]["chain"] == str(tmp_path / "own.toml")
