@@ -23,8 +23,8 @@ _CLASSES = {
 #: Half of the width of the strip of a profile [m], and most waveforms in it.
 _STRIP, _MOST_WAVEFORMS = 1.5, 2000
 
-#: Heights in a profile above the sea and below the deepest point [m], and cells of its picture.
-_ABOVE, _BELOW, _CELLS = 1.0, 1.5, (300, 160)
+#: Heights in a profile above the sea and below the deepest point [m], and most cells of its picture.
+_ABOVE, _BELOW, _CELLS = 1.0, 1.5, (200, 160)
 
 #: Orders of magnitude of the signals in a profile.
 _DECADES = 3.0
@@ -108,14 +108,16 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
     surface = strip["kind"].values == PointClass.SURFACE
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
+    seen = np.unique(strip["shot"].values)
     first, last = np.quantile(strip["x"].values, [0.0, 1.0])
-    edges = np.linspace(first, last, _CELLS[0] + 1), np.linspace(-depth, _ABOVE, _CELLS[1] + 1)
-    total, number = np.zeros(_CELLS), np.zeros(_CELLS)
+    # A column of cells for each few pulses, so that they fill the picture.
+    shape = int(np.clip(len(seen) / 2, 10, _CELLS[0])), _CELLS[1]
+    edges = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
+    total, number = np.zeros(shape), np.zeros(shape)
     width = float(flown.store.attributes["bin_width_ns"])
     group, index = (float(flown.attributes[name]) for name in ("group_index", "refractive_index"))
     signal, start = flown.values("signal"), flown.values("sample_start_ns")
     origin, axis = flown.vectors("origin"), flown.vectors("axis")
-    seen = np.unique(strip["shot"].values)
     for shot in seen[:: max(len(seen) // _MOST_WAVEFORMS, 1)]:
         way = 0.299792458 / 2 * (start[shot] + (np.arange(signal.shape[-1]) + 0.5) * width)
         to_sea = -origin[shot, 2] / axis[shot, 2]
@@ -137,7 +139,8 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
         ax.plot(strip["x"].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
     order = np.argsort(strip["x"].values[wet])
     ax.plot(
-        *(strip[name].values[wet][order] for name in ("x", "true_z")), "-", color="white", linewidth=0.8, label="truth"
+        *(strip[name].values[wet][order] for name in ("x", "true_z")), "-", color="white", linewidth=1.2, label="truth"
     )
+    ax.set_facecolor("black")
     ax.set(xlabel="x (m)", ylabel="z (m)", title=f"Waveforms and points within {_STRIP:g} m of y = {middle:.1f} m")
-    ax.legend(loc="lower right", fontsize="small")
+    ax.legend(loc="lower right", fontsize="small", facecolor="#555555", labelcolor="white")

@@ -91,13 +91,14 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator):
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
     stacked = Pose(*(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left")))
-    poses = ShotPoses.of_receiver(renderer.scene, stacked)
+    lengths = np.array([0.0, 0.11, 0.07])
+    poses = ShotPoses.of_receiver(renderer.scene, stacked).delayed(lengths)
     np.testing.assert_allclose(poses.places, [shot[0] for shot in shots], atol=1e-9)
     seeds = [pass_seed(number, each) for number in range(len(shots)) for each in range(passes)]
     axis = renderer.scene.axis
     together = batches.at(poses)(passes).render_pass(seeds).histogram.energy()
     together = together.reshape(len(shots), passes, -1, axis.bin_count)
-    later = poses.extra_range(renderer.scene) / 0.299792458
+    later = (poses.extra_range(renderer.scene) - lengths) / 0.299792458
     for pose, delay, found in zip(given, later, together, strict=True):
         session = open_scene(
             "docs/survey_lidar.xml", params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]}

@@ -159,7 +159,7 @@ class MergingLayout:
             grid = grid.of_shots(heights, entries, axes, max(wider, 1.0), buckets)
             rings = grid.rings
         # A copy has capacities of its own.
-        uneven = solids_of_several_levels(scene, self.region, shots)
+        uneven = solids_of_several_levels(scene, self.region, shots, copies)
         patch_width = self.patch_width * max(wider, 1.0)
         return replace(self, grid=grid, rings=rings, uneven=uneven, side_bits=side_bits, patch_width=patch_width)
 
