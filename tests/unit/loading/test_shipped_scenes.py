@@ -67,6 +67,12 @@ OWN = {
     "fig14_1x4": {**SQUARE, "layout": "1x4"},
     "fig15_1x1": {**LAYERS, "layout": "1x1"},
     "fig15_2x2": LAYERS,
+    "flight": {
+        **{"wind_speed": "6", "bottom_depth": "6", "bottom_reflectance": "0.15"},
+        **{"bottom_slope_x_deg": "1", "bottom_slope_y_deg": "0", "bottom_ripple_height": "0.1"},
+        **{"bottom_ripple_length": "6", "bottom_refined_size": "160", "bottom_size": "400"},
+        **{"cube_x": "0", "cube_y": "0", "cube_depth": "5.5", "cube_size": "1", "cube_reflectance": "0.3"},
+    },
     "fresh_water_lens": {
         **{"refractive_index": "1.33667, 1.34240", "group_index": "1.35839, 1.36476", "layer_tops": "0, 2"},
         **{"attenuation": "0.6, 0.3", "scattering": "0.35, 0.15", "backscattering": "0.007, 0.003"},
