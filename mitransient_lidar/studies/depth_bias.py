@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -15,11 +16,13 @@ from mitransient_lidar._version import __version__
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, summarize_depths
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import finite_array, integer
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.shot_series import render_shots
+
+_LOG = logging.getLogger(__name__)
 
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")
@@ -97,8 +100,8 @@ def depth_bias(
     waters
         Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
-        Depths of the bottom [m], ascending. Where no channel finds a bottom that was found at a smaller depth, deeper
-        ones are not rendered: their ``found`` and ``wrong`` are 0, other numbers NaN.
+        Depths of the bottom [m], above 0, ascending. Not rendered are bottoms that waves uncover, and those below one
+        that no channel finds though it found a shallower one: ``found`` and ``wrong`` are 0, other numbers NaN.
     estimators
         Estimators of `echo_table.extract`.
     receiver
@@ -150,10 +153,8 @@ def depth_bias(
     geometry: dict[str, float] = {}
     for number, place in enumerate(np.ndindex(*(values.size for values in axes.values()))):
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
-        shallower = [cells[(*place[:3], index)] for index in range(place[3])]
-        if _is_lost(shallower):
-            cells[place] = _without_bottom(shallower[-1])
-        else:
+        shallower = [cells[(*place[:3], index)] for index in range(place[3]) if (*place[:3], index) in cells]
+        if not _is_lost(shallower):
             given = {
                 "wavelength_nm": _WAVELENGTH,
                 **(params or {}),
@@ -166,17 +167,23 @@ def depth_bias(
             }
             options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)]}
             error = _ERRORS[bool(wind)]
-            rendered = render_shots(
-                scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
-            )
-            recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
-            cells[place] = _cell(recorded, estimators, corrections)
-            pixels = [str(name) for name in recorded["pixel"].values]
-            geometry = {name: float(recorded.attrs[name]) for name in _GEOMETRY if name in recorded.attrs}
+            try:
+                rendered = render_shots(
+                    scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
+                )
+            except DryBottomError:
+                _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
+            else:
+                recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
+                cells[place] = _cell(recorded, estimators, corrections)
+                pixels = [str(name) for name in recorded["pixel"].values]
+                geometry = {name: float(recorded.attrs[name]) for name in _GEOMETRY if name in recorded.attrs}
         if progress is not None:
             elapsed = time.perf_counter() - began
             left = elapsed / (number + 1) * (total - number - 1)
             progress(Progress(number + 1, total, "render", elapsed, left))
+    if not cells:
+        raise UserError(f"depth = {axes['depth'].tolist()} must hold one below the waves of {winds} m/s")
     attributes = {
         "title": f"Errors of the depths of {instrument}",
         "source": f"mitransient-lidar {__version__}",
@@ -221,12 +228,6 @@ def _is_lost(shallower: Sequence[Mapping[str, Any]]) -> bool:
     return any(found) and not found[-1]
 
 
-def _without_bottom(shallower: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers of a cell that was not rendered, with the shapes of those of another one."""
-    zero = ("found", "wrong")
-    return {name: np.full(np.shape(value), 0.0 if name in zero else np.nan) for name, value in shallower.items()}
-
-
 def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return the numbers of one sea, over estimator and pixel, or pixel, or without dimensions."""
     truth = recorded["true_bottom_depth_below_surface"].values
@@ -258,7 +259,7 @@ def _labelled(
 
     def table(name: str) -> Any:
         first = np.asarray(next(iter(cells.values()))[name])
-        values = np.full((*shape, *first.shape), np.nan)
+        values = np.full((*shape, *first.shape), 0.0 if name in ("found", "wrong") else np.nan)
         for place, cell in cells.items():
             values[place] = cell[name]
         return values
@@ -270,9 +271,11 @@ def _labelled(
             data[name] = (dims, table(name), {"units": unit, "long_name": text})
     for name, text in _SLOPES.items():
         data[name] = (AXES, table(name), {"units": "1", "long_name": text})
-    measured = np.nanmedian(np.where(np.isnan(table("attenuation")), np.inf, table("attenuation")), axis=-1)
+    measured = table("attenuation")
+    known = np.isfinite(measured).any(axis=-1)
+    median = np.nanmedian(np.where(known[..., np.newaxis], measured, 0.0), axis=-1)
     described = {"units": "1/m", "long_name": "median attenuation of the column along the path"}
-    data["attenuation"] = (AXES[:3], np.where(np.isfinite(measured), measured, np.nan), described)
+    data["attenuation"] = (AXES[:3], np.where(known, median, np.nan), described)
     units = {"off_nadir_deg": "degree", "wind_speed": "m s-1", "depth": "m"}
     coords: dict[str, Any] = {
         name: (name, values, {"units": units[name]} if name in units else {}) for name, values in axes.items()

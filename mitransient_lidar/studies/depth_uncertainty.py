@@ -114,19 +114,19 @@ def depth_uncertainty(
 def describe_depth_uncertainty(found: xr.Dataset) -> list[str]:
     """Return the lines of a table of a result of `depth_uncertainty`, one for each water and wind.
 
-    TVU at 95 % of each depth [cm], of depths that are corrected where they are, with the first letters of the order
-    met, and a [cm] and b [%] of the fit at one standard deviation, with the root mean square of its residuals [cm].
+    TVU at 95 % of each depth [cm], corrected if there are corrections, with the order met, and a [cm] and b [%] of the
+    fit at one standard deviation, with the root mean square of its residuals [cm].
     """
     one = found.isel(correction=-1)
-    names = [order.name[:4] for order in SURVEY_ORDERS] + ["none", ""]
-    heads = "".join(f"{f'{depth:g} m':>14}" for depth in one["depth"].values)
+    names = [*(order.name for order in SURVEY_ORDERS), "none"]
+    heads = "".join(f"{f'{depth:g} m':>7}{'':10}" for depth in one["depth"].values)
     lines = [f"{'altitude':>8}{'angle':>7}{'wind':>6} {'water':<6}{heads}{'a':>8}{'b':>7}{'residual':>10}"]
     for place in np.ndindex(*(one.sizes[axis] for axis in ("altitude", "off_nadir_deg", "wind_speed", "water"))):
         cell = one.isel(dict(zip(("altitude", "off_nadir_deg", "wind_speed", "water"), place, strict=True)))
         text = f"{float(cell['altitude']):>8g}{float(cell['off_nadir_deg']):>7g}{float(cell['wind_speed']):>6g} "
         text += f"{cell['water'].item():<6}"
         for tvu, order in zip(cell["tvu"].values, cell["order"].values, strict=True):
-            text += f"{100 * tvu:>8.1f} {names[order]:<5}" if order >= 0 else f"{'-':>8}{'':6}"
+            text += f"{100 * tvu:>7.1f} {names[order]:<9}" if order >= 0 else f"{'-':>7}{'':10}"
         residual = np.sqrt((cell["vertical_residual"] ** 2).mean())
         text += "".join(f"{100 * float(cell[f'vertical_{name}']):>{8 - number}.2f}" for number, name in enumerate("ab"))
         lines.append(f"{text}{100 * float(residual):>10.2f}")

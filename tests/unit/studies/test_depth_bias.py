@@ -4,18 +4,20 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.studies import depth_bias as study
 from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
 
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """Cells whose bottom is hidden by the surface at 0.2 m and lost below 6 m, and the depths that are rendered."""
+    """Depths that are rendered: waves uncover 0.1 m, the surface hides 0.2 m, and bottoms from 6 m on are lost."""
     depths = []
 
     def render(scene, given, **options):
         depths.append(given["bottom_depth"])
+        if given["bottom_depth"] == 0.1:
+            raise DryBottomError("shape 'bottom' up to z = -0.1 m rises through the sea surface")
         return xr.Dataset(coords={"pixel": ["single"]}, attrs={"depth": given["bottom_depth"], "altitude": 150.0})
 
     def cell(recorded, estimators, corrections):
@@ -33,16 +35,21 @@ def rendered(monkeypatch):
 def test_bottoms_below_a_lost_one_are_not_rendered(rendered):
     states = []
     options = {"angles_deg": [20.0], "winds": [0.0, 3.0], "waters": ["IB"], "estimators": ["gaussian"]}
-    table = study.depth_bias("riegl_vq840g", depths=[0.2, 3, 6, 8, 10], progress=states.append, **options)
+    table = study.depth_bias("riegl_vq840g", depths=[0.1, 0.2, 3, 6, 8, 10], progress=states.append, **options)
     # A bottom that the surface hides is no lost one.
-    assert rendered == 2 * [0.2, 3, 6]
+    assert rendered == 2 * [0.1, 0.2, 3, 6]
     one = table.isel(off_nadir_deg=0, wind_speed=1, water=0, estimator=0, pixel=0)
-    np.testing.assert_array_equal(one["found"], [0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(one["found"], [0, 0, 1, 0, 0, 0])
     np.testing.assert_array_equal(one["wrong"], 0)
-    np.testing.assert_array_equal(one["bias"], [0.1, 0.1, 0.1, np.nan, np.nan])
-    assert [state.done for state in states] == list(range(1, 11))
+    np.testing.assert_array_equal(one["bias"], [np.nan, 0.1, 0.1, 0.1, np.nan, np.nan])
+    assert [state.done for state in states] == list(range(1, 13))
     assert table["attenuation"].item(0) == pytest.approx(0.2)
     assert table.attrs["altitude"] == 150
+
+
+def test_a_table_needs_a_depth_below_the_waves(rendered):
+    with pytest.raises(UserError, match=r"depth = \[0\.1\] must hold one below the waves of \[3\.0\] m/s"):
+        study.depth_bias("riegl_vq840g", depths=[0.1], winds=[3.0], waters=["IB"])
 
 
 @pytest.mark.parametrize(
