@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shot_series import render_shots
     from mitransient_lidar.studies.depth_bias import depth_bias
+    from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
 
@@ -71,6 +72,7 @@ _FUNCTIONS = {
     "correct_depths": ("analysis.waveforms.depth_correction", "correct_depths"),
     "cut_gates": ("analysis.gates.cut", "cut_gates"),
     "depth_bias": ("studies.depth_bias", "depth_bias"),
+    "depth_uncertainty": ("studies.depth_uncertainty", "depth_uncertainty"),
     "detect": ("studies.detection", "detect"),
     "estimate": ("studies.estimate", "estimate"),
     "fly": ("flights.fly", "fly"),
@@ -91,6 +93,7 @@ __all__ = [
     "correct_depths",
     "cut_gates",
     "depth_bias",
+    "depth_uncertainty",
     "detect",
     "estimate",
     "fly",

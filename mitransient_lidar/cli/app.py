@@ -41,6 +41,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.detect,
         studies.estimate,
         depth_bias.depth_bias,
+        depth_bias.tpu,
         studies.beam_spread,
         studies.fov_sweep,
         studies.scattering_orders,

@@ -11,6 +11,10 @@ class UserError(ValueError):
     """
 
 
+class DryBottomError(UserError):
+    """A bottom that rises through the sea where the receiver looks."""
+
+
 class WriteError(UserError):
     """A file that cannot be written, for want of space or permission."""
 

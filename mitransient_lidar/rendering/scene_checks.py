@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.rendering.echo_window import EchoProbe, SolidEcho
 from mitransient_lidar.transport.opaque import is_one_of, opaque_point
@@ -269,7 +269,7 @@ def _check_solids(scene: LidarScene, probe: EchoProbe) -> None:
             logger.warning("shape %r lies above the sea, from z = %.3g m", solid.id(), low)
     for solid in probe.pierced:
         if any(solid is bottom for bottom in bottoms):
-            raise UserError(
+            raise DryBottomError(
                 f"shape {solid.id()!r} up to z = {solid.bbox().max.z:.3g} m rises through the sea surface where the "
                 "receiver looks: a bottom must lie below the waves"
             )

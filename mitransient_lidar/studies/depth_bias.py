@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -15,11 +16,13 @@ from mitransient_lidar._version import __version__
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, summarize_depths
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import finite_array, integer
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.shot_series import render_shots
+
+_LOG = logging.getLogger(__name__)
 
 #: Waters by their Jerlov types: clear ocean, coast, and turbid coast.
 WATERS = ("IB", "1C", "5C")
@@ -39,6 +42,9 @@ _FURTHER, _GRAZING = 5.0, 60.0
 #: Distance from the bottom within which its signal is the largest [m].
 _NEAR = 0.5
 
+#: Attributes of renders that do not depend on angle, wind, water and depth.
+_GEOMETRY = ("altitude", "divergence_mrad", "refractive_index")
+
 _NUMBERS = {
     "bias": ("m", "mean error of the depth below the local surface"),
     "spread": ("m", "standard deviation of that error"),
@@ -51,6 +57,12 @@ _NUMBERS = {
     "corrected_spread": ("m", "standard deviation after correction"),
     "corrected_z": ("1", "root mean square of error over stated error after correction"),
     "snr": ("1", "median over shots of the largest signal-to-noise ratio within 0.5 m of the bottom"),
+}
+
+#: Root mean squares of slopes, in the names of the truth of shots.
+_SLOPES = {
+    "slope_along": "root mean square over shots of the slope in the line of sight, mean over the beam",
+    "slope_across": "root mean square over shots of the slope across the line of sight, mean over the beam",
 }
 
 
@@ -88,7 +100,8 @@ def depth_bias(
     waters
         Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
-        Depths of the bottom [m], ascending.
+        Depths of the bottom [m], above 0, ascending. Not rendered are bottoms that waves uncover, and those below one
+        that no channel finds though it found a shallower one: ``found`` and ``wrong`` are 0, other numbers NaN.
     estimators
         Estimators of `echo_table.extract`.
     receiver
@@ -108,7 +121,8 @@ def depth_bias(
     xarray.Dataset
         Over ``off_nadir_deg``, ``wind_speed``, ``water``, ``depth``, ``estimator`` and ``pixel``: ``bias``, ``spread``,
         ``found``, ``noise_error``, ``error``, ``z`` and ``wrong`` of `summarize_depths`; with `corrections` also
-        ``corrected_bias``, ``corrected_spread`` and ``corrected_z``. Without estimator: ``snr``; and over
+        ``corrected_bias``, ``corrected_spread`` and ``corrected_z``. Without estimator: ``snr``; without estimator and
+        pixel: ``slope_along`` and ``slope_across``, root mean squares of the mean slopes in the beam; and over
         ``off_nadir_deg``, ``wind_speed`` and ``water``, the ``attenuation`` [1/m] that is measured. The truth is the
         depth of the bottom below the mean surface in the beam.
 
@@ -126,37 +140,50 @@ def depth_bias(
         "water": np.asarray(waters, dtype=str),
         "depth": finite_array("depths", depths),
     }
-    for name in ("off_nadir_deg", "wind_speed", "depth"):
+    for name in ("off_nadir_deg", "wind_speed"):
         if axes[name].size == 0 or np.any(np.diff(axes[name]) <= 0) or axes[name][0] < 0:
             raise UserError(f"{name} = {axes[name].tolist()} must be numbers of at least 0 that ascend")
+    if axes["depth"].size == 0 or np.any(np.diff(axes["depth"], prepend=0.0) <= 0):
+        raise UserError(f"depth = {axes['depth'].tolist()} must be numbers above 0 that ascend")
     shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
     seed = integer("seed", seed, 0, 2**31)
     cells: dict[tuple[int, ...], dict[str, Any]] = {}
     began, total = time.perf_counter(), math.prod(values.size for values in axes.values())
     pixels: list[str] = []
+    geometry: dict[str, float] = {}
     for number, place in enumerate(np.ndindex(*(values.size for values in axes.values()))):
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
-        given = {
-            "wavelength_nm": _WAVELENGTH,
-            **(params or {}),
-            "off_nadir_deg": float(angle),
-            "wind_speed": float(wind) or _RIPPLES,
-            "jerlov": str(water),
-            "bottom_depth": float(depth),
-            "surface_seed": seed + number,
-            **({} if wind else {"spectrum": "flat"}),
-        }
-        options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)]}
-        rendered = render_shots(
-            scene, given, instrument=instrument, target_error=_ERRORS[bool(wind)], seed=seed, first_seed=seed, **options
-        )
-        recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
-        cells[place] = _cell(recorded, estimators, corrections)
-        pixels = [str(name) for name in recorded["pixel"].values]
+        shallower = [cells[(*place[:3], index)] for index in range(place[3]) if (*place[:3], index) in cells]
+        if not _is_lost(shallower):
+            given = {
+                "wavelength_nm": _WAVELENGTH,
+                **(params or {}),
+                "off_nadir_deg": float(angle),
+                "wind_speed": float(wind) or _RIPPLES,
+                "jerlov": str(water),
+                "bottom_depth": float(depth),
+                "surface_seed": seed + number,
+                **({} if wind else {"spectrum": "flat"}),
+            }
+            options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)]}
+            error = _ERRORS[bool(wind)]
+            try:
+                rendered = render_shots(
+                    scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
+                )
+            except DryBottomError:
+                _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
+            else:
+                recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
+                cells[place] = _cell(recorded, estimators, corrections)
+                pixels = [str(name) for name in recorded["pixel"].values]
+                geometry = {name: float(recorded.attrs[name]) for name in _GEOMETRY if name in recorded.attrs}
         if progress is not None:
             elapsed = time.perf_counter() - began
             left = elapsed / (number + 1) * (total - number - 1)
             progress(Progress(number + 1, total, "render", elapsed, left))
+    if not cells:
+        raise UserError(f"depth = {axes['depth'].tolist()} must hold one below the waves of {winds} m/s")
     attributes = {
         "title": f"Errors of the depths of {instrument}",
         "source": f"mitransient-lidar {__version__}",
@@ -167,6 +194,7 @@ def depth_bias(
         "shots": shots,
         "records": records,
         "seed": seed,
+        **geometry,
     }
     return _labelled(axes, cells, pixels, list(estimators), attributes)
 
@@ -194,6 +222,12 @@ def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[
     return lines
 
 
+def _is_lost(shallower: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether a bottom was found at one of the smaller depths, and none at the last of them."""
+    found = [bool(np.any(cell["found"] > 0)) for cell in shallower]
+    return any(found) and not found[-1]
+
+
 def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:
     """Return the numbers of one sea, over estimator and pixel, or pixel, or without dimensions."""
     truth = recorded["true_bottom_depth_below_surface"].values
@@ -204,6 +238,8 @@ def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Datas
         numbers |= {f"corrected_{name}": after[name] for name in ("bias", "spread", "z")}
     attenuation = found["attenuation"].values
     numbers["attenuation"] = float(np.nanmedian(attenuation)) if np.isfinite(attenuation).any() else np.nan
+    for name in _SLOPES:
+        numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
     depth = (recorded["time"] - recorded["surface_time"]) * recorded["depth_per_ns"]
     near = np.abs(depth - float(np.mean(truth))) < _NEAR
     largest = recorded["snr"].where(near).max("time")
@@ -223,7 +259,7 @@ def _labelled(
 
     def table(name: str) -> Any:
         first = np.asarray(next(iter(cells.values()))[name])
-        values = np.full((*shape, *first.shape), np.nan)
+        values = np.full((*shape, *first.shape), 0.0 if name in ("found", "wrong") else np.nan)
         for place, cell in cells.items():
             values[place] = cell[name]
         return values
@@ -233,9 +269,13 @@ def _labelled(
         if name in next(iter(cells.values())):
             dims = (*AXES, "pixel") if name == "snr" else (*AXES, "estimator", "pixel")
             data[name] = (dims, table(name), {"units": unit, "long_name": text})
-    measured = np.nanmedian(np.where(np.isnan(table("attenuation")), np.inf, table("attenuation")), axis=-1)
+    for name, text in _SLOPES.items():
+        data[name] = (AXES, table(name), {"units": "1", "long_name": text})
+    measured = table("attenuation")
+    known = np.isfinite(measured).any(axis=-1)
+    median = np.nanmedian(np.where(known[..., np.newaxis], measured, 0.0), axis=-1)
     described = {"units": "1/m", "long_name": "median attenuation of the column along the path"}
-    data["attenuation"] = (AXES[:3], np.where(np.isfinite(measured), measured, np.nan), described)
+    data["attenuation"] = (AXES[:3], np.where(known, median, np.nan), described)
     units = {"off_nadir_deg": "degree", "wind_speed": "m s-1", "depth": "m"}
     coords: dict[str, Any] = {
         name: (name, values, {"units": units[name]} if name in units else {}) for name, values in axes.items()

@@ -12,7 +12,7 @@ from scipy.stats import t
 from significance import largest_z
 
 import mitransient_lidar
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.loading import scenes as loading
 from mitransient_lidar.rendering import accuracy
@@ -274,7 +274,7 @@ def test_unknown_plugin_and_parameter_in_a_file(tmp_path):
 @pytest.mark.slow
 def test_bottom_through_the_waves_is_refused_and_a_target_is_reported(caplog):
     """Waves at 6 m/s have half a metre, and this sea a trough in view; a pile of 0.6 m across stands in the beam."""
-    with pytest.raises(UserError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
+    with pytest.raises(DryBottomError, match=r"shape 'bottom' up to z = -0.1 m rises through the sea surface"):
         small(params={"wind_speed": 6, "bottom_depth": 0.1, "surface_seed": 2})
     pile = {"type": "cylinder", "p0": [0, 0, -2.0], "p1": [0, 0, 1.0], "radius": 0.3, "bsdf": {"type": "diffuse"}}
     scene = {

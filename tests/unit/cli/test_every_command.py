@@ -6,6 +6,7 @@ from command_line import assert_refused, run
 
 from mitransient_lidar.cli.app import app
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.results import netcdf
 
 #: The reference compiles one kernel, merging three.
 FAST = '<integrator type="lidar_volpath"><integer name="paths_per_pass" value="4096"/></integrator>'
@@ -142,6 +143,30 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
 
 
 @pytest.mark.slow
+def test_uncertainties_of_an_instrument_from_end_to_end(tmp_path):
+    """The table of a level sea: its errors are those of depth-bias, and the footprint is that of the beam."""
+    few = ["--winds", "0", "--waters", "IB,5C", "--depths", "3,6", "--shots", 4, "--records", 4, "-q"]
+    folder = tmp_path / "made"
+    check(run("tpu", "riegl_vq840g", *few, "-D", "altitude=120", "-o", folder), tmp_path)
+    stem = "riegl_vq840g_120m_20deg"
+    names = {f"{stem}_{name}" for name in ("tvu.csv", "tvu_corrected.csv", "thu.csv", "tvu.png", "orders.png")}
+    assert {path.name for path in folder.iterdir()} == {"riegl_vq840g_tpu.nc", *names}
+    table = tmp_path / "table.nc"
+    check(run("depth-bias", "riegl_vq840g", *few, "-D", "altitude=120", "--angles", 20, "-o", table), tmp_path)
+    bias = netcdf.read_netcdf(table).sel(estimator="gaussian").isel(off_nadir_deg=0, wind_speed=0, pixel=0)
+    found = netcdf.read_netcdf(folder / "riegl_vq840g_tpu.nc").isel(altitude=0, off_nadir_deg=0, wind_speed=0)
+    vertical = np.hypot(bias["bias"], bias["spread"]).where(bias["found"] >= 0.5)
+    assert np.isfinite(vertical.sel(water="IB")).all()
+    np.testing.assert_allclose(found["subaqueous_vertical"].sel(correction="none"), vertical)
+    rows = [line.split(",") for line in (folder / f"{stem}_thu.csv").read_text().splitlines()]
+    assert rows[0] == ["Wind", "JerlovType", "a", "b"]
+    # 1 mrad at e^-1/2, 2 sigma, at 120 m, and 20 degrees off nadir.
+    cos = np.cos(np.radians(20))
+    assert float(rows[1][2]) == pytest.approx(0.06 * np.sqrt(0.5 * (cos**-4 + cos**-2)), rel=1e-5)
+    assert float(rows[1][3]) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.slow
 def test_series_of_shots_from_end_to_end(scene, tmp_path):
     """Shots, a record of them, its echoes, slopes, and drawings, each from the file of the one before."""
     shots, echoes, signals = (tmp_path / name for name in ("shots.nc", "echoes.csv", "signals.nc"))
@@ -175,7 +200,7 @@ def test_command_without_a_result(command, tmp_path, monkeypatch):
 
 
 def test_every_command_is_run():
-    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare", "depth-bias"}
+    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare", "depth-bias", "tpu"}
     names = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     groups = {group.name for group in app.registered_groups}
     # The benchmark measures for minutes; its tests replace the renders. tests/system runs campaigns and flights.

@@ -1,0 +1,217 @@
+"""Uncertainties of soundings from tables of the errors of an instrument's depths, and their fits against depth."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.waveforms.depth_correction import AXES
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.sounding_errors import (
+    HORIZONTAL_95,
+    SURVEY_ORDERS,
+    VERTICAL_95,
+    TrajectoryErrors,
+    order_met,
+    shift_by_pointing,
+    shift_by_slope,
+)
+from mitransient_lidar.results.geometry import required_number
+
+#: Smallest share of shots with a depth for which a cell has an uncertainty.
+LEAST_FOUND = 0.5
+
+#: Names of the dimension ``correction``: depths as measured, and corrected by a table of mean errors.
+CORRECTIONS = ("none", "table")
+
+_DESCRIBED = {
+    "subaqueous_vertical": ("m", "standard deviation of the depth below the sea, its bias in quadrature"),
+    "subaqueous_horizontal": ("m", "standard deviation of the place on the bottom by waves and footprint, one axis"),
+    "stated": ("m", "median of the stated error of the depth, one standard deviation"),
+    "tvu": ("m", "total vertical uncertainty at 95 %, errors of the trajectory included"),
+    "thu": ("m", "total horizontal uncertainty at 95 %, errors of the trajectory included"),
+    "order": ("1", "strictest order of S-44 that is met"),
+    "channel": ("1", "channel with the smallest uncertainty"),
+    "found": ("1", "share of shots with a depth"),
+    "vertical_a": ("m", "constant part a of the fit sqrt(a^2 + (b d)^2) to subaqueous_vertical"),
+    "vertical_b": ("1", "part b by depth of the fit sqrt(a^2 + (b d)^2) to subaqueous_vertical"),
+    "vertical_residual": ("m", "subaqueous_vertical less its fit"),
+    "horizontal_a": ("m", "constant part a of the fit a + b d to subaqueous_horizontal"),
+    "horizontal_b": ("1", "part b by depth of the fit a + b d to subaqueous_horizontal"),
+}
+
+
+def sounding_uncertainty(table: xr.Dataset, trajectory: TrajectoryErrors | None = None) -> xr.Dataset:
+    """Return the uncertainties of soundings with one estimator at one altitude, and their fits.
+
+    Parameters
+    ----------
+    table : xarray.Dataset
+        From `studies.depth_bias.depth_bias`, of one estimator; with the attributes ``altitude`` [m],
+        ``refractive_index`` and ``divergence_mrad``.
+    trajectory : TrajectoryErrors, optional
+        Errors of the survey's trajectory.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``off_nadir_deg``, ``wind_speed``, ``water`` and ``depth``, with ``correction`` in front for depths
+        measured and, if the table has them, corrected: ``subaqueous_vertical``, ``tvu``, ``thu`` and ``order``; for
+        both the same ``subaqueous_horizontal``, ``stated``, ``found`` and ``channel``; and without ``depth`` the fits
+        ``vertical_a`` and ``vertical_b``, ``horizontal_a`` and ``horizontal_b``, with ``vertical_residual`` over all.
+        All but ``found`` are NaN (-1 for ``order``, an empty ``channel``) where fewer than half of the shots have a
+        depth, fits where no depth remains; of a single one the fit is constant.
+
+    Notes
+    -----
+    ``subaqueous_vertical`` is the root mean square of the error of depths below the sea in the beam, of shots of all
+    waves of a wind: sqrt(bias^2 + spread^2), of the channel with the smallest. ``subaqueous_horizontal`` has the
+    refraction by the mean slopes in the beam, which a survey takes as level (pooled over waters and depths of a wind),
+    and the standard deviation of the beam on the sea. ``tvu`` is 1.96 times, ``thu`` 2.45 times the root of the sum of
+    the squares of these and of the errors of the trajectory; horizontal errors are means of both axes.
+    """
+    trajectory = trajectory or TrajectoryErrors()
+    one = table.isel(estimator=0, drop=True).transpose(*AXES, "pixel", ...)
+    measured = _root(one["bias"], one["spread"]).where(one["found"] >= LEAST_FOUND)
+    best = measured.fillna(np.inf).argmin("pixel")
+    known = measured.notnull().any("pixel")
+    parts = [measured]
+    if "corrected_bias" in one:
+        parts.append(_root(one["corrected_bias"], one["corrected_spread"]))
+    vertical = xr.concat([part.isel(pixel=best).where(known) for part in parts], "correction")
+    vertical = vertical.assign_coords(correction=list(CORRECTIONS[: len(parts)])).drop_vars("pixel")
+    horizontal = _subaqueous_horizontal(one, table.attrs).where(known)
+    tvu, thu = _totals(vertical, horizontal, table.attrs, trajectory)
+    depth = one["depth"].broadcast_like(tvu).transpose(*tvu.dims)
+    data: dict[str, Any] = {
+        "subaqueous_vertical": vertical,
+        "subaqueous_horizontal": horizontal,
+        "stated": one["error"].isel(pixel=best).where(known).drop_vars("pixel"),
+        "tvu": tvu,
+        "thu": thu,
+        "order": (tvu.dims, order_met(depth.values, tvu.values, thu.broadcast_like(tvu).transpose(*tvu.dims).values)),
+        "channel": one["pixel"].isel(pixel=best).where(known, "").drop_vars("pixel").astype(str),
+        "found": one["found"].max("pixel"),
+    }
+    data |= _fits(vertical, horizontal)
+    found = xr.Dataset(data).transpose("correction", *AXES)
+    for name, (unit, text) in _DESCRIBED.items():
+        found[name].attrs = {"units": unit, "long_name": text}
+    found["order"].attrs |= {
+        "flag_values": np.arange(-1, len(SURVEY_ORDERS) + 1),
+        "flag_meanings": " ".join(["unknown", *(one.name for one in SURVEY_ORDERS), "none"]),
+    }
+    errors = {name: getattr(trajectory, name) for name in ("pointing_mrad", "position_m", "height_m")}
+    return found.assign_attrs(
+        {**table.attrs, **errors, "title": f"Uncertainties of the soundings of {table.attrs['instrument']}"}
+    )
+
+
+def non_negative_line(x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[float, float]:
+    """Return the intercept and the slope, both at least 0, of the line with the least squares of residuals.
+
+    NaN among `y` are left out; without any other both are NaN, and of values at a single x the line is constant. With
+    two unknowns the solution is the unconstrained one, the proportional one, or the constant one.
+    """
+    values: FloatArray = np.asarray(y, dtype=np.float64)
+    known = np.isfinite(values)
+    x, y = np.asarray(x, dtype=np.float64)[known], values[known]
+    if not x.size:
+        return math.nan, math.nan
+    if np.ptp(x) == 0:
+        return max(float(y.mean()), 0.0), 0.0
+    slope = float(np.sum((x - x.mean()) * y) / np.sum((x - x.mean()) ** 2))
+    intercept = float(y.mean() - slope * x.mean())
+    if intercept < 0:
+        intercept, slope = 0.0, float(np.sum(x * y) / np.sum(x**2))
+    if slope < 0:
+        intercept, slope = max(float(y.mean()), 0.0), 0.0
+    return intercept, slope
+
+
+def write_fits(found: xr.Dataset, part: str, path: str | os.PathLike[str]) -> None:
+    """Write the fits of one altitude, angle and correction as uncertainty tools read them.
+
+    Parameters
+    ----------
+    found : xarray.Dataset
+        From `sounding_uncertainty`, without the dimensions ``altitude``, ``off_nadir_deg`` and ``correction``.
+    part : str
+        ``vertical`` or ``horizontal``.
+    path
+        CSV file with the columns Wind, JerlovType, a and b, in m and per metre of depth, one standard deviation; rows
+        by wind [m/s] and then by water, nan where there is no fit.
+    """
+    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(("Wind", "JerlovType", "a", "b"))
+        for wind in found["wind_speed"].values:
+            for water in found["water"].values:
+                cell = found.sel(wind_speed=wind, water=water)
+                rows.writerow((f"{wind:g}", water, *(f"{float(cell[f'{part}_{name}']):.6g}" for name in "ab")))
+
+
+def _subaqueous_horizontal(table: xr.Dataset, attributes: Any) -> xr.DataArray:
+    """Return the standard deviation of the place on the bottom by waves and footprint [m], mean of both axes."""
+    index = required_number(attributes, "refractive_index")
+    beam = 0.5e-3 * required_number(attributes, "divergence_mrad") * required_number(attributes, "altitude")
+    angles = np.radians(table["off_nadir_deg"].values)
+    per_slope = np.array([shift_by_slope(float(angle), index) for angle in angles])
+    square = xr.zeros_like(table["found"].isel(pixel=0, drop=True))
+    for axis, name in enumerate(("slope_along", "slope_across")):
+        shift = table["off_nadir_deg"].copy(data=per_slope[:, axis])
+        on_sea = table["off_nadir_deg"].copy(data=beam / np.cos(angles) ** (2 - axis))
+        slopes = (table[name] ** 2).mean(("water", "depth"))
+        square = square + 0.5 * ((shift * table["depth"]) ** 2 * slopes + on_sea**2)
+    return (square**0.5).transpose(*AXES)
+
+
+def _root(*parts: xr.DataArray) -> xr.DataArray:
+    """Return the root of the sum of squares."""
+    square = parts[0] ** 2
+    for part in parts[1:]:
+        square = square + part**2
+    return square**0.5
+
+
+def _totals(
+    vertical: xr.DataArray, horizontal: xr.DataArray, attributes: Any, trajectory: TrajectoryErrors
+) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return total vertical and horizontal uncertainties at 95 % [m]."""
+    height, index = (required_number(attributes, name) for name in ("altitude", "refractive_index"))
+    depth: FloatArray = vertical["depth"].values
+    angles = np.radians(vertical["off_nadir_deg"].values)
+    # Shape (axis, angle, depth).
+    shifts = np.array([shift_by_pointing(float(one), height, depth, index) for one in angles]).transpose(1, 0, 2)
+    shifts *= 1e-3 * trajectory.pointing_mrad
+    along, across, up = (xr.DataArray(one, dims=("off_nadir_deg", "depth")) for one in shifts)
+    tvu = VERTICAL_95 * (vertical**2 + up**2 + trajectory.height_m**2) ** 0.5
+    thu = HORIZONTAL_95 * (horizontal**2 + 0.5 * (along**2 + across**2) + trajectory.position_m**2) ** 0.5
+    return tvu.transpose(*vertical.dims), thu.transpose(*horizontal.dims)
+
+
+def _fits(vertical: xr.DataArray, horizontal: xr.DataArray) -> dict[str, xr.DataArray]:
+    """Return the coefficients of the fits against depth, and the residuals of the vertical one."""
+    depth = vertical["depth"]
+
+    def lines(x: xr.DataArray, y: xr.DataArray) -> Any:
+        return xr.apply_ufunc(
+            non_negative_line, x, y, input_core_dims=[["depth"]] * 2, output_core_dims=[[], []], vectorize=True
+        )
+
+    constant, by_depth = (one**0.5 for one in lines(depth**2, vertical**2))
+    first, second = lines(depth, horizontal)
+    return {
+        "vertical_a": constant,
+        "vertical_b": by_depth,
+        "vertical_residual": vertical - _root(constant, by_depth * depth),
+        "horizontal_a": first,
+        "horizontal_b": second,
+    }

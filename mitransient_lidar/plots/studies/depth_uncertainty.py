@@ -1,0 +1,99 @@
+"""Figures of the uncertainty of soundings: against depth by water, and orders of surveys by wind and water."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+
+from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS
+from mitransient_lidar.plots import drawing
+
+_COLUMNS = 3
+#: Of the orders from the strictest on, of none, and of an unknown depth.
+_ORDER_COLOURS = ("#1a7f37", "#8fd19e", "#f2c14e", "#e07a2f", "#b3261e", "0.9")
+
+
+def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the total vertical uncertainty at 95 % against depth, one panel a water, with the orders of S-44.
+
+    `found` is a result of `studies.depth_uncertainty` at one altitude and angle. Lines with full markers are of
+    corrected depths, or of measured ones without corrections; open markers of depths as measured.
+    """
+    waters = found["water"].values
+    columns = min(_COLUMNS, waters.size)
+    rows = -(-waters.size // columns)
+    figure = drawing.new_figure(path, 3.9 * columns + 1.2, 3.1 * rows + 0.6)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, found.sizes["wind_speed"]))
+    for ax, water in zip(axes.flat, waters, strict=False):
+        _draw_orders(ax, float(found["depth"].max()))
+        for wind, colour in zip(found["wind_speed"].values, colours, strict=True):
+            one = found["tvu"].sel(water=water, wind_speed=wind)
+            style = {"color": colour, "linewidth": 1.4, "markersize": 4.5, "marker": "o"}
+            ax.plot(found["depth"], one.isel(correction=-1), label=f"{wind:g} m/s", **style)
+            if one.sizes["correction"] > 1:
+                ax.plot(found["depth"], one.isel(correction=0), **{**style, "linestyle": "none"}, mfc="none")
+        ax.set_title(f"Jerlov {water}", fontsize="medium")
+        drawing.add_grid(ax)
+    for ax in axes.flat[waters.size :]:
+        ax.axis("off")
+    axes[0, 0].set_ylim(0, 1.15 * max(float(found["tvu"].max()), float(SURVEY_ORDERS[1].largest_tvu(0.0))))
+    for ax in axes[-1]:
+        ax.set_xlabel("depth (m)")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("TVU at 95 % (m)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, title="wind")
+    figure.suptitle(_title(found, "total vertical uncertainty"))
+    return drawing.save(figure, path)
+
+
+def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw the strictest order of S-44 that is met by wind and water, one panel a depth.
+
+    `found` is a result of `studies.depth_uncertainty` at one altitude and angle; corrected depths count where there
+    are any.
+    """
+    depths = found["depth"].values
+    figure = drawing.new_figure(path, 2.3 * depths.size + 1.8, 3.4)
+    names = [one.name for one in SURVEY_ORDERS]
+    colours = ListedColormap(_ORDER_COLOURS)
+    norm = BoundaryNorm(np.arange(len(_ORDER_COLOURS) + 1) - 0.5, len(_ORDER_COLOURS))
+    axes = figure.subplots(1, depths.size, sharey=True, squeeze=False)[0]
+    orders = found["order"].isel(correction=-1).transpose("water", "wind_speed", "depth").values
+    shown = np.where(orders < 0, len(_ORDER_COLOURS) - 1, orders)
+    for number, (ax, depth) in enumerate(zip(axes, depths, strict=True)):
+        image = ax.imshow(shown[..., number], cmap=colours, norm=norm, origin="upper", aspect="auto")
+        ax.set_xticks(range(found.sizes["wind_speed"]), [f"{wind:g}" for wind in found["wind_speed"].values])
+        ax.set_yticks(range(found.sizes["water"]), found["water"].values.tolist())
+        ax.set_title(f"{depth:g} m", fontsize="medium")
+        ax.set_xlabel("wind (m/s)")
+    axes[0].set_ylabel("Jerlov type")
+    bar = figure.colorbar(image, ax=axes, ticks=range(len(_ORDER_COLOURS)), pad=0.01)
+    bar.ax.set_yticklabels([*names, "none", "bottom lost"])
+    bar.ax.invert_yaxis()
+    figure.suptitle(_title(found, "order of S-44"))
+    return drawing.save(figure, path)
+
+
+def _draw_orders(ax: Axes, deepest: float) -> None:
+    """Draw the largest vertical uncertainty of each order, with its name at the right end."""
+    depth = np.linspace(0, 1.05 * deepest, 50)
+    for one in SURVEY_ORDERS:
+        ax.plot(depth, one.largest_tvu(depth), color="0.6", linewidth=0.9, linestyle="--")
+        end = (depth[-1], float(one.largest_tvu(depth[-1])))
+        text: dict[str, Any] = {"ha": "right", "fontsize": 7, "color": "0.4", "textcoords": "offset points"}
+        ax.annotate(one.name, end, (-2, 2), annotation_clip=True, **text)
+    ax.set_xlim(0, depth[-1])
+
+
+def _title(found: xr.Dataset, text: str) -> str:
+    depths = "corrected" if found.sizes["correction"] > 1 else "measured"
+    place = f"{float(found['altitude']):g} m, {float(found['off_nadir_deg']):g}° off nadir"
+    return f"{found.attrs['instrument']}, {place}: {text} of {depths} depths"

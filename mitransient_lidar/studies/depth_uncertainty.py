@@ -1,0 +1,133 @@
+"""Total vertical and horizontal uncertainty of an instrument's soundings, from renders over known bottoms."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.analysis.depth_uncertainty import sounding_uncertainty
+from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import finite, finite_array
+from mitransient_lidar.loading.instruments import read_instrument
+from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS, TrajectoryErrors
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.studies.depth_bias import depth_bias
+
+#: Winds [m/s] and waters of the tables of uncertainty tools, and depths at which airborne lidars find the bottom.
+WINDS, WATERS, DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), ("III", "1C", "3C", "5C", "7C", "9C"), (1.0, 1.5, 3.0, 6.0, 10.0)
+
+
+def depth_uncertainty(
+    instrument: str,
+    params: Mapping[str, Any] | None = None,
+    *,
+    altitudes: Sequence[float] | None = None,
+    angles_deg: Sequence[float] | None = None,
+    winds: Sequence[float] = WINDS,
+    waters: Sequence[str] = WATERS,
+    depths: Sequence[float] = DEPTHS,
+    trajectory: TrajectoryErrors | None = None,
+    scene: str = "table1",
+    receiver: str | None = None,
+    estimator: str = "gaussian",
+    shots: int = 12,
+    records: int = 4,
+    seed: int = 1,
+    corrections: xr.Dataset | None = None,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Determine the uncertainties of an instrument's soundings by altitude, angle, wind, water and depth.
+
+    Parameters
+    ----------
+    instrument, params, waters, depths, scene, receiver, shots, records, seed, corrections
+        As of `depth_bias.depth_bias`.
+    altitudes
+        Heights of the lidar above the sea [m], above 0, ascending; by default that of the instrument.
+    angles_deg
+        Angles from nadir [degree], ascending; by default that of the instrument.
+    winds
+        Wind speeds [m/s], ascending, at least 0; 0 for a level sea with ripples.
+    trajectory
+        Errors of the survey's trajectory.
+    estimator
+        An estimator of `echo_table.extract`.
+    progress
+        Called with a `passes.Progress` after every cell of the table.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of `sounding_uncertainty`, with the dimension ``altitude`` in front.
+
+    Raises
+    ------
+    UserError
+        If the instrument or estimator is unknown, or a number or parameter is out of range.
+    """
+    usual = {one.name: one.value for one in read_instrument(instrument).parameters}
+    if estimator not in ESTIMATORS:
+        raise UserError(f"estimator = {estimator!r} must be one of {', '.join(ESTIMATORS)}")
+    given = dict(params or {})
+    own = [finite("altitude", given.get("altitude", usual["altitude"]))]
+    heights = finite_array("altitudes", own if altitudes is None else altitudes)
+    if heights.size == 0 or np.any(np.diff(heights, prepend=0.0) <= 0):
+        raise UserError(f"altitudes = {heights.tolist()} must be numbers above 0 that ascend")
+    angles = [float(usual["off_nadir_deg"])] if angles_deg is None else angles_deg
+    began, found = time.perf_counter(), []
+    for number, height in enumerate(heights):
+
+        def report(state: Progress, number: int = number) -> None:
+            if progress is not None and state.planned is not None:
+                done, planned = number * state.planned + state.done, heights.size * state.planned
+                elapsed = time.perf_counter() - began
+                left = elapsed / done * (planned - done)
+                progress(replace(state, done=done, planned=planned, unit="cell", elapsed_s=elapsed, remaining_s=left))
+
+        table = depth_bias(
+            instrument,
+            {**given, "altitude": float(height)},
+            scene=scene,
+            receiver=receiver,
+            angles_deg=angles,
+            winds=winds,
+            waters=waters,
+            depths=depths,
+            estimators=[estimator],
+            shots=shots,
+            records=records,
+            seed=seed,
+            corrections=corrections,
+            progress=report,
+        )
+        found.append(sounding_uncertainty(table, trajectory))
+    joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
+    return joined.assign_coords(altitude=("altitude", heights, {"units": "m"})).assign_attrs(estimator=estimator)
+
+
+def describe_depth_uncertainty(found: xr.Dataset) -> list[str]:
+    """Return the lines of a table of a result of `depth_uncertainty`, one for each water and wind.
+
+    TVU at 95 % of each depth [cm], corrected if there are corrections, with the order met, and a [cm] and b [%] of the
+    fit at one standard deviation, with the root mean square of its residuals [cm].
+    """
+    one = found.isel(correction=-1)
+    names = [*(order.name for order in SURVEY_ORDERS), "none"]
+    heads = "".join(f"{f'{depth:g} m':>7}{'':10}" for depth in one["depth"].values)
+    lines = [f"{'altitude':>8}{'angle':>7}{'wind':>6} {'water':<6}{heads}{'a':>8}{'b':>7}{'residual':>10}"]
+    for place in np.ndindex(*(one.sizes[axis] for axis in ("altitude", "off_nadir_deg", "wind_speed", "water"))):
+        cell = one.isel(dict(zip(("altitude", "off_nadir_deg", "wind_speed", "water"), place, strict=True)))
+        text = f"{float(cell['altitude']):>8g}{float(cell['off_nadir_deg']):>7g}{float(cell['wind_speed']):>6g} "
+        text += f"{cell['water'].item():<6}"
+        for tvu, order in zip(cell["tvu"].values, cell["order"].values, strict=True):
+            text += f"{100 * tvu:>7.1f} {names[order]:<9}" if order >= 0 else f"{'-':>7}{'':10}"
+        residual = np.sqrt((cell["vertical_residual"] ** 2).mean())
+        text += "".join(f"{100 * float(cell[f'vertical_{name}']):>{8 - number}.2f}" for number, name in enumerate("ab"))
+        lines.append(f"{text}{100 * float(residual):>10.2f}")
+    return lines

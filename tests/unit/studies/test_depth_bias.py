@@ -1,0 +1,100 @@
+"""Tables of errors of depths: which cells are rendered, and refusals."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitransient_lidar.core.errors import DryBottomError, UserError
+from mitransient_lidar.studies import depth_bias as study
+from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """Depths that are rendered: waves uncover 0.1 m, the surface hides 0.2 m, and bottoms from 6 m on are lost."""
+    depths = []
+
+    def render(scene, given, **options):
+        depths.append(given["bottom_depth"])
+        if given["bottom_depth"] == 0.1:
+            raise DryBottomError("shape 'bottom' up to z = -0.1 m rises through the sea surface")
+        return xr.Dataset(coords={"pixel": ["single"]}, attrs={"depth": given["bottom_depth"], "altitude": 150.0})
+
+    def cell(recorded, estimators, corrections):
+        found = float(0.2 < recorded.attrs["depth"] < 6)
+        numbers = {name: np.full((1, 1), 0.1) for name in ("bias", "spread", "error", "z")}
+        numbers |= {"found": np.full((1, 1), found), "wrong": np.zeros((1, 1)), "snr": np.full(1, 9.0)}
+        return {**numbers, "attenuation": 0.2, "slope_along": 0.05, "slope_across": 0.04}
+
+    monkeypatch.setattr(study, "render_shots", render)
+    monkeypatch.setattr(study, "detect_waveforms", lambda result, *options: result)
+    monkeypatch.setattr(study, "_cell", cell)
+    return depths
+
+
+def test_bottoms_below_a_lost_one_are_not_rendered(rendered):
+    states = []
+    options = {"angles_deg": [20.0], "winds": [0.0, 3.0], "waters": ["IB"], "estimators": ["gaussian"]}
+    table = study.depth_bias("riegl_vq840g", depths=[0.1, 0.2, 3, 6, 8, 10], progress=states.append, **options)
+    # A bottom that the surface hides is no lost one.
+    assert rendered == 2 * [0.1, 0.2, 3, 6]
+    one = table.isel(off_nadir_deg=0, wind_speed=1, water=0, estimator=0, pixel=0)
+    np.testing.assert_array_equal(one["found"], [0, 0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(one["wrong"], 0)
+    np.testing.assert_array_equal(one["bias"], [np.nan, 0.1, 0.1, 0.1, np.nan, np.nan])
+    assert [state.done for state in states] == list(range(1, 13))
+    assert table["attenuation"].item(0) == pytest.approx(0.2)
+    assert table.attrs["altitude"] == 150
+
+
+def test_a_table_needs_a_depth_below_the_waves(rendered):
+    with pytest.raises(UserError, match=r"depth = \[0\.1\] must hold one below the waves of \[3\.0\] m/s"):
+        study.depth_bias("riegl_vq840g", depths=[0.1], winds=[3.0], waters=["IB"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"depths": [0.0, 3.0]}, r"depth = \[0\.0, 3\.0\] must be numbers above 0 that ascend"),
+        ({"winds": [5.0, 3.0]}, r"wind_speed = \[5\.0, 3\.0\] must be numbers of at least 0 that ascend"),
+        ({"altitudes": [300.0, 300.0]}, r"altitudes = \[300\.0, 300\.0\] must be numbers above 0 that ascend"),
+        ({"altitudes": [-1.0]}, "must be numbers above 0"),
+        ({"estimator": "eye"}, "estimator = 'eye' must be one of threshold"),
+        ({"params": {"altitude": "high"}}, "altitude = 'high' must be a number"),
+    ],
+)
+def test_uncertainty_refuses_wrong_input_before_it_renders(options, message, rendered):
+    with pytest.raises(UserError, match=message):
+        depth_uncertainty("riegl_vq840g", **options)
+    assert not rendered
+
+
+def test_uncertainty_reports_the_cells_of_all_altitudes(monkeypatch):
+    """Progress counts two altitudes of three cells; the table of each is that of its own height."""
+    heights = []
+
+    def table(instrument, params, *, progress, **options):
+        from mitransient_lidar.rendering.passes import Progress
+
+        heights.append(params["altitude"])
+        for done in (1, 2, 3):
+            progress(Progress(done, 3, "render"))
+        shape = (1, 1, 1, 3, 1, 1)
+        dims = ("off_nadir_deg", "wind_speed", "water", "depth", "estimator", "pixel")
+        names = ("bias", "spread", "found", "error")
+        data = {name: (dims, np.full(shape, 1e-4 * params["altitude"] + (name == "found"))) for name in names}
+        data["snr"] = (dims[:4] + dims[5:], np.ones(shape[:5]))
+        data |= {name: (dims[:4], np.zeros(shape[:4])) for name in ("slope_along", "slope_across")}
+        coords = {"off_nadir_deg": [0.0], "wind_speed": [0.0], "water": ["IB"], "depth": [1.0, 2.0, 4.0]}
+        attributes = {"instrument": instrument, "refractive_index": 1.34, "divergence_mrad": 1.0, **params}
+        return xr.Dataset(data, {**coords, "estimator": ["gaussian"], "pixel": ["single"]}, attributes)
+
+    monkeypatch.setattr("mitransient_lidar.studies.depth_uncertainty.depth_bias", table)
+    states = []
+    found = depth_uncertainty("riegl_vq840g", altitudes=[100, 400], progress=states.append)
+    assert heights == [100, 400]
+    assert [(state.done, state.planned) for state in states] == [(done, 6) for done in range(1, 7)]
+    assert states[-1].remaining_s == 0
+    vertical = found["subaqueous_vertical"].isel(correction=0, depth=0)
+    np.testing.assert_allclose(vertical.values.ravel(), np.hypot([0.01, 0.04], [0.01, 0.04]))
+    assert "altitude" not in found.attrs
