@@ -237,9 +237,9 @@ def fly(path: Path) -> None:
     """Work out the pulses of a flight."""
     from mitransient_lidar.core.files import read_text
     from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
-    from mitransient_lidar.flights.mounting import Mounting, pulse_poses
-    from mitransient_lidar.flights.scanner import Scanner
-    from mitransient_lidar.flights.trajectory import Trajectory
+    from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
+    from mitransient_lidar.flights.poses.scanner import Scanner
+    from mitransient_lidar.flights.poses.trajectory import Trajectory
 
     tables = ("platform", "scanner", "mounting")
     given = parse_toml(read_text(path), path)
@@ -264,7 +264,7 @@ def follow(**platform: Any) -> Callable[[Path], None]:
     """Return what reads a trajectory from a file, and interpolates it."""
 
     def read(path: Path) -> None:
-        from mitransient_lidar.flights.trajectory import Trajectory
+        from mitransient_lidar.flights.poses.trajectory import Trajectory
 
         trajectory = Trajectory.of({"file": path.name, **platform}, path.parent)
         trajectory.at(np.linspace(*trajectory.lines[0], 50))

@@ -1,1 +1,1 @@
-"""Flights: trajectories of platforms, scanners and their mounting."""
+"""Flights: pulses along a trajectory, the places of their echoes, and files of points and waveforms."""

@@ -15,10 +15,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml, required, table
 from mitransient_lidar.core.validation import finite_array, in_range, integer, non_negative, positive, shown
-from mitransient_lidar.flights.mounting import Mounting, PulsePoses, pulse_poses
+from mitransient_lidar.flights.poses.mounting import Mounting, PulsePoses, pulse_poses
+from mitransient_lidar.flights.poses.scanner import Scanner
+from mitransient_lidar.flights.poses.trajectory import Trajectory
 from mitransient_lidar.flights.refracted_paths import PoseErrors
-from mitransient_lidar.flights.scanner import Scanner
-from mitransient_lidar.flights.trajectory import Trajectory
 
 #: Most pulses of a flight.
 MOST_PULSES = 1_000_000

@@ -18,8 +18,8 @@ from mitransient_lidar.campaigns.runs import Array
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
-from mitransient_lidar.flights.mounting import PulsePoses
 from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.poses.mounting import PulsePoses
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.session import open_scene
@@ -355,16 +355,21 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
         If the bottom does not cover the places of the pulses, or its light arrives after the record.
     """
     from mitransient_lidar.rendering.describe import axis_on_bottom
+    from mitransient_lidar.rendering.shot_truth import solids_below
     from mitransient_lidar.transport.scene import LidarScene
 
-    angle, height, x, y = _lidar_of(inputs)
-    params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": x, "aim_y": y}
+    angle, height, *aim = _lidar_of(inputs)
+    params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": aim[0], "aim_y": aim[1]}
     session = open_scene(record, params)
     lidar = LidarScene.from_scene(session.scene, session.sensor)
     poses = _shot_poses(lidar, inputs)
     bottom = axis_on_bottom(lidar, poses=poses.in_scene)[:, 2]
     if not lidar.bottoms:
         raise UserError(f"scene {plan.scene} has no bottom below the flight")
+    # The axis may meet a target before the bottom.
+    level = float(np.nanmedian(bottom)) if np.isfinite(bottom).any() else -1.0
+    x, y = lidar.level_sea.at_height(_vectors(inputs, "origin"), _vectors(inputs, "axis"), level).T
+    bottom = np.where(np.isnan(bottom), solids_below(lidar, x, y, bottoms=True)[0], bottom)
     if missed := np.count_nonzero(np.isnan(bottom)):
         row = int(np.argmax(np.isnan(bottom)))
         raise UserError(

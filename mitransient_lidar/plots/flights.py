@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.flights.attitude import rotation_matrices
-from mitransient_lidar.flights.scanner import Fixed
+from mitransient_lidar.flights.poses.attitude import rotation_matrices
+from mitransient_lidar.flights.poses.scanner import Fixed
 from mitransient_lidar.plots import drawing
 
 #: Angles of the drawing [deg].

@@ -99,8 +99,10 @@ def water_means(water: Any, depth: FloatArray) -> dict[str, FloatArray]:
     return {name: np.asarray(shares @ values) for name, values in layers.items()}
 
 
-def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the height of the highest solid at places [m], NaN without one, and whether it is a target.
+def solids_below(
+    lidar: LidarScene, x: FloatArray, y: FloatArray, *, bottoms: bool = False
+) -> tuple[FloatArray, BoolArray]:
+    """Return the height of the highest solid, or bottom, at places [m], NaN without one, and whether it is a target.
 
     Places have the shape (n,); targets are `WaterScene.targets`.
     """
@@ -109,7 +111,7 @@ def solids_below(lidar: LidarScene, x: FloatArray, y: FloatArray) -> tuple[Float
     from mitransient_lidar.rendering.shot_batches import scene_of_shapes
     from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque
 
-    solids = scene_of_shapes(lidar.solids)
+    solids = scene_of_shapes(lidar.bottoms if bottoms else lidar.solids)
     if solids is None:
         return np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
     top = opaque(float(solids.bbox().max.z) + 1.0)

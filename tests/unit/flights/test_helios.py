@@ -12,9 +12,9 @@ turns by the pitch about (1, 0, 0), then by the roll about (0, 1, 0), then by th
 import numpy as np
 import pytest
 
-from mitransient_lidar.flights.mounting import Mounting, pulse_poses
-from mitransient_lidar.flights.scanner import Fixed, Oscillating, Palmer
-from mitransient_lidar.flights.trajectory import Trajectory
+from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
+from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
+from mitransient_lidar.flights.poses.trajectory import Trajectory
 
 R2, R3, R6 = np.sqrt([2.0, 3.0, 6.0])
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.flights.mounting import Mounting, pulse_poses
-from mitransient_lidar.flights.scanner import Fixed, Oscillating, Palmer
-from mitransient_lidar.flights.trajectory import Trajectory
+from mitransient_lidar.flights.poses.mounting import Mounting, pulse_poses
+from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
+from mitransient_lidar.flights.poses.trajectory import Trajectory
 
 
 def _level(heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height=200.0):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.flights.scanner import Scanner
+from mitransient_lidar.flights.poses.scanner import Scanner
 
 PALMER = {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 50.0}
 ARC = {"kind": "semi_arc", "nadir_angle_deg": 20.0, "rate_hz": 10.0}

@@ -4,7 +4,7 @@ import significance
 from significance import largest_z
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.flights.trajectory import Trajectory
+from mitransient_lidar.flights.poses.trajectory import Trajectory
 
 LINES = {"kind": "lines", "start": [10, 20], "heading_deg": 30, "speed": 50, "height": 200, "length": 500}
 MAST = {"kind": "mast", "position": [1, 2, 15], "heading_deg": 120, "duration_s": 30}

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.toml_files import check_keys, required, table
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, in_range, integer, positive, shown
-from mitransient_lidar.flights.records import Records
+from mitransient_lidar.flights.poses.records import Records
 
 #: Most flight lines, and most records of all of them.
 _MOST_LINES, _MOST_RECORDS = 10_000, 10_000_000

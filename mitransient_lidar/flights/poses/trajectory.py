@@ -14,10 +14,10 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.toml_files import check_keys, required
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
-from mitransient_lidar.flights.attitude import check_rotation_spec, rotation_matrices
-from mitransient_lidar.flights.records import Records, check_records
-from mitransient_lidar.flights.straight_lines import fixed_platform, straight_lines
-from mitransient_lidar.flights.trajectory_files import read_sbet_records, read_text_records
+from mitransient_lidar.flights.poses.attitude import check_rotation_spec, rotation_matrices
+from mitransient_lidar.flights.poses.records import Records, check_records
+from mitransient_lidar.flights.poses.straight_lines import fixed_platform, straight_lines
+from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
 
 #: Kinds of platforms of a plan.
 KINDS = ("lines", "mast", "csv", "sbet")

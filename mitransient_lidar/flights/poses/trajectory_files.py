@@ -12,7 +12,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, integer, is_number
-from mitransient_lidar.flights.records import Records, check_records
+from mitransient_lidar.flights.poses.records import Records, check_records
 
 #: Columns of a text file, in the order that holds without a heading, and what a heading may call them.
 _COLUMNS = {

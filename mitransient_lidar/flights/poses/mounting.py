@@ -12,9 +12,9 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.toml_files import check_keys
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite, finite_array, shown
-from mitransient_lidar.flights.attitude import rotation_matrices
-from mitransient_lidar.flights.scanner import Scanner
-from mitransient_lidar.flights.trajectory import Trajectory
+from mitransient_lidar.flights.poses.attitude import rotation_matrices
+from mitransient_lidar.flights.poses.scanner import Scanner
+from mitransient_lidar.flights.poses.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Poses of pulses: trajectories of platforms, scanners and their mounting."""
