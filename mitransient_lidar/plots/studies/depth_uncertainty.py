@@ -76,7 +76,7 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
         ax.set_xlabel("wind (m/s)")
     axes[0].set_ylabel("Jerlov type")
     bar = figure.colorbar(image, ax=axes, ticks=range(len(_ORDER_COLOURS)), pad=0.01)
-    bar.ax.set_yticklabels([*names, "none", "bottom lost"])
+    bar.ax.set_yticklabels([*names, "none", "no depth"])
     bar.ax.invert_yaxis()
     figure.suptitle(_title(found, "order of S-44"))
     return drawing.save(figure, path)

@@ -47,7 +47,7 @@ def test_orders_are_drawn_by_depth_with_lost_bottoms_apart(uncertainty):
         expected = uncertainty["order"].sel(correction="table", depth=depth).transpose("water", "wind_speed").values
         np.testing.assert_array_equal(image, np.where(expected < 0, 5, expected))
     labels = [text.get_text() for text in figure.axes[-1].get_yticklabels()]
-    assert labels == ["exclusive", "special", "1a/1b", "2", "none", "bottom lost"]
+    assert labels == ["exclusive", "special", "1a/1b", "2", "none", "no depth"]
 
 
 @pytest.mark.slow
