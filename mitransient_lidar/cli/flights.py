@@ -25,7 +25,9 @@ def fly(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
     ] = None,
-    shard_size: Annotated[int | None, typer.Option(help="Pulses that one process renders and writes.")] = None,
+    shard_size: Annotated[
+        int | None, typer.Option(help="Pulses that one process renders and writes; by default 512.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Render the pulses of a flight, and write the points and waveforms that its receiver finds.

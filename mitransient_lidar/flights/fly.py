@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 #: Name of the store in the folder of a flight.
 STORE = "flight.zarr"
 
+#: Pulses of a shard, whose process takes about as long as 60 of them to start.
+_SHARD = 512
+
 #: Pulses whose arrays show those of the store.
 _SAMPLE = 2
 
@@ -46,8 +49,10 @@ def fly(
         A TOML file, the name of a shipped flight, or a dict of its contents; see docs/flights.md.
     folder
         Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``.
-    workers, scheduler, shard_size
-        As for `campaigns.sweep.sweep`, of pulses.
+    workers, scheduler
+        As for `campaigns.sweep.sweep`.
+    shard_size
+        Pulses of a shard, which one process renders and writes, by default 512. The bits depend on it.
     progress
         Called with a `rendering.passes.Progress` about every second.
 
@@ -85,4 +90,5 @@ def _prepare(plan: FlightPlan, path: Path, shard_size: int | None) -> Store:
         return store
     renderer, columns = FlightRenderer.of(plan)
     arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})
-    return Store.create(path, renderer, columns, arrays, coordinates, shard_size, attributes)
+    size = min(_SHARD, len(columns["pulse"])) if shard_size is None else shard_size
+    return Store.create(path, renderer, columns, arrays, coordinates, size, attributes)
