@@ -85,7 +85,7 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
         # Deep down, ripples would carry some per cent of the light over the edge between a dark and a bright cell.
         sea={"slope_variance": "2e-5"},
         bottom=DEPTH,
-        integrator={"paths_per_pass": 2**17},
+        integrator={"paths_per_pass": 2**15},
     )
     energy = passes(scene, 16).sum(axis=-1)
     quadrants = [
@@ -98,7 +98,7 @@ def test_bottom_echo_through_a_narrow_view(kind, lidar_scene, passes, z_score, t
     expected = np.array([expected_bottom(density, quadrant) for quadrant in quadrants])
     assert expected.max() > 1.3 * expected.min()
     z, relative = z_score(energy, expected)
-    assert np.all(relative < 4e-3), relative
+    assert np.all(relative < 8e-3), relative
     # The grid of the closed form resolves rims and the edge of the view to 1e-3, and ripples still carry that much.
     assert np.all(np.abs(energy.mean(axis=0) / expected - 1) < largest_z(16, 4) * relative + 2e-3), (
         z,

@@ -147,20 +147,20 @@ def truth_and_light(dataset, bottom):
 
 
 @pytest.mark.parametrize(
-    ("layout", "depth_from"),
+    ("layout", "depth_from", "bottoms"),
     [
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("2x2", "echo"),)),
+        pytest.param("2x2", "echo", ("falls", "rises"), marks=pytest.mark.slow),
         *(
-            pytest.param(layout, depth_from, marks=pytest.mark.long)
+            pytest.param(layout, depth_from, ("level", "falls", "rises"), marks=pytest.mark.long)
             for layout in ("1x1", "2x2", "hex7", "8x8")
             for depth_from in ("echo", "mean")
         ),
     ],
 )
-def test_rendered_waveforms_give_the_depth_of_each_pixel(lidar_scene, layout, depth_from):
+def test_rendered_waveforms_give_the_depth_of_each_pixel(lidar_scene, layout, depth_from, bottoms):
     """Over level, falling and rising planes, depths deviate by the errors of noise and method together."""
     z = []
-    for bottom in ("level", "falls", "rises"):
+    for bottom in bottoms:
         dataset = shoot(lidar_scene, layout, bottom, 2**14, 8)
         truth, lit = truth_and_light(dataset, bottom)
         found = echo_table.extract(dataset, depth_from=depth_from).sel(echo="bottom")

@@ -108,18 +108,18 @@ def walks(request):
 
 
 @pytest.mark.parametrize(
-    ("integrator", "view", "count"),
-    [pytest.param("lidar_volpath", 0.5e-3, 48, marks=pytest.mark.long), ("lidar_merging", 5e-3, 16)],
+    ("integrator", "view", "count", "paths"),
+    [pytest.param("lidar_volpath", 0.5e-3, 48, 2**16, marks=pytest.mark.long), ("lidar_merging", 5e-3, 16, 2**14)],
     ids=str,
 )
-def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, walks, integrator, view, count):
+def test_waveform_agrees_with_an_independent_random_walk(lidar_scene, passes, walks, integrator, view, count, paths):
     (attenuation, scattering, index), references = walks
     # By reciprocity (tested on its own) the pencil beam and the wide view of the walk may be exchanged: a wide beam
     # lights every vertex, where a pencil would be met by chance. Energies go with the solid angle that is seen. Merging
     # would be slow with a view that is smaller than a cell.
     beam = 2 * HALF_VIEW
     scene = {
-        "integrator": {"type": integrator},
+        "integrator": {"type": integrator, "paths_per_pass": paths},
         "tx": {"off_nadir_deg": 0.0, "beam_profile": "top_hat", "divergence_mrad": 1e3 * beam},
         "rx": {"off_nadir_deg": 0.0, "field_of_view_mrad": 1e3 * view, "layout": "1x1"},
         "film": {"time_start_ns": float(GATES_NS[0]), "bin_width_ns": 0.5, "bin_count": 200},

@@ -114,9 +114,10 @@ def test_echoes_do_not_depend_on_the_shortest_wave():
     gates = (0.6, 1.4, 2.5, 4.0, 7.0)
     found = {}
     for wave, cell in ((1.06, 0.088), (0.15, 0.0375)):
-        for focuses in (True, False):
+        # Two seas show what is missing without it; the comparison with it needs four.
+        for focuses, seas in ((True, 4), (False, 2)):
             rows = []
-            for seed in range(4):
+            for seed in range(seas):
                 params = {"surface_seed": seed, "surface_shortest_wave": wave, "surface_cell_size": cell}
                 params |= {"ripple_focusing": str(focuses).lower(), "layout": "1x1"}
                 got = mitransient_lidar.render("table1", params=params, passes=2, components=True, seed=seed)

@@ -91,13 +91,16 @@ def test_plume_that_fills_the_water_is_water_that_scatters_more(lidar_scene, pas
         {**hg, "attenuation": 0.35, "scattering": 0.2, **bubbles, "plume_phase": {"type": "hg", "g": 0.9}},
         {**hg, "attenuation": 0.55, "scattering": 0.4},
     )
-    engine = {"type": integrator, "paths_per_pass": 2**16}
+    # Ten passes find a factor of 3 %.
+    engine = {"type": integrator, "paths_per_pass": 2**14}
+    if integrator == "lidar_merging":
+        engine["photons_per_pass"] = 2**14
     film = {"time_start_ns": 1400.0, "bin_width_ns": 20.0, "bin_count": 6}
     energy = [
-        passes(lidar_scene(integrator=engine, water=water, film=film), 8, first_seed=100 * number).sum(axis=1)
+        passes(lidar_scene(integrator=engine, water=water, film=film), 10, first_seed=100 * number).sum(axis=1)
         for number, water in enumerate(waters)
     ]
-    assert_same(energy[0][:, :5], energy[1][:, :5], error=0.015)
+    assert_same(energy[0][:, :5], energy[1][:, :5], error=0.02)
 
 
 @pytest.mark.long

@@ -96,7 +96,8 @@ def test_a_closed_terminal_keeps_the_passes(tmp_path):
         os.setsid()
         os.close(os.open(os.ttyname(follower), os.O_RDWR))
 
-    arguments = [int(signal.SIGHUP), *RENDER, "--passes", 100_000, "-o", tmp_path]
+    coarse = ["-D", "surface_size=60", "-D", "surface_cell_size=0.5"]
+    arguments = [int(signal.SIGHUP), *RENDER, *coarse, "--passes", 100_000, "-o", tmp_path]
     process = start(INTERRUPTED, *arguments, stdin=follower, stdout=follower, stderr=follower, preexec_fn=take_terminal)
     os.close(follower)
     shown = b""

@@ -59,6 +59,7 @@ def test_import_loads_nothing_heavy():
 def test_commands_other_than_sweep_import_no_dask(tmp_path):
     code = "import sys; from mitransient_lidar.cli.app import main\ntry: main()\nfinally: print(sorted(sys.modules))"
     command = [sys.executable, "-c", code, "find-shots", "fig09_2x2", "--no-waveforms"]
+    command += ["-D", "surface_size=60", "-D", "surface_cell_size=0.25"]
     modules = subprocess.check_output(command, text=True, cwd=tmp_path)
     assert "'xarray'" in modules
     assert "'dask.base'" not in modules

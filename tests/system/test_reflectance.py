@@ -46,9 +46,10 @@ def shot(lidar_scene):
     ("tx", "rx"),
     [
         pytest.param({}, {}, id="quarters"),
-        pytest.param({}, {"obscuration": 0.3}, id="obscured"),
+        # Hexagons with gaps are obscured, too.
+        pytest.param({}, {"obscuration": 0.3}, id="obscured", marks=pytest.mark.long),
         pytest.param({}, {"fill_factor": 0.5}, id="gaps"),
-        pytest.param({}, {"layout": "hex7"}, id="hexagons"),
+        pytest.param({}, {"layout": "hex7"}, id="hexagons", marks=pytest.mark.long),
         pytest.param({}, {"layout": "hex19", "fill_factor": 0.5, "obscuration": 0.3}, id="hexagons with gaps"),
         pytest.param({}, OFF_AXIS, id="off axis"),
         pytest.param(

@@ -26,31 +26,28 @@ def prepared(scene, params, integrator):
     return chosen.prepare(session.scene, session.sensor)
 
 
+# In the slow tier the next test does, with places and poses.
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("scene", "integrator", "passes", "places"),
-    [
-        pytest.param("docs/survey_lidar.xml", "lidar_merging", 8, PLACES[1:], marks=pytest.mark.slow),
-        pytest.param("docs/survey_lidar.xml", "lidar_merging", 24, PLACES, marks=pytest.mark.long),
-        pytest.param("table1", "lidar_merging", 24, PLACES, marks=pytest.mark.long),
-        pytest.param("table1", "lidar_volpath", 24, PLACES, marks=pytest.mark.long),
-    ],
+    ("scene", "integrator"),
+    [("docs/survey_lidar.xml", "lidar_merging"), ("table1", "lidar_merging"), ("table1", "lidar_volpath")],
 )
-def test_batches_give_what_single_shots_do(scene, integrator, passes, places):
+def test_batches_give_what_single_shots_do(scene, integrator):
     """Places of a sea of 6 m/s, one of them 280 m away, over a slope with sand waves and over a level bottom.
 
     A sea or a bottom that is not displaced with the lidar has echoes at other times.
     """
-    params = {"wind_speed": 6}
+    params, passes = {"wind_speed": 6}, 24
     if scene == "table1":
         params |= RECORD
     renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
-    several = batches.at(ShotPoses(places))(passes)
-    seeds = [pass_seed(number, each) for number in range(len(places)) for each in range(passes)]
+    several = batches.at(ShotPoses(PLACES))(passes)
+    seeds = [pass_seed(number, each) for number in range(len(PLACES)) for each in range(passes)]
     bins = renderer.scene.axis.bin_count
-    together = several.render_pass(seeds).histogram.energy().reshape(len(places), passes, -1, bins)
-    for place, found in zip(places, together, strict=True):
+    together = several.render_pass(seeds).histogram.energy().reshape(len(PLACES), passes, -1, bins)
+    for place, found in zip(PLACES, together, strict=True):
         alone = prepared(scene, {**params, "aim_x": place[0], "aim_y": place[1]}, integrator).scaled(share)
         axis = alone.scene.axis
         shift = round((axis.start_ns - renderer.scene.axis.start_ns) / axis.bin_width_ns)

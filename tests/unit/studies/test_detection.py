@@ -289,9 +289,11 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
 
     monkeypatch.setattr(detection, "target_signal", signal)
     done = []
-    count = {"clutter": 4, "shots": 200}
+    # Ten meshes are made, of which nothing is rendered.
+    coarse = {"surface_size": 60, "surface_cell_size": 0.5}
+    count = {"clutter": 4, "shots": 200, "receiver": "ideal"}
     found = detection.detect(
-        "fig13_2x2", depths=(7,), progress=lambda state: done.append((state.done, state.planned)), **count
+        "fig13_2x2", coarse, depths=(7,), progress=lambda state: done.append((state.done, state.planned)), **count
     )
     assert [(seed, depth) for seed, depth, _ in asked] == [(9 + i, d) for d in (8, 7) for i in range(4)]
     # The same random numbers at each depth, others for each sea.

@@ -48,11 +48,11 @@ def irradiances(spread, variance, length, cells, side, seed):
 @pytest.mark.parametrize("spread", [0.5, 1.0])
 def test_irradiance_of_random_seas(spread):
     """Mean product of irradiances at two points, whose lines are displaced by their distance: g of it."""
-    variance, length, side, cells = 0.01, 0.25, 8.0, 400
+    variance, length, side, cells = 0.01, 0.25, 4.0, 200
     structure = gaussian_structure(variance, length)
     steps = (2, 5, 12, 30)
     found = []
-    for seed in range(8):
+    for seed in range(16):
         light = irradiances(spread, variance, length, cells, side, [seed, significance.seed_shift])
         found.append([np.mean(light * np.roll(light, step, axis)) for step in steps for axis in (0, 1)])
     # Cells blur over their side, which is far below the waves.
