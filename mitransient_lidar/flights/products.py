@@ -165,11 +165,11 @@ def describe_points(points: xr.Dataset) -> list[str]:
     stated = points["vertical_uncertainty"].values
     target = points["true_target"].values.astype(bool)
     kind = points["kind"].values
-    wet = np.isin(kind, (PointClass.BOTTOM, PointClass.OBJECT))
     rows = {
         "water surface": kind == PointClass.SURFACE,
-        "bottom": wet & ~target,
-        "above a target": wet & target,
+        "bottom": (kind == PointClass.BOTTOM) & ~target,
+        "bottom, above a target": (kind == PointClass.BOTTOM) & target,
+        "object": kind == PointClass.OBJECT,
         "no echo": kind == PointClass.NO_ECHO,
     }
     for name, chosen in rows.items():

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.flights.positions import PointClass
 from mitransient_lidar.flights.products import Flown
 from mitransient_lidar.plots import drawing
@@ -23,8 +24,11 @@ _CLASSES = {
 #: Half of the width of the strip of a profile [m], and most waveforms in it.
 _STRIP, _MOST_WAVEFORMS = 1.5, 2000
 
-#: Heights in a profile above the sea and below the deepest point [m], and most cells of its picture.
-_ABOVE, _BELOW, _CELLS = 1.0, 1.5, (200, 160)
+#: Heights in a profile above the sea and below the deepest point [m], and most columns of cells of its picture.
+_ABOVE, _BELOW, _COLUMNS = 1.0, 1.5, 200
+
+#: Range of a nanosecond between pulse and echo in the air [m].
+_PER_NS = 0.5e-9 * C0
 
 #: Orders of magnitude of the signals in a profile.
 _DECADES = 3.0
@@ -110,16 +114,17 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
     seen = np.unique(strip["shot"].values)
     first, last = np.quantile(strip["x"].values, [0.0, 1.0])
-    # A column of cells for each few pulses, so that they fill the picture.
-    shape = int(np.clip(len(seen) / 2, 10, _CELLS[0])), _CELLS[1]
-    edges = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
-    total, number = np.zeros(shape), np.zeros(shape)
     width = float(flown.store.attributes["bin_width_ns"])
     group, index = (float(flown.attributes[name]) for name in ("group_index", "refractive_index"))
+    # Cells with a few pulses and samples each, so that they fill the picture.
+    rows = (depth + _ABOVE) / (2 * _PER_NS * width / group)
+    shape = int(np.clip(len(seen) / 3, 10, _COLUMNS)), max(int(rows), 10)
+    edges = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
+    total, number = np.zeros(shape), np.zeros(shape)
     signal, start = flown.values("signal"), flown.values("sample_start_ns")
     origin, axis = flown.vectors("origin"), flown.vectors("axis")
     for shot in seen[:: max(len(seen) // _MOST_WAVEFORMS, 1)]:
-        way = 0.299792458 / 2 * (start[shot] + (np.arange(signal.shape[-1]) + 0.5) * width)
+        way = _PER_NS * (start[shot] + (np.arange(signal.shape[-1]) + 0.5) * width)
         to_sea = -origin[shot, 2] / axis[shot, 2]
         down = axis[shot] / index
         down[2] = -np.sqrt(1 - down[:2] @ down[:2])
