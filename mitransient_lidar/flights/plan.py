@@ -26,7 +26,7 @@ MOST_PULSES = 1_000_000
 #: Keys of a plan, of its table of pulses, and of that of the receiver.
 _KEYS = (
     *("scene", "instrument", "parameters", "platform", "scanner", "mounting", "pulses", "receiver", "errors"),
-    *("estimator", "corrections", "surface_radius", "target_error", "seed", "still_sea", "crs", "origin"),
+    *("estimator", "corrections", "surface_radius", "target_error", "max_time", "seed", "still_sea", "crs", "origin"),
 )
 _OF_PULSES = ("rate_hz", "most", "every")
 _OF_RECEIVER = ("chain", "gain", "optical_density", "background_power_w")
@@ -57,6 +57,8 @@ class FlightPlan:
         Radius of planes through surface points [m], 0 for a level sea.
     target_error
         Relative standard error of the median bin of the shots of a batch.
+    max_time
+        Longest time for the passes of a batch [s], None for any. Shots that it ends have other bits elsewhere.
     errors
         Standard deviations of poses.
     seed
@@ -85,6 +87,7 @@ class FlightPlan:
     corrections: str
     surface_radius: float
     target_error: float
+    max_time: float | None
     errors: PoseErrors
     seed: int
     still_sea: bool
@@ -149,6 +152,7 @@ class FlightPlan:
             corrections=_path(given.get("corrections", "none"), folder, ".nc"),
             surface_radius=non_negative("surface_radius", given.get("surface_radius", 2.0)),
             target_error=positive("target_error", given.get("target_error", 0.1)),
+            max_time=None if given.get("max_time") is None else positive("max_time", given["max_time"]),
             errors=PoseErrors.of(table("errors", given.get("errors", {}))),
             seed=integer("seed", given.get("seed", 1), 0, 2**31),
             still_sea=still,

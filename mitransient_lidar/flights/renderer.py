@@ -213,6 +213,8 @@ class FlightRenderer:
             share or share_for_error(plan.target_error),
             target_error,
         )
+        if plan.max_time is not None:
+            batches = batches.limited(passes or MOST_PASSES_FOR_ERROR, plan.max_time)
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
             time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)

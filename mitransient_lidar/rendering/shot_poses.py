@@ -14,15 +14,12 @@ from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 
-#: Angle from nadir of a lidar [deg] below which azimuths are those of the direction of +angle_x.
-_NADIR_DEG = 3.0
-
 
 @dataclass(frozen=True)
 class ShotPoses:
     """Places of shots, and poses that differ from that of the lidar.
 
-    The frame of a shot is turned about the vertical, so that its receiver looks towards the azimuth of the lidar, and
+    The frame of a shot is turned about the vertical, so that its receiver differs least from that of the lidar, and
     displaced, so that the receiver's axis meets the mean sea level where the lidar's does.
 
     Attributes
@@ -30,7 +27,7 @@ class ShotPoses:
     places
         Points (x, y) where the receiver's axes meet the mean sea level [m], shape (shots, 2).
     turns
-        Cosine and sine of the azimuths against that of the lidar, shape (shots, 2); None without any difference.
+        Cosine and sine of the rotations about the vertical, shape (shots, 2); None without any difference.
     receiver, transmitter
         Poses in the frame of each shot; None where all are those of the lidar.
     in_scene
@@ -51,14 +48,16 @@ class ShotPoses:
         """
         own = lidar.receiver.pose
         places = receiver.origin - receiver.axis * (receiver.origin[:, 2:] / receiver.axis[:, 2:])
-        # Near nadir, small changes of attitude turn the axis to any azimuth.
-        ahead = [pose.far if own.off_nadir_deg < _NADIR_DEG else pose.axis for pose in (receiver, own)]
-        turns = _azimuths(ahead[0]) * np.conj(_azimuths(ahead[1]))
+        # The rotation from the lidar to each shot, and that about the vertical which is nearest to it.
+        whole = np.stack([receiver.axis, receiver.far, receiver.left], axis=-1) @ np.stack(
+            [own.axis, own.far, own.left]
+        )
+        azimuth = whole[:, 0, 0] + whole[:, 1, 1] + 1j * (whole[:, 1, 0] - whole[:, 0, 1])
+        turns = azimuth / np.abs(azimuth)
         to_frame = _rotations(np.conj(turns))
         centre = own.ground_point()
-        sides = [np.squeeze(to_frame @ side[..., None], -1) for side in (receiver.axis, receiver.far, receiver.left)]
         origin = np.squeeze(to_frame @ (receiver.origin - places)[..., None], -1) + centre
-        rotation = np.stack(sides, axis=-1) @ np.stack([own.axis, own.far, own.left])
+        rotation = to_frame @ whole
         shift = origin - rotation @ own.origin
         own_receiver, own_transmitter = (pose.moved(rotation, shift) for pose in (own, lidar.transmitter.pose))
         cos_sin = np.stack([turns.real, turns.imag], axis=-1)
@@ -114,12 +113,6 @@ class ShotPoses:
         reference = lidar.receiver.pose.nearby_point()
         ranges = [np.linalg.norm(pose.origin - reference, axis=1) for pose in (self.receiver, self.transmitter)]
         return np.asarray(ranges[0] + ranges[1] - lidar.reference_length)
-
-
-def _azimuths(directions: FloatArray) -> npt.NDArray[np.complex128]:
-    """Return the azimuths of directions as complex numbers of modulus 1."""
-    number = directions[..., 0] + 1j * directions[..., 1]
-    return np.asarray(number / np.abs(number))
 
 
 def _rotations(turns: npt.NDArray[np.complex128]) -> FloatArray:

@@ -103,11 +103,11 @@ class ShotScene:
         """Return the renderer of the scene loaded at a place [m]."""
         return self._prepare(self._open(self._at(x, y)))
 
-    def batches(self, passes: int, share: float, target_error: float | None) -> ShotBatches:
-        """Return the shots in batches, for passes with a share of the paths of a full pass, or until an error."""
+    def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
+        """Return the shots in batches, for passes with a share of the paths of a full pass, or until a relative error."""
         from mitransient_lidar.rendering.shot_batches import ShotBatches
 
-        goal = None if target_error is None else (target_error, self.window)
+        goal = None if error is None else (error, self.window)
         return ShotBatches(self._renderer, self._place, passes, share, goal, self.companions, self._loaded_at)
 
     def attributes(self, used: Mapping[str, float], **others: Any) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from mitransient_lidar.transport.refracted_connection import RefractedLaserSampl
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
-    transmitter = SimpleNamespace(pose=Pose.from_angles(altitude, angle))
+    pose = Pose.from_angles(altitude, angle)
     parts = {"refractive_index": 1.34, "slope_variance": slope_variance, "index_layers": None}
-    return RefractedLaserSampler(SimpleNamespace(transmitter=transmitter, **parts))
+    return RefractedLaserSampler(SimpleNamespace(transmitter_pose=pose, **parts))
 
 
 def chi_squared(sample, density):

@@ -40,6 +40,7 @@ def test_shipped_flights_have_poses(name):
         ({"still_sea": 1}, "still_sea = 1 must be true or false"),
         ({"parameters": {"altitude": 200}}, "'altitude' follows from the poses"),
         ({"seed": -1}, "seed = -1 must"),
+        ({"max_time": 0}, "max_time = 0 must"),
         ({"surface_radius": -1}, "surface_radius = -1"),
     ],
 )
