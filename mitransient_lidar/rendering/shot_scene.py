@@ -104,7 +104,7 @@ class ShotScene:
         return self._prepare(self._open(self._at(x, y)))
 
     def batches(self, passes: int, share: float, error: float | None) -> ShotBatches:
-        """Return the shots in batches, for passes with a share of the paths of a full pass, or until a relative error."""
+        """Return the shots in batches, for passes of a share of the paths of a full one, or until a relative error."""
         from mitransient_lidar.rendering.shot_batches import ShotBatches
 
         goal = None if error is None else (error, self.window)
