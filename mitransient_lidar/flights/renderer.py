@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.ndimage import uniform_filter1d
 
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
@@ -41,6 +42,9 @@ _BATCH, _STILL_S = 64, 0.05
 
 #: Rounding of times over the time in which waves stand still.
 _ROUNDING = 1e-6
+
+#: Bins whose relative standard errors are pooled, and whose mean power they are relative to.
+_POOLED_BINS, _MEAN_BINS = 21, 5
 
 #: Places of a group of pulses that decide how long their record is.
 _PLACES = 6
@@ -165,6 +169,7 @@ class FlightRenderer:
     def _stacked(self, inputs: Mapping[str, Column], options: Mapping[str, Any]) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes."""
         series, later = self._render(inputs, **options)
+        series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         plan = self.plan
         recorded = detect_waveforms(
             series,
@@ -232,6 +237,20 @@ class FlightRenderer:
         attributes = scene.attributes(used=batches.used_values, passes=max(record.passes for record in records))
         series = scene.dataset(joined, [], attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
         return series, 1e9 / C0 * (further - further % width)
+
+
+def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
+    """Return standard errors that are at least those which neighbouring bins have, relative to the waveforms.
+
+    A standard error of a few passes is itself uncertain by a third: where it is too small by chance, what a render left
+    of its noise would count as an echo. The mean square of the relative error of 21 bins has enough degrees of freedom.
+    """
+    power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
+    # A mean over bins, since one that is low by chance is so in both.
+    level = uniform_filter1d(np.abs(power), _MEAN_BINS, axis=-1, mode="nearest")
+    square = np.divide(error, level, out=np.zeros_like(error), where=level > 0) ** 2
+    pooled = level * np.sqrt(uniform_filter1d(square, _POOLED_BINS, axis=-1, mode="nearest"))
+    return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
 
 
 def scene_of(plan: FlightPlan) -> SceneRecord:

@@ -63,8 +63,9 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
     wet = points.isel(point=np.isin(points["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT)))
     error = wet["z"].values - wet["true_z"].values
     limit = float(np.nanquantile(np.abs(error), 0.98)) if error.size else 1.0
+    deepest, highest = np.quantile(wet["z"].values, [0.002, 0.99]) if error.size else (-1.0, 0.0)
     for ax, values, label, style in (
-        (heights, wet["z"].values, "height of the bottom (m)", {"cmap": "viridis"}),
+        (heights, wet["z"].values, "height of the bottom (m)", {"cmap": "viridis", "vmin": deepest, "vmax": highest}),
         (errors, error, "error of the height (m)", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
     ):
         drawn = ax.scatter(wet["x"].values, wet["y"].values, c=values, s=3, linewidths=0, **style)
