@@ -249,7 +249,9 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
     # A mean over bins, since one that is low by chance is so in both.
     level = uniform_filter1d(np.abs(power), _MEAN_BINS, axis=-1, mode="nearest")
     square = np.divide(error, level, out=np.zeros_like(error), where=level > 0) ** 2
-    pooled = level * np.sqrt(uniform_filter1d(square, _POOLED_BINS, axis=-1, mode="nearest"))
+    # Running sums leave rounding errors below 0.
+    mean = np.maximum(uniform_filter1d(square, _POOLED_BINS, axis=-1, mode="nearest"), 0)
+    pooled = level * np.sqrt(mean)
     return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
 
 
