@@ -23,6 +23,7 @@ from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import FARTHEST
 
@@ -147,12 +148,11 @@ class FlightRenderer:
 
     def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
         """Return the arrays of pulses of one group that are rendered together; raise `UserError` if that fails."""
-        arrays, _ = self._stacked(inputs, {})
-        return arrays
+        return self._stacked(inputs)[0]
 
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
         """Return arrays of few paths, the coordinates of their dimensions, and the attributes of echoes."""
-        arrays, echoes = self._stacked(inputs, {"passes": 2, "share": 1 / 512, "target_error": None})
+        arrays, echoes = self._stacked(inputs, few_paths=True)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
         found = {
             name: Array(tuple(map(str, echoes[name].dims)), echoes[name].values, _plain(echoes[name].attrs))
@@ -166,9 +166,9 @@ class FlightRenderer:
         stacked = {name: array._replace(values=array.values[0]) for name, array in arrays.items()}
         return stacked, found, {"echo_attributes": _plain(echoes.attrs)}
 
-    def _stacked(self, inputs: Mapping[str, Column], options: Mapping[str, Any]) -> tuple[dict[str, Array], xr.Dataset]:
+    def _stacked(self, inputs: Mapping[str, Column], few_paths: bool = False) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes."""
-        series, later = self._render(inputs, **options)
+        series, later = self._render(inputs, few_paths)
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         plan = self.plan
         recorded = detect_waveforms(
@@ -197,29 +197,24 @@ class FlightRenderer:
             found[f"echo_{name}"] = _single(values, dtype)
         return found, echoes
 
-    def _render(
-        self, inputs: Mapping[str, Column], passes: int | None = None, share: float | None = None, **goal: float | None
-    ) -> tuple[xr.Dataset, FloatArray]:
+    def _render(self, inputs: Mapping[str, Column], few_paths: bool) -> tuple[xr.Dataset, FloatArray]:
         """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
         from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, share_for_error
         from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
         plan, axis = self.plan, self.axis
         assert axis is not None
-        target_error = goal.get("target_error", plan.target_error)
         start = float(inputs["record_start_ns"][0])
         scene = _shot_scene(self, *_lidar_of(inputs), TimeAxis(start, axis.bin_width_ns, axis.bin_count))
         poses = _shot_poses(scene.lidar, inputs)
         # Records start at whole bins after the pulse, as the clock of a digitizer that the pulse starts.
         further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * axis.bin_width_ns
         poses = poses.delayed(further % width)
-        batches = scene.batches(
-            passes or MOST_PASSES_FOR_ERROR,
-            share or share_for_error(plan.target_error),
-            target_error,
-        )
+        error = plan.target_error
+        effort = (2, SMALLEST_SHARE, None) if few_paths else (MOST_PASSES_FOR_ERROR, share_for_error(error), error)
+        batches = scene.batches(*effort)
         if plan.max_time is not None:
-            batches = batches.limited(passes or MOST_PASSES_FOR_ERROR, plan.max_time)
+            batches = batches.limited(effort[0], plan.max_time)
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
             time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)
@@ -385,6 +380,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
     params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": aim[0], "aim_y": aim[1]}
     session = open_scene(record, params)
     lidar = LidarScene.from_scene(session.scene, session.sensor)
+    if lidar.receiver.pixels.grid is not None:
+        raise UserError(f"scene {plan.scene} has an imager: a flight needs a receiver whose pixels are a list")
     poses = _shot_poses(lidar, inputs)
     bottom = axis_on_bottom(lidar, poses=poses.in_scene)[:, 2]
     if not lidar.bottoms:

@@ -140,6 +140,7 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
     [
         ({"parameters": {**FLIGHT["parameters"], "bottom_size": 60}}, "the bottom does not cover the flight"),
         ({"parameters": {"bottom_dept": 3}}, "has no parameter bottom_dept"),
+        ({"instrument": None, "parameters": {"layout": "8x8"}}, "has an imager"),
         (
             {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},
             "no bottom within the record",
