@@ -262,7 +262,7 @@ class SeaPatches:
         self.shapes: mi.Scene | None = None
 
     def set_time(self, time_s: float) -> None:
-        """Let the waves of the patches move to a time [s]."""
+        """Set the time [s] of the waves of later patches."""
         self._sea = self._surface.sea.at(time_s)
 
     def move(self, places: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ import difflib
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,46 @@ class Array(NamedTuple):
     dims: tuple[str, ...]
     values: npt.NDArray[Any]
     attributes: dict[str, Any]
+
+
+class Renderer(Protocol):
+    """What renders the runs of a store."""
+
+    @property
+    def unit(self) -> str:
+        """Name of a run."""
+
+    @property
+    def kind(self) -> str:
+        """What the store is of, ``campaign`` or ``flight``."""
+
+    @property
+    def text(self) -> str:
+        """What is rendered, as JSON."""
+
+    @property
+    def scene(self) -> SceneRecord:
+        """The scene."""
+
+    @property
+    def axis(self) -> TimeAxis | None:
+        """Time bins of all runs; None where each has its own."""
+
+    @property
+    def shots(self) -> int:
+        """Number of shots of a run, where they have a dimension."""
+
+    def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
+        """Return the rows of the runs of a shard, those that are rendered together in one list."""
+
+    def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
+        """Return arrays that are known of runs before they are rendered."""
+
+    def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
+        """Return the arrays of runs that are rendered together, which are the first dimension; raise `UserError`."""
+
+    def describe_input(self, name: str, column: Column) -> dict[str, Any]:
+        """Return the attributes of a parameter of the runs."""
 
 
 @dataclass(frozen=True)

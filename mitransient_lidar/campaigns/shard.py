@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.campaigns.runs import Array
-from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Renderer, Store
+from mitransient_lidar.campaigns.runs import Array, Renderer
+from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
 from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
 
 #: Time between two writes of a shard that is not finished [s].

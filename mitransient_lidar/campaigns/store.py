@@ -16,7 +16,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mitransient_lidar.campaigns.design import MOST_RUNS, Column
-from mitransient_lidar.campaigns.runs import Array
+from mitransient_lidar.campaigns.runs import Array, Renderer
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer
@@ -80,46 +80,6 @@ _RENDERERS = {
     "campaign": ("mitransient_lidar.campaigns.runs", "RunRenderer", "run"),
     "flight": ("mitransient_lidar.flights.renderer", "FlightRenderer", "shot"),
 }
-
-
-class Renderer(Protocol):
-    """What renders the runs of a store."""
-
-    @property
-    def unit(self) -> str:
-        """Name of a run."""
-
-    @property
-    def kind(self) -> str:
-        """What the store is of, one of `_RENDERERS`."""
-
-    @property
-    def text(self) -> str:
-        """What is rendered, as JSON."""
-
-    @property
-    def scene(self) -> SceneRecord:
-        """The scene."""
-
-    @property
-    def axis(self) -> TimeAxis | None:
-        """Time bins of all runs; None where each has its own."""
-
-    @property
-    def shots(self) -> int:
-        """Number of shots of a run, where they have a dimension."""
-
-    def batches(self, inputs: Mapping[str, Column]) -> Iterator[list[int]]:
-        """Return the rows of the runs of a shard, those that are rendered together in one list."""
-
-    def own_inputs(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Any]:
-        """Return arrays that are known of runs before they are rendered."""
-
-    def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
-        """Return the arrays of runs that are rendered together, which are the first dimension; raise `UserError`."""
-
-    def describe_input(self, name: str, column: Column) -> dict[str, Any]:
-        """Return the attributes of a parameter of the runs."""
 
 
 class Store:

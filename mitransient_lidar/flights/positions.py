@@ -167,7 +167,7 @@ def positions(
         "y": y,
         "z": z,
         "kind": np.array([*_ECHOES.values(), PointClass.NO_ECHO])[echo].astype(np.uint8),
-        # The surface is where depths count from, though its echo may be later: other pixels tell of it, too.
+        # The surface from which depths count, estimated from all pixels of the shot; its own echo may be later.
         "depth": np.where(echo == 0, 0.0, table.value("depth_m", shot, pixel, echo)),
         "intensity": table.value("amplitude", shot, pixel, echo),
         "x_uncertainty": sigma_x,

@@ -160,7 +160,7 @@ class ShotBatches:
         return several
 
     def set_time(self, time_s: float) -> None:
-        """Let the waves move to a time [s]."""
+        """Set the time [s] at which shots meet the waves."""
         for sea in self._seas:
             sea.set_time(time_s)
 
