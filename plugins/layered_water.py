@@ -20,7 +20,7 @@ from mitransient_lidar.plugins.phase.tabulated import TabulatedPhaseFunction
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
-from mitransient_lidar.transport.medium.water_phases import KINDS, ScattererPhases, phases_of_layers
+from mitransient_lidar.transport.medium.water_phases import KINDS, LayerPhases, ScattererPhases
 from mitransient_lidar.transport.nested_objects import create_object
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
@@ -144,7 +144,9 @@ class LayeredWater(mi.Medium):
         for value in () if chi_p is None else chi_p:
             in_range("chi_p", value, 0.1, 10)
         tabulated = partial(TabulatedPhaseFunction, mi.Properties())
-        of_layers = phases_of_layers(self.column, phases, kind, phase_g, molecules, chi_p, tabulated)
+        #: The layers as given, and their phase functions for changed coefficients.
+        self.layers = LayerPhases(self.column, phases, kind, phase_g, molecules, chi_p, tabulated)
+        of_layers = self.layers.functions()
         self.column, kept = _joined(self.column, [*indices, np.array([id(phase) for phase in of_layers])])
         of_layers = [of_layers[layer] for layer in kept]
         #: Scattering by water molecules of each layer, a part of b [1/m]; 0 where it is not known.
@@ -190,6 +192,10 @@ class LayeredWater(mi.Medium):
         bubbles = self.plume.scattering_at(point)
         is_bubble = rng.next_float32() * (bubbles + flight.attenuation(layer)) < bubbles
         return dr.select(is_bubble, mi.UInt32(self.column.count), layer)
+
+    def is_water(self, scatterer: mi.UInt32) -> mi.Bool:
+        """Return whether scatterers are layers of water, not bubbles."""
+        return scatterer < self.column.count
 
     def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32) -> mi.Float:
         """Return the coefficient of a scatterer in `flight` [1/m]."""

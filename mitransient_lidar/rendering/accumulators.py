@@ -15,11 +15,13 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import ErrorInflation, ErrorWindow, PassStatistics
+from mitransient_lidar.rendering.reweighting import Case, check_share, effective_share
 from mitransient_lidar.results.gate_stack import build_gates, check_train
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from mitransient_lidar.rendering.derivatives import Parameter
     from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
     from mitransient_lidar.transport.scene import LidarScene
 
@@ -112,13 +114,20 @@ class WaveformAccumulator(PassAccumulator):
     """Statistics of energy and power in every bin, and of the gates cut from them."""
 
     def __init__(
-        self, scene: LidarScene, window: ErrorWindow, train: GateTrain | None, origins: Sequence[str] = ()
+        self,
+        scene: LidarScene,
+        window: ErrorWindow,
+        train: GateTrain | None,
+        origins: Sequence[str] = (),
+        parameters: Sequence[Parameter] = (),
+        reweighted: Sequence[Case] = (),
     ) -> None:
         super().__init__(scene, window, train)
         response = scene.receiver.optics.response_time_ns
         self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
         self._energy, self._power, self._inflation = PassStatistics(), PassStatistics(), ErrorInflation()
-        self._origins = list(origins)
+        self._origins, self._parameters, self._cases = list(origins), list(parameters), list(reweighted)
+        self._perturbed = PassStatistics(), PassStatistics()
         self._parts = PassStatistics(), PassStatistics()
         self._weights = None if train is None else _weights(scene, train)
 
@@ -140,6 +149,12 @@ class WaveformAccumulator(PassAccumulator):
             self._parts[0].add(parts)
             self._parts[1].add(waveform(parts, self.scene.axis.bin_width_ns, self._kernel))
             energy = parts.sum(axis=1)
+        if self._parameters or self._cases:
+            perturbed, classes = histogram.perturbed(), max(len(self._origins), 1)
+            shape = len(perturbed), self.scene.receiver.pixels.count, classes, -1
+            perturbed = perturbed.reshape(shape).sum(axis=2)
+            self._perturbed[0].add(perturbed)
+            self._perturbed[1].add(waveform(perturbed, self.scene.axis.bin_width_ns, self._kernel))
         energy = energy.reshape(self.scene.receiver.pixels.count, -1)
         power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
         self._energy.add(energy)
@@ -176,10 +191,26 @@ class WaveformAccumulator(PassAccumulator):
         if self._origins:
             arrays = (values for part in self._parts for values in (part.mean, part.stderr))
             built = results.add_components(built, self._origins, *arrays)
+        if self._parameters:
+            about = ([getattr(one, name) for one in self._parameters] for name in ("name", "value", "units", "method"))
+            built = results.add_derivatives(built, *about, *self._perturbations(slice(0, len(self._parameters))))
+        if self._cases:
+            first = len(self._parameters)
+            mean = self._perturbed[0].mean[first:]
+            pairs = zip(mean[::2], mean[1::2], strict=True)
+            shares = [effective_share(self._energy.mean, *pair) for pair in pairs]
+            for case, share in zip(self._cases, shares, strict=True):
+                check_share(case.label, share)
+            labels, values = [case.label for case in self._cases], self._perturbations(slice(first, None, 2))
+            built = results.add_reweighted(built, labels, shares, *values)
         if self.train is None:
             return built
         stack = self._gate_stack(built.coords, dict(built.attrs))
         return built.merge(stack, combine_attrs="override").assign_attrs(stack.attrs)
+
+    def _perturbations(self, chosen: slice) -> list[FloatArray]:
+        """Return energy, power and their standard errors of some perturbations."""
+        return [values[chosen] for part in self._perturbed for values in (part.mean, part.stderr)]
 
 
 class GateAccumulator(PassAccumulator):
@@ -227,11 +258,13 @@ def choose_accumulator(
     surface_time_ns: float | None,
     max_memory: float,
     origins: Sequence[str] = (),
+    parameters: Sequence[Parameter] = (),
+    reweighted: Sequence[Case] = (),
 ) -> PassAccumulator:
     """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
     Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
-    `origins` if there are any.
+    `origins`, differentiated by `parameters`, and `reweighted`, if there are any.
 
     Raises
     ------
@@ -241,16 +274,21 @@ def choose_accumulator(
     from mitransient_lidar.transport.histogram import TransientHistogram
 
     pixels, per_bin = scene.receiver.pixels.count, TransientHistogram.BYTES_PER_BIN
-    bins, limit = pixels * scene.axis.bin_count * (1 + len(origins)), 1e9 * max_memory
+    each, limit = pixels * scene.axis.bin_count, 1e9 * max_memory
+    channels = 1 + len(parameters) + 2 * len(reweighted)
+    bins = each * (1 + len(origins)) * channels
     train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + gates
     if everything <= limit:
-        return WaveformAccumulator(scene, window, train, origins)
+        return WaveformAccumulator(scene, window, train, origins, parameters, reweighted)
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
     if origins:
         size = size.replace(" takes", f" x {len(origins)} components takes")
         raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer bins or pixels")
+    if channels > 1:
+        size = size.replace(" takes", f" x {channels} with derivatives takes")
+        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer of them")
     if train is None:
         raise UserError(
             f"{size}: more than max_memory = {max_memory:g} GB allows; "

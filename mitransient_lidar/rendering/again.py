@@ -97,6 +97,8 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
         own |= _frame_options(attributes, given)
     else:
         own["components"] = bool(attributes.get("components", 0))
+        if "derivatives" in attributes:
+            own["derivatives"] = np.atleast_1d(attributes["derivatives"]).tolist()
     if any(name in given for name in _ENDS):
         own = {name: value for name, value in own.items() if name not in (*_ENDS, "pass_share")}
     return kind, {"scene": scene, **own, **given}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -56,6 +57,9 @@ class RenderOptions:
         attribute="max_memory_gb",
     )
     components: bool | None = _option("Also separate the light of surface, water, bottom and targets")
+    derivatives: Sequence[str] | str | None = _option(
+        "Also differentiate the waveforms by a parameter, e.g. attenuation or bottom_reflectance; may be repeated"
+    )
     variant: str | None = _option("Mitsuba variant, e.g. llvm_ad_mono", attribute="variant")
 
     def __post_init__(self) -> None:

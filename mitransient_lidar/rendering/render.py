@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.options import RenderOptions
@@ -50,6 +51,8 @@ def render(
     max_memory: float | None = None,
     pass_share: float | None = None,
     components: bool | None = None,
+    derivatives: Sequence[str] | str | None = None,
+    reweight: Sequence[Mapping[str, float]] | None = None,
     variant: str | None = None,
     progress: ProgressCallback | None = None,
     **others: Any,
@@ -92,6 +95,14 @@ def render(
         Whether to separate the light by its origin, by default not: ``surface``, ``water``, and the id of each solid,
         such as ``bottom``. The origin is the last solid that the light has met, else the water if that has scattered
         it, else the surface.
+    derivatives
+        Names of parameters by which the light is differentiated, from the paths that it takes: ``attenuation``,
+        ``scattering`` and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water
+        of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; and ``<id>_reflectance`` of
+        diffuse solids, such as ``bottom_reflectance``.
+    reweight
+        Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
+        whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.
     variant
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
@@ -106,7 +117,10 @@ def render(
         standard errors, over (pixel, time) or (row, column, time); see `results.dataset`. With gates in the film,
         ``gate_energy`` [J] in addition or instead; see `results.gate_stack`. With `components`, the parts
         ``impulse_response_by_origin`` and ``waveform_by_origin``, with standard errors, over ``origin`` and the same
-        dimensions, whose sums over ``origin`` are the whole. After Ctrl-C it includes the completed
+        dimensions, whose sums over ``origin`` are the whole. With `derivatives`, ``waveform_derivative`` and
+        ``impulse_response_derivative``, with standard errors, over ``parameter`` and the same dimensions. With
+        `reweight`, ``waveform_reweighted`` and ``impulse_response_reweighted``, with standard errors, over ``case`` and
+        the same dimensions, and the coordinate ``effective_share``. After Ctrl-C it includes the completed
         passes, and the attribute ``interrupted`` is 1. Of a result, as of the function that rendered it.
 
     Notes
@@ -121,12 +135,15 @@ def render(
         If the scene, the result, a parameter or an option is invalid, or no light returns.
     """
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
+    if reweight is not None and again.is_result(scene):
+        raise UserError("reweight: a result is rendered again with its own parameters; give its scene")
     if again.is_result(scene):
         result: Any = scene
         scene_options = {"params": params, "instrument": instrument, "integrator": integrator, "progress": progress}
         return render_again(result, **scene_options, **options, **others)
     chosen = RenderOptions(**options, **others)
-    return _render(open_scene(scene, params, chosen.variant, instrument), integrator, chosen, progress)
+    session = open_scene(scene, params, chosen.variant, instrument)
+    return _render(session, integrator, chosen, reweight or [], progress)
 
 
 def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.Dataset:
@@ -166,7 +183,11 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
 
 
 def _render(
-    session: Session, integrator: Any, options: RenderOptions, progress: ProgressCallback | None
+    session: Session,
+    integrator: Any,
+    options: RenderOptions,
+    reweight: Sequence[Mapping[str, float]],
+    progress: ProgressCallback | None,
 ) -> xarray.Dataset:
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
@@ -177,6 +198,15 @@ def _render(
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
     session.tell_record()
+    from mitransient_lidar.rendering.derivatives import path_parameters
+    from mitransient_lidar.rendering.reweighting import cases
+
+    parameters = path_parameters(renderer, options.derivatives or [])
+    reweighted = cases(renderer, reweight)
+    perturbations = [one.perturbation for one in parameters]
+    perturbations += [one for case in reweighted for one in (case.perturbation, case.squared)]
+    if perturbations:
+        renderer = renderer.perturbed(perturbations)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
     from mitransient_lidar.rendering.pass_size import fit_to_time
@@ -187,7 +217,8 @@ def _render(
     check_scene(lidar, renderer.sampler, probe)
     described = describe_scene(lidar, probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
-    accumulator = choose_accumulator(lidar, window, described.get("surface_time_ns"), max_memory, origins)
+    surface = described.get("surface_time_ns")
+    accumulator = choose_accumulator(lidar, window, surface, max_memory, origins, parameters, reweighted)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
@@ -227,6 +258,7 @@ def _render(
         pass_share=share,
         max_memory_gb=max_memory,
         components=int(components),
+        **({"derivatives": [one.name for one in parameters]} if parameters else {}),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

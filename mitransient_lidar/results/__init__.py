@@ -2,6 +2,8 @@
 
 from mitransient_lidar.results.dataset import (
     add_components,
+    add_derivatives,
+    add_reweighted,
     build,
     build_series,
     open,
@@ -14,6 +16,8 @@ from mitransient_lidar.results.dataset import (
 
 __all__ = [
     "add_components",
+    "add_derivatives",
+    "add_reweighted",
     "build",
     "build_series",
     "open",

@@ -6,7 +6,9 @@ time) for an imager. The coordinates are ``time`` [ns] at the centres of the bin
 the pixels in tangent-plane angles, ``angle_x`` and ``angle_y`` [mrad]. The parameters of the render are attributes,
 among them the scene and all parameters of its plugins (`loading.scene_record`), from which it can be rendered again. A
 series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
-by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions.
+by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions; derivatives
+by parameters of the scene are in ``waveform_derivative`` and ``impulse_response_derivative``, over ``parameter`` and
+these, and the light in other water in ``waveform_reweighted`` and ``impulse_response_reweighted``, over ``case``.
 
 EXR files round the values to 32 bits and store everything else exactly, without the light by origin; NetCDF files store
 everything exactly.
@@ -179,6 +181,92 @@ def add_components(
     return dataset.assign(data).assign_coords(origin=names)
 
 
+def add_derivatives(
+    dataset: xr.Dataset,
+    names: Sequence[str],
+    values: Sequence[float],
+    units: Sequence[str],
+    methods: Sequence[str],
+    impulse_response: npt.ArrayLike,
+    impulse_response_stderr: npt.ArrayLike,
+    waveform: npt.ArrayLike,
+    waveform_stderr: npt.ArrayLike,
+) -> xr.Dataset:
+    """Return a result of `build` or `build_series` with its derivatives by parameters.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result.
+    names, values, units, methods : sequences
+        Of each parameter: unique name, value at which the light was rendered, unit, and ``score`` or ``central
+        differences``.
+    impulse_response, impulse_response_stderr, waveform, waveform_stderr : array-like of shape (parameter, pixel, time)
+        Derivatives of what `build` takes, by the parameter in its unit; of a series with the shots after the
+        parameters.
+    """
+    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
+    dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
+    data = {}
+    for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
+        described = {
+            "units": f"{about['units']} per unit of the parameter",
+            "long_name": about["long_name"].replace("received", "derivative of the received"),
+        }
+        if "ancillary_variables" in about:
+            described["ancillary_variables"] = derivative_of(about["ancillary_variables"])
+        reshaped = np.asarray(array, dtype=np.float64).reshape(len(names), *shape)
+        data[derivative_of(name)] = (("parameter", *dims), reshaped, described)
+    coords = {
+        "parameter": ("parameter", np.array(names, dtype=str), {"long_name": "parameter of the scene"}),
+        "parameter_value": ("parameter", np.array(values, dtype=np.float64), {"long_name": "value of the parameter"}),
+        "parameter_units": ("parameter", np.array(units, dtype=str), {"long_name": "unit of the parameter"}),
+        "parameter_method": ("parameter", np.array(methods, dtype=str), {"long_name": "estimate of the derivative"}),
+    }
+    return dataset.assign(data).assign_coords(coords)
+
+
+def add_reweighted(
+    dataset: xr.Dataset, labels: Sequence[str], shares: Sequence[float], *arrays: npt.ArrayLike
+) -> xr.Dataset:
+    """Return a result of `build` with the light in other water.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result.
+    labels, shares : sequences
+        Description of each case, and the share of the paths that are effective there, 0 to 1.
+    arrays : array-like of shape (case, pixel, time)
+        Of each case what `build` takes: energy, its standard error, power, its standard error.
+    """
+    dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
+    data = {}
+    for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
+        described = {**about, "long_name": f"{about['long_name']}, by case"}
+        if "ancillary_variables" in described:
+            described["ancillary_variables"] = reweighted(described["ancillary_variables"])
+        values = np.asarray(array, dtype=np.float64).reshape(len(labels), *shape)
+        data[reweighted(name)] = (("case", *dims), values, described)
+    coords = {
+        "case": ("case", np.array(labels, dtype=str), {"long_name": "values of parameters"}),
+        "effective_share": ("case", np.array(shares), {"units": "1", "long_name": "share of the paths effective here"}),
+    }
+    return dataset.assign(data).assign_coords(coords)
+
+
+def reweighted(name: str) -> str:
+    """Return the name of a variable of a result for light in other water."""
+    stem = name.removesuffix("_stderr")
+    return f"{stem}_reweighted{name[len(stem) :]}"
+
+
+def derivative_of(name: str) -> str:
+    """Return the name of the derivative of a variable of a result."""
+    stem = name.removesuffix("_stderr")
+    return f"{stem}_derivative{name[len(stem) :]}"
+
+
 def by_origin(name: str) -> str:
     """Return the name of a variable of a result for light by origin."""
     stem = name.removesuffix("_stderr")
@@ -306,7 +394,9 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         if file_format == "exr":
             _write_exr(dataset, path, temporary)
         else:
-            large = [name for name in (*_VARIABLES, *map(by_origin, _VARIABLES)) if name in dataset]
+            ways = by_origin, derivative_of, reweighted
+            large = [*_VARIABLES, *(way(name) for way in ways for name in _VARIABLES)]
+            large = [name for name in large if name in dataset]
             netcdf.write_netcdf(dataset, temporary, large)
 
 

@@ -13,6 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain, ResponseTable
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.opaque import opaque, opaque_index
+from mitransient_lidar.transport.perturbations import Perturbations, Sums
 
 #: Largest number of sums: more do not fit the memory of a laptop.
 _LARGEST = 2**28
@@ -73,7 +74,7 @@ class GateWeights:
 
 
 class TransientHistogram:
-    """Energy of each pixel in each time bin, or in each gate.
+    """Energy of each pixel in each time bin, or in each gate, and its perturbations.
 
     Energies are summed as integers of two units, so that the sums do not depend on their order.
 
@@ -89,11 +90,13 @@ class TransientHistogram:
         Gates that are summed instead of the time bins, or None.
     reference_length
         Length that is left out of path lengths [m], so that they are accurate in single precision.
+    perturbations
+        Perturbations, each of which is summed as the energies are.
 
     Raises
     ------
     UserError
-        When pixels times bins, or pixels times gates, exceed 2^28.
+        When pixels times bins, or pixels times gates, exceed 2^28, with those of the perturbations.
     """
 
     #: Memory of a bin, or of a gate [bytes]: two sums and a mark.
@@ -106,17 +109,23 @@ class TransientHistogram:
         emitted: float,
         gates: GateWeights | None = None,
         reference_length: float = 0.0,
+        perturbations: Perturbations | None = None,
     ) -> None:
-        self.axis, self.gates = axis, gates
+        self.axis, self.gates, self.perturbations = axis, gates, perturbations or Perturbations()
         #: Number of sums of a pixel: time bins, or gates.
         self.record_length = axis.bin_count if gates is None else gates.count
         pixels = int(np.prod(shape))
-        if pixels * self.record_length > _LARGEST:
+        channels = 1 + self.perturbations.count
+        if pixels * self.record_length * channels > _LARGEST:
             name = "bin_count" if gates is None else "gate_count"
-            raise UserError(f"{name} = {self.record_length} times {pixels} pixels must not exceed {_LARGEST} in all")
+            derivatives = f" times {channels} with the derivatives" if channels > 1 else ""
+            raise UserError(
+                f"{name} = {self.record_length} times {pixels} pixels{derivatives} must not exceed {_LARGEST} in all"
+            )
         #: Shape of `energy`: pixels, then time bins or gates.
         self.shape = (*shape, self.record_length)
-        self._count = pixels * self.record_length
+        self._each = pixels * self.record_length
+        self._count = channels * self._each
         sizes = self.record_length, self.record_length - 1, self._count
         self._length, self._last, self._fine_sums = map(opaque_index, sizes)
         self._start = opaque(axis.start_ns * 1e-9 * C0 - reference_length)
@@ -136,38 +145,57 @@ class TransientHistogram:
         """Compute the sums."""
         dr.eval(self._sums, self._invalid)
 
-    def add(self, pixel: mi.UInt32, path_length: mi.Float, energy: mi.Float, active: mi.Bool) -> None:
-        """Add energy [J] that arrives after an optical path (group index included) of a relative length [m]."""
+    def add(
+        self, pixel: mi.UInt32, path_length: mi.Float, energy: mi.Float, active: mi.Bool, sums: Sums | None = None
+    ) -> None:
+        """Add energy [J] that arrives after an optical path (group index included) of a relative length [m].
+
+        `sums` are those of the perturbations along the paths.
+        """
+        sums = sums or []
         if self.gates is not None:
-            self.gates.add(path_length, energy, active, lambda k, e, on: self.add_at(pixel, k, e, on))
+            self.gates.add(path_length, energy, active, lambda k, e, on: self.add_at(pixel, k, e, on, sums))
             return
         position = (path_length - self._start) * self._per_metre
         active = active & (position >= 0) & (position < mi.Float(self._length))
-        self.add_at(pixel, dr.minimum(mi.UInt32(position), self._last), energy, active)
+        self.add_at(pixel, dr.minimum(mi.UInt32(position), self._last), energy, active, sums)
 
-    def add_at(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
+    def add_at(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool, sums: Sums) -> None:
         """Add energy to time bin or gate `number` of a pixel."""
         index = pixel * self._length + number
+        self._add_share(index, energy, active)
+        for channel, perturbed in enumerate(self.perturbations.channels(energy, sums), 1):
+            self._add_share(index + channel * opaque_index(self._each), perturbed, active)
+
+    def _add_share(self, index: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
         valid = dr.isfinite(energy)
         dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
         # Units themselves are too small for single precision where pulses are weak.
         share = energy * self._per_emitted
-        small = share < _COARSEST_FINE * 2.0**-_COARSE_BITS
+        small = (dr.abs(share) if self.perturbations.count else share) < _COARSEST_FINE * 2.0**-_COARSE_BITS
         units = mi.Int64(dr.round(share * dr.select(small, 2.0 ** (_COARSE_BITS + _FINE_BITS), 2.0**_COARSE_BITS)))
         dr.scatter_add(self._sums, units, index + dr.select(small, self._fine_sums, 0), active & valid)
 
     def energy(self) -> np.ndarray:
         """Return the energy [J] as float64, shape `shape`; NaN where a value was added that is not finite."""
-        coarse, fine = np.array(self._sums)[: 2 * self._count].reshape(2, self._count)
-        energy = coarse * self._units[0] + fine * self._units[1]
-        energy[np.array(self._invalid) > 0] = np.nan
-        return np.asarray(energy.reshape(self.shape))
+        return np.asarray(self._channels(slice(0, 1))[0])
+
+    def perturbed(self) -> np.ndarray:
+        """Return the derivatives of the energy, or the perturbed energies, shape (perturbation, *shape)."""
+        return self._channels(slice(1, None))
+
+    def _channels(self, chosen: slice) -> np.ndarray:
+        """Return energies or their derivatives as float64, shape (channel, *shape)."""
+        sums = np.array(self._sums)[: 2 * self._count].reshape(2, -1, self._each)[:, chosen]
+        found = sums[0] * self._units[0] + sums[1] * self._units[1]
+        found[np.array(self._invalid).reshape(-1, self._each)[chosen] > 0] = np.nan
+        return np.asarray(found.reshape(-1, *self.shape))
 
     def rounded_energy(self) -> np.ndarray:
         """Return `energy` as float32, at a quarter of the cost."""
         coarse, fine = (mi.Float64(unit) for unit in self._units)
-        index = dr.arange(mi.UInt32, self._count)
+        index = dr.arange(mi.UInt32, self._each)
         sums = (mi.Float64(dr.gather(mi.Int64, self._sums, index + first)) for first in (0, self._count))
         energy = mi.Float(next(sums) * coarse + next(sums) * fine)
-        energy = dr.select(self._invalid > 0, dr.nan, energy)
+        energy = dr.select(dr.gather(mi.UInt32, self._invalid, index) > 0, dr.nan, energy)
         return np.array(energy).reshape(self.shape)

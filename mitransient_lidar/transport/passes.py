@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
 from mitransient_lidar.transport.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
@@ -51,15 +52,19 @@ class PassRecord:
         energy: mi.Float,
         active: mi.Bool,
         echo: Echo | None = None,
+        sums: Sums | None = None,
     ) -> None:
         """Add the energy [J] of paths by relative optical length [m] and by what their class depends on.
 
         That is the order of scattering, the number of reversals, and the number of the last solid that the light has
-        met, from 1 on, or 0 (`PathClasses`). An `echo` from under water is enhanced by ripples.
+        met, from 1 on, or 0 (`PathClasses`). An `echo` from under water is enhanced by ripples. `sums` are those of the
+        perturbations of the scene.
         """
         if self.focusing is not None and echo is not None:
-            energy = energy * self.focusing.of(echo, order, length)
-        self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active)
+            factor = self.focusing.of(echo, order, length)
+            energy = energy * factor
+            sums = self.focusing.perturb(sums or [], self.histogram.perturbations, factor, echo, order, length)
+        self.histogram.add(self.classes.index(pixel, order, reversals, solid), length, energy, active, sums)
 
     def lose(self, energy: mi.Float, active: mi.Bool) -> None:
         """Add energy [J] that is lost because the surface mesh ends."""
@@ -106,6 +111,14 @@ class PassRenderer(ABC):
         separate.classes = replace(PathClasses.by_origin(self.scene.solids), counted=self.classes.counted)
         return separate
 
+    def perturbed(self, perturbations: Sequence[Perturbation]) -> PassRenderer:
+        """Return a renderer whose records hold perturbations, too."""
+        perturbed = copy.copy(self)
+        perturbed.scene = replace(self.scene, perturbations=Perturbations(perturbations))
+        if self.focusing is not None:
+            perturbed.focusing = self.focusing.perturbed(perturbations)
+        return perturbed
+
     def of_shots(self, scene: LidarScene, shots: int, copies: int) -> PassRenderer:
         """Return a renderer of a number of shots that meet a scene in parts, each `copies` of them at one place."""
         moved = copy.copy(self)
@@ -129,8 +142,8 @@ class PassRenderer(ABC):
         flat = (shots.count * pixels.count * self.classes.count,)
         shape = flat if self.classes.separate or shots.count > 1 else pixels.grid or flat
         scene = self.scene
-        emitted = scene.transmitter.energy
-        histogram = TransientHistogram(scene.axis, shape, emitted, gates, scene.reference_length)
+        emitted, length = scene.transmitter.energy, scene.reference_length
+        histogram = TransientHistogram(scene.axis, shape, emitted, gates, length, scene.perturbations)
         record = PassRecord(histogram, self.classes, self.focusing)
         with dr.suspend_grad():
             self.trace(record, shots, self.paths if paths is None else paths)

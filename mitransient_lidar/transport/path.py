@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import WaterScene
 
@@ -48,6 +49,8 @@ class Path:
         Number of rays traced so far, for the benchmark.
     active
         Whether the path continues.
+    sums
+        Sums of the `Perturbations` of the path so far.
     """
 
     point: mi.Point3f
@@ -63,6 +66,7 @@ class Path:
     before_first_solid: mi.Bool
     rays: mi.UInt32
     active: mi.Bool
+    sums: Sums
 
     @property
     def depth(self) -> mi.Float:
@@ -99,6 +103,7 @@ class Path:
             "before_first_solid": mi.Bool(True),
             "rays": mi.UInt32(0),
             "active": active,
+            "sums": scene.perturbations.start(),
         }
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.path import Path, advance
+from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import WaterScene
 
 
@@ -147,6 +148,25 @@ class PathStep:
         turned = path.active & (vertex.on_surface | vertex.scattered)
         path.direction = dr.select(turned, direction, path.direction)
         path.reversals += dr.select(path.active & (before * path.direction.z < 0), mi.UInt32(1), 0)
+
+    def perturb(
+        self, path: Path, vertex: Vertex, event: ScatteringEvent, direction: mi.Vector3f, passes: mi.Bool
+    ) -> None:
+        """Add what perturbations have at the last vertices of paths that continue in a direction."""
+        path.sums = self._sums_at_event(path, vertex.scattered, event, direction)
+        path.sums = self.scene.perturbations.at_solid(path.sums, vertex.si.shape, vertex.on_solid & ~passes)
+
+    def perturbed_connection(
+        self, path: Path, vertex: Vertex, event: ScatteringEvent, direction: mi.Vector3f, active: mi.Bool
+    ) -> Sums:
+        """Return the sums of paths with the last vertex connected in a direction where active."""
+        sums = self._sums_at_event(path, vertex.scattered & active, event, direction)
+        return self.scene.perturbations.at_solid(sums, vertex.si.shape, vertex.on_solid)
+
+    def _sums_at_event(self, path: Path, active: mi.Bool, event: ScatteringEvent, direction: mi.Vector3f) -> Sums:
+        if self.scene.water is not None and self.scene.perturbations.count:
+            active = active & self.scene.water.is_water(event.scatterer)
+        return self.scene.perturbations.at_event(path.sums, path.depth, path.direction, direction, active=active)
 
     def cross_boundary(self, path: Path, at_boundary: mi.Bool) -> None:
         """Refract paths at a boundary of index layers, or reflect them totally."""

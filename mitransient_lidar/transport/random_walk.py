@@ -148,7 +148,7 @@ class RandomWalk:
         `on_first_hit` where its first segment ends on the sea or on a solid in the air. `past_solids` is whether paths
         continue beyond the first solid.
         """
-        step = self._step
+        step, perturbations = self._step, self.scene.perturbations
 
         def body(path: RandomWalkPath, rng: mi.PCG32) -> tuple[RandomWalkPath, mi.PCG32]:
             first, wet = mi.Bool(path.at_start), path.active & path.in_water
@@ -160,6 +160,7 @@ class RandomWalk:
             path.offset = segments.add(path, in_record, label, wet & path.active & path.before_first_solid)
             absorption = self._water.absorption_flight.optical_depth(path.depth, path.downward, vertex.length)
             path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
+            path.sums = perturbations.along(path.sums, path.depth, path.downward, vertex.length, wet & path.active)
             depth = self._water.scattering_flight.optical_depth(path.depth, path.downward, vertex.length)
             edge = dr.select(path.inverse > 0, path.inverse * dr.square(vertex.length) * dr.exp(depth), 0)
             step.arrive(path, vertex)
@@ -218,6 +219,7 @@ class RandomWalk:
         survival = dr.select(vertex.on_solid, dr.minimum(factor, 1), 1)
         path.active &= (factor > 0) & (rng.next_float32() < survival)
         passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        step.perturb(path, vertex, event, direction, passes)
         step.redirect(path, vertex, direction, factor / survival, bs, passes)
 
     def _enter_outside(self, path: RandomWalkPath, outside: mi.Bool) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
+from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import LidarScene, WaterScene
 from mitransient_lidar.transport.snell import refract
 
@@ -208,6 +209,8 @@ class TopLayerRay:
         Optical length [m], optical depth and that of absorption alone below the top index layer.
     factor
         Factor of the radiance: square of the ratio of the refractive indices; 0 where the ray is blocked.
+    sums
+        Sums of the perturbations below the top index layer.
     """
 
     ray: mi.Ray3f
@@ -215,11 +218,12 @@ class TopLayerRay:
     optical_depth: mi.Float
     absorption_depth: mi.Float
     factor: mi.Float
+    sums: Sums
 
 
 def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, active: mi.Bool) -> TopLayerRay:
     """Trace rays from under water up to the top index layer."""
-    traced = TopLayerRay(ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(1))
+    traced = TopLayerRay(ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(1), scene.perturbations.start())
     layers: IndexLayers | None = scene.index_layers
     if layers is None:
         return traced
@@ -236,6 +240,7 @@ def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, activ
         traced.optical_length += dr.select(here, distance * layers.group(mi.UInt32(number)), 0)
         traced.optical_depth += dr.select(here, optical_depth, 0)
         traced.absorption_depth += dr.select(here, absorption, 0)
+        traced.sums = scene.perturbations.along(traced.sums, -segment.o.z, -segment.d.z, distance, here)
         traced.factor *= dr.select(here, dr.select(passes & ~blocked, ratio * ratio, 0), 1)
         origin = dr.select(here, segment.o + segment.d * distance, segment.o)
         traced.ray = mi.Ray3f(origin, dr.select(here, direction, segment.d))
@@ -275,6 +280,14 @@ class StraightConnection:
             irradiance *= dr.exp(-scene.water.optical_depth(point, direction, distance))
             length += opaque(scene.group_index - 1) * distance
         return cls(direction, irradiance, distance, length)
+
+
+def perturbed_to_laser(scene: LidarScene, sums: Sums, point: mi.Point3f) -> Sums:
+    """Return the sums of paths with the straight lines from points to the laser, which count under water only."""
+    if not scene.submerged:
+        return sums
+    line = StraightConnection.to_laser(scene, point)
+    return scene.perturbations.along(sums, -point.z, -line.direction.z, line.distance)
 
 
 def connect_event_to_laser(

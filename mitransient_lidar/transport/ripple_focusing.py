@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -17,8 +19,11 @@ from mitransient_lidar.physics.sea.double_passage import (
     slope_structures,
 )
 from mitransient_lidar.physics.water.forward_scattering import displacements
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.transport.medium.water_phases import table_of
 from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.perturbations import Perturbation, Perturbations, Sums
 from mitransient_lidar.transport.scene import LidarScene
 
 #: Largest depth of the table [m], and its number of depths.
@@ -64,6 +69,8 @@ class RippleFocusing:
         Enhancement by all waves, of the shape of `factors`.
     events
         Mean number of scattering events on both ways to each depth.
+    enhancements
+        Returns the enhancements by all waves and by those drawn, of the shape of `factors` transposed, of other water.
     """
 
     def __init__(
@@ -73,9 +80,12 @@ class RippleFocusing:
         depth_per_length: float,
         enhancement: FloatArray,
         events: FloatArray,
+        enhancements: Callable[[WaterColumn, Sequence[PowerLawTable]], tuple[FloatArray, FloatArray]],
     ) -> None:
         self.depths, self.factors, self.enhancement, self.events = depths, factors, enhancement, events
         self._table, self._depth_per_length = aligned(mi.Float, factors.astype(np.float32)), opaque(depth_per_length)
+        self._enhancements = enhancements
+        self._changes: list[mi.Float | None] = []
 
     @classmethod
     def of_scene(cls, scene: LidarScene) -> RippleFocusing | None:
@@ -97,15 +107,34 @@ class RippleFocusing:
         offset = transmitter.origin - receiver.origin
         apart = complex(*(float(offset @ side) for side in (receiver.far, receiver.left)))
         radius = np.sqrt(scene.receiver.optics.aperture_area / np.pi)
-        phases = [table_of(phase) for phase in scene.water.phases.phases[: scene.water.column.count]]
-        rng = np.random.default_rng(0)
-        disc = radius * np.sqrt(rng.random(_SAMPLES)) * np.exp(2j * np.pi * rng.random(_SAMPLES))
-        between = (apart + disc) / (scene.refractive_index * distance) * depths[:, None, None]
-        moves = displacements(scene.water.column, phases, depths, _MOST_EVENTS, _SAMPLES, rng)
-        moved = np.abs(between + moves) / cos_water
-        true, drawn = (table.at(depths[:, None, None], moved).mean(axis=-1) for table in tables)
-        events = 2 * scene.water.column.optical_depth_of_scattering(depths) / cos_water
-        return cls(depths, (true / drawn).T, 0.5 * cos_water / scene.group_index, true.T, events)
+        index = scene.refractive_index
+
+        def enhancements(column: WaterColumn, phases: Sequence[PowerLawTable]) -> tuple[FloatArray, FloatArray]:
+            # The same random numbers for all water.
+            rng = np.random.default_rng(0)
+            disc = radius * np.sqrt(rng.random(_SAMPLES)) * np.exp(2j * np.pi * rng.random(_SAMPLES))
+            between = (apart + disc) / (index * distance) * depths[:, None, None]
+            moves = displacements(column, phases, depths, _MOST_EVENTS, _SAMPLES, rng)
+            moved = np.abs(between + moves) / cos_water
+            true, drawn = (table.at(depths[:, None, None], moved).mean(axis=-1) for table in tables)
+            return true, drawn
+
+        column = scene.water.column
+        true, drawn = enhancements(column, [table_of(phase) for phase in scene.water.phases.phases[: column.count]])
+        events = 2 * column.optical_depth_of_scattering(depths) / cos_water
+        return cls(depths, (true / drawn).T, 0.5 * cos_water / scene.group_index, true.T, events, enhancements)
+
+    def factors_of(self, column: WaterColumn, phases: Sequence[PowerLawTable]) -> FloatArray:
+        """Return the factors in other water, of the shape of `factors`: its layers and their phase functions."""
+        true, drawn = self._enhancements(column, phases)
+        return np.asarray((true / drawn).T)
+
+    def perturbed(self, perturbations: Sequence[Perturbation]) -> RippleFocusing:
+        """Return these factors with their changes by perturbations."""
+        changed = copy.copy(self)
+        tables = [one.focusing for one in perturbations]
+        changed._changes = [None if one is None else aligned(mi.Float, one.astype(np.float32)) for one in tables]
+        return changed
 
     def describe(self) -> dict[str, list[float]]:
         """Return attributes of a result: mean enhancement by all waves by depth [m], linear and to 1 at 0 m.
@@ -123,14 +152,29 @@ class RippleFocusing:
 
         One event turns light in the water. Light that the surface alone has reflected has the factor 1.
         """
+        return self._look_up(self._table, 1.0, echo, order, length)
+
+    def perturb(
+        self, sums: Sums, perturbations: Perturbations, factor: mi.Float, echo: Echo, order: mi.UInt32, length: mi.Float
+    ) -> Sums:
+        """Return the sums of perturbations with the changes of the factors."""
+        found = []
+        for total, one, table in zip(sums, perturbations.perturbations, self._changes, strict=True):
+            if table is not None:
+                change = self._look_up(table, 1.0 if one.finite else 0.0, echo, order, length) / factor
+                total = total + (dr.log(change) if one.finite else change)
+            found.append(total)
+        return found
+
+    def _look_up(self, table: mi.Float, at_surface: float, echo: Echo, order: mi.UInt32, length: mi.Float) -> mi.Float:
+        """Return the values of a table, which are `at_surface` at the surface and for light that it has reflected."""
         turned = dr.select(mi.Bool(echo.on_solid), mi.UInt32(0), 1)
         events = dr.minimum(dr.select(order > turned, order - turned, 0), _MOST_EVENTS)
         depth = (length - echo.surface_length) * self._depth_per_length
         step = np.log(_DEEPEST / LEAST_DEPTH) / (_DEPTHS - 1)
         place = dr.clip(dr.log(dr.maximum(depth, 1e-6) / LEAST_DEPTH) / step, 0, _DEPTHS - 1)
         low = dr.minimum(mi.UInt32(place), _DEPTHS - 2)
-        first, second = (dr.gather(mi.Float, self._table, events * _DEPTHS + low + more) for more in (0, 1))
+        first, second = (dr.gather(mi.Float, table, events * _DEPTHS + low + more) for more in (0, 1))
         factor = dr.lerp(first, second, place - mi.Float(low))
-        # From 1 at the surface.
-        factor = dr.lerp(1, factor, dr.clip(depth / LEAST_DEPTH, 0, 1))
-        return dr.select(order >= turned, factor, 1)
+        factor = dr.lerp(at_surface, factor, dr.clip(depth / LEAST_DEPTH, 0, 1))
+        return dr.select(order >= turned, factor, at_surface)

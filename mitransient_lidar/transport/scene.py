@@ -17,6 +17,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Instrument
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
+from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.pose import Pose, RelativePose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -91,6 +92,8 @@ class WaterScene:
         Parts of the scene at places that differ between shots, in place of `mitsuba_scene`; none for a single shot.
     receiver_poses
         Pose of the receiver in each shot, where they differ.
+    perturbations
+        Changes of water and solids whose effect on each path is summed.
     """
 
     mitsuba_scene: mi.Scene
@@ -100,6 +103,7 @@ class WaterScene:
     slope_variance: float
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
     receiver_poses: Pose | None = field(default=None, kw_only=True)
+    perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
 
     def of(self: SceneT, lanes: Lanes) -> SceneT:
         """Return the scene as the shots of lanes meet it, in the frame of the lidar."""

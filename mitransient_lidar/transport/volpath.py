@@ -17,6 +17,7 @@ from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.path_step import PathStep, ScatteringEvent, Vertex
+from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.refracted_connection import (
     ConnectedPath,
     EmitterDirection,
@@ -25,6 +26,7 @@ from mitransient_lidar.transport.refracted_connection import (
     SubmergedLaserSampler,
     connect_event_to_laser,
     connect_laser,
+    perturbed_to_laser,
     trace_to_top_layer,
 )
 from mitransient_lidar.transport.ripple_focusing import Echo
@@ -105,9 +107,12 @@ class PathLight:
 
     @abstractmethod
     def receive(
-        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool
+        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
     ) -> None:
-        """Record light that arrives along paths of an optical length [m], connected from solids or elsewhere."""
+        """Record light that arrives along paths of an optical length [m], connected from solids or elsewhere.
+
+        `sums` are those of the perturbations of the complete paths.
+        """
 
     @abstractmethod
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
@@ -164,14 +169,15 @@ class LaserLight(PathLight):
         return self.record.classes.solid(shape)
 
     def receive(
-        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool
+        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
     ) -> None:
         """Add energy to the histogram."""
         # The connection to a laser above goes up: from a vertex that was reached downwards it is one more reversal.
         upward = self.scene.transmitter_pose.point.z - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
         echo = Echo(path.surface_length, on_solid | ~path.before_first_solid)
-        self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo)
+        sums = perturbed_to_laser(self.scene, sums, path.point)
+        self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo, sums)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add energy to the losses."""
@@ -234,6 +240,9 @@ class PathTracer:
         if self._absorption is not None:
             absorbed = self._absorption.optical_depth(path.depth, path.downward, vertex.length)
             path.throughput *= dr.select(path.active & path.in_water, dr.exp(-absorbed), 1)
+        path.sums = self.scene.perturbations.along(
+            path.sums, path.depth, path.downward, vertex.length, path.active & path.in_water
+        )
         self._step.arrive(path, vertex)
         by_surface = self.light.length_by(path)
         path.surface_length = dr.select(first & vertex.at_sea, by_surface, path.surface_length)
@@ -298,7 +307,9 @@ class PathTracer:
         # One ray along the path, one up to the surface, one to the emitter.
         path.rays += dr.select(path.active, mi.UInt32(1), 0) + dr.select(sampled, mi.UInt32(1), 0)
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
-        light.receive(path, path.length + water_length + air_length, energy, radiance > 0, vertex.on_solid)
+        sums = joined(self._step.perturbed_connection(path, vertex, event, up, met), top.sums)
+        sums = scene.perturbations.along(sums, -top.ray.o.z, -top.ray.d.z, above.t, met)
+        light.receive(path, path.length + water_length + air_length, energy, radiance > 0, vertex.on_solid, sums)
         light.reflect(path, si, rng, vertex.at_sea & ~vertex.in_water)
         # For the loss, the density of the sampled direction replaces that of the surface's BSDF.
         share = light.weight * path.throughput * connected * density
@@ -318,7 +329,8 @@ class PathTracer:
         if self.options.complement_only:
             energy = dr.select(self._merged(path, vertex, first), 0, energy)
         path.rays += dr.select(path.active, mi.UInt32(2), 0)
-        light.receive(path, path.length + length, energy, radiance > 0, vertex.on_solid)
+        sums = self._step.perturbed_connection(path, vertex, event, direction, vertex.scattered)
+        light.receive(path, path.length + length, energy, radiance > 0, vertex.on_solid, sums)
 
     @staticmethod
     def _submerged(vertex: Vertex) -> mi.Bool:
@@ -426,6 +438,7 @@ class PathTracer:
         sampler_pdf = self.light.sampler.pdf_in_layer(emitter, direction, path.index_layer)
         ratio = dr.select(submerged & ~specular & (pdf > 0), sampler_pdf / pdf, 0)
         path.emitter_ratio = dr.select(turned, ratio, path.emitter_ratio)
+        self._step.perturb(path, vertex, event, direction, passes)
         self._step.redirect(path, vertex, direction, factor, bs, passes)
         path.solid = dr.select(path.before_first_solid, mi.UInt32(0), path.solid)
         path.specular = dr.select(turned, specular, path.specular)

@@ -97,7 +97,7 @@ def test_moments_of_an_infinite_medium(system, z_score):
         path = RandomWalkPath.start(parts, parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(step))
         path.point, path.in_water = mi.Point3f(0, 0, -start), mi.Bool(True)
         path.at_start, path.length = mi.Bool(False), mi.Float(1)
-        segments = SegmentBuffer(parts.water, PathClasses(), step, count, 150 * count)
+        segments = SegmentBuffer(parts, PathClasses(), step, count, 150 * count)
         end = parts.reference_length + 500.0
         RandomWalk(parts, mi.TransportMode.Importance, parts.receiver.pose, end).run(
             path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.daylight.sampling import FovSampler
 from mitransient_lidar.transport.daylight.scene import DaylightScene
+from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.refracted_connection import (
     ConnectedPath,
     EmitterDirection,
@@ -74,7 +75,7 @@ class DaylightLight(PathLight):
         return connect_sun(self.scene, si, emitter.in_air, sun.sampled_irradiance, active), mi.Float(0)
 
     def receive(
-        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool
+        self, path: ConnectedPath, length: mi.Float, energy: mi.Float, active: mi.Bool, on_solid: mi.Bool, sums: Sums
     ) -> None:
         """Add light of the sun."""
         self.add(self.pixel, energy, active)

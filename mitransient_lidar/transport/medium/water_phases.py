@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -66,18 +67,11 @@ class ScattererPhases:
         return NumberedPhase(self._stack, number)
 
 
-def phases_of_layers(
-    column: WaterColumn,
-    nested: dict[str, mi.PhaseFunction],
-    kind: str,
-    phase_g: float,
-    water_scattering: np.ndarray,
-    chi_p: np.ndarray | None,
-    tabulated: Callable[[PowerLawTable], mi.PhaseFunction],
-) -> list[mi.PhaseFunction]:
-    """Return one phase function a layer, the same object where layers share it.
+@dataclass(frozen=True)
+class LayerPhases:
+    """How the phase functions of layers follow from their coefficients.
 
-    Parameters
+    Attributes
     ----------
     column
         The layers.
@@ -93,31 +87,69 @@ def phases_of_layers(
         bb/(2 pi p(pi) b) of the particles of each layer, shape (layers,), or None for that of their function.
     tabulated
         Constructor of a phase function from a table.
-
-    Raises
-    ------
-    UserError
-        When nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
     """
-    count = column.count
-    share = np.divide(water_scattering, column.scattering, out=np.zeros(count), where=column.scattering > 0)
-    if len(nested) == 1:
-        particles = list(nested.values()) * count
-    elif nested:
-        wanted = [f"phase_{layer}" for layer in range(count)]
-        if sorted(nested) != sorted(wanted):
-            raise UserError(
-                f"layered_water: nested phase functions are named {', '.join(sorted(nested))}; "
-                f"allowed is one of any name, or one a layer: {', '.join(wanted)}"
-            )
-        particles = [nested[name] for name in wanted]
-    elif kind == "petzold":
-        particles = [create_object("petzold")] * count
-    elif kind == "hg":
-        particles = [create_object("hg", g=phase_g)] * count
-    else:
-        particles, share = _fournier_forand(column, water_scattering, share)
-    return _mixed(particles, share, [None] * count if chi_p is None else chi_p.tolist(), tabulated)
+
+    column: WaterColumn
+    nested: dict[str, mi.PhaseFunction]
+    kind: str
+    phase_g: float
+    water_scattering: np.ndarray
+    chi_p: np.ndarray | None
+    tabulated: Callable[[PowerLawTable], mi.PhaseFunction]
+
+    def functions(self) -> list[mi.PhaseFunction]:
+        """Return one phase function a layer, the same object where layers share it.
+
+        Raises
+        ------
+        UserError
+            When nested functions are neither one nor one a layer, or `chi_p` makes a function negative.
+        """
+        column, nested, count = self.column, self.nested, self.column.count
+        share = np.divide(self.water_scattering, column.scattering, out=np.zeros(count), where=column.scattering > 0)
+        if len(nested) == 1:
+            particles = list(nested.values()) * count
+        elif nested:
+            wanted = [f"phase_{layer}" for layer in range(count)]
+            if sorted(nested) != sorted(wanted):
+                raise UserError(
+                    f"layered_water: nested phase functions are named {', '.join(sorted(nested))}; "
+                    f"allowed is one of any name, or one a layer: {', '.join(wanted)}"
+                )
+            particles = [nested[name] for name in wanted]
+        elif self.kind == "petzold":
+            particles = [create_object("petzold")] * count
+        elif self.kind == "hg":
+            particles = [create_object("hg", g=self.phase_g)] * count
+        else:
+            particles, share = _fournier_forand(column, self.water_scattering, share)
+        return _mixed(particles, share, [None] * count if self.chi_p is None else self.chi_p.tolist(), self.tabulated)
+
+    def table(
+        self,
+        layer: int,
+        *,
+        scattering: float | None = None,
+        backscattering: float | None = None,
+        phase_g: float | None = None,
+    ) -> PowerLawTable:
+        """Return the phase function of a layer, with some of its coefficients [1/m] or its mean cosine changed."""
+        column = self.column
+        b = float(column.scattering[layer]) if scattering is None else scattering
+        bb = float(column.backscattering[layer]) if backscattering is None else backscattering
+        # The attenuation does not change the function, and must not be less than the scattering.
+        values = (np.array([value]) for value in (0.0, max(float(column.attenuation[layer]), b), b, bb))
+        molecules = np.broadcast_to(self.water_scattering, (column.count,))[layer : layer + 1]
+        nested = {"phase": self.nested.get(f"phase_{layer}", next(iter(self.nested.values())))} if self.nested else {}
+        alone = replace(
+            self,
+            column=WaterColumn(*values),
+            nested=nested,
+            phase_g=self.phase_g if phase_g is None else phase_g,
+            water_scattering=molecules,
+            chi_p=None if self.chi_p is None else self.chi_p[layer : layer + 1],
+        )
+        return table_of(alone.functions()[0])
 
 
 def _fournier_forand(

@@ -24,6 +24,7 @@ from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentP
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.passes import PassRecord
+from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -148,8 +149,11 @@ class WaterConnections:
         ray.maxt = distance
         clear = scene.is_clear(point.point.z) & scene.is_clear(other.point.z)
         active &= ~scene.ray_test(ray, active & ~clear)
-        length = point.length + other.length
-        self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active)
+        length, depth, perturbed = point.length + other.length, -point.point.z, scene.perturbations
+        sums = perturbed.along(joined(point.sums, other.sums), depth, -direction.z, distance)
+        sums = perturbed.at_event(sums, depth, point.direction, direction)
+        sums = perturbed.at_event(sums, -other.point.z, other.direction, -direction)
+        self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active, sums)
 
     def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some photons on solids."""
@@ -172,7 +176,11 @@ class WaterConnections:
         energy = scale * point.weight * photon.weight * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length
-        self._receive(point, photon, solid, direction, 1, length, distance, energy, active, on_solid=True)
+        depth, perturbed = -point.point.z, self.scene.perturbations
+        sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)
+        sums = perturbed.at_event(sums, depth, point.direction, direction)
+        sums = perturbed.at_solid(sums, si.shape)
+        self._receive(point, photon, solid, direction, 1, length, distance, energy, active, sums, on_solid=True)
 
     def _segment(self, point: SegmentPoints, place: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Return direction, length [m] and absorption of segments, and their length^2 / transmittance of scattering."""
@@ -205,10 +213,11 @@ class WaterConnections:
         distance: mi.Float,
         energy: mi.Float,
         active: mi.Bool,
+        sums: Sums,
         on_solid: bool = False,
     ) -> None:
         """Add the energy of connected paths to the record."""
         subpath = SensorSubpath.at(self.record, point, solid)
         group: Any = self._water.index_layers.group(mi.UInt32(0))
         length = length + distance * group
-        subpath.add(self.record, light, events, length, energy, active, [direction], on_solid)
+        subpath.add(self.record, light, events, length, energy, active, sums, [direction], on_solid)

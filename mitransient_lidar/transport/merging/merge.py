@@ -16,6 +16,7 @@ from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentP
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.random_walk import Action, RandomWalkPath
 from mitransient_lidar.transport.ripple_focusing import Echo
 from mitransient_lidar.transport.rng import Shots
@@ -46,6 +47,7 @@ def store_points(
         position,
         points.edge,
         points.label,
+        points.sums,
     )
     photons.fill(photon, tag)
     return photons
@@ -65,7 +67,7 @@ def merge_in_water(
     volume V each pair adds beta s w s' / V times scattering coefficient and phase function, weighted among all merges
     and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
     """
-    water = scene.water
+    water, perturbations = scene.water, scene.perturbations
     bucket, cell, volume = cells.locate(points.point, points.direction)
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi = points.point, -points.direction
@@ -85,16 +87,20 @@ def merge_in_water(
         active = index < end
         photon, tag = photons.photon(index, active)
         active &= tag == cell
-        shared = mi.Float(0)
+        shared, shares = mi.Float(0), []
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
             own = (typical + connections * (points.edge + photon.edge)) / (scattering * value[0])
-            shared += dr.rcp(own + points.mis_partial_sum + photon.mis_partial_sum)
+            shares.append(dr.rcp(own + points.mis_partial_sum + photon.mis_partial_sum))
+            shared += shares[-1]
         # The photon continues to the plane through the point normal to its direction, so that times do not blur.
         beyond = dr.dot(points.point, photon.direction) - photon.position
         energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + beyond * group
-        subpath.add(record, photon, 1, length, energy, active)
+        by_water = None if len(scatterers) == 1 else shares[0] / shared
+        depth, light = -points.point.z, -photon.direction
+        sums = perturbations.at_event(joined(points.sums, photon.sums), depth, points.direction, light, by_water)
+        subpath.add(record, photon, 1, length, energy, active, sums)
         return (index + 1,)
 
     dr.while_loop((first,), lambda index: index < end, merge, label="merge in the water")
@@ -120,6 +126,7 @@ def merge_on_solids(
         patch, random = patches.locate(si), mi.PCG32(rng)
         first, end = photons.find(patch.bucket, active)
         solid = record.classes.solid(si.shape)
+        sums = record.histogram.perturbations.at_solid(path.sums, si.shape)
         events = path.scatterings, path.reversals
         subpath = SensorSubpath(pixel, *events, solid, path.direction, path.weight, path.surface_length)
         weight = path.weight * patches.inverse_share(patch, si.shape, random, active & (first < end)) / patch.area
@@ -137,8 +144,8 @@ def merge_on_solids(
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
             share = typical / dr.fma(connection, photon.edge, typical)
             energy = weight * photon.weight * bsdf * share
-            lit = within & (bsdf > 0)
-            subpath.add(record, photon, 0, path.length + photon.length, energy, lit, on_solid=True)
+            lit, length = within & (bsdf > 0), path.length + photon.length
+            subpath.add(record, photon, 0, length, energy, lit, joined(sums, photon.sums), on_solid=True)
             return (index + 1,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge on solids")
@@ -172,13 +179,15 @@ class SensorSubpath:
         length: mi.Float,
         energy: mi.Float,
         active: mi.Bool,
+        sums: Sums,
         between: Sequence[mi.Vector3f] = (),
         on_solid: bool = False,
     ) -> None:
         """Add complete paths to a record, with a number of scattering `events` where the parts meet.
 
-        `on_solid` is whether they have met a solid, `between` are the directions of segments between the receiver's
-        part and the light's. Paths of which one part lies outside the surface mesh count as lost.
+        `sums` are those of the perturbations of the complete paths, `on_solid` is whether they have met a solid,
+        `between` are the directions of segments between the receiver's part and the light's. Paths of which one part
+        lies outside the surface mesh count as lost.
         """
         outside = (self.weight < 0) | (light.weight < 0)
         order, reversals = self.scatterings + events, self.reversals
@@ -191,5 +200,6 @@ class SensorSubpath:
                 reversals = reversals + dr.select(here * following < 0, mi.UInt32(1), 0)
             reversals = reversals + reversed_before
         echo = Echo(self.surface_length, on_solid)
-        record.receive(self.pixel, order, reversals, self.solid, length, dr.abs(energy), active & ~outside, echo)
+        inside = active & ~outside
+        record.receive(self.pixel, order, reversals, self.solid, length, dr.abs(energy), inside, echo, sums)
         record.lose(dr.abs(energy), active & outside)

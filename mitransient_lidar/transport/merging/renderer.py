@@ -25,7 +25,7 @@ from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.passes import PassRecord, PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
-from mitransient_lidar.transport.refracted_connection import connect_laser
+from mitransient_lidar.transport.refracted_connection import connect_laser, perturbed_to_laser
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import IMAGE_PIXELS, SensorSampler
@@ -317,8 +317,8 @@ class MergingRenderer(PassRenderer):
         layout, lanes, count = self.layout, shots.paths(self.photons), shots.count * self.photons
         scene, patches, rng = self.scene.of(lanes), patches.of(lanes), shots.streams(_LIGHT_STREAM, lanes)
         capacity = int(layout.light_segments * count)
-        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, self.photons, capacity, shots.count)
-        hits = PhotonBuffer(int(layout.hits * count), self.photons, self.classes, shots.count)
+        segments = SegmentBuffer(scene, self.classes, layout.spacing, self.photons, capacity, shots.count)
+        hits = PhotonBuffer(int(layout.hits * count), self.photons, self.classes, shots.count, scene.perturbations)
         angles, energy = self._beam.sample(lanes.number, self.photons, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.transmitter_pose, angles, energy, offset)
@@ -357,7 +357,7 @@ class MergingRenderer(PassRenderer):
         rng = shots.streams(_SENSOR_STREAM, lanes)
         start = self.sampler.sample_shots(lanes, paths, rng)
         capacity = int(layout.sensor_segments * count)
-        segments = SegmentBuffer(scene.water, self.classes, layout.spacing, paths, capacity, shots.count)
+        segments = SegmentBuffer(scene, self.classes, layout.spacing, paths, capacity, shots.count)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.receiver_pose, start.angles, start.weight, offset)
         walk = RandomWalk(
@@ -370,7 +370,9 @@ class MergingRenderer(PassRenderer):
             energy = path.throughput * radiance
             # No scattering event, and one reversal.
             order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(si.shape)
-            record.receive(start.pixel, order, reversals, solid, path.length + length, energy, radiance > 0)
+            sums, length = scene.perturbations.at_solid(path.sums, si.shape), path.length + length
+            sums = perturbed_to_laser(scene, sums, path.point)
+            record.receive(start.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
 
         of_merges = shots.streams(_MERGE_STREAM, lanes)
         merge = merge_on_solids(patches_of_paths, record, light.on_patches, start.pixel, rates.on_solids, of_merges)

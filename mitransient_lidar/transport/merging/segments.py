@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,8 +10,10 @@ import numpy as np
 
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
+from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
+from mitransient_lidar.transport.scene import LidarScene
 
 #: Numbers that tell the points of a path apart; those of paths with more points may be those of other paths.
 _KEYS_PER_PATH = 1021
@@ -42,6 +43,8 @@ class SegmentPoints:
         Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
     surface_length
         As of the path [m].
+    sums
+        Sums of the perturbations of the path up to the point.
     """
 
     point: mi.Point3f
@@ -52,6 +55,7 @@ class SegmentPoints:
     edge: mi.Float
     label: mi.UInt32
     surface_length: mi.Float
+    sums: Sums
 
 
 class SegmentBuffer:
@@ -61,9 +65,9 @@ class SegmentBuffer:
     """
 
     def __init__(
-        self, water: Any, classes: PathClasses, spacing: float, paths: int, capacity: int, shots: int = 1
+        self, scene: LidarScene, classes: PathClasses, spacing: float, paths: int, capacity: int, shots: int = 1
     ) -> None:
-        self._water, self._classes = water, classes
+        self._water, self._perturbations, self._classes = scene.water, scene.perturbations, classes
         self._paths, self._shots = paths, shots
         #: Number of points before those of each shot, and of all.
         self.first_points = np.zeros(shots + 1, np.uint32)
@@ -76,6 +80,7 @@ class SegmentBuffer:
         self._start = dr.empty(mi.Float, 4 * capacity)
         self._direction = dr.empty(mi.Float, 4 * capacity)
         self._weight = dr.empty(mi.Float, 4 * capacity)
+        self._sums = [dr.empty(mi.Float, capacity) for _ in range(self._perturbations.count)]
         self._first = mi.UInt32()
         self._slot = mi.UInt32()
 
@@ -92,6 +97,8 @@ class SegmentBuffer:
         dr.scatter(self._direction, direction, slot, keep)
         weight = mi.Vector4f(path.weight, path.mis_partial_sum, path.inverse, path.surface_length)
         dr.scatter(self._weight, weight, slot, keep)
+        for stored, total in zip(self._sums, path.sums, strict=True):
+            dr.scatter(stored, total, slot, keep)
         path.points += number
         dr.scatter(self._of_path, path.points, path.lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
@@ -99,6 +106,7 @@ class SegmentBuffer:
     def finalize(self) -> tuple[int, int]:
         """Assign numbers to the points; return their number and that of the segments, stored or not."""
         dr.eval(self._stored, self._of_path, self._place, self._label, self._start, self._direction, self._weight)
+        dr.eval(self._sums)
         end = dr.cumsum(self._of_path)
         last = dr.arange(mi.UInt32, self._shots) * self._paths + (self._paths - 1)
         self.first_points[1:] = np.array(dr.gather(mi.UInt32, end, last))
@@ -153,4 +161,5 @@ class SegmentBuffer:
             edge,
             dr.gather(mi.UInt32, self._label, segment),
             surface_length,
+            self._perturbations.along([dr.gather(mi.Float, one, segment) for one in self._sums], -z, -dz, along),
         )

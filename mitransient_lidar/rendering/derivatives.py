@@ -1,0 +1,146 @@
+"""Parameters by which waveforms are differentiated."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import shown
+from mitransient_lidar.transport.medium.water_changes import (
+    COEFFICIENTS,
+    coefficient_derivative,
+    mean_cosine_derivative,
+)
+from mitransient_lidar.transport.perturbations import Perturbation
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.scene import LidarScene
+
+#: Largest number of parameters of a render.
+MOST_PARAMETERS = 64
+
+_NAME = re.compile(r"(?P<stem>\w+?)(\[(?P<layer>\d+)\])?\Z")
+_REFLECTANCE = "_reflectance"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a scene by which light is differentiated.
+
+    Attributes
+    ----------
+    name, value, units
+        Name, with the number of the layer in brackets where there are several; value and its unit.
+    perturbation
+        What paths sum for the derivative.
+    """
+
+    name: str
+    value: float
+    units: str
+    perturbation: Perturbation
+
+    #: How the derivative is estimated.
+    method = "score"
+
+
+def path_parameters(renderer: PassRenderer, names: Sequence[str] | str, option: str = "derivatives") -> list[Parameter]:
+    """Return the parameters of names: a coefficient of layered water stands for that of each layer.
+
+    Messages name the `option` by which the names were given.
+
+    Raises
+    ------
+    UserError
+        If a name is unknown or given twice, or the light does not depend on the parameter.
+    """
+    if not isinstance(names, (str, Sequence)):
+        raise UserError(f"{option} = {shown(names)} must be names of parameters")
+    listed = [names] if isinstance(names, str) else list(names)
+    found: list[Parameter] = []
+    for name in listed:
+        found += _parameters(renderer, name, option)
+    repeated = [one.name for index, one in enumerate(found) if one.name in [other.name for other in found[:index]]]
+    if repeated:
+        raise UserError(f"{option}: {repeated[0]} is given twice")
+    if len(found) > MOST_PARAMETERS:
+        raise UserError(f"{option}: {len(found)} parameters; allowed are at most {MOST_PARAMETERS}")
+    return found
+
+
+def known_names(scene: LidarScene) -> list[str]:
+    """Return the names of the parameters of a scene for which paths sum derivatives."""
+    names: list[str] = []
+    if scene.water is not None:
+        layers = scene.water.layers
+        for name in COEFFICIENTS:
+            count = layers.column.count
+            names += [name] if count == 1 else [f"{name}[{layer}]" for layer in range(count)]
+        names += ["phase_g"] if layers.kind == "hg" and not layers.nested else []
+    return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in scene.solids)]
+
+
+def _parameters(renderer: PassRenderer, name: str, option: str) -> list[Parameter]:
+    """Return the parameters of a name."""
+    scene, focusing = renderer.scene, renderer.focusing
+    match = _NAME.match(name) if isinstance(name, str) else None
+    known = known_names(scene)
+    stem = match["stem"] if match else ""
+    of_water = scene.water is not None and (stem in COEFFICIENTS or name == "phase_g")
+    solid = next((one for one in scene.solids if f"{one.id()}{_REFLECTANCE}" == name), None)
+    if match is None or not (of_water or solid is not None):
+        close = get_close_matches(str(name), known, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        raise UserError(f"{option}: {shown(name)} is no parameter of the scene: allowed are {', '.join(known)}{hint}")
+    if solid is not None:
+        return [_reflectance(name, solid)]
+    if name == "phase_g":
+        return [Parameter(name, scene.water.layers.phase_g, "1", mean_cosine_derivative(scene.water, focusing))]
+    column = scene.water.layers.column
+    layers = range(column.count) if match["layer"] is None else [int(match["layer"])]
+    if layers[-1] >= column.count:
+        raise UserError(f"{option}: {name} must have the number of a layer, 0 to {column.count - 1}")
+    return [
+        Parameter(
+            stem if column.count == 1 else f"{stem}[{layer}]",
+            float(getattr(column, stem)[layer]),
+            "1/m",
+            coefficient_derivative(scene.water, stem, layer, focusing),
+        )
+        for layer in layers
+    ]
+
+
+def _reflectance(name: str, solid: mi.Shape) -> Parameter:
+    """Return the parameter of the reflectance of a solid."""
+    value = _uniform_reflectance(solid)
+    if value is None:
+        raise UserError(f"derivatives: {name} must be of a solid that is diffuse, with one reflectance everywhere")
+    if value == 0:
+        raise UserError(f"derivatives: {name} = 0 must be greater than 0: the solid returns no light")
+    return Parameter(name, value, "1", Perturbation(solids=((solid, 1 / value),)))
+
+
+def _uniform_reflectance(solid: Any) -> float | None:
+    """Return the reflectance of a diffuse solid, None for others."""
+    import mitsuba as mi
+
+    bottom = getattr(solid, "bottom", None)
+    if bottom is not None and "reflectance.scale" in mi.traverse(solid.bsdf()):
+        values = np.unique([bottom.reflectance, *(patch.reflectance for patch in bottom.patches)])
+        return float(values[0]) if values.size == 1 else None
+    kept = mi.traverse(solid.bsdf())
+    names = list(kept.keys())
+    # A diffuse BSDF shows its reflectance alone, also within one for two sides.
+    if names not in (["reflectance.value"], ["brdf_0.reflectance.value"]):
+        return None
+    return float(np.array(kept[names[0]]).ravel()[0])

@@ -1,0 +1,167 @@
+"""Changes of coefficients and phase functions of water, as perturbations of paths."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
+from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
+from mitransient_lidar.transport.ripple_focusing import RippleFocusing
+
+#: Coefficients by which light is differentiated, each with the other two held fixed [1/m].
+COEFFICIENTS = ("attenuation", "scattering", "backscattering")
+
+#: Relative step of the numerical derivatives of phase functions by their parameters.
+_STEP = 1e-4
+
+#: That of the factors of ripples, which are means of samples.
+_FOCUSING_STEP = 0.02
+
+#: Largest derivative of ln p by the logarithm of a parameter that counts as none: rounding of tables.
+_NEGLIGIBLE = 1e-6
+
+
+def coefficient_derivative(water: Any, name: str, layer: int, focusing: RippleFocusing | None = None) -> Perturbation:
+    """Return the derivative by a coefficient of a layer, with the other coefficients held fixed.
+
+    With lengths L and n scattering events in the layer, the derivative of the logarithm of a contribution is -L by c;
+    by b it is n / b, as absorption falls where scattering grows, and by bb 0; to the latter two every scattering event
+    adds the derivative of the logarithm of the phase function, which follows from b and bb, as does that of the factors
+    of ripples.
+
+    Raises
+    ------
+    UserError
+        If the light does not depend on the coefficient, or the derivative at its value cannot be estimated.
+    """
+    column = water.layers.column
+    top, bottom = _limits(column.layer_tops, layer)
+    if name == "attenuation":
+        return Perturbation((LayerChange(top, bottom, per_metre=-1.0),))
+    b = float(column.scattering[layer])
+    label = name if column.count == 1 else f"{name}[{layer}]"
+    if b == 0:
+        raise UserError(
+            f"{label}: the layer has scattering = 0, where no light is scattered by which the derivative could be "
+            "estimated; give it a small scattering, such as 1e-4"
+        )
+    value = float(getattr(column, name)[layer])
+    by_angle = _log_derivative(water.layers, layer, name, value)
+    by_ripples = _focusing_derivative(focusing, water.layers, layer, name, value)
+    if name == "scattering":
+        return Perturbation((LayerChange(top, bottom, per_event=1 / b, by_angle=by_angle),), focusing=by_ripples)
+    if by_angle is None:
+        raise UserError(
+            f"{label}: the light does not depend on it, as the phase function does not follow from it; allowed are "
+            "fournier_forand functions"
+        )
+    return Perturbation((LayerChange(top, bottom, by_angle=by_angle),), focusing=by_ripples)
+
+
+def layer_change(water: Any, layer: int, changed: Mapping[str, float]) -> LayerChange:
+    """Return the change of a layer to other coefficients [1/m], as the logarithm of a ratio of contributions.
+
+    Raises
+    ------
+    UserError
+        If light that is not scattered in the unchanged water would be, or coefficients exceed each other.
+    """
+    column = water.layers.column
+    before = {name: float(getattr(column, name)[layer]) for name in COEFFICIENTS}
+    after = {**before, **changed}
+    WaterColumn.from_text("0", **after)
+    b, b_after = before["scattering"], after["scattering"]
+    if b_after > 0 and b == 0:
+        raise UserError(f"scattering = {b_after:g} of layer {layer}: the paths are of water without scattering")
+    per_event, by_angle = 0.0, None
+    if b > 0:
+        per_event = float(np.log(max(b_after, 1e-30) / b))
+        own = {name: after[name] for name in ("scattering", "backscattering")}
+        if b_after > 0 and own != {name: before[name] for name in own}:
+            by_angle = _logarithm(water.layers.table(layer, **own)) - _logarithm(water.layers.table(layer))
+    per_metre = before["attenuation"] - after["attenuation"]
+    return LayerChange(*_limits(column.layer_tops, layer), per_metre, per_event, by_angle)
+
+
+def changed_factors(focusing: RippleFocusing, water: Any, changed: Mapping[int, Mapping[str, float]]) -> FloatArray:
+    """Return the factors of ripples with other coefficients [1/m] of some layers."""
+    return focusing.factors_of(*_changed_water(water.layers, changed))
+
+
+def mean_cosine_derivative(water: Any, focusing: RippleFocusing | None = None) -> Perturbation:
+    """Return the derivative by the mean cosine of the function ``hg`` of all layers; raise UserError for others."""
+    layers = water.layers
+    if layers.kind != "hg" or layers.nested:
+        raise UserError("phase_g: the water has no phase function hg, the only one that depends on it")
+    count, value = layers.column.count, layers.phase_g
+    changes = []
+    for layer in range(count):
+        top, bottom = _limits(layers.column.layer_tops, layer)
+        changes.append(LayerChange(top, bottom, by_angle=_log_derivative(layers, layer, "phase_g", value)))
+    if focusing is None:
+        return Perturbation(tuple(changes))
+    step = _FOCUSING_STEP * abs(value)
+    low, high = (
+        focusing.factors_of(
+            *_changed_water(layers, {layer: {"phase_g": value + sign * step} for layer in range(count)})
+        )
+        for sign in (-1, 1)
+    )
+    return Perturbation(tuple(changes), focusing=(high - low) / (2 * step))
+
+
+def _limits(tops: FloatArray, layer: int) -> tuple[float, float]:
+    """Return the depths between which light is in a layer [m]: the first includes wave crests, the last is infinite."""
+    top = -np.inf if layer == 0 else float(tops[layer])
+    return top, float(tops[layer + 1]) if layer + 1 < len(tops) else np.inf
+
+
+def _log_derivative(layers: Any, layer: int, name: str, value: float) -> FloatArray | None:
+    """Return the derivative of ln p by a parameter at the nodes of `LayerChange`; None where it is 0."""
+    step = _STEP * abs(value)
+    if step == 0:
+        return None
+    low, high = (_logarithm(layers.table(layer, **{name: value + sign * step})) for sign in (-1, 1))
+    found = np.asarray((high - low) / (2 * step))
+    return found if np.abs(found).max() * abs(value) > _NEGLIGIBLE else None
+
+
+def _changed_water(layers: Any, changed: Mapping[int, Mapping[str, float]]) -> tuple[WaterColumn, list[PowerLawTable]]:
+    """Return layers and their phase functions with other values of some."""
+    column = layers.column
+    values = {name: np.array(getattr(column, name)) for name in COEFFICIENTS}
+    for layer, given in changed.items():
+        for name, value in given.items():
+            if name in values:
+                values[name][layer] = value
+    # The factors do not depend on the attenuation, which must not be less than the scattering.
+    values["attenuation"] = np.maximum(values["attenuation"], values["scattering"])
+    tables = [layers.table(layer, **_of_phase(changed.get(layer, {}))) for layer in range(column.count)]
+    return WaterColumn(column.layer_tops, **values), tables
+
+
+def _of_phase(given: Mapping[str, float]) -> dict[str, float]:
+    """Return the values on which phase functions depend."""
+    return {name: value for name, value in given.items() if name != "attenuation"}
+
+
+def _focusing_derivative(
+    focusing: RippleFocusing | None, layers: Any, layer: int, name: str, value: float
+) -> FloatArray | None:
+    """Return the derivative of the factors of ripples by a coefficient; None where there are none."""
+    if focusing is None or value == 0:
+        return None
+    step = _FOCUSING_STEP * value
+    low, high = (focusing.factors_of(*_changed_water(layers, {layer: {name: value + sign * step}})) for sign in (-1, 1))
+    return np.asarray((high - low) / (2 * step))
+
+
+def _logarithm(table: PowerLawTable) -> FloatArray:
+    """Return the logarithm of a phase function at the nodes of `LayerChange`."""
+    return np.asarray(np.log(table.eval_s(np.exp(DEFAULT_LOG_S0 * np.linspace(1, 0, DEFAULT_COUNT)))))

@@ -1,0 +1,198 @@
+"""Derivatives of the contributions of paths by properties of water and solids, and their weights in other water.
+
+A path of lengths L in the layers, with n scattering events by the angles theta and m reflections by a solid,
+contributes in proportion to exp(-c L) b^n times the product of p(theta) and reflectance^m. Its logarithm is a sum over
+the path, and so is any change of it: -L for a change of c (b fixed), n / b for one of b (c fixed), and so on. The sum
+gives the derivative, contribution times sum, or the contribution in other water, contribution times exp(sum), from
+paths that are drawn for the unchanged scene (perturbation Monte Carlo: Hayakawa et al. 2001,
+doi:10.1364/OL.26.001335). The weights between techniques that find the same path add up to 1 in any water, and are not
+differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
+from mitransient_lidar.transport.medium.tabulated_phase import half_angle
+from mitransient_lidar.transport.opaque import aligned, opaque
+
+#: Shortest change of depth [m] of segments that are divided among layers by their depths.
+_SMALLEST_EXTENT = 1e-6
+
+#: Sum of each perturbation along a path, empty without perturbations.
+Sums = list[Any]
+
+
+@dataclass(frozen=True)
+class LayerChange:
+    """What a perturbation adds for each metre and each scattering event between two depths.
+
+    Attributes
+    ----------
+    top, bottom
+        Depths [m], -inf and inf for no limit.
+    per_metre, per_event
+        Addition for each metre travelled [1/m], and for each scattering event by water.
+    by_angle
+        Addition by scattering angle for each of these events, at nodes that are uniform in ln s from `DEFAULT_LOG_S0`
+        to 0 with s = sin^2(theta/2), shape (DEFAULT_COUNT,); or None.
+    """
+
+    top: float
+    bottom: float
+    per_metre: float = 0.0
+    per_event: float = 0.0
+    by_angle: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """A change of water and solids: what it adds to the logarithm of a path's contribution.
+
+    Attributes
+    ----------
+    layers
+        Additions by water between depths.
+    solids
+        Solids with what a reflection by each adds.
+    finite
+        Whether the sum is the logarithm of a ratio of contributions, instead of a derivative.
+    focusing
+        Derivative of `RippleFocusing.factors`, or the changed factors; None where they do not change.
+    """
+
+    layers: tuple[LayerChange, ...] = ()
+    solids: tuple[tuple[mi.Shape, float], ...] = ()
+    finite: bool = False
+    focusing: FloatArray | None = None
+
+
+class _Layer:
+    """A `LayerChange` as numbers that kernels read from memory."""
+
+    def __init__(self, change: LayerChange) -> None:
+        self._limits = change.top, change.bottom
+        self._top, self._bottom = (opaque(max(min(depth, 1e9), -1e9)) for depth in self._limits)
+        self.travels = change.per_metre != 0
+        self.scatters = change.per_event != 0 or change.by_angle is not None
+        self._per_metre, self._per_event = opaque(change.per_metre), opaque(change.per_event)
+        self._by_angle = None if change.by_angle is None else aligned(mi.Float, change.by_angle.astype(np.float32))
+
+    def along(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
+        """Return the addition of segments: depth of the start [m], downward component, length [m]."""
+        if self._limits == (-np.inf, np.inf):
+            return self._per_metre * length
+        end = depth + downward * length
+        low, high = dr.minimum(depth, end), dr.maximum(depth, end)
+        overlap = dr.maximum(dr.minimum(high, self._bottom) - dr.maximum(low, self._top), 0)
+        level = dr.select(self._contains(depth), mi.Float(1), 0)
+        share = dr.select(high - low > _SMALLEST_EXTENT, overlap / (high - low), level)
+        return self._per_metre * length * share
+
+    def at_event(self, depth: mi.Float, cell: mi.UInt32, fraction: mi.Float) -> mi.Float:
+        """Return the addition of scattering events: depth [m], and place among the nodes."""
+        found = self._per_event
+        if self._by_angle is not None:
+            low, high = (dr.gather(mi.Float, self._by_angle, cell + step) for step in (0, 1))
+            found = found + dr.lerp(low, high, fraction)
+        if self._limits == (-np.inf, np.inf):
+            return found
+        return dr.select(self._contains(depth), found, 0)
+
+    def _contains(self, depth: mi.Float) -> mi.Bool:
+        return (depth >= self._top) & (depth < self._bottom)
+
+
+class Perturbations:
+    """Sums of perturbations along paths; without perturbations all of them are empty.
+
+    Parameters
+    ----------
+    perturbations
+        The perturbations.
+    """
+
+    def __init__(self, perturbations: Sequence[Perturbation] = ()) -> None:
+        self.perturbations = tuple(perturbations)
+        self._layers = [[_Layer(change) for change in one.layers] for one in self.perturbations]
+        self._solids = [[(solid, opaque(addition)) for solid, addition in one.solids] for one in self.perturbations]
+        self._by_angle = any(change.by_angle is not None for one in self.perturbations for change in one.layers)
+
+    @property
+    def count(self) -> int:
+        """Number of perturbations."""
+        return len(self.perturbations)
+
+    def start(self) -> Sums:
+        """Return the sums of paths that start."""
+        return [mi.Float(0) for _ in self.perturbations]
+
+    def along(self, sums: Sums, depth: mi.Float, downward: mi.Float, length: mi.Float, active: Any = True) -> Sums:
+        """Return sums beyond segments in water: depth of their start [m], downward component, length [m]."""
+        found = []
+        for before, layers in zip(sums, self._layers, strict=True):
+            for layer in layers:
+                if layer.travels:
+                    before = before + dr.select(mi.Bool(active), layer.along(depth, downward, length), 0)
+            found.append(before)
+        return found
+
+    def at_event(
+        self,
+        sums: Sums,
+        depth: mi.Float,
+        before: mi.Vector3f,
+        after: mi.Vector3f,
+        share: Any = None,
+        active: Any = True,
+    ) -> Sums:
+        """Return sums beyond scattering events by water, from one direction to another.
+
+        `share` is that of the water among the scatterers that may have scattered, 1 by default.
+        """
+        if not sums:
+            return sums
+        cell, fraction = mi.UInt32(0), mi.Float(0)
+        if self._by_angle:
+            s = dr.maximum(half_angle(before, after), np.exp(DEFAULT_LOG_S0))
+            place = (dr.log(s) - DEFAULT_LOG_S0) * ((DEFAULT_COUNT - 1) / -DEFAULT_LOG_S0)
+            cell = dr.minimum(mi.UInt32(dr.maximum(place, 0)), DEFAULT_COUNT - 2)
+            fraction = place - mi.Float(cell)
+        found = []
+        for total, layers in zip(sums, self._layers, strict=True):
+            for layer in layers:
+                if layer.scatters:
+                    addition = layer.at_event(depth, cell, fraction)
+                    addition = addition if share is None else addition * share
+                    total = total + dr.select(mi.Bool(active), addition, 0)
+            found.append(total)
+        return found
+
+    def at_solid(self, sums: Sums, shape: mi.ShapePtr, active: Any = True) -> Sums:
+        """Return sums beyond reflections by solids."""
+        found = []
+        for total, solids in zip(sums, self._solids, strict=True):
+            for solid, addition in solids:
+                total = total + dr.select(mi.Bool(active) & (shape == mi.ShapePtr(solid)), addition, 0)
+            found.append(total)
+        return found
+
+    def channels(self, energy: mi.Float, sums: Sums) -> list[mi.Float]:
+        """Return the derivatives of energies of complete paths, or the energies in the perturbed scene."""
+        return [
+            energy * (dr.exp(total) if one.finite else total)
+            for one, total in zip(self.perturbations, sums, strict=True)
+        ]
+
+
+def joined(first: Sums, second: Sums) -> Sums:
+    """Return the sums of paths of two parts."""
+    return [one + other for one, other in zip(first, second, strict=True)]
