@@ -59,6 +59,9 @@ class ShotRecord:
         Number of passes.
     parts
         The same four arrays of light by origin; none unless the renderer separates it.
+    derivatives
+        The same four arrays of derivatives, of shape (shots, parameters, pixels, bins); none unless the renderer has
+        perturbations.
     missed
         Whether the passes ended before the error that was requested.
     """
@@ -70,6 +73,7 @@ class ShotRecord:
     lost: float
     passes: int
     parts: tuple[FloatArray, ...] = ()
+    derivatives: tuple[FloatArray, ...] = ()
     missed: bool = False
 
 
@@ -123,8 +127,8 @@ class ShotBatches:
         self._seas = [SeaPatches(shape) for shape in waves]
         self._going, self._fixed = scene_of_shapes(going), scene_of_shapes(fixed)
         paths = max(self._renderer.path_count // 2, 1)
-        self._origins = renderer.classes.count
-        bins = lidar.receiver.pixels.count * lidar.axis.bin_count * self._origins
+        self._origins, self._perturbations = renderer.classes.count, lidar.perturbations.count
+        bins = lidar.receiver.pixels.count * lidar.axis.bin_count * self._origins * (1 + self._perturbations)
         #: Shots in a batch.
         self.size = 1 if has_plume else int(np.clip(_PATHS // (paths * in_turn), 1, _MOST_SHOTS))
         #: Passes of a batch in one launch.
@@ -178,7 +182,7 @@ class ShotBatches:
         """Render the shots of a batch, each with its own seed."""
         shots, done, copies, lost, needed = len(poses), 0, 0, 0.0, self._together
         ends = [time.perf_counter()]
-        energy, power, parts = PassStatistics(), PassStatistics(), (PassStatistics(), PassStatistics())
+        energy, power, parts, perturbed = PassStatistics(), PassStatistics(), _pair(), _pair()
         try:
             several = self.at(poses)
             while done < self.passes and needed > 0:
@@ -188,13 +192,21 @@ class ShotBatches:
                 record = renderer.render_pass(numbers)
                 lost += float(record.edge_loss[0])
                 axis = renderer.scene.axis
-                found = record.histogram.energy().reshape(shots, here, -1, self._origins, axis.bin_count)
+                shape = shots, here, -1, self._origins, axis.bin_count
+                found = record.histogram.energy().reshape(shape)
+                changes = None
+                if self._perturbations:
+                    changes = record.histogram.perturbed().reshape(self._perturbations, *shape)
                 for number in range(here):
                     both = found[:, number], waveform(found[:, number], axis.bin_width_ns, self._kernel)
                     for whole, part, values in zip((energy, power), parts, both, strict=True):
                         whole.add(values.sum(axis=2))
                         if self._origins > 1:
                             part.add(values)
+                    if changes is not None:
+                        derivatives = np.moveaxis(changes[:, :, number].sum(axis=3), 0, 1)
+                        perturbed[0].add(derivatives)
+                        perturbed[1].add(waveform(derivatives, axis.bin_width_ns, self._kernel))
                 done += here
                 ends.append(time.perf_counter())
                 if self._goal is not None and done >= _PASSES_FOR_ERROR:
@@ -211,9 +223,10 @@ class ShotBatches:
         if self._origins > 1:
             # The whole is the sum of its parts to the bit.
             means = [part.mean.sum(axis=2) for part in parts]
-            by_origin = tuple(values for part in parts for values in (part.mean, part.stderr))
-        missed = self._goal is not None and needed > 0
-        return ShotRecord(means[0], energy.stderr, means[1], power.stderr, lost / done, done, by_origin, missed)
+            by_origin = _arrays(parts)
+        missed, derivatives = self._goal is not None and needed > 0, _arrays(perturbed) if self._perturbations else ()
+        arrays = means[0], energy.stderr, means[1], power.stderr
+        return ShotRecord(*arrays, lost / done, done, by_origin, derivatives, missed)
 
     def parts(self, count: int) -> Iterator[slice]:
         """Return the shots of each batch of `count`."""
@@ -224,6 +237,16 @@ class ShotBatches:
     def used_values(self) -> dict[str, float]:
         """Values used for parameters of the integrator that may be automatic."""
         return self._renderer.used_values
+
+
+def _pair() -> tuple[PassStatistics, PassStatistics]:
+    """Return statistics of energy and power."""
+    return PassStatistics(), PassStatistics()
+
+
+def _arrays(pair: tuple[PassStatistics, PassStatistics]) -> tuple[FloatArray, ...]:
+    """Return means and standard errors of energy and power."""
+    return tuple(values for part in pair for values in (part.mean, part.stderr))
 
 
 def share_for_error(error: float) -> float:
@@ -241,10 +264,11 @@ def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) 
     return each.relative_errors(*(values.reshape(-1, values.shape[-1]) for values in (power, stderr)))
 
 
-def check_size(shots: int, pixels: int, bins: int, origins: int = 0) -> None:
-    """Refuse series that do not fit the memory, with light by `origins` beside the whole."""
-    if shots * pixels * bins * (1 + origins) > _MOST_BINS:
+def check_size(shots: int, pixels: int, bins: int, origins: int = 0, parameters: int = 0) -> None:
+    """Refuse series that do not fit the memory, with light by `origins` and derivatives beside the whole."""
+    if shots * pixels * bins * (1 + origins + parameters) > _MOST_BINS:
         components = f", and {origins} components of each," if origins else ""
+        components += f", and {parameters} derivatives of each," if parameters else ""
         raise UserError(
             f"{shots} shots of {pixels} pixels x {bins} bins{components} are more than {_MOST_BINS} bins: "
             "take fewer shots, or reduce the pixels or bin_count"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import xarray as xr
 
 from mitransient_lidar import results
@@ -47,7 +48,9 @@ class ShotScene:
         axis: TimeAxis | None,
         components: bool,
         check: bool = True,
+        derivatives: Sequence[str] | str = (),
     ) -> None:
+        from mitransient_lidar.rendering.derivatives import path_parameters
         from mitransient_lidar.rendering.describe import describe_scene
         from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
@@ -55,6 +58,7 @@ class ShotScene:
         from mitransient_lidar.transport.scene import LidarScene
 
         self._scene, self._params, self._target, self._components = scene, params, target, components
+        self._derivatives = derivatives
         self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
         self.session = self._open(self._at(*self._place))
         self._integrator = choose_integrator(self.session.scene, None)
@@ -67,7 +71,9 @@ class ShotScene:
         self.lidar: LidarScene = self._renderer.scene
         self.companions = self._find_companions()
         origins = self._renderer.classes.count if components else 0
-        check_size(len(places), self.lidar.receiver.pixels.count, self.lidar.axis.bin_count, origins)
+        self.parameters = path_parameters(self._renderer, derivatives)
+        bins = self.lidar.receiver.pixels.count, self.lidar.axis.bin_count
+        check_size(len(places), *bins, origins, len(self.parameters))
         probe = probe_echoes(self.lidar, self._renderer.sampler)
         self.window = error_window(self.lidar, probe)
         if check:
@@ -82,7 +88,12 @@ class ShotScene:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
         session.share_record(self._axis)
         renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
-        return renderer.by_origin() if self._components else renderer
+        from mitransient_lidar.rendering.derivatives import path_parameters
+
+        renderer = renderer.by_origin() if self._components else renderer
+        if not self._derivatives:
+            return renderer
+        return renderer.perturbed([one.perturbation for one in path_parameters(renderer, self._derivatives)])
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
         """Return the parameters of a shot at a place [m]."""
@@ -121,9 +132,13 @@ class ShotScene:
         }
 
     def dataset(
-        self, arrays: Sequence[FloatArray], parts: Sequence[FloatArray], attributes: Mapping[str, Any]
+        self,
+        arrays: Sequence[FloatArray],
+        parts: Sequence[FloatArray],
+        attributes: Mapping[str, Any],
+        derivatives: Sequence[FloatArray] = (),
     ) -> xr.Dataset:
-        """Return the labelled result of arrays of shape (shots, pixels, bins), and (shots, pixels, origins, bins)."""
+        """Return the labelled result of arrays as those of a `ShotRecord`."""
         from mitransient_lidar.rendering.describe import with_lines_of_sight
 
         pixels = self.lidar.receiver.pixels
@@ -137,6 +152,10 @@ class ShotScene:
         )
         if parts:
             dataset = results.add_components(dataset, self._renderer.classes.names, *parts).transpose("shot", ...)
+        if derivatives:
+            about = ([getattr(one, name) for one in self.parameters] for name in ("name", "value", "units", "method"))
+            first = (np.moveaxis(values, 1, 0) for values in derivatives)
+            dataset = results.add_derivatives(dataset, *about, *first).transpose("shot", ...)
         return with_lines_of_sight(dataset, self.lidar)
 
 

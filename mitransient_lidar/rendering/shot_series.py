@@ -77,6 +77,7 @@ def render_shots(
     axis: TimeAxis | None = None,
     shot_passes: npt.ArrayLike | None = None,
     components: bool | None = None,
+    derivatives: Sequence[str] | str | None = None,
     instrument: str | None = None,
     describe_sea: bool = True,
     progress: ProgressCallback | None = None,
@@ -118,6 +119,8 @@ def render_shots(
         Most passes of each shot, shape (shots,), 2 to `passes`, as the coordinate of a series that is rendered again.
     components
         Whether to separate the light by its origin, by default not, as for `rendering.render.render`.
+    derivatives
+        Names of parameters by which the light is differentiated, as for `rendering.render.render`.
     instrument
         Name of the instrument whose laser and receiver replace those of the scene.
     describe_sea
@@ -150,7 +153,9 @@ def render_shots(
     from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
     from mitransient_lidar.rendering.shot_poses import ShotPoses
 
-    options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
+    options = RenderOptions(
+        target_error=target_error, max_time=max_time, pass_share=pass_share, derivatives=derivatives
+    )
     wanted = options.target_error
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
@@ -164,7 +169,10 @@ def render_shots(
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    series = ShotScene(scene, params, instrument, target, places, axis, bool(components))
+    wanted_derivatives = options.derivatives or ()
+    series = ShotScene(
+        scene, params, instrument, target, places, axis, bool(components), derivatives=wanted_derivatives
+    )
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*AIM, *(TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
@@ -199,7 +207,10 @@ def render_shots(
         interrupted = True
     _warn_of_the_end(records, done, len(places), options, interrupted)
     joined = [np.concatenate([getattr(record, name) for record in records]) for name in _ARRAYS]
-    by_origin = [np.concatenate(arrays) for arrays in zip(*(record.parts for record in records), strict=True)]
+    by_origin, changes = (
+        [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+        for parts in ([record.parts for record in records], [record.derivatives for record in records])
+    )
     found = np.concatenate(errors)
     median, p95 = np.quantile(found, [0.5, 0.95], method="higher")
     lost, received = (sum(values) for values in zip(*((one.lost, one.energy.sum()) for one in records), strict=True))
@@ -219,6 +230,7 @@ def render_shots(
         interrupted=int(interrupted),
         moved_target=int(move_target),
         components=int(bool(components)),
+        **({"derivatives": [one.name for one in series.parameters]} if series.parameters else {}),
         series_parameters=json.dumps(own),
         **({} if wanted is None else {"target_error": wanted}),
         **({"places_seed": seed} if given is None else {}),
@@ -228,7 +240,7 @@ def render_shots(
     known = {name: (dim, values[:done], about) for name, (dim, values, about) in truth.items()}
     rendered = np.repeat([record.passes for record in records], [len(record.power) for record in records])
     known["shot_passes"] = ("shot", rendered, {"units": "1", "long_name": "number of passes of the shot"})
-    return series.dataset(joined, by_origin, attributes).assign_coords(known)
+    return series.dataset(joined, by_origin, attributes, changes).assign_coords(known)
 
 
 def _progress(done: int, planned: int, elapsed: float, errors: FloatArray, options: RenderOptions) -> Progress:
