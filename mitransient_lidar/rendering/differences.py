@@ -21,8 +21,9 @@ from mitransient_lidar.rendering.session import Session, open_scene
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer
 
-#: Shift of an echo by a step of a depth, over the pulse's full width at half maximum.
-_SHIFT_PER_WIDTH = 0.05
+#: Shift of an echo by a step of a depth, over the pulse's full width at half maximum; of the edges of layers, which
+#: change the record little, the step is longer by a factor.
+_SHIFT_PER_WIDTH, _LAYER_FACTOR = 0.05, 2.0
 
 #: Step of other lengths [m].
 _LENGTH_STEP = 0.05
@@ -59,6 +60,13 @@ class Differences:
     Each pass renders the scene with a parameter above and below its value, from the same random numbers, with time
     bins, cells and sea of the unchanged scene: most of the noise cancels in the difference. The session and its scene
     remain as they are.
+
+    Standard errors are smaller than those from independent random numbers, in `table1` (rms over lit bins, default
+    steps) by factors of 82 (``pulse_fwhm_ns``), 160 (``bottom_reflectance``), 7 (``bottom_depth``) and 3
+    (``off_nadir_deg``), and in `fig13_2x2` and `fig15_2x2` by 18 (``target_depth``) and 20 (``layer_tops[1]``): light
+    from above the change is the same. Beams and views (``divergence_mrad``, ``field_of_view_mrad``) move paths from
+    cell to cell, where they meet other light: there the factor of ``lidar_merging`` is 1.1 to 1.2, and that of
+    ``lidar_volpath`` 3 to 5.
 
     Parameters
     ----------
@@ -208,7 +216,7 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
     if known == "altitude":
         return float(shift)
     if "depth" in known or known == "layer_tops":
-        return float(shift / scene.group_index)
+        return float(shift / scene.group_index) * (_LAYER_FACTOR if known == "layer_tops" else 1.0)
     fixed = {"m": _LENGTH_STEP, "degree": _ANGLE_STEP_DEG}.get(unit or "")
     relative = _VIEW_STEP if unit == "mrad" else _RELATIVE_STEP
     return fixed or relative * abs(value) or _STEP_FROM_ZERO

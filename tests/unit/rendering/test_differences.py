@@ -49,7 +49,12 @@ def test_a_pass_is_the_difference_of_two_renders(level):
 
 @pytest.mark.parametrize(
     ("name", "shift_ns"),
-    [("bottom_depth", 2 * 1.34 / 0.299792458), ("altitude", 2 / 0.299792458)],
+    [
+        ("bottom_depth", 2 * 1.34 / 0.299792458),
+        ("altitude", 2 / 0.299792458),
+        # Edges of layers by a tenth.
+        ("layer_tops[1]", 1.34 / 0.299792458),
+    ],
 )
 def test_steps_of_depths_shift_echoes_by_a_twentieth_of_the_pulse(level, name, shift_ns):
     session, integrator = level
