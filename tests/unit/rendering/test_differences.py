@@ -112,3 +112,29 @@ def test_loaded_scenes_are_refused(lidar_scene):
     session = open_scene(lidar_scene())
     with pytest.raises(UserError, match="derivatives by bottom_depth need an XML scene"):
         Differences(session, choose_integrator(session.scene, FEW), ["bottom_depth"])
+
+
+def test_the_sea_of_a_changed_scene_has_the_same_cells_and_waves():
+    session = open_scene("table1", {"surface_size": 1000})
+
+    def vertices(scene):
+        mesh = next(shape for shape in scene.shapes() if shape.is_medium_transition())
+        return np.array(mesh.vertex_positions_buffer())
+
+    own, same = (
+        open_scene(session.record, {"divergence_mrad": 20}, model=model).scene for model in (None, session.scene)
+    )
+    assert np.array_equal(vertices(same), vertices(session.scene))
+    assert not np.array_equal(vertices(own), vertices(session.scene))
+
+
+def test_the_cells_of_a_changed_scene_are_the_same_and_know_its_solids():
+    """The sphere has parts above each other, which patches tell apart by the shape itself."""
+    session = open_scene("fig02_mine", {"spectrum": "flat", "surface_size": 1000})
+    integrator = choose_integrator(session.scene, FEW)
+    base = integrator.prepare(session.scene, session.sensor)
+    moved = open_scene(session.record, {"target_depth": 8.9}, model=session.scene)
+    layout = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout
+    assert layout.grid is base.layout.grid
+    assert [shape.id() for shape in layout.uneven] == [shape.id() for shape in base.layout.uneven] == ["target"]
+    assert layout.uneven[0] in moved.scene.shapes()
