@@ -116,9 +116,9 @@ class LidarMerging(LidarIntegrator):
         """Return the renderer of passes of a scene, by default with one class of light and the sensor's own receiver.
 
         `layout_of` is the renderer of another scene whose time bins, points and cells are used, so that the same seeds
-        make the same paths in scenes that differ by a target. Without `connections` paths that do not meet the target
-        return the same light with and without it, but for light in cells that are full; the errors of narrow beams are
-        larger.
+        make the same paths in scenes that differ by a target, or a little in a parameter. Without `connections` paths
+        that do not meet the target return the same light with and without it, but for light in cells that are full; the
+        errors of narrow beams are larger.
 
         Raises
         ------

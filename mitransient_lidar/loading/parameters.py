@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import shown
+from mitransient_lidar.core.validation import finite, is_number, shown
 from mitransient_lidar.loading.document import SceneDocument
 
 _COEFFICIENTS = ("attenuation", "scattering", "backscattering")
@@ -36,9 +37,7 @@ def fill(document: SceneDocument, params: Mapping[str, Any] | None) -> SceneDocu
     known, given = document.parameters, {}
     for name, value in (params or {}).items():
         if name not in known:
-            close = difflib.get_close_matches(str(name), known, n=3)
-            hint = f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(known))}"
-            raise UserError(f"parameter {name!r} is not one of scene {scene}: {hint}")
+            raise UserError(f"parameter {name!r} is not one of scene {scene}: {_closest(name, known)}")
         given[name] = _text(name, value)
         if not given[name].strip() and known[name].strip():
             raise UserError(f"{name} = {given[name]!r} is empty: it must have a value, as {known[name]}")
@@ -58,6 +57,69 @@ def without_alternatives(parameters: Mapping[str, str], given: Mapping[str, str]
                 others = {name for one in alternatives for name in one} - names - set(chosen)
                 kept |= {name: "" for name in others if name in kept}
     return kept
+
+
+def value_of(parameters: Mapping[str, str], name: str) -> float:
+    """Return the value of a number among the parameters of a scene, in the unit of `core.ranges.unit_of`.
+
+    Parameters
+    ----------
+    parameters
+        Parameters of a scene with their values as text.
+    name
+        Name of a parameter; of a list, such as "0.9, 0.5", with the index of an element from 0 on (``attenuation[1]``).
+        A list of one value holds for every layer of ``layer_tops``, and has their indices, too.
+
+    Raises
+    ------
+    UserError
+        If there is no such parameter or element, it is a list and `name` has no index, or it is no finite number.
+    """
+    words, index = _words(parameters, name)
+    return finite(name, words[index])
+
+
+def with_value(parameters: Mapping[str, str], name: str, value: float) -> dict[str, str]:
+    """Return a copy of the parameters of a scene in which the number `name` of `value_of` has another value.
+
+    A list of one value that holds for several layers gets one value for each of them.
+    """
+    words, index = _words(parameters, name)
+    words[index] = repr(finite(name, value))
+    return {**parameters, parameter_of(name): ", ".join(words)}
+
+
+def parameter_of(name: str) -> str:
+    """Return the name of the parameter that holds a number: without the index of an element."""
+    return name.partition("[")[0]
+
+
+def _words(parameters: Mapping[str, str], name: str) -> tuple[list[str], int]:
+    """Return the numbers of a parameter as text, and the index of the one with a name."""
+    known = parameter_of(name)
+    index = re.fullmatch(r"\[(\d{1,9})\]", name[len(known) :])
+    if known not in parameters or (index is None and known != name):
+        raise UserError(f"parameter {name!r} is not one of the scene: {_closest(known, parameters)}")
+    text = parameters[known]
+    words = text.replace(",", " ").split()
+    if not words or not all(is_number(word) for word in words):
+        raise UserError(f"parameter {name} = {shown(text)} is not a number")
+    layers = len(parameters.get("layer_tops", "").replace(",", " ").split())
+    if known in (*_COEFFICIENTS, "water_scattering") and len(words) == 1 and index is not None:
+        words *= max(layers, 1)
+    if index is None and len(words) > 1:
+        last = f"{name}[{len(words) - 1}]"
+        raise UserError(f"parameter {name} = {shown(text)} is a list: name one of its elements {name}[0] to {last}")
+    number = 0 if index is None else int(index[1])
+    if number >= len(words):
+        raise UserError(f"parameter {name}: the index must be 0 to {len(words) - 1}, as {known} = {shown(text)}")
+    return words, number
+
+
+def _closest(name: object, known: Mapping[str, str]) -> str:
+    """Return what to say of an unknown name: the names that are close to it, or all."""
+    close = difflib.get_close_matches(str(name), known, n=3)
+    return f"did you mean {' or '.join(close)}" if close else f"it has {', '.join(sorted(known)) or 'none'}"
 
 
 def check_params(params: object) -> None:

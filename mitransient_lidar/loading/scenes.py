@@ -49,7 +49,12 @@ def load_scene(
     return loaded.scene, loaded.name, loaded.parameters
 
 
-def load(scene: Any, params: Mapping[str, Any] | None = None, instrument: str | None = None) -> LoadedScene:
+def load(
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    instrument: str | None = None,
+    model: mi.Scene | None = None,
+) -> LoadedScene:
     """Load a scene.
 
     Parameters
@@ -61,6 +66,8 @@ def load(scene: Any, params: Mapping[str, Any] | None = None, instrument: str | 
         Values for the ``<default>`` parameters of an XML scene, and of the instrument.
     instrument
         Name of the instrument whose laser and receiver replace those of an XML scene; see `instruments.mount`.
+    model
+        Loaded scene whose lasers and receivers choose the automatic values of the sea, by default the scene itself.
 
     Raises
     ------
@@ -83,7 +90,7 @@ def load(scene: Any, params: Mapping[str, Any] | None = None, instrument: str | 
         loaded = _load_xml(scene, params, instrument)
     else:
         raise UserError(f"scene = {shown(scene)} must be a shipped name, a path, a dict or a loaded scene")
-    fit_seas(loaded.scene)
+    fit_seas(loaded.scene, model)
     return loaded
 
 

@@ -69,7 +69,11 @@ class Session:
 
 
 def open_scene(
-    scene: Any, params: Mapping[str, Any] | None = None, variant: str | None = None, instrument: str | None = None
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    variant: str | None = None,
+    instrument: str | None = None,
+    model: mi.Scene | None = None,
 ) -> Session:
     """Load a scene as `loading.scenes.load`, with a Mitsuba variant as for `loading.variants.set_variant`.
 
@@ -83,7 +87,7 @@ def open_scene(
     if isinstance(scene, Session) and not params:
         return scene
     variants.set_variant(variant)
-    loaded = load(scene, params, instrument)
+    loaded = load(scene, params, instrument, model)
     sensors = loaded.scene.sensors()
     if not sensors:
         raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")

@@ -383,19 +383,20 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
     return receiver
 
 
-def fit_seas(scene: mi.Scene) -> None:
+def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
     """Set the automatic values of each ``ocean_surface`` from the lasers and receivers of the scene, once.
 
-    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used.
+    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
+    the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
     """
     instruments = []
-    for emitter in scene.emitters():
+    for emitter in (model or scene).emitters():
         if hasattr(emitter, "pulse_energy") and (place := _seen_sea(emitter.pose)):
             spreads = emitter.angular_spread, emitter.widest_angular_spread
             instruments.append(Instrument.laser(*place, spreads))
         elif hasattr(emitter, "pulse_energy"):
             instruments.append(_without_sea(emitter.pose))
-    for sensor in scene.sensors():
+    for sensor in (model or scene).sensors():
         receiver = getattr(sensor, "receiver", None)
         if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
             pixels = receiver.pixels

@@ -163,6 +163,10 @@ class MergingLayout:
         patch_width = self.patch_width * max(wider, 1.0)
         return replace(self, grid=grid, rings=rings, uneven=uneven, side_bits=side_bits, patch_width=patch_width)
 
+    def of_scene_alike(self, scene: LidarScene) -> MergingLayout:
+        """Return the same points and cells for a scene that differs a little, whose solids may be other objects."""
+        return replace(self, uneven=solids_of_several_levels(scene, self.region))
+
     @classmethod
     def of_scene(cls, scene: LidarScene, sampler: SensorSampler, options: MergingOptions) -> MergingLayout:
         """Choose points and cells for a scene."""
@@ -247,7 +251,7 @@ class MergingRenderer(PassRenderer):
         super().__init__(scene, classes, paths_of_pass(options, pixels))
         photons = _PHOTONS_FOR_IMAGES if pixels >= IMAGE_PIXELS else _PHOTONS
         self.photons = options.photons_per_pass or photons
-        self.layout = layout or MergingLayout.of_scene(scene, self.sampler, options)
+        self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_scene(scene, self.sampler, options)
         self._connections = connections
         self._beam = BeamSampler(scene.transmitter, scene.receiver)
 

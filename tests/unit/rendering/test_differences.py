@@ -1,0 +1,140 @@
+"""Central differences: steps, refused parameters, and the scene that stays as it is."""
+
+import numpy as np
+import pytest
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.rendering.differences import Differences, default_step, differences
+from mitransient_lidar.rendering.session import choose_integrator, open_scene
+
+FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
+
+
+@pytest.fixture(scope="module")
+def level():
+    """Session of a level sea, and an integrator of few paths."""
+    session = open_scene("fig15_2x2", {"spectrum": "flat", "surface_size": 1000})
+    return session, choose_integrator(session.scene, FEW)
+
+
+@pytest.mark.slow
+def test_the_scene_and_its_parameters_stay(level):
+    session, integrator = level
+    parameters, axis = dict(session.parameters), session.sensor.film().axis
+    renderer = integrator.prepare(session.scene, session.sensor)
+    before = renderer.render_pass(5).histogram.energy()
+    found = differences(session, integrator, ["bottom_depth", "layer_tops[1]"], passes=2)
+    assert found.waveform.shape == found.impulse_response_stderr.shape == (2, *before.shape)
+    assert found.values.tolist() == [8.0, 3.0]
+    assert (session.parameters, session.sensor.film().axis or axis) == (parameters, renderer.scene.axis)
+    assert np.array_equal(renderer.render_pass(5).histogram.energy(), before)
+
+
+@pytest.mark.slow
+def test_a_pass_is_the_difference_of_two_renders(level):
+    """The energy of a pulse multiplies all light, so that its derivative is the record over the energy."""
+    session, integrator = level
+    found = Differences(session, integrator, ["pulse_energy_mj", "pulse_fwhm_ns"], steps={"pulse_energy_mj": 1.0})
+    found.add_pass(3)
+    energy = integrator.prepare(session.scene, session.sensor).render_pass(3).histogram.energy()
+    quantum = np.abs(energy).max() * 1e-6
+    assert found.impulse_response[0] == pytest.approx(energy / 5.0, rel=1e-4, abs=quantum)
+    # The width of the pulse moves power in time, and no energy between ideal echoes.
+    assert not found.impulse_response[1].any()
+    assert found.waveform[1].sum() == pytest.approx(0, abs=1e-3 * np.abs(found.waveform[1]).sum())
+    assert np.isnan(found.waveform_stderr).all()
+    found.add_pass(4, share=0.5)
+    assert np.isfinite(found.waveform_stderr).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shift_ns"),
+    [
+        ("bottom_depth", 2 * 1.34 / 0.299792458),
+        ("altitude", 2 / 0.299792458),
+        # Edges of layers by a tenth.
+        ("layer_tops[1]", 1.34 / 0.299792458),
+    ],
+)
+def test_steps_of_depths_shift_echoes_by_a_twentieth_of_the_pulse(level, name, shift_ns):
+    session, integrator = level
+    renderer = integrator.prepare(session.scene, session.sensor)
+    assert default_step(name, 8.0, renderer) * shift_ns == pytest.approx(0.05 * 5.0)
+
+
+def test_steps_off_nadir_shift_the_surface_as_much(level):
+    session, integrator = level
+    renderer = integrator.prepare(session.scene, session.sensor)
+    step = np.deg2rad(default_step("off_nadir_deg", 20.0, renderer))
+    ways = 200 / np.cos(np.deg2rad(20) + np.array([0, step]))
+    assert np.diff(ways)[0] * 2 / 0.299792458 == pytest.approx(0.05 * 5.0, rel=2e-3)
+    # At nadir the range does not depend on the angle.
+    assert default_step("off_nadir_deg", 0.0, renderer) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "step"),
+    [
+        ("divergence_mrad", 10, 1.0),
+        ("target_x", 0, 0.05),
+        ("attenuation[1]", 0.5, 0.005),
+        ("wind_direction_deg", 0, 0.5),
+    ],
+)
+def test_steps_of_others(level, name, value, step):
+    session, integrator = level
+    assert default_step(name, value, integrator.prepare(session.scene, session.sensor)) == pytest.approx(step)
+
+
+@pytest.mark.parametrize(
+    ("names", "steps", "message"),
+    [
+        (["botom_depth"], {}, "'botom_depth' is not one of the scene: did you mean bottom_depth"),
+        (["layout"], {}, "layout = '2x2' is not a number"),
+        (["bin_width_ns"], {}, "bin_width_ns = 1 belongs to the record"),
+        (["surface_seed"], {}, "surface_seed = 1 belongs to the record"),
+        (["bottom_depth"], {"bottom_depth": 0.0}, "step of bottom_depth = 0 must be greater than 0"),
+        (["bottom_depth"], {"target_depth": 0.1}, "steps: 'target_depth' is not among the parameters bottom_depth"),
+        (
+            ["bottom_depth"],
+            {"bottom_depth": 7.0},
+            "bottom_depth = 8 needs values 7 below and above, and layer_tops = 3",
+        ),
+        (["bottom_reflectance"], {"bottom_reflectance": 0.2}, "bottom_reflectance = 0.1 needs values 0.2 below and"),
+    ],
+)
+def test_refused_parameters_and_steps(level, names, steps, message):
+    with pytest.raises(UserError, match=message):
+        Differences(*level, names, steps=steps)
+
+
+def test_loaded_scenes_are_refused(lidar_scene):
+    session = open_scene(lidar_scene())
+    with pytest.raises(UserError, match="derivatives by bottom_depth need an XML scene"):
+        Differences(session, choose_integrator(session.scene, FEW), ["bottom_depth"])
+
+
+def test_the_sea_of_a_changed_scene_has_the_same_cells_and_waves():
+    session = open_scene("table1", {"surface_size": 1000})
+
+    def vertices(scene):
+        mesh = next(shape for shape in scene.shapes() if shape.is_medium_transition())
+        return np.array(mesh.vertex_positions_buffer())
+
+    own, same = (
+        open_scene(session.record, {"divergence_mrad": 20}, model=model).scene for model in (None, session.scene)
+    )
+    assert np.array_equal(vertices(same), vertices(session.scene))
+    assert not np.array_equal(vertices(own), vertices(session.scene))
+
+
+def test_the_cells_of_a_changed_scene_are_the_same_and_know_its_solids():
+    """The sphere has parts above each other, which patches tell apart by the shape itself."""
+    session = open_scene("fig02_mine", {"spectrum": "flat", "surface_size": 1000})
+    integrator = choose_integrator(session.scene, FEW)
+    base = integrator.prepare(session.scene, session.sensor)
+    moved = open_scene(session.record, {"target_depth": 8.9}, model=session.scene)
+    layout = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout
+    assert layout.grid is base.layout.grid
+    assert [shape.id() for shape in layout.uneven] == [shape.id() for shape in base.layout.uneven] == ["target"]
+    assert layout.uneven[0] in moved.scene.shapes()
