@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from mitransient_lidar.rendering.derivatives import Parameter
+    from mitransient_lidar.rendering.differences import Differences
     from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
     from mitransient_lidar.transport.scene import LidarScene
 
@@ -121,13 +122,15 @@ class WaveformAccumulator(PassAccumulator):
         origins: Sequence[str] = (),
         parameters: Sequence[Parameter] = (),
         reweighted: Sequence[Case] = (),
+        differences: Differences | None = None,
     ) -> None:
         super().__init__(scene, window, train)
         response = scene.receiver.optics.response_time_ns
         self._kernel = scene.transmitter.pulse.kernel(scene.axis.bin_width_ns, response)
         self._energy, self._power, self._inflation = PassStatistics(), PassStatistics(), ErrorInflation()
         self._origins, self._parameters, self._cases = list(origins), list(parameters), list(reweighted)
-        self._perturbed = PassStatistics(), PassStatistics()
+        self._perturbed, self._differences = (PassStatistics(), PassStatistics()), differences
+        self._scores = sum(one.perturbation is not None for one in self._parameters)
         self._parts = PassStatistics(), PassStatistics()
         self._weights = None if train is None else _weights(scene, train)
 
@@ -149,7 +152,7 @@ class WaveformAccumulator(PassAccumulator):
             self._parts[0].add(parts)
             self._parts[1].add(waveform(parts, self.scene.axis.bin_width_ns, self._kernel))
             energy = parts.sum(axis=1)
-        if self._parameters or self._cases:
+        if self._scores or self._cases:
             perturbed, classes = histogram.perturbed(), max(len(self._origins), 1)
             shape = len(perturbed), self.scene.receiver.pixels.count, classes, -1
             perturbed = perturbed.reshape(shape).sum(axis=2)
@@ -193,9 +196,9 @@ class WaveformAccumulator(PassAccumulator):
             built = results.add_components(built, self._origins, *arrays)
         if self._parameters:
             about = ([getattr(one, name) for one in self._parameters] for name in ("name", "value", "units", "method"))
-            built = results.add_derivatives(built, *about, *self._perturbations(slice(0, len(self._parameters))))
+            built = results.add_derivatives(built, *about, *self._derivatives())
         if self._cases:
-            first = len(self._parameters)
+            first = self._scores
             mean = self._perturbed[0].mean[first:]
             pairs = zip(mean[::2], mean[1::2], strict=True)
             shares = [effective_share(self._energy.mean, *pair) for pair in pairs]
@@ -211,6 +214,20 @@ class WaveformAccumulator(PassAccumulator):
     def _perturbations(self, chosen: slice) -> list[FloatArray]:
         """Return energy, power and their standard errors of some perturbations."""
         return [values[chosen] for part in self._perturbed for values in (part.mean, part.stderr)]
+
+    def _derivatives(self) -> list[FloatArray]:
+        """Return derivatives of energy and power and their standard errors, in the order of the parameters."""
+        of_paths = self._perturbations(slice(0, self._scores)) if self._scores else []
+        if self._differences is None:
+            return of_paths
+        one = self._differences
+        others = one.impulse_response, one.impulse_response_stderr, one.waveform, one.waveform_stderr
+        last = [parameter.perturbation is None for parameter in self._parameters]
+        order = np.argsort(np.argsort(last, kind="stable"))
+        return [
+            np.concatenate([*([of_paths[number]] if of_paths else []), values])[order]
+            for number, values in enumerate(others)
+        ]
 
 
 class GateAccumulator(PassAccumulator):
@@ -260,11 +277,12 @@ def choose_accumulator(
     origins: Sequence[str] = (),
     parameters: Sequence[Parameter] = (),
     reweighted: Sequence[Case] = (),
+    differences: Differences | None = None,
 ) -> PassAccumulator:
     """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
     Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
-    `origins`, differentiated by `parameters`, and `reweighted`, if there are any.
+    `origins`, differentiated by `parameters`, some by `differences`, and `reweighted`, if there are any.
 
     Raises
     ------
@@ -281,7 +299,7 @@ def choose_accumulator(
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + gates
     if everything <= limit:
-        return WaveformAccumulator(scene, window, train, origins, parameters, reweighted)
+        return WaveformAccumulator(scene, window, train, origins, parameters, reweighted, differences)
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
     if origins:
         size = size.replace(" takes", f" x {len(origins)} components takes")

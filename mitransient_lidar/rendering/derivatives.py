@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.loading.parameters import parameter_of, value_of
 from mitransient_lidar.transport.medium.water_changes import (
     COEFFICIENTS,
     coefficient_derivative,
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
 #: Largest number of parameters of a render.
 MOST_PARAMETERS = 64
 
+#: Estimate of derivatives by parameters of which paths have no sums.
+DIFFERENCES = "central differences"
+
 _NAME = re.compile(r"(?P<stem>\w+?)(\[(?P<layer>\d+)\])?\Z")
 _REFLECTANCE = "_reflectance"
 
@@ -41,22 +46,30 @@ class Parameter:
     name, value, units
         Name, with the number of the layer in brackets where there are several; value and its unit.
     perturbation
-        What paths sum for the derivative.
+        What paths sum for the derivative; None where it is from central differences.
     """
 
     name: str
     value: float
     units: str
-    perturbation: Perturbation
+    perturbation: Perturbation | None
 
-    #: How the derivative is estimated.
-    method = "score"
+    @property
+    def method(self) -> str:
+        """How the derivative is estimated."""
+        return DIFFERENCES if self.perturbation is None else "score"
 
 
-def path_parameters(renderer: PassRenderer, names: Sequence[str] | str, option: str = "derivatives") -> list[Parameter]:
+def path_parameters(
+    renderer: PassRenderer,
+    names: Sequence[str] | str,
+    option: str = "derivatives",
+    others: Mapping[str, str] | None = None,
+) -> list[Parameter]:
     """Return the parameters of names: a coefficient of layered water stands for that of each layer.
 
-    Messages name the `option` by which the names were given.
+    Messages name the `option` by which the names were given. `others` are the parameters of the scene, with their
+    values as text, of which those whose derivatives paths do not sum are left to central differences; none by default.
 
     Raises
     ------
@@ -67,14 +80,24 @@ def path_parameters(renderer: PassRenderer, names: Sequence[str] | str, option: 
         raise UserError(f"{option} = {shown(names)} must be names of parameters")
     listed = [names] if isinstance(names, str) else list(names)
     found: list[Parameter] = []
+    known = known_names(renderer.scene)
     for name in listed:
-        found += _parameters(renderer, name, option)
+        of_paths = isinstance(name, str) and (name in known or name in COEFFICIENTS)
+        if others and not of_paths and isinstance(name, str) and parameter_of(name) in others:
+            found.append(Parameter(name, value_of(others, name), unit_of(parameter_of(name)) or "1", None))
+        else:
+            found += _parameters(renderer, name, option)
     repeated = [one.name for index, one in enumerate(found) if one.name in [other.name for other in found[:index]]]
     if repeated:
         raise UserError(f"{option}: {repeated[0]} is given twice")
     if len(found) > MOST_PARAMETERS:
         raise UserError(f"{option}: {len(found)} parameters; allowed are at most {MOST_PARAMETERS}")
     return found
+
+
+def perturbations(parameters: Sequence[Parameter]) -> list[Perturbation]:
+    """Return the perturbations of the parameters that have one."""
+    return [one.perturbation for one in parameters if one.perturbation is not None]
 
 
 def known_names(scene: LidarScene) -> list[str]:

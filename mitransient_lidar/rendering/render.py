@@ -99,7 +99,9 @@ def render(
         Names of parameters by which the light is differentiated, from the paths that it takes: ``attenuation``,
         ``scattering`` and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water
         of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; and ``<id>_reflectance`` of
-        diffuse solids, such as ``bottom_reflectance``.
+        diffuse solids, such as ``bottom_reflectance``. Derivatives by other numbers of the scene, such as
+        ``bottom_depth`` or ``divergence_mrad``, are central differences on common random numbers, which take two more
+        renders each (`differences.Differences`).
     reweight
         Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
         whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.
@@ -198,15 +200,17 @@ def _render(
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
     session.tell_record()
-    from mitransient_lidar.rendering.derivatives import path_parameters
+    from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
+    from mitransient_lidar.rendering.differences import Differences
     from mitransient_lidar.rendering.reweighting import cases
 
-    parameters = path_parameters(renderer, options.derivatives or [])
+    parameters = path_parameters(renderer, options.derivatives or [], others=session.parameters)
+    moved = [one.name for one in parameters if one.perturbation is None]
+    differences = Differences(session, chosen, moved, renderer=renderer) if moved else None
     reweighted = cases(renderer, reweight)
-    perturbations = [one.perturbation for one in parameters]
-    perturbations += [one for case in reweighted for one in (case.perturbation, case.squared)]
-    if perturbations:
-        renderer = renderer.perturbed(perturbations)
+    changes = perturbations(parameters) + [one for case in reweighted for one in (case.perturbation, case.squared)]
+    if changes:
+        renderer = renderer.perturbed(changes)
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
     from mitransient_lidar.rendering.pass_size import fit_to_time
@@ -218,7 +222,7 @@ def _render(
     described = describe_scene(lidar, probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
-    accumulator = choose_accumulator(lidar, window, surface, max_memory, origins, parameters, reweighted)
+    accumulator = choose_accumulator(lidar, window, surface, max_memory, origins, parameters, reweighted, differences)
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
@@ -232,6 +236,8 @@ def _render(
             fitted, share, first = fit_to_time(renderer, goal.max_time, start_ns, seed=seed, gates=gates)
         record = first or fitted.render_pass(seed, gates=gates)
         accumulator.add(record.histogram)
+        if differences is not None:
+            differences.add_pass(seed, share)
         return float(record.edge_loss[0])
 
     log = run_passes(

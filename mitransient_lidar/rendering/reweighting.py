@@ -79,7 +79,9 @@ def _case(renderer: PassRenderer, values: dict[str, Any]) -> Case:
             by_layer.setdefault(int(rest.rstrip("]") or 0), {})[stem] = float(value)
             continue
         ratio = in_range(name, value, 1e-6, 1.0) / known[name].value
-        solids.append((known[name].perturbation.solids[0][0], float(np.log(ratio))))
+        change = known[name].perturbation
+        assert change is not None
+        solids.append((change.solids[0][0], float(np.log(ratio))))
     layers = tuple(layer_change(scene.water, layer, changed) for layer, changed in by_layer.items())
     focusing = renderer.focusing
     factors = None if focusing is None or not by_layer else changed_factors(focusing, scene.water, by_layer)

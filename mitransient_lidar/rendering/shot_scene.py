@@ -88,12 +88,12 @@ class ShotScene:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
         session.share_record(self._axis)
         renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
-        from mitransient_lidar.rendering.derivatives import path_parameters
+        from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
 
         renderer = renderer.by_origin() if self._components else renderer
         if not self._derivatives:
             return renderer
-        return renderer.perturbed([one.perturbation for one in path_parameters(renderer, self._derivatives)])
+        return renderer.perturbed(perturbations(path_parameters(renderer, self._derivatives)))
 
     def _at(self, x: float, y: float) -> dict[str, Any]:
         """Return the parameters of a shot at a place [m]."""
