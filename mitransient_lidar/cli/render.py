@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the files; created if missing.")]
 
 
-@render_options("target_error", "target_quantile", "max_time", "passes", "seed", "max_memory", "components", "variant")
+@render_options(
+    *("target_error", "target_quantile", "max_time", "passes", "seed", "max_memory", "components", "derivatives"),
+    "variant",
+)
 def render(
     scene: SceneOrResult,
     define: Define = None,
@@ -37,9 +40,9 @@ def render(
     """Render the waveforms and gates of a scene.
 
     Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with gates
-    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by origin is in
-    the .nc file, and drawn in _components.png. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep
-    the completed passes, from the second one on.
+    gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by origin and
+    derivatives are in the .nc file, and drawn in _components.png and _derivatives.png. The files appear together or not
+    at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second one on.
     """
     params = parameters(define)
     name, text, _ = scene_of(scene, "render")
@@ -48,6 +51,7 @@ def render(
         raise UserError(f"{scene} has no gates to show: its film needs a gate_count, or cut some with gates.")
     targets = [output / f"{name}{ending}" for ending in (".exr", ".nc", *((".png", "_layout.png") if plot else ()))]
     targets += [output / f"{name}_components.png"] if plot and options["components"] else []
+    targets += [output / f"{name}_derivatives.png"] if plot and options["derivatives"] else []
     gates = GateFiles.of(output, name, drawings=plot, gif=gif, mp4=mp4, html=html)
     check_targets(output, [*targets, *gates.names()], scene)
     from mitransient_lidar.rendering import render as rendering
@@ -76,13 +80,17 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
     from mitransient_lidar.results import gate_files
 
     if target.suffix == ".exr":
-        results.save(dataset.drop_dims(["gate", "origin"], errors="ignore"), target)
+        results.save(dataset.drop_dims(["gate", "origin", "parameter"], errors="ignore"), target)
     elif target.suffix == ".nc":
         (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
     elif target.stem.endswith("_components"):
         from mitransient_lidar.plots.waveforms import plot_components
 
         plot_components(dataset, target)
+    elif target.stem.endswith("_derivatives"):
+        from mitransient_lidar.plots.derivatives import plot_derivatives
+
+        plot_derivatives(dataset, target)
     elif not target.stem.endswith("_layout"):
         from mitransient_lidar.plots.waveforms import plot_waveforms
 

@@ -86,7 +86,7 @@ def path_parameters(
         if others and not of_paths and isinstance(name, str) and parameter_of(name) in others:
             found.append(Parameter(name, value_of(others, name), unit_of(parameter_of(name)) or "1", None))
         else:
-            found += _parameters(renderer, name, option)
+            found += _parameters(renderer, name, option, others or {})
     repeated = [one.name for index, one in enumerate(found) if one.name in [other.name for other in found[:index]]]
     if repeated:
         raise UserError(f"{option}: {repeated[0]} is given twice")
@@ -112,7 +112,7 @@ def known_names(scene: LidarScene) -> list[str]:
     return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in scene.solids)]
 
 
-def _parameters(renderer: PassRenderer, name: str, option: str) -> list[Parameter]:
+def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[str, str]) -> list[Parameter]:
     """Return the parameters of a name."""
     scene, focusing = renderer.scene, renderer.focusing
     match = _NAME.match(name) if isinstance(name, str) else None
@@ -121,9 +121,10 @@ def _parameters(renderer: PassRenderer, name: str, option: str) -> list[Paramete
     of_water = scene.water is not None and (stem in COEFFICIENTS or name == "phase_g")
     solid = next((one for one in scene.solids if f"{one.id()}{_REFLECTANCE}" == name), None)
     if match is None or not (of_water or solid is not None):
-        close = get_close_matches(str(name), known, 1)
+        close = get_close_matches(str(name), [*known, *others], 1)
         hint = f"; did you mean {close[0]}?" if close else ""
-        raise UserError(f"{option}: {shown(name)} is no parameter of the scene: allowed are {', '.join(known)}{hint}")
+        more = ", or a number among the scene's parameters" if others else ""
+        raise UserError(f"{option} = {shown(name)} must be one of {', '.join(known)}{more}{hint}")
     if solid is not None:
         return [_reflectance(name, solid)]
     if name == "phase_g":

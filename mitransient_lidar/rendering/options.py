@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -57,8 +56,9 @@ class RenderOptions:
         attribute="max_memory_gb",
     )
     components: bool | None = _option("Also separate the light of surface, water, bottom and targets")
-    derivatives: Sequence[str] | str | None = _option(
-        "Also differentiate the waveforms by a parameter, e.g. attenuation or bottom_reflectance; may be repeated"
+    derivatives: list[str] | None = _option(  # noqa: RUF009 (the default is None)
+        "Also differentiate the waveforms by this parameter, e.g. attenuation, bottom_reflectance or bottom_depth. "
+        "Repeatable"
     )
     variant: str | None = _option("Mitsuba variant, e.g. llvm_ad_mono", attribute="variant")
 

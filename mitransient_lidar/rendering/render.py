@@ -136,6 +136,7 @@ def render(
     UserError
         If the scene, the result, a parameter or an option is invalid, or no light returns.
     """
+    derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}
     if reweight is not None and again.is_result(scene):
         raise UserError("reweight: a result is rendered again with its own parameters; give its scene")

@@ -153,9 +153,7 @@ def render_shots(
     from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, relative_errors, share_for_error
     from mitransient_lidar.rendering.shot_poses import ShotPoses
 
-    options = RenderOptions(
-        target_error=target_error, max_time=max_time, pass_share=pass_share, derivatives=derivatives
-    )
+    options = RenderOptions(target_error=target_error, max_time=max_time, pass_share=pass_share)
     wanted = options.target_error
     usual = (8, 1.0) if wanted is None else (MOST_PASSES_FOR_ERROR, share_for_error(wanted))
     passes = integer("passes", usual[0] if passes is None else passes, 2, 10_000)
@@ -169,10 +167,7 @@ def render_shots(
     if places is None:
         assert session is not None
         places = random_places(SeaMap.of_scene(session.scene), count, seed)
-    wanted_derivatives = options.derivatives or ()
-    series = ShotScene(
-        scene, params, instrument, target, places, axis, bool(components), derivatives=wanted_derivatives
-    )
+    series = ShotScene(scene, params, instrument, target, places, axis, bool(components), derivatives=derivatives or ())
     sea = SeaMap.of_scene(series.session.scene) if describe_sea and _has_waves(series.session.scene) else None
     replaced = (*AIM, *(TARGET if move_target else ()))
     own = {name: value for name, value in (session or series.session).parameters.items() if name in replaced}
