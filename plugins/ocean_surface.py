@@ -215,14 +215,19 @@ class OceanSurface(mi.Mesh):
         whole = self.sea.refined_size
         return max(whole - SIZE_MARGIN, 0.5 * whole) if self._values["refined_size"] == "auto" else whole
 
-    def _ripples(self, refractive_index: float) -> mi.BSDF:
-        """Return the BSDF of the ripples."""
+    def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
+        """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
+        return self._ripples(refractive_index, factor)
+
+    def _ripples(self, refractive_index: float, factor: float = 1.0) -> mi.BSDF:
+        """Return the BSDF of the ripples, with their variances times a factor."""
         indices = {"int_ior": refractive_index, "ext_ior": 1.0}
         series = self.sea.slope_series
         if series is None:
-            roughness = dict(zip(("alpha_u", "alpha_v"), self._roughness(), strict=True))
+            alpha = (float(np.sqrt(factor)) * value for value in self._roughness())
+            roughness = dict(zip(("alpha_u", "alpha_v"), alpha, strict=True))
             return create_object("roughdielectric", distribution="beckmann", **roughness, **indices)
-        along, across = self.ripple_variance
+        along, across = (factor * variance for variance in self.ripple_variance)
         return create_object(
             "gram_charlier_dielectric", variance_u=along, variance_v=across, **dataclasses.asdict(series), **indices
         )

@@ -58,10 +58,8 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
         change, spread = slopes[number] * scale, np.sqrt(variance[number]) * np.abs(scale)
         time, colour = dataset["time"].values, f"C{number % 10}"
         ax.axhline(0, color="0.6", linewidth=0.8)
-        ax.fill_between(
-            dataset["time"], change - spread, change + spread, color=f"C{number % 10}", alpha=0.35, linewidth=0
-        )
-        ax.plot(dataset["time"], change, color=f"C{number % 10}", linewidth=1.2)
+        ax.fill_between(time, change - spread, change + spread, color=colour, alpha=0.35, linewidth=0)
+        ax.plot(time, change, color=colour, linewidth=1.2)
         unit = str(dataset["parameter_units"].values[number])
         shown = f"{parameter} = {value:.4g}" + ("" if unit == "1" else f" {unit}")
         ax.set_title(shown, loc="left", fontsize="medium", pad=3)

@@ -33,6 +33,9 @@ MOST_PARAMETERS = 64
 #: Estimate of derivatives by parameters of which paths have no sums.
 DIFFERENCES = "central differences"
 
+#: Slope variance of the ripples, and the relative step of its numerical derivative.
+RIPPLES, _RIPPLE_STEP = "ripple_variance", 0.02
+
 _NAME = re.compile(r"(?P<stem>\w+?)(\[(?P<layer>\d+)\])?\Z")
 _REFLECTANCE = "_reflectance"
 
@@ -109,6 +112,7 @@ def known_names(scene: LidarScene) -> list[str]:
             count = layers.column.count
             names += [name] if count == 1 else [f"{name}[{layer}]" for layer in range(count)]
         names += ["phase_g"] if layers.kind == "hg" and not layers.nested else []
+    names += [RIPPLES] if _rippled(scene) else []
     return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in scene.solids)]
 
 
@@ -120,13 +124,15 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
     stem = match["stem"] if match else ""
     of_water = scene.water is not None and (stem in COEFFICIENTS or name == "phase_g")
     solid = next((one for one in scene.solids if f"{one.id()}{_REFLECTANCE}" == name), None)
-    if match is None or not (of_water or solid is not None):
+    if match is None or not (of_water or solid is not None or name in known):
         close = get_close_matches(str(name), [*known, *others], 1)
         hint = f"; did you mean {close[0]}?" if close else ""
         more = ", or a number among the scene's parameters" if others else ""
         raise UserError(f"{option} = {shown(name)} must be one of {', '.join(known)}{more}{hint}")
     if solid is not None:
         return [_reflectance(name, solid)]
+    if name == RIPPLES and name in known:
+        return [_ripples(scene)]
     if name == "phase_g":
         return [Parameter(name, scene.water.layers.phase_g, "1", mean_cosine_derivative(scene.water, focusing))]
     column = scene.water.layers.column
@@ -142,6 +148,22 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
         )
         for layer in layers
     ]
+
+
+def _rippled(scene: LidarScene) -> list[Any]:
+    """Return the sea surfaces of a scene whose ripples have a variance."""
+    surfaces = [one for one in scene.surfaces if getattr(one, "has_ripples", False)]
+    return [one for one in surfaces if sum(one.ripple_variance) > 0]
+
+
+def _ripples(scene: LidarScene) -> Parameter:
+    """Return the parameter of the slope variance of the ripples, along and across the wind in proportion."""
+    seas = _rippled(scene)
+    if len(seas) > 1:
+        raise UserError(f"derivatives: {RIPPLES} must be of one sea; the scene has {len(seas)}")
+    value = float(sum(seas[0].ripple_variance))
+    below, above = (seas[0].scaled_ripples(scene.refractive_index, 1 + sign * _RIPPLE_STEP) for sign in (-1, 1))
+    return Parameter(RIPPLES, value, "1", Perturbation(ripples=(below, above, 2 * _RIPPLE_STEP * value)))
 
 
 def _reflectance(name: str, solid: mi.Shape) -> Parameter:

@@ -99,7 +99,8 @@ def render(
         Names of parameters by which the light is differentiated, from the paths that it takes: ``attenuation``,
         ``scattering`` and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water
         of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; and ``<id>_reflectance`` of
-        diffuse solids, such as ``bottom_reflectance``. Derivatives by other numbers of the scene, such as
+        diffuse solids, such as ``bottom_reflectance``; and ``ripple_variance``, the slope variance of the sea's
+        ripples, without the change of `transport.ripple_focusing`. Derivatives by other numbers of the scene, such as
         ``bottom_depth`` or ``divergence_mrad``, are central differences on common random numbers, which take two more
         renders each (`differences.Differences`).
     reweight

@@ -155,6 +155,7 @@ class PathStep:
         """Add what perturbations have at the last vertices of paths that continue in a direction."""
         path.sums = self._sums_at_event(path, vertex.scattered, event, direction)
         path.sums = self.scene.perturbations.at_solid(path.sums, vertex.si.shape, vertex.on_solid & ~passes)
+        path.sums = self.scene.perturbations.at_sea(path.sums, vertex.si, vertex.si.to_local(direction), vertex.at_sea)
 
     def perturbed_connection(
         self, path: Path, vertex: Vertex, event: ScatteringEvent, direction: mi.Vector3f, active: mi.Bool

@@ -24,8 +24,8 @@ from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_L
 from mitransient_lidar.transport.medium.tabulated_phase import half_angle
 from mitransient_lidar.transport.opaque import aligned, opaque
 
-#: Shortest change of depth [m] of segments that are divided among layers by their depths.
-_SMALLEST_EXTENT = 1e-6
+#: Smallest vertical component of segments that are divided among layers: others lie in one.
+_SMALLEST_SLOPE = 1e-9
 
 #: Sum of each perturbation along a path, empty without perturbations.
 Sums = list[Any]
@@ -67,12 +67,16 @@ class Perturbation:
         Whether the sum is the logarithm of a ratio of contributions, instead of a derivative.
     focusing
         Derivative of `RippleFocusing.factors`, or the changed factors; None where they do not change.
+    ripples
+        For a derivative, ripples of the sea with a parameter below and above its value, and the difference of these two
+        values; None where they do not change.
     """
 
     layers: tuple[LayerChange, ...] = ()
     solids: tuple[tuple[mi.Shape, float], ...] = ()
     finite: bool = False
     focusing: FloatArray | None = None
+    ripples: tuple[mi.BSDF, mi.BSDF, float] | None = None
 
 
 class _Layer:
@@ -90,12 +94,11 @@ class _Layer:
         """Return the addition of segments: depth of the start [m], downward component, length [m]."""
         if self._limits == (-np.inf, np.inf):
             return self._per_metre * length
-        end = depth + downward * length
-        low, high = dr.minimum(depth, end), dr.maximum(depth, end)
-        overlap = dr.maximum(dr.minimum(high, self._bottom) - dr.maximum(low, self._top), 0)
-        level = dr.select(self._contains(depth), mi.Float(1), 0)
-        share = dr.select(high - low > _SMALLEST_EXTENT, overlap / (high - low), level)
-        return self._per_metre * length * share
+        # Distances to the edges, which neighbouring layers share: their parts add up to the length exactly.
+        level = dr.abs(downward) < _SMALLEST_SLOPE
+        slope = dr.select(level, dr.copysign(mi.Float(_SMALLEST_SLOPE), downward), downward)
+        first, second = (dr.clip((edge - depth) / slope, 0, length) for edge in (self._top, self._bottom))
+        return self._per_metre * dr.abs(second - first)
 
     def at_event(self, depth: mi.Float, cell: mi.UInt32, fraction: mi.Float) -> mi.Float:
         """Return the addition of scattering events: depth [m], and place among the nodes."""
@@ -182,6 +185,18 @@ class Perturbations:
         for total, solids in zip(sums, self._solids, strict=True):
             for solid, addition in solids:
                 total = total + dr.select(mi.Bool(active) & (shape == mi.ShapePtr(solid)), addition, 0)
+            found.append(total)
+        return found
+
+    def at_sea(self, sums: Sums, si: mi.SurfaceInteraction3f, outgoing: mi.Vector3f, active: mi.Bool) -> Sums:
+        """Return sums beyond the sea surface, in a direction of the frame of the interaction."""
+        found = []
+        for total, one in zip(sums, self.perturbations, strict=True):
+            if one.ripples is not None:
+                below, above, width = one.ripples
+                low, high = (bsdf.eval(mi.BSDFContext(), si, outgoing, active)[0] for bsdf in (below, above))
+                lit = active & (low > 0) & (high > 0)
+                total = total + dr.select(lit, dr.log(high / low) * opaque(1 / width), 0)
             found.append(total)
         return found
 

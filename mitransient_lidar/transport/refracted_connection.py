@@ -282,11 +282,17 @@ class StraightConnection:
         return cls(direction, irradiance, distance, length)
 
 
-def perturbed_to_laser(scene: LidarScene, sums: Sums, point: mi.Point3f) -> Sums:
-    """Return the sums of paths with the straight lines from points to the laser, which count under water only."""
-    if not scene.submerged:
+def perturbed_to_laser(
+    scene: LidarScene, sums: Sums, point: mi.Point3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+) -> Sums:
+    """Return the sums of paths with straight lines from points to the laser, which begin at surfaces where active."""
+    if not sums:
         return sums
     line = StraightConnection.to_laser(scene, point)
+    at_sea = active & scene.is_surface(si.shape)
+    sums = scene.perturbations.at_sea(sums, si, si.to_local(line.direction), at_sea)
+    if not scene.submerged:
+        return sums
     return scene.perturbations.along(sums, -point.z, -line.direction.z, line.distance)
 
 

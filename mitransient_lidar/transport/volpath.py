@@ -114,6 +114,10 @@ class PathLight:
         `sums` are those of the perturbations of the complete paths.
         """
 
+    def perturbed(self, sums: Sums, point: mi.Point3f, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Sums:
+        """Return the sums of paths with the lines from points to the emitter, which begin at surfaces where active."""
+        return sums
+
     @abstractmethod
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
         """Add connections beyond the end of the surface mesh to the losses, as through a flat sea at normal incidence.
@@ -160,6 +164,10 @@ class LaserLight(PathLight):
         """Connect scattering events to a laser under water."""
         return connect_event_to_laser(self.scene, point, active)
 
+    def perturbed(self, sums: Sums, point: mi.Point3f, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Sums:
+        """Return the sums of paths with the lines from points to the laser."""
+        return perturbed_to_laser(self.scene, sums, point, si, active)
+
     def length_by(self, path: ConnectedPath) -> mi.Float:
         """Return the optical length from the receiver by the last vertex straight to the laser [m]."""
         return path.length + self._to_laser.distance(path.point)
@@ -176,7 +184,6 @@ class LaserLight(PathLight):
         upward = self.scene.transmitter_pose.point.z - path.point.z
         reversals = path.reversals + dr.select(path.downward * upward > 0, mi.UInt32(1), 0)
         echo = Echo(path.surface_length, on_solid | ~path.before_first_solid)
-        sums = perturbed_to_laser(self.scene, sums, path.point)
         self.record.receive(self.pixel, path.scatterings, reversals, path.solid, length, energy, active, echo, sums)
 
     def lose(self, emitter: EmitterDirection, share: mi.Float, crossing: mi.Point3f) -> None:
@@ -309,6 +316,7 @@ class PathTracer:
         path.rays += dr.select(met | direct, mi.UInt32(1), 0)
         sums = joined(self._step.perturbed_connection(path, vertex, event, up, met), top.sums)
         sums = scene.perturbations.along(sums, -top.ray.o.z, -top.ray.d.z, above.t, met)
+        sums = light.perturbed(sums, crossing.p, crossing, met | direct)
         light.receive(path, path.length + water_length + air_length, energy, radiance > 0, vertex.on_solid, sums)
         light.reflect(path, si, rng, vertex.at_sea & ~vertex.in_water)
         # For the loss, the density of the sampled direction replaces that of the surface's BSDF.
@@ -330,6 +338,7 @@ class PathTracer:
             energy = dr.select(self._merged(path, vertex, first), 0, energy)
         path.rays += dr.select(path.active, mi.UInt32(2), 0)
         sums = self._step.perturbed_connection(path, vertex, event, direction, vertex.scattered)
+        sums = light.perturbed(sums, path.point, vertex.si, vertex.on_surface)
         light.receive(path, path.length + length, energy, radiance > 0, vertex.on_solid, sums)
 
     @staticmethod

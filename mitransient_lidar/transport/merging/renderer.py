@@ -375,7 +375,7 @@ class MergingRenderer(PassRenderer):
             # No scattering event, and one reversal.
             order, reversals, solid = mi.UInt32(0), mi.UInt32(1), self.classes.solid(si.shape)
             sums, length = scene.perturbations.at_solid(path.sums, si.shape), path.length + length
-            sums = perturbed_to_laser(scene, sums, path.point)
+            sums = perturbed_to_laser(scene, sums, si.p, si, active)
             record.receive(start.pixel, order, reversals, solid, length, energy, radiance > 0, sums=sums)
 
         of_merges = shots.streams(_MERGE_STREAM, lanes)

@@ -1,0 +1,185 @@
+"""Derivatives and reweighted light: against arrival times, orders of scattering, and scenes with other values."""
+
+import numpy as np
+import pytest
+import significance
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.rendering.derivatives import path_parameters
+from mitransient_lidar.rendering.reweighting import cases
+from mitransient_lidar.transport.path_classes import PathClasses
+
+pytestmark = pytest.mark.slow
+
+INTEGRATORS = ("lidar_merging", "lidar_volpath")
+SMALL = 2**14
+INDEX = 1.34
+#: Energy [J] whose sums, in integers, have rounding errors below 1e-5.
+EXACT = 1e-14
+#: Water without and with a phase function that follows from its coefficients.
+FIXED = {"attenuation": 0.5, "scattering": 0.35, "phase_function": "petzold"}
+NATURAL = {"attenuation": 0.4, "scattering": 0.3, "backscattering": 0.008}
+LAYERS = {
+    "layer_tops": "0, 3",
+    "attenuation": "0.5, 0.3",
+    "scattering": "0.35, 0.2",
+    "backscattering": "0.01, 0.003",
+}
+
+
+@pytest.fixture
+def lidar(lidar_scene):
+    """Return the renderer of a scene at nadir with an integrator, perturbed by parameters, and these."""
+
+    def prepare(integrator, names=(), classes=None, water=None, **options):
+        pose = {"off_nadir_deg": 0.0, **options.pop("pose", {})}
+        loaded = lidar_scene(
+            integrator={"type": integrator, "paths_per_pass": SMALL},
+            tx=pose,
+            rx={**pose, "layout": "1x1", "field_of_view_mrad": 30},
+            film={"time_start_ns": 1320.0, "bin_count": 160, **options.pop("film", {})},
+            water=water or FIXED,
+            **options,
+        )
+        renderer = loaded.integrator().prepare(loaded, loaded.sensors()[0], classes=classes)
+        parameters = path_parameters(renderer, names)
+        return renderer.perturbed([one.perturbation for one in parameters]), parameters
+
+    return prepare
+
+
+def one_pass(renderer, seed=0):
+    """Return the energies of a pass, and their perturbations, with pixels and bins last."""
+    histogram = renderer.render_pass(seed).histogram
+    return histogram.energy(), histogram.perturbed()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_attenuation_follows_from_the_time_of_arrival(lidar, integrator):
+    """With b fixed, ln E falls by the length in water, (c0 t - length in air) / n, summed over layers.
+
+    Ways in the air at nadir are 400 m, up to 0.07 m more for light that leaves the water 4 m away on either side.
+    """
+    renderer, parameters = lidar(integrator, ["attenuation"], water={**LAYERS, "phase_function": "petzold"})
+    assert [one.name for one in parameters] == ["attenuation[0]", "attenuation[1]"]
+    energy, changes = one_pass(renderer)
+    lit = energy[0] > EXACT
+    length = -changes.sum(axis=0)[0][lit] / energy[0][lit]
+    edges = renderer.scene.axis.edges_ns * 1e-9 * C0
+    shortest, longest = (edges[:-1] - 400.07) / INDEX, (edges[1:] - 400.0) / INDEX
+    assert lit.sum() > 40
+    assert np.all(length > shortest[lit] - 1e-3)
+    assert np.all(length < longest[lit] + 1e-3)
+    # Light that returns from above 2.5 m has not met the second layer.
+    early = edges[1:] < 400.0 + 2 * 2.5 * INDEX
+    assert not changes[1, 0][early].any()
+    assert changes[0, 0][early].any()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_attenuation_about_a_lidar_under_water(lidar, integrator):
+    """All of the way is in water: ln E falls by c0 t / n."""
+    renderer, _ = lidar(
+        integrator, ["attenuation"], pose={"altitude": -1.0}, film={"time_start_ns": 0.5, "bin_count": 90}
+    )
+    energy, changes = one_pass(renderer)
+    lit = energy[0] > EXACT
+    length = -changes[0, 0][lit] / energy[0][lit]
+    edges = renderer.scene.axis.edges_ns * 1e-9 * C0 / INDEX
+    assert lit.sum() > 30
+    assert np.all((length > edges[:-1][lit] - 1e-3) & (length < edges[1:][lit] + 1e-3))
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_scattering_follows_from_the_number_of_events(lidar, integrator):
+    """With attenuation and phase function fixed, light of n scattering events is in proportion to b^n."""
+    orders = 9
+    renderer, _ = lidar(integrator, ["scattering"], classes=PathClasses(orders=orders))
+    energy, changes = (values.reshape(-1, 2, orders + 1, 160) for values in one_pass(renderer))
+    for n in range(orders):
+        lit = energy[:, :, n] > EXACT
+        found = changes[:, :, n][lit] / energy[:, :, n][lit]
+        np.testing.assert_allclose(found, n / FIXED["scattering"], rtol=1e-4, atol=1e-6)
+    assert (energy.sum(axis=(0, 1, 3)) > 0).all()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_reflectance_follows_from_the_number_of_reflections(lidar, integrator):
+    """Light that has not met the bottom does not change; nearly all other light has met it once."""
+    renderer, _ = lidar(integrator, ["bottom_reflectance"], rho=0.3)
+    energy, changes = (values.reshape(3, 160) for values in one_pass(renderer.by_origin()))
+    assert not changes[:2].any()
+    times = 0.3 * changes[2].sum() / energy[2].sum()
+    assert 1 - 1e-6 < times < 1.02
+    assert energy[:2].any()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_ripple_variance_of_an_echo_at_nadir(lidar, integrator):
+    """Facets that return light are at most 15 mrad from level, where slopes have a density of exp(-tan^2 / (2 v)) / v.
+
+    With v = 0.005 along and across, ln E falls by between 0.95 and 1 for ln v.
+    """
+    renderer, (parameter,) = lidar(integrator, ["ripple_variance"], sea={"slope_variance": "0.01"})
+    assert parameter.value == pytest.approx(0.01)
+    energy, changes = (values.reshape(3, 160)[0].sum() for values in one_pass(renderer.by_origin()))
+    assert -1 - 1e-3 < parameter.value * changes / energy < -0.95
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", ["attenuation[1]", "scattering[0]", "backscattering[1]", "bottom_reflectance"])
+def test_derivatives_are_limits_of_reweighted_light(lidar, integrator, name):
+    """A change of 0.5 % from the same paths, over the step."""
+    plain, _ = lidar(integrator, water=LAYERS)
+    (parameter,) = path_parameters(plain, [name])
+    step = 5e-3 * parameter.value
+    (case,) = cases(plain, [{name: parameter.value + step}])
+    energy, (slope, changed) = one_pass(plain.perturbed([parameter.perturbation, case.perturbation]))
+    scale = np.abs(slope).max()
+    np.testing.assert_allclose((changed - energy) / step, slope, atol=0.01 * scale, rtol=0.03)
+    assert scale > 0
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"attenuation[0]": 0.54, "attenuation[1]": 0.27, "bottom_reflectance": 0.13},
+        {"scattering[0]": 0.39, "scattering[1]": 0.22, "backscattering[0]": 0.012, "backscattering[1]": 0.0028},
+    ],
+)
+def test_reweighted_light_is_that_of_the_other_scene(lidar, integrator, changed):
+    """Waves and ripples, two layers; the other scene on other random numbers."""
+    sea = {"spectrum": "elfouhaily", "slope_variance": "cox_munk", "wind_speed": 4.0, "size": 60.0}
+    passes = 12 if integrator == "lidar_merging" else 24
+    renderer, _ = lidar(integrator, water=LAYERS, sea=sea)
+    (case,) = cases(renderer, [changed])
+    perturbed = renderer.perturbed([case.perturbation])
+    found = np.array([one_pass(perturbed, seed)[1][0] for seed in range(passes)])
+    water, rho = dict(LAYERS), changed.get("bottom_reflectance", 0.1)
+    for name in LAYERS:
+        values = LAYERS[name].split(", ")
+        water[name] = ", ".join(str(changed.get(f"{name}[{layer}]", value)) for layer, value in enumerate(values))
+    other, _ = lidar(integrator, water=water, sea=sea, rho=rho)
+    wanted = np.array([one_pass(other, 1000 + seed)[0] for seed in range(passes)])
+    in_bins = (values.reshape(passes, 1, -1, 8).sum(axis=3)[:, :, :13] for values in (found, wanted))
+    significance.assert_same(*in_bins, error=0.1 if integrator == "lidar_volpath" else 0.03, bias=0.003)
+
+
+def test_mean_cosine(lidar):
+    """Henyey-Greenstein functions: the change by g from 0.85 to 0.87, against a scene of 0.87 and the limit."""
+    water = {"attenuation": 0.4, "scattering": 0.3, "backscattering": 0.0, "phase_function": "hg", "phase_g": 0.86}
+    renderer, (parameter,) = lidar("lidar_merging", ["phase_g"], water=water)
+    assert parameter.value == pytest.approx(0.86)
+    passes, step = 8, 0.01
+    found = np.array([one_pass(renderer, seed)[1][0] for seed in range(passes)])
+    sides = []
+    for number, sign in enumerate((1, -1)):
+        other, _ = lidar("lidar_merging", water={**water, "phase_g": 0.86 + sign * step})
+        sides.append(np.array([one_pass(other, 1000 * (number + 1) + seed)[0] for seed in range(passes)]))
+    wanted = (sides[0] - sides[1]) / (2 * step)
+    column = slice(16, 64)
+    # More forward scattering leaves less light to return.
+    significance.assert_same(
+        -found[:, :, column].sum(axis=2)[..., None], -wanted[:, :, column].sum(axis=2)[..., None], error=0.05, bias=0.01
+    )
