@@ -203,5 +203,6 @@ def test_every_command_is_run():
     tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare", "depth-bias", "tpu"}
     names = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     groups = {group.name for group in app.registered_groups}
-    # The benchmark measures for minutes; its tests replace the renders. tests/system runs campaigns and flights.
-    assert names | groups == tested | {"bench", "sweep", "fly"}
+    # The benchmark measures for minutes; its tests replace the renders, as do those of bounds. tests/system runs
+    # campaigns and flights.
+    assert names | groups == tested | {"bench", "bounds", "sweep", "fly"}
