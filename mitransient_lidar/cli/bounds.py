@@ -29,7 +29,12 @@ def bounds(
             "Repeatable: all combinations count.",
         ),
     ] = None,
-    receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's, or apd.")] = None,
+    receiver: Annotated[
+        str | None,
+        typer.Option(
+            help=f"{RECEIVERS} Several, separated by commas, are compared. By default the instrument's, or apd."
+        ),
+    ] = None,
     gain: Annotated[
         str | None, typer.Option(help="Factor of the receiver's gain, or auto for the largest without saturation.")
     ] = None,
@@ -81,7 +86,7 @@ def bounds(
             parameters(define),
             free=unknown,
             over=designs,
-            receiver=receiver,
+            receiver=None if receiver is None else [name.strip() for name in receiver.split(",")],
             background_power_w=background_power_w,
             nuisances=nuisances,
             renders=renders,

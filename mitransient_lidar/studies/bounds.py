@@ -18,7 +18,8 @@ from mitransient_lidar.analysis.jackknife import jackknife_error
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.core.validation import integer, non_negative
+from mitransient_lidar.core.validation import integer, non_negative, shown
+from mitransient_lidar.physics.receiver.receiver_files import Receiver
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.session import open_scene
@@ -57,7 +58,8 @@ def bounds(
         Values of parameters of the scene, by name; designs are all combinations of them, the last one changing first,
         at most 1000. None for the scene as it is.
     receiver, gain, optical_density
-        As `chain`, `gain` and `optical_density` of `analysis.receiver.detect_waveforms`.
+        As `chain`, `gain` and `optical_density` of `analysis.receiver.detect_waveforms`; several receivers in a list
+        are compared on the same renders, and ``receiver`` is then the last parameter of a design.
     background_power_w
         Steady power on each pixel [W], at least 0.
     nuisances
@@ -87,12 +89,14 @@ def bounds(
     ------
     UserError
         If the scene, a parameter or an option is invalid, or the records of a design hold no information.
+    KeyboardInterrupt
+        If a render was interrupted.
     """
     if isinstance(free, str) or len(free) == 0 or len(set(free)) != len(free):
         raise UserError(f"free = {free!r} must be a list of different names of parameters")
     renders, passes = integer("renders", renders, 2, 1000), integer("passes", passes, 2, 100_000)
     seed, sky = integer("seed", seed, 0, 2**53), non_negative("background_power_w", background_power_w)
-    chain = None if receiver is None else receiver_of("receiver", receiver)
+    receivers = _receivers(receiver, gain)
     known, designs = priors(nuisances or {}), _designs(over or {})
     for design in designs:  # before the first render
         session = open_scene(scene, {**(params or {}), **design})
@@ -103,33 +107,43 @@ def bounds(
             # Seeds of a render are signed.
             options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
             results.append(render(scene, params={**(params or {}), **design}, **options))
+            if results[-1].attrs.get("interrupted"):
+                raise KeyboardInterrupt("interrupted; bounds need all renders, and none is kept.")
             if progress is not None:
                 done, planned = number * renders + i + 1, len(designs) * renders
                 elapsed = time.perf_counter() - began
                 left = elapsed / done * (planned - done)
                 progress(Progress(done, planned, "render", elapsed_s=elapsed, remaining_s=left))
-        found.append(
-            fisher_information(results, chain, sky, gain=gain, optical_density=optical_density, nuisances=known)
-        )
+        for chain in receivers.values():
+            settings: dict[str, Any] = {"gain": gain, "optical_density": optical_density, "nuisances": known}
+            found.append(fisher_information(results, chain, sky, **settings))
         if found[-1]["parameter"].values.tolist() != (names := found[0]["parameter"].values.tolist()):
             raise UserError(f"over: the design {design} has other parameters than the first, {', '.join(names)}")
     attributes = {
         "scene": session.name,
-        "receiver": _receiver_name(receiver, found[0]),
+        "receiver": ", ".join(name or str(found[0].attrs.get("instrument", "apd")) for name in receivers),
         "renders": renders,
         "passes": passes,
         "seed": seed,
         "background_power_w": sky,
         **{f"scene.{name}": str(value) for name, value in (params or {}).items()},
     }
+    if len(receivers) > 1:
+        designs = [{**design, "receiver": name} for design in designs for name in receivers]
     return _compared(found, designs, attributes)
 
 
-def _receiver_name(receiver: Any, first: xr.Dataset) -> str:
-    """Return the name of a receiver for titles."""
-    if receiver is None:
-        return str(first.attrs.get("instrument", "apd"))
-    return os.fspath(receiver) if isinstance(receiver, (str, os.PathLike)) else "custom"
+def _receivers(given: Any, gain: Any) -> dict[str, Receiver | None]:
+    """Return receivers by name, None with an empty name for that of the scene's instrument."""
+    listed = list(given) if isinstance(given, (list, tuple)) else [given]
+    found = [None if one is None else receiver_of("receiver", one) for one in listed]
+    named = {"" if one is None else one.name: one for one in found}
+    if len(named) < len(listed) or not named:
+        raise UserError(f"receiver = {shown(given)} must be one receiver, or several with different names")
+    for name, one in named.items():
+        if gain is not None and one is not None and one.default.chain.amplifier is None:
+            raise UserError(f"gain = {gain} needs a receiver with an amplifier, which {name} lacks")
+    return named
 
 
 def _designs(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:

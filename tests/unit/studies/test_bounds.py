@@ -10,6 +10,9 @@ from differentiated import PHOTON, result
 from PIL import Image
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver
 from mitransient_lidar.plots.studies.bounds import plot_bounds
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.studies import bounds as study
@@ -133,6 +136,31 @@ def test_parameters_of_a_design_that_is_not_determined_are_said(rendered):
     assert "scale = 1 1, known to 0.1" in lines
 
 
+def test_receivers_are_compared_on_the_same_renders(rendered):
+    """A detector of a quantum efficiency of 0.7 without other noise knows counts to 1/sqrt(0.7) times the error."""
+    weak = Receiver(Channel(ReceiverChain(LinearDetector(0.7))), name="weak")
+    options = {"free": ["attenuation"], "over": {"layout": ["1x1", "2x2"]}, "renders": 2}
+    found = study.bounds("table1", SMALL, receiver=["ideal", weak], **options)
+    assert len(rendered) == 2 * 2
+    assert found["design"].values.tolist() == [
+        f"layout={layout}, receiver={name}" for layout in ("1x1", "2x2") for name in ("ideal", "weak")
+    ]
+    ratio = found["bound"].values.reshape(2, 2)
+    np.testing.assert_allclose(ratio[:, 1] / ratio[:, 0], 0.7**-0.5, rtol=1e-6)
+
+
+def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
+    def render(scene, **options):
+        return light(scene, **options).assign_attrs(interrupted=1)
+
+    monkeypatch.setattr(study, "render", render)
+    small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
+    done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
+    assert done.exit_code == 130
+    assert done.stderr == "interrupted; bounds need all renders, and none is kept.\n"
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_figure_ranks_designs(found):
     figure = plot_bounds(found)
@@ -190,6 +218,8 @@ def test_values_with_commas_are_separated_by_semicolons():
         ({"over": {"layuot": ["1x1"]}}, "layuot"),
         ({"over": {"bin_count": list(range(1001))}}, "over gives 1001 designs: at most 1000"),
         ({"receiver": "eye"}, "receiver = 'eye' must be one of ideal"),
+        ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
+        ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
         ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
         ({"renders": 1}, "renders = 1 must lie between 2 and 1000"),
         ({"passes": 1}, "passes = 1 must lie between 2"),
