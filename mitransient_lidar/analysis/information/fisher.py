@@ -270,7 +270,8 @@ def _whitened(root: FloatArray, change: FloatArray) -> FloatArray:
 def _unresolved(found: Bounds, left: Sequence[Bounds]) -> list[str]:
     """Return a sentence if the noise of the render could make the matrix singular."""
     error = jackknife_error(np.array([one.smallest for one in left]))
-    if found.smallest > 2 * error:
+    # A negative eigenvalue has been named already.
+    if not 0 <= found.smallest <= 2 * error:
         return []
     return [
         f"the smallest eigenvalue of the scaled information, {found.smallest:.2g}, is within twice its error by the "
