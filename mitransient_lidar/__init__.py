@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shot_series import render_shots
+    from mitransient_lidar.studies.bounds import bounds
     from mitransient_lidar.studies.depth_bias import depth_bias
     from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
     from mitransient_lidar.studies.detection import detect
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
+    "bounds": ("studies.bounds", "bounds"),
     "correct_depths": ("analysis.waveforms.depth_correction", "correct_depths"),
     "cut_gates": ("analysis.gates.cut", "cut_gates"),
     "depth_bias": ("studies.depth_bias", "depth_bias"),
@@ -90,6 +92,7 @@ _FUNCTIONS = {
 
 __all__ = [
     "__version__",
+    "bounds",
     "correct_depths",
     "cut_gates",
     "depth_bias",

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -89,29 +89,76 @@ def detect_waveforms(
     shot noise lacks the correlation of that response: render with a response time of 0 for a chain with a bandwidth.
     Dead times of counters and cells lose light without being marked as saturated.
     """
-    receiver = receiver_of("chain", chain) if chain is not None else _own_receiver(dataset)
-    if gain is not None or optical_density is not None:
-        receiver = receiver.with_settings(gain, optical_density)
-    names = [str(name) for name in np.atleast_1d(dataset["pixel"].values)] if "pixel" in dataset.dims else []
-    groups: dict[int, list[int]] = {}
-    for number, name in enumerate(names):
-        groups.setdefault(id(receiver.of(name)), []).append(number)
-    sky = _background(dataset, background_power, tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot"))
-    if len(groups) < 2:
-        channel = receiver.of(names[0]) if names else receiver.default
-        recorded = _record_channel(dataset, channel, shots, seed, sky)
+    receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
+    if len(groups) == 1:
+        recorded = _record_channel(dataset, groups[0][0], shots, seed, sky)
     else:
         parts = []
-        for number, pixels in enumerate(groups.values()):
+        for number, (channel, pixels) in enumerate(groups):
             part, light = dataset.isel(pixel=pixels), sky if np.ndim(sky) == 0 else sky[pixels]
-            parts.append(_record_channel(part, receiver.of(names[pixels[0]]), shots, seed + number, light))
-        recorded = _joined(parts, list(groups.values()))
+            parts.append(_record_channel(part, channel, shots, seed + number, light))
+        recorded = _joined(parts, [pixels for _, pixels in groups])
     recorded.attrs |= {"noise_seed": int(seed)} | ({} if receiver.name == "custom" else {"receiver": receiver.name})
     if receiver.pulse_repetition_khz is not None:
         recorded.attrs["pulse_repetition_khz"] = receiver.pulse_repetition_khz
     if recorded["saturated"].any():
         _LOG.warning("%s", saturation_advice(recorded))
     return recorded
+
+
+class PixelChain(NamedTuple):
+    """Receiver of one pixel as used in a record, with its gain."""
+
+    chain: ReceiverChain
+    transmittance: float  #: Of the filter before the detector [1], for signal and background.
+    background: float  #: Power of the background before the filter [W].
+
+
+def pixel_chains(
+    dataset: xr.Dataset,
+    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
+    background_power: npt.ArrayLike | xr.DataArray = 0.0,
+    *,
+    gain: Setting | None = None,
+    optical_density: Setting | None = None,
+) -> list[PixelChain]:
+    """Return the receiver of each pixel with the gain and filter that `detect_waveforms` would use.
+
+    Arguments and errors are those of `detect_waveforms`, for a result without ``shot``; pixels of an imager are in
+    row-major order.
+    """
+    _, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
+    width, (_, light) = results.time_axis(dataset).bin_width_ns, _waveform(dataset)
+    light = light.reshape(-1, light.shape[-1])
+    backgrounds = np.broadcast_to(sky.ravel(), len(light))
+    found: dict[int, PixelChain] = {}
+    for channel, pixels in groups:
+        own = backgrounds[pixels]
+        used, density, _ = _in_range(channel.chain, channel.gain, channel.optical_density, light[pixels], width, own)
+        found |= {pixel: PixelChain(used, 10**-density, float(backgrounds[pixel])) for pixel in pixels}
+    return [found[pixel] for pixel in range(len(light))]
+
+
+def _channels(
+    dataset: xr.Dataset,
+    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None,
+    gain: Setting | None,
+    optical_density: Setting | None,
+    background_power: npt.ArrayLike | xr.DataArray,
+) -> tuple[Receiver, list[tuple[Channel, list[int]]], FloatArray]:
+    """Return the receiver, its channels with the numbers of their pixels, and the background."""
+    receiver = receiver_of("chain", chain) if chain is not None else _own_receiver(dataset)
+    if gain is not None or optical_density is not None:
+        receiver = receiver.with_settings(gain, optical_density)
+    dims = tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot")
+    sky = _background(dataset, background_power, dims)
+    if dims != ("pixel",):
+        return receiver, [(receiver.default, list(range(math.prod(dataset.sizes[dim] for dim in dims))))], sky
+    groups: dict[int, tuple[Channel, list[int]]] = {}
+    for number, name in enumerate(dataset["pixel"].values):
+        channel = receiver.of(str(name))
+        groups.setdefault(id(channel), (channel, []))[1].append(number)
+    return receiver, list(groups.values()), sky
 
 
 def _own_receiver(dataset: xr.Dataset) -> Receiver:

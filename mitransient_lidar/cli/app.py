@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.cli import (
+    bounds,
     campaigns,
     depth_bias,
     flights,
@@ -42,6 +43,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.estimate,
         depth_bias.depth_bias,
         depth_bias.tpu,
+        bounds.bounds,
         studies.beam_spread,
         studies.fov_sweep,
         studies.scattering_orders,

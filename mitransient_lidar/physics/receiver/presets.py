@@ -151,7 +151,7 @@ class ReceiverChain:
         mean, variance = self._unlimited(power, bin_width_ns, background)
         if self.amplifier is None:
             return Expected(mean, variance, np.zeros_like(mean))
-        return self._readout().expected(mean, variance)
+        return self.readout().expected(mean, variance)
 
     def with_gain(self, factor: float) -> ReceiverChain:
         """Return the chain with another gain: of a photomultiplier's dynodes, or of the amplifier behind others.
@@ -184,7 +184,7 @@ class ReceiverChain:
         factor, chain = 1.0, self
         # Behind a photomultiplier, the noise of the amplifier stays and the excess noise grows.
         for _ in range(_MOST_STEPS):
-            if chain.amplifier is None or not math.isfinite(top := chain._readout().top_v):
+            if chain.amplifier is None or not math.isfinite(top := chain.readout().top_v):
                 break
             highest = float(chain._highest(power, bin_width_ns, background, samples).max())
             if highest <= top * (1 + _IN_RANGE):
@@ -204,7 +204,7 @@ class ReceiverChain:
         """
         from scipy.optimize import brentq
 
-        if self.amplifier is None or not math.isfinite(top := self._readout().top_v):
+        if self.amplifier is None or not math.isfinite(top := self.readout().top_v):
             return 1.0
         light = np.asarray(power, dtype=np.float64)
         sky = np.broadcast_to(np.asarray(background, dtype=np.float64), light.shape[:-1]).ravel()
@@ -260,7 +260,7 @@ class ReceiverChain:
         spread = max(self.detector.charge_spread, 1e-6)
         rare = np.clip(_RARE / np.maximum(number, 1e-12), 0, 1)
         charge = np.where(rare < 1, gamma.isf(rare, 1 / spread, scale=spread), 0.0) * self.detector.gain
-        peak = float(low_pass.weights.max()) * self._volts_per_electron(bin_width_ns)
+        peak = float(low_pass.weights.max()) * self.volts_per_electron(bin_width_ns)
         return (charge * peak).reshape(np.shape(power)[:-1])
 
     def snr(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
@@ -316,16 +316,16 @@ class ReceiverChain:
         variance = low_pass.sampled(covariances[0], stride, weights**2)
         for lag, covariance in enumerate(covariances[1:], 1):
             variance += 2 * low_pass.sampled(covariance, stride, weights[:-lag] * weights[lag:])
-        volts = 1.0 if self.amplifier is None else self._volts_per_electron(bin_width_ns)
+        volts = 1.0 if self.amplifier is None else self.volts_per_electron(bin_width_ns)
         return low_pass.sampled(charge, stride) * volts, np.maximum(variance, 0) * volts**2
 
-    def _volts_per_electron(self, bin_width_ns: float) -> float:
+    def volts_per_electron(self, bin_width_ns: float) -> float:
         """Mean voltage over a part of a bin per electron in it."""
         assert self.amplifier is not None
         width = bin_width_ns / self.low_pass(bin_width_ns).parts
         return self.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * width)
 
-    def _readout(self) -> Readout:
+    def readout(self) -> Readout:
         """Return the stages behind the low-pass."""
         assert self.amplifier is not None
         limits = [] if self.amplifier.limit_v is None else [self.amplifier.limit_v]
@@ -341,12 +341,12 @@ class ReceiverChain:
         if self.amplifier is None:
             signal = low_pass.sampled(charge, stride)
             return signal, np.zeros(signal.shape, np.bool_)
-        volts = low_pass.sampled(charge, stride) * self._volts_per_electron(bin_width_ns)
+        volts = low_pass.sampled(charge, stride) * self.volts_per_electron(bin_width_ns)
         deviation, weights = self.amplifier.noise(bin_width_ns, stride)
         if deviation > 0:
             normal = random.standard_normal((*volts.shape[:-1], volts.shape[-1] + weights.size - 1))
             volts += deviation * filtered(normal, weights)
-        return self._readout().read(volts)
+        return self.readout().read(volts)
 
 
 # A gain of 5 and six of 4 give an excess noise of 1.27; photomultipliers have 1.2 to 1.3 (Hamamatsu, questions and

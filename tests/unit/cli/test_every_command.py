@@ -16,7 +16,7 @@ WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots", "shot-statistics")
 #: Those that take most time.
 SLOW = {"detect", "target-signal", "shot-statistics", "beam-spread", "fov-sweep", "plot", "passive"}
-SLOW |= {"waveforms", "scattering-orders"}
+SLOW |= {"waveforms", "scattering-orders", "bounds"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
@@ -25,6 +25,7 @@ SCENE_COMMANDS = {
     "target-signal": ["--passes", 16],
     "detect": ["--passes", 16, "--shots", 1000, "--renders", 3],
     "estimate": [],
+    "bounds": ["--free", "attenuation,target_depth", "--over", "layout=1x1,2x2", "--renders", 2, "--passes", 2],
     "beam-spread": ["--depths", "2,5", "--passes", 2],
     "fov-sweep": ["--fov-mrad", "20,35", "--passes", 8],
     "scattering-orders": ["--passes", 2, "--orders", 2],

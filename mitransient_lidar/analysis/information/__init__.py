@@ -1,0 +1,1 @@
+"""Information of records about the parameters of a scene."""

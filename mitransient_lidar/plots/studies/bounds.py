@@ -1,0 +1,110 @@
+"""Figures of the least errors of parameters: of one design, and of several in comparison."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mitransient_lidar.plots import drawing
+
+_COLUMNS = 3  # panels side by side
+_SHOWN = 20  # designs in a panel, the best ones
+_WIDE = 20.0  # largest over smallest ratio from which on the axis is logarithmic
+
+
+def plot_bounds(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figure:
+    """Draw a result of `studies.bounds.bounds`.
+
+    Of several designs, a panel for each parameter ranks them by the ratio of their bound to that of the first, best on
+    top, at most 20; of a single one, the bounds beside those with the other parameters known, and the correlations.
+    """
+    if found.sizes["design"] == 1:
+        return _plot_one(found.isel(design=0), path)
+    names, shown = found["parameter"].values, min(found.sizes["design"], _SHOWN)
+    columns = min(_COLUMNS, names.size)
+    rows = math.ceil(names.size / columns)
+    labels = 0.075 * max(len(str(label)) for label in found["design"].values)
+    figure = drawing.new_figure(path, (2.9 + labels) * columns, (0.27 * shown + 1.1) * rows + 0.4)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, name in zip(axes, names, strict=False):
+        _rank(ax, found.sel(parameter=name))
+    for ax in axes[names.size :]:
+        ax.axis("off")
+    text = f"bounds of single shots relative to {found['design'].values[0]}, receiver {found.attrs['receiver']}"
+    figure.suptitle(drawing.titled(found.attrs, text))
+    return drawing.save(figure, path)
+
+
+def _rank(ax: Axes, one: xr.Dataset) -> None:
+    """Draw the ratios of one parameter, with the bounds as numbers."""
+    order = np.argsort(one["bound"].values, kind="stable")[:_SHOWN]
+    ranked = one.isel(design=order)
+    places = np.arange(order.size)
+    ratio, error = ranked["ratio"].values, np.nan_to_num(ranked["ratio_stderr"].values)
+    colours = ["#d81e1e" if number == 0 else "#1f5fd6" for number in order]
+    drawn = np.isfinite(ratio)
+    for place in places[drawn]:
+        style = {"fmt": "o", "color": colours[place], "markersize": 5, "capsize": 3}
+        ax.errorbar(ratio[place], place, xerr=error[place], **style)
+    for place in places:
+        value = float(ranked["bound"][place])
+        text = f"{value:.3g}" if math.isfinite(value) else "no bound"
+        ax.annotate(
+            text,
+            (1, place),
+            (4, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            size=7,
+        )
+    ax.axvline(1, color="0.6", linewidth=0.9)
+    ax.set_yticks(places, ranked["design"].values.tolist(), fontsize="small")
+    ax.set(ylim=(order.size - 0.5, -0.5), xlabel="bound over that of the first design")
+    if drawn.any() and ratio[drawn].max() > _WIDE * ratio[drawn].min():
+        ax.set_xscale("log")
+    unit = one["parameter_units"].item()
+    ax.set_title(f"{one['parameter'].item()}, bounds in {'units of 1' if unit == '1' else unit}", fontsize="medium")
+    drawing.add_grid(ax, "x")
+
+
+def _plot_one(one: xr.Dataset, path: drawing.FilePath | None) -> Figure:
+    """Draw bounds and correlations of one design."""
+    names = [str(name) for name in one["parameter"].values]
+    figure = drawing.new_figure(path, 9.2, 0.42 * len(names) + 2.2)
+    left, right = figure.subplots(1, 2)
+    places = np.arange(len(names))
+    # Offsets and angles may be 0, where a relative bound does not exist.
+    value = np.abs(one["parameter_value"].values)
+    scale = np.where(value > 0, value, 1.0)
+    labels = [
+        name if size > 0 else f"{name} ({unit})"
+        for name, size, unit in zip(names, value, one["parameter_units"].values, strict=True)
+    ]
+    for key, colour, fill, text in (
+        ("bound", "#1f5fd6", "#1f5fd6", "all unknown"),
+        ("bound_known", "#1f5fd6", "none", "others known"),
+    ):
+        relative = one[key].values / scale
+        drawn = np.isfinite(relative)
+        left.plot(relative[drawn], places[drawn], "o", color=colour, markerfacecolor=fill, label=text)
+    for place in places[~np.isfinite(one["bound"].values)]:
+        left.text(0.02, place, "no bound", transform=left.get_yaxis_transform(), va="center", size=8, color="0.4")
+    left.set_yticks(places, labels)
+    left.set(xscale="log", ylim=(len(names) - 0.5, -0.5), xlabel="bound over the value, absolute where a unit is given")
+    drawing.add_grid(left, "x")
+    left.legend(frameon=False, fontsize="small")
+    image = right.imshow(one["correlation"].values, vmin=-1, vmax=1, cmap="RdBu_r")
+    for (row, column), number in np.ndenumerate(one["correlation"].values):
+        if math.isfinite(number):
+            colour = "white" if abs(number) > 0.6 else "black"
+            right.text(column, row, f"{number:.2f}", ha="center", va="center", size=7, color=colour)
+    right.set_xticks(places, names, rotation=40, ha="right", fontsize="small")
+    right.set_yticks(places, names, fontsize="small")
+    figure.colorbar(image, ax=right, label="correlation of the estimates", shrink=0.8)
+    figure.suptitle(drawing.titled(one.attrs, f"bounds of a single shot, receiver {one.attrs['receiver']}"))
+    return drawing.save(figure, path)

@@ -1,0 +1,245 @@
+"""Least errors of parameters that a receiver's records allow, for one design of the lidar or several."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mitransient_lidar.analysis.information.fisher import fisher_information, priors
+from mitransient_lidar.analysis.jackknife import jackknife_error
+from mitransient_lidar.analysis.receiver import receiver_of
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.validation import integer, non_negative, shown
+from mitransient_lidar.physics.receiver.receiver_files import Receiver
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
+from mitransient_lidar.rendering.render import render
+from mitransient_lidar.rendering.session import open_scene
+
+#: Most designs of a comparison.
+MOST_DESIGNS = 1000
+
+_JOINED = ("bound", "bound_stderr", "bound_known", "variance_share", "monte_carlo_share", "correlation")
+
+
+def bounds(
+    scene: Any,
+    params: Mapping[str, Any] | None = None,
+    *,
+    free: Sequence[str],
+    over: Mapping[str, Sequence[Any]] | None = None,
+    receiver: Any = None,
+    gain: Any = None,
+    optical_density: Any = None,
+    background_power_w: float = 0.0,
+    nuisances: Mapping[str, float] | None = None,
+    renders: int = 4,
+    passes: int = 16,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Compute the Cramer-Rao bounds of parameters of a scene from one shot's record, and compare designs.
+
+    Parameters
+    ----------
+    scene, params
+        As for `rendering.render.render`.
+    free
+        Names of the unknown parameters, as for the `derivatives` of `rendering.render.render`; at least one.
+    over
+        Values of parameters of the scene, by name; designs are all combinations of them, the last one changing first,
+        at most 1000. None for the scene as it is.
+    receiver, gain, optical_density
+        As `chain`, `gain` and `optical_density` of `analysis.receiver.detect_waveforms`; several receivers in a list
+        are compared on the same renders, and ``receiver`` is then the last parameter of a design.
+    background_power_w
+        Steady power on each pixel [W], at least 0.
+    nuisances
+        As for `analysis.information.fisher.fisher_information`.
+    renders
+        Independent renders of each design, 2 to 1000, whose noise is kept out of the information; from three on their
+        spread gives standard errors.
+    passes
+        Passes of each render, 2 to 100 000.
+    seed
+        Seed of the random numbers, at least 0; all designs have the same ones.
+    progress
+        Called with a `passes.Progress` after every render.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``design`` (its parameters as text) and ``parameter``: ``bound``, ``bound_stderr``, ``bound_known``,
+        ``variance_share`` and ``monte_carlo_share`` of `fisher_information`, and ``ratio``, the bound over that of the
+        first design, with ``ratio_stderr`` by the spread of the renders. Over ``design``, ``parameter`` and
+        ``other_parameter``: ``correlation``. Over ``design``: ``lost_samples``, the share of samples of all pixels that
+        saturate, and ``remarks``, sentences on parameters that are not determined, one a line. Coordinates are those of
+        `fisher_information`, ``parameter_value`` over design and parameter, and ``design_NAME`` for each parameter of
+        `over`, as text.
+
+    Raises
+    ------
+    UserError
+        If the scene, a parameter or an option is invalid, or the records of a design hold no information.
+    KeyboardInterrupt
+        If a render was interrupted.
+    """
+    if isinstance(free, str) or len(free) == 0 or len(set(free)) != len(free):
+        raise UserError(f"free = {free!r} must be a list of different names of parameters")
+    renders, passes = integer("renders", renders, 2, 1000), integer("passes", passes, 2, 100_000)
+    seed, sky = integer("seed", seed, 0, 2**53), non_negative("background_power_w", background_power_w)
+    receivers = _receivers(receiver, gain)
+    known, designs = priors(nuisances or {}), _designs(over or {})
+    for design in designs:  # before the first render
+        session = open_scene(scene, {**(params or {}), **design})
+    began, found = time.perf_counter(), []
+    for number, design in enumerate(designs):
+        results = []
+        for i in range(renders):
+            # Seeds of a render are signed.
+            options: dict[str, Any] = {"derivatives": list(free), "passes": passes, "seed": pass_seed(seed, i) >> 1}
+            results.append(render(scene, params={**(params or {}), **design}, **options))
+            if results[-1].attrs.get("interrupted"):
+                raise KeyboardInterrupt("interrupted; bounds need all renders, and none is kept.")
+            if progress is not None:
+                done, planned = number * renders + i + 1, len(designs) * renders
+                elapsed = time.perf_counter() - began
+                left = elapsed / done * (planned - done)
+                progress(Progress(done, planned, "render", elapsed_s=elapsed, remaining_s=left))
+        for chain in receivers.values():
+            settings: dict[str, Any] = {"gain": gain, "optical_density": optical_density, "nuisances": known}
+            found.append(fisher_information(results, chain, sky, **settings))
+        if found[-1]["parameter"].values.tolist() != (names := found[0]["parameter"].values.tolist()):
+            raise UserError(f"over: the design {design} has other parameters than the first, {', '.join(names)}")
+    attributes = {
+        "scene": session.name,
+        "receiver": ", ".join(name or str(found[0].attrs.get("instrument", "apd")) for name in receivers),
+        "renders": renders,
+        "passes": passes,
+        "seed": seed,
+        "background_power_w": sky,
+        **{f"scene.{name}": str(value) for name, value in (params or {}).items()},
+    }
+    if len(receivers) > 1:
+        designs = [{**design, "receiver": name} for design in designs for name in receivers]
+    return _compared(found, designs, attributes)
+
+
+def _receivers(given: Any, gain: Any) -> dict[str, Receiver | None]:
+    """Return receivers by name, None with an empty name for that of the scene's instrument."""
+    listed = list(given) if isinstance(given, (list, tuple)) else [given]
+    found = [None if one is None else receiver_of("receiver", one) for one in listed]
+    named = {"" if one is None else one.name: one for one in found}
+    if len(named) < len(listed) or not named:
+        raise UserError(f"receiver = {shown(given)} must be one receiver, or several with different names")
+    for name, one in named.items():
+        if gain is not None and one is not None and one.default.chain.amplifier is None:
+            raise UserError(f"gain = {gain} needs a receiver with an amplifier, which {name} lacks")
+    return named
+
+
+def _designs(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Return the parameters of each design."""
+    for name, values in over.items():
+        if isinstance(values, str) or len(values) == 0 or len({str(value) for value in values}) != len(values):
+            raise UserError(f"over: {name} = {values!r} must be a list of different values")
+    if (count := math.prod(len(values) for values in over.values())) > MOST_DESIGNS:
+        raise UserError(f"over gives {count} designs: at most {MOST_DESIGNS} can be compared")
+    return [dict(zip(over, values, strict=True)) for values in itertools.product(*over.values())]
+
+
+def _compared(
+    found: Sequence[xr.Dataset], designs: Sequence[Mapping[str, Any]], attributes: Mapping[str, Any]
+) -> xr.Dataset:
+    """Return the bounds of all designs, with their ratios to the first."""
+    labels = [", ".join(f"{name}={value}" for name, value in one.items()) or "scene" for one in designs]
+    joined = xr.concat([one[list(_JOINED)].drop_vars("parameter_value") for one in found], "design")
+    joined = joined.drop_vars([name for name in ("pixel", "angle_x", "angle_y") if name in joined.coords])
+    first = found[0]["bound"].values
+    with np.errstate(invalid="ignore"):
+        # Nothing is compared with a first design that has no bound.
+        ratio = joined["bound"].values / np.where(np.isfinite(first), first, np.nan)
+        errors = [_ratio_errors(one, found[0]) for one in found]
+    one_each = {"units": "1"}
+    joined = joined.assign(
+        ratio=(("design", "parameter"), ratio, {**one_each, "long_name": "bound over that of the first design"}),
+        ratio_stderr=(("design", "parameter"), errors, {**one_each, "long_name": "standard error of the ratio"}),
+        lost_samples=(
+            "design",
+            [float(one["lost_samples"].mean()) for one in found],
+            {**one_each, "long_name": "share of samples that saturate"},
+        ),
+        remarks=("design", [one.attrs["remarks"] for one in found], {"long_name": "what a record does not determine"}),
+    )
+    values = np.stack([one["parameter_value"].values for one in found])
+    coords: dict[str, Any] = {"design": labels, "parameter_value": (("design", "parameter"), values)}
+    coords |= {f"design_{name}": ("design", [str(one[name]) for one in designs]) for name in designs[0]}
+    joined = joined.assign_coords(coords)
+    return joined.assign_attrs(attributes)
+
+
+def _ratio_errors(one: xr.Dataset, first: xr.Dataset) -> list[float]:
+    """Return standard errors of ratios of bounds; renders of the same random numbers are left out together."""
+    if "bound_left_out" not in one:
+        return [math.nan] * one.sizes["parameter"]
+    ratios = (one["bound_left_out"] / first["bound_left_out"].values).values
+    return [jackknife_error(column) if np.isfinite(column).all() else math.nan for column in ratios.T]
+
+
+def write_table(found: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a result of `bounds` as a CSV file, one row a design and parameter.
+
+    Columns are the parameters of the designs, the free parameter with its value and unit, and bound, bound_stderr,
+    bound_known, ratio and ratio_stderr; a bound that does not exist is inf, an unknown error nan.
+    """
+    varied = [str(name) for name in found.coords if str(name).startswith("design_")]
+    numbers = ("bound", "bound_stderr", "bound_known", "ratio", "ratio_stderr")
+    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow((*(name.removeprefix("design_") for name in varied), "parameter", "value", "units", *numbers))
+        for place in itertools.product(range(found.sizes["design"]), range(found.sizes["parameter"])):
+            cell = found.isel(design=place[0], parameter=place[1])
+            own = [cell[name].item() for name in (*varied, "parameter")]
+            value, units = float(cell["parameter_value"]), cell["parameter_units"].item()
+            rows.writerow((*own, f"{value:.9g}", units, *(f"{float(cell[name]):.6g}" for name in numbers)))
+
+
+def describe_bounds(found: xr.Dataset) -> list[str]:
+    """Return the lines of a table of a result of `bounds`, and its remarks.
+
+    One block a parameter, with the designs from the best to the worst: bound, its standard error, bound with the other
+    parameters known, and ratio to the first design.
+    """
+    lines = []
+    width = max(12, *(len(str(name)) for name in found["design"].values))
+    for name in found["parameter"].values:
+        one = found.sel(parameter=name)
+        first = one.isel(design=0)
+        prior = float(first["prior"])
+        known = f", known to {prior:g}" if math.isfinite(prior) else ""
+        unit = first["parameter_units"].item()
+        lines.append(f"{name} = {float(first['parameter_value']):g} {unit}{known}")
+        lines.append(f"  {'design':<{width}}{'bound':>11}{'+-':>10}{'others known':>14}{'ratio':>9}{'+-':>8}")
+        for place in np.argsort(one["bound"].values, kind="stable"):
+            row = one.isel(design=int(place))
+            cells = [float(row[key]) for key in ("bound", "bound_stderr", "bound_known", "ratio", "ratio_stderr")]
+            text = [
+                f"{value:>{size}.{digits}g}" if math.isfinite(value) else f"{'-':>{size}}"
+                for value, size, digits in zip(cells, (11, 10, 14, 9, 8), (4, 2, 4, 4, 2), strict=True)
+            ]
+            lines.append(f"  {row['design'].item():<{width}}{''.join(text)}")
+    for design in found["design"].values:
+        one = found.sel(design=design)
+        said = one["remarks"].item().splitlines()
+        if (lost := float(one["lost_samples"])) > 0:
+            said.append(f"{100 * lost:.2g} % of the samples saturate and count as lost")
+        lines += [f"{design}: {sentence}" for sentence in said]
+    return lines

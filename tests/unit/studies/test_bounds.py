@@ -1,0 +1,251 @@
+"""Bounds of designs from closed-form light in place of renders: ratios, table, figures and the command."""
+
+import csv
+
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import assert_refused, run
+from differentiated import PHOTON, result
+from PIL import Image
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver
+from mitransient_lidar.plots.studies.bounds import plot_bounds
+from mitransient_lidar.rendering.options import RenderOptions
+from mitransient_lidar.studies import bounds as study
+
+T = np.arange(60.0)
+SMALL = {"spectrum": "flat", "surface_size": 60, "surface_cell_size": 5}
+
+
+def light(_, *, params, derivatives, passes, seed):
+    """Return counts of a decay, whose height is the energy of the pulse; four pixels share its light."""
+    RenderOptions(passes=passes, seed=seed)  # refuses what a render would
+    random = np.random.default_rng(seed)
+    energy, rate = float(params.get("pulse_energy_mj", 5)), float(params.get("attenuation", 0.3))
+    pixels = 4 if params.get("layout", "1x1") == "2x2" else 1
+    decay = np.stack([100 * energy / pixels * np.exp(-rate * T)] * pixels)
+    noise = 1 + 1e-3 * random.normal(size=decay.shape)
+    slopes = {"attenuation": -T * decay * noise, "bottom_reflectance": decay * noise, "none": 0 * decay}
+    chosen = {name: PHOTON * slopes[name] for name in derivatives}
+    return result(PHOTON * (decay + 1), chosen, values={"attenuation": rate})
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """Replace the renders, and return the list of what is asked for."""
+    asked = []
+
+    def render(scene, **options):
+        asked.append(options)
+        return light(scene, **options)
+
+    monkeypatch.setattr(study, "render", render)
+    return asked
+
+
+@pytest.fixture(scope="module")
+def compared():
+    """Bounds of three energies with one pixel and with four, and what was rendered for them."""
+    asked = []
+
+    def render(scene, **options):
+        asked.append(options)
+        return light(scene, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "render", render)
+        found = study.bounds(
+            "table1",
+            {**SMALL, "attenuation": 0.3},
+            free=["attenuation", "bottom_reflectance"],
+            over={"pulse_energy_mj": [5, 20, 1.25], "layout": ["1x1", "2x2"]},
+            receiver="ideal",
+            passes=2,
+        )
+    return found, asked
+
+
+@pytest.fixture
+def found(compared):
+    """Bounds of three energies with one pixel and with four."""
+    return compared[0]
+
+
+@pytest.mark.slow
+def test_designs_are_rendered_on_the_same_random_numbers(compared):
+    _, rendered = compared
+    assert len(rendered) == 6 * 4
+    energies = [(one["params"]["pulse_energy_mj"], one["params"]["layout"]) for one in rendered[::4]]
+    assert energies == [(5, "1x1"), (5, "2x2"), (20, "1x1"), (20, "2x2"), (1.25, "1x1"), (1.25, "2x2")]
+    seeds = [one["seed"] for one in rendered]
+    assert seeds == seeds[:4] * 6
+    assert len(set(seeds)) == 4
+    assert rendered[0]["derivatives"] == ["attenuation", "bottom_reflectance"]
+    assert rendered[0]["params"]["attenuation"] == 0.3
+
+
+@pytest.mark.slow
+def test_ratios_of_counts_go_with_the_root_of_the_energy(found):
+    """Four times the photons halve the errors of counts, and pixels that share the light change nothing."""
+    assert found["bound"].dims == ("design", "parameter")
+    assert found["design_layout"].values.tolist() == ["1x1", "2x2"] * 3
+    # The steady photon of each bin, the photon noise of the tail, matters more at low energies and per pixel.
+    ratio = found["ratio"].values.reshape(3, 2, 2)
+    assert np.all(ratio[0, 0] == 1)
+    np.testing.assert_allclose(ratio[1, 0], 0.5, rtol=0.08)
+    np.testing.assert_allclose(ratio[2, 0], 2.0, rtol=0.15)
+    assert np.all((ratio[:, 1] > ratio[:, 0]) & (ratio[:, 1] < 1.3 * ratio[:, 0]))
+    assert np.all(found["ratio_stderr"][0] == 0)
+    assert np.all((found["ratio_stderr"][1:] > 0) & (found["ratio_stderr"][1:] < 1e-2))
+    assert np.all(found["bound_stderr"] < 1e-2 * found["bound"])
+
+
+@pytest.mark.slow
+def test_description_ranks_designs(found):
+    lines = study.describe_bounds(found)
+    assert lines[0] == "attenuation = 0.3 1/m"
+    names = [line[2:36].split("  ")[0] for line in lines[2:8]]
+    assert names[0] == "pulse_energy_mj=20, layout=1x1"
+    assert names[-1] == "pulse_energy_mj=1.25, layout=2x2"
+
+
+@pytest.mark.slow
+def test_table_has_a_row_for_each_design_and_parameter(found, tmp_path):
+    study.write_table(found, tmp_path / "table.csv")
+    rows = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
+    assert len(rows) == 12
+    assert rows[2] | {"bound": ""} == rows[2] | {"bound": "", "pulse_energy_mj": "5", "layout": "2x2"}
+    for number, row in enumerate(rows):
+        cell = found.isel(design=number // 2, parameter=number % 2)
+        assert row["parameter"] == cell["parameter"].item()
+        assert float(row["bound"]) == pytest.approx(float(cell["bound"]), rel=1e-5)
+        assert float(row["ratio"]) == pytest.approx(float(cell["ratio"]), rel=1e-5)
+
+
+def test_parameters_of_a_design_that_is_not_determined_are_said(rendered):
+    del rendered
+    found = study.bounds("table1", SMALL, free=["attenuation", "none"], receiver="ideal", nuisances={"scale": 0.1})
+    assert found["design"].values.tolist() == ["scene"]
+    assert np.isinf(found["bound"][0, 1])
+    lines = study.describe_bounds(found)
+    assert "scene: none has no influence on the record: no bound" in lines
+    assert "scale = 1 1, known to 0.1" in lines
+
+
+def test_receivers_are_compared_on_the_same_renders(rendered):
+    """A detector of a quantum efficiency of 0.7 without other noise knows counts to 1/sqrt(0.7) times the error."""
+    weak = Receiver(Channel(ReceiverChain(LinearDetector(0.7))), name="weak")
+    options = {"free": ["attenuation"], "over": {"layout": ["1x1", "2x2"]}, "renders": 2}
+    found = study.bounds("table1", SMALL, receiver=["ideal", weak], **options)
+    assert len(rendered) == 2 * 2
+    assert found["design"].values.tolist() == [
+        f"layout={layout}, receiver={name}" for layout in ("1x1", "2x2") for name in ("ideal", "weak")
+    ]
+    ratio = found["bound"].values.reshape(2, 2)
+    np.testing.assert_allclose(ratio[:, 1] / ratio[:, 0], 0.7**-0.5, rtol=1e-6)
+
+
+def test_interrupted_renders_are_not_kept(monkeypatch, tmp_path):
+    def render(scene, **options):
+        return light(scene, **options).assign_attrs(interrupted=1)
+
+    monkeypatch.setattr(study, "render", render)
+    small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
+    done = run("bounds", "table1", *small, "--free", "attenuation", "-o", tmp_path / "bounds.png", "-q")
+    assert done.exit_code == 130
+    assert done.stderr == "interrupted; bounds need all renders, and none is kept.\n"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_figure_ranks_designs(found):
+    figure = plot_bounds(found)
+    panels = figure.axes
+    assert [ax.get_title() for ax in panels] == ["attenuation, bounds in 1/m", "bottom_reflectance, bounds in 1/m"]
+    for number, ax in enumerate(panels):
+        labels = [text.get_text() for text in ax.get_yticklabels()]
+        order = np.argsort(found["bound"].values[:, number])
+        assert labels == found["design"].values[order].tolist()
+        drawn = [float(container.lines[0].get_xdata()[0]) for container in ax.containers]
+        np.testing.assert_allclose(drawn, found["ratio"].values[order, number])
+
+
+@pytest.mark.slow
+def test_figure_of_one_design(rendered):
+    del rendered
+    found = study.bounds("table1", SMALL, free=["attenuation", "bottom_reflectance", "none"], receiver="ideal")
+    left, right, _ = plot_bounds(found).axes
+    np.testing.assert_allclose(left.lines[0].get_xdata(), found["bound"].values[0, :2] / [0.3, 1])
+    assert "no bound" in [text.get_text() for text in left.texts]
+    np.testing.assert_array_equal(right.images[0].get_array(), found["correlation"].values[0])
+
+
+@pytest.mark.slow
+def test_command_writes_figure_data_and_table(rendered, tmp_path):
+    figure = tmp_path / "made" / "bounds.png"
+    small = [part for name, value in SMALL.items() for part in ("-D", f"{name}={value}")]
+    options = ["--free", "attenuation, bottom_reflectance", "--over", "layout=1x1,2x2", "--over", "layer_tops=0"]
+    chosen = ["--nuisance", "scale=0.05", "--nuisance", "time_offset", "--receiver", "ideal", "--passes", 2]
+    done = run("bounds", "table1", *small, *options, *chosen, "-o", figure, "-q")
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.splitlines()[:3] == [str(figure.with_suffix(end)) for end in (".png", ".nc", ".csv")]
+    assert rendered[0]["params"]["layout"] == "1x1"
+    with Image.open(figure) as picture:
+        assert picture.format == "PNG"
+    with xr.open_dataset(figure.with_suffix(".nc"), engine="h5netcdf") as kept:
+        assert kept["parameter"].values.tolist() == ["attenuation", "bottom_reflectance", "scale", "time_offset"]
+        assert kept["prior"].values.tolist() == [np.inf, np.inf, 0.05, np.inf]
+    assert len(figure.with_suffix(".csv").read_text().splitlines()) == 9
+
+
+def test_values_with_commas_are_separated_by_semicolons():
+    from mitransient_lidar.cli.bounds import _values
+
+    assert _values("layer_tops=0,2;0,3") == ("layer_tops", ["0,2", "0,3"])
+    assert _values("layout = 1x1, 2x2") == ("layout", ["1x1", "2x2"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"free": []}, r"free = \[\] must be a list of different names"),
+        ({"free": ["attenuation", "attenuation"]}, "must be a list of different names"),
+        ({"over": {"layout": ["1x1", "1x1"]}}, r"over: layout = \['1x1', '1x1'\] must be a list of different values"),
+        ({"over": {"layuot": ["1x1"]}}, "layuot"),
+        ({"over": {"bin_count": list(range(1001))}}, "over gives 1001 designs: at most 1000"),
+        ({"receiver": "eye"}, "receiver = 'eye' must be one of ideal"),
+        ({"receiver": ["apd", "apd"]}, r"receiver = \['apd', 'apd'\] must be one receiver, or several with different"),
+        ({"receiver": ["apd", "spad"], "gain": "auto"}, "gain = auto needs a receiver with an amplifier, which spad"),
+        ({"nuisances": {"phase": 1}}, "nuisance = 'phase' must be one of time_offset, scale"),
+        ({"renders": 1}, "renders = 1 must lie between 2 and 1000"),
+        ({"passes": 1}, "passes = 1 must lie between 2"),
+        ({"background_power_w": -1}, "background_power_w = -1 must not be negative"),
+    ],
+)
+def test_invalid_input_is_refused_before_a_render(rendered, options, message):
+    with pytest.raises(UserError, match=message):
+        study.bounds("table1", SMALL, **{"free": ["attenuation"], **options})
+    assert not rendered
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--free", "attenuation,"], "--free = 'attenuation,' has an empty entry"),
+        (["--free", "attenuation", "--over", "layout"], "--over layout is not of the form name=value,value,..."),
+        (["--free", "attenuation", "--over", "layout=1x1,"], "--over layout=1x1, is not of the form"),
+        (["--free", "attenuation", "--over", "layout=1x1", "--over", "layout=2x2"], "--over names a parameter twice"),
+        (["--free", "attenuation", "--nuisance", "scale=wide"], "--nuisance scale = 'wide' must be a number"),
+        (["--free", "attenuation", "--gain", "most"], "--gain most must be a number or auto"),
+        (["--free", "attenuation", "-o", "bounds.txt"], "must end in .png"),
+        ([], "Missing option '--free'"),
+    ],
+)
+def test_command_refuses_invalid_options(options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(run("bounds", "table1", *options), message)
+    assert not list(tmp_path.iterdir())
