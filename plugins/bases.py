@@ -150,8 +150,11 @@ class LidarIntegrator(mi.CppADIntegrator):
         return result if develop else mi.TensorXf()
 
     def render_forward(self, *args: Any, **kwargs: Any) -> mi.TensorXf:
-        """Raise UserError: there are no derivatives."""
-        raise UserError(f"{self.plugin} has no derivatives: render without parameters that track gradients")
+        """Raise UserError: Mitsuba's gradients do not pass through scattering."""
+        raise UserError(
+            f"{self.plugin} passes no gradients of Mitsuba: render without parameters that track them, and with "
+            "mitransient_lidar.render(..., derivatives=[...]) for derivatives"
+        )
 
     render_backward = render_forward
 

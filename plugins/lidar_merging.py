@@ -83,7 +83,7 @@ class LidarMerging(LidarIntegrator):
     from the reference by 0.04 +- 0.12 % in the first metre and 0.01 +- 0.06 % below; at 75 degrees over waves of 3 m/s
     by -1.4 +- 0.6 and -0.5 +- 0.5 %. The first 2 % of the light of narrow beams that meet several facets is 6 to 9 %
     high (1 mrad from 100 m at 40 degrees over 10 m/s; the column -0.2 %): a smaller ``point_spacing`` cures it. Wider
-    cells (``cell_size``) have more bias. There are no derivatives.
+    cells (``cell_size``) have more bias. Derivatives come from `mitransient_lidar.render`, not by Mitsuba.
 
     .. code-block:: xml
 

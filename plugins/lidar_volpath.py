@@ -73,7 +73,8 @@ class LidarVolpath(VolpathIntegrator):
     phase functions with a strong forward peak make rare, large values: in multiple scattering from a narrow beam, their
     standard errors are too small and their means mostly too low. ``lidar_merging`` does not have this limit.
 
-    Every segment is timed with the group index of the medium that it crosses. There are no derivatives.
+    Every segment is timed with the group index of the medium that it crosses. Derivatives come from
+    `mitransient_lidar.render`, not from Mitsuba's gradients.
 
     .. code-block:: xml
 

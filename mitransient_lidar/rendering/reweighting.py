@@ -11,8 +11,8 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range
 from mitransient_lidar.rendering.derivatives import path_parameters
-from mitransient_lidar.transport.medium.water_changes import COEFFICIENTS, changed_factors, layer_change
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
+from mitransient_lidar.transport.water_changes import COEFFICIENTS, changed_factors, layer_change
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer

@@ -39,16 +39,16 @@ def test_an_edited_scene_is_laid_out_anew(lidar_scene, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", INTEGRATORS)
-def test_derivatives_are_refused(lidar_scene, name):
+def test_gradients_are_refused(lidar_scene, name):
     scene = scene_with(lidar_scene, name)
-    with pytest.raises(UserError, match=f"{name} has no derivatives"):
+    with pytest.raises(UserError, match=f"{name} passes no gradients"):
         scene.integrator().render_forward(scene, None)
     parameters = mi.traverse(scene)
     key = "bottom.bsdf.reflectance.value"
     dr.enable_grad(parameters[key])
     parameters.update()
     energy = dr.sum(mi.render(scene, parameters, seed=1), axis=None)
-    with pytest.raises(UserError, match=f"{name} has no derivatives"):
+    with pytest.raises(UserError, match=f"{name} passes no gradients"):
         dr.backward(energy)
 
 

@@ -1,0 +1,161 @@
+"""Names of parameters by which light is differentiated, the water they change, and labelled results."""
+
+import numpy as np
+import pytest
+
+import mitransient_lidar
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
+from mitransient_lidar.rendering.derivatives import path_parameters
+from mitransient_lidar.rendering.reweighting import cases, check_share, effective_share
+from mitransient_lidar.rendering.session import choose_integrator, open_scene
+
+FEW = {"type": "lidar_merging", "paths_per_pass": 1024, "photons_per_pass": 1024}
+LAYERS = {
+    "layer_tops": "0, 3",
+    "attenuation": "0.5, 0.3",
+    "scattering": "0.3, 0",
+    "backscattering": "0.01, 0",
+    "spectrum": "flat",
+}
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    """Return the renderer of a scene with layers, the second without scattering."""
+    session = open_scene("table1", LAYERS)
+    return choose_integrator(session.scene, FEW).prepare(session.scene, session.sensor)
+
+
+def test_a_coefficient_stands_for_all_layers(renderer):
+    found = path_parameters(renderer, ["attenuation", "bottom_reflectance", "scattering[0]"])
+    assert [one.name for one in found] == ["attenuation[0]", "attenuation[1]", "bottom_reflectance", "scattering[0]"]
+    assert [one.value for one in found] == pytest.approx([0.5, 0.3, 0.1, 0.3])
+    assert [one.units for one in found] == ["1/m", "1/m", "1", "1/m"]
+    assert {one.method for one in found} == {"score"}
+
+
+def test_layers_of_equal_water_stay_apart():
+    """Layers of equal properties are traced as one, and differentiated each by itself."""
+    session = open_scene(
+        "table1", {**LAYERS, "attenuation": "0.3, 0.3", "scattering": "0.1", "backscattering": "0.001"}
+    )
+    renderer = choose_integrator(session.scene, FEW).prepare(session.scene, session.sensor)
+    assert renderer.scene.water.column.count == 1
+    assert len(path_parameters(renderer, "scattering")) == 2
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["atenuation"], r"derivatives = 'atenuation' must be one of attenuation\[0\], .*did you mean attenuation"),
+        (["attenuation[2]"], "must have the number of a layer, 0 to 1"),
+        (["attenuation", "attenuation[1]"], r"attenuation\[1\] is given twice"),
+        (["scattering[1]"], r"scattering\[1\]: the layer has scattering = 0"),
+        (["phase_g"], "phase_g: the water has no phase function hg"),
+        (["surface_reflectance"], "derivatives = 'surface_reflectance' must be one of"),
+        ([3], "derivatives = 3 must be one of"),
+        (5, "derivatives = 5 must be names of parameters"),
+    ],
+)
+def test_unknown_names_are_refused(renderer, names, message):
+    with pytest.raises(UserError, match=message):
+        path_parameters(renderer, names)
+
+
+@pytest.mark.parametrize("water", [{"phase_function": "petzold"}, {"phase_function": "hg", "phase_g": 0.9}])
+def test_backscattering_without_influence_is_refused(lidar_scene, water):
+    scene = lidar_scene(integrator=FEW, water=water)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    with pytest.raises(UserError, match="backscattering: the light does not depend on it"):
+        path_parameters(renderer, ["backscattering"])
+
+
+def test_phase_functions_stay_normalised(renderer):
+    """The mean of d ln p over the function is 0, to the linear interpolation of the tables, and its spread is not."""
+    (parameter,) = path_parameters(renderer, ["backscattering[0]"])
+    slope = parameter.perturbation.layers[0].by_angle
+    table = renderer.scene.water.layers.table(0)
+    s = np.exp(DEFAULT_LOG_S0 * np.linspace(1, 0, DEFAULT_COUNT))
+    weight = 4 * np.pi * table.eval_s(s) * s * table.step
+    weight[[0, -1]] *= 0.5
+    mean, spread = (weight @ slope) / weight.sum(), np.sqrt((weight @ slope**2) / weight.sum())
+    assert abs(mean) < 2e-3 * spread
+    # More light goes back, and less is in the peak.
+    assert slope[-1] > 0 > slope[0]
+
+
+def test_cases_of_other_values(renderer):
+    (case,) = cases(renderer, [{"attenuation[0]": 0.6, "bottom_reflectance": 0.2}])
+    assert case.label == "attenuation[0] = 0.6, bottom_reflectance = 0.2"
+    assert case.perturbation.layers[0].per_metre == pytest.approx(-0.1)
+    assert case.perturbation.solids[0][1] == pytest.approx(np.log(2))
+    assert case.squared.layers[0].per_metre == pytest.approx(-0.2)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"attenuation": 0.4}, "reweight: attenuation must be a coefficient of one layer"),
+        ({"scattering[1]": 0.1}, r"scattering\[1\]: the layer has scattering = 0"),
+        ({"attenuation[0]": 0.2}, "scattering = 0.3 must not exceed attenuation = 0.2"),
+        ({"bottom_reflectance": 1.5}, "bottom_reflectance = 1.5 must lie between"),
+        ({"colour": 1}, "reweight = 'colour' must be one of"),
+    ],
+)
+def test_cases_that_cannot_be_reached_are_refused(renderer, values, message):
+    with pytest.raises(UserError, match=message):
+        cases(renderer, [values])
+
+
+def test_effective_share():
+    """Equal ratios keep all paths; a ratio of which one path in four carries the light keeps a quarter."""
+    energy = np.ones(4)
+    assert effective_share(energy, 2 * energy, 4 * energy) == pytest.approx(1)
+    single = np.array([8.0, 0, 0, 0])
+    assert effective_share(energy, single, single**2) == pytest.approx(0.25)
+    with pytest.raises(UserError, match=r"reweight: a = 1 is too far .* a share of 0.1"):
+        check_share("a = 1", 0.1)
+
+
+@pytest.mark.slow
+def test_results_with_derivatives(tmp_path):
+    """Waveforms are those without derivatives; a file holds all, and is rendered again to the same bits."""
+    options = {"params": LAYERS, "passes": 4, "seed": 5, "integrator": FEW}
+    names = ["attenuation[0]", "bottom_depth", "bottom_reflectance"]
+    shot = mitransient_lidar.render("table1", derivatives=names, reweight=[{"attenuation[0]": 0.52}], **options)
+    plain = mitransient_lidar.render("table1", **options)
+    np.testing.assert_array_equal(shot["waveform"], plain["waveform"])
+    assert shot["parameter"].values.tolist() == names
+    assert shot["parameter_method"].values.tolist() == ["score", "central differences", "score"]
+    assert shot["waveform_derivative"].dims == ("parameter", "pixel", "time")
+    assert shot["waveform_reweighted"].dims == ("case", "pixel", "time")
+    assert 0.9 < float(shot["effective_share"][0]) < 1
+    # Light falls with absorption, and by less than exp(-0.02 * 17 m).
+    total = float(shot["waveform_reweighted"].sum() / plain["waveform"].sum())
+    assert np.exp(-0.34) < total < 1
+    results.save(shot, tmp_path / "shot.nc")
+    held = mitransient_lidar.open(tmp_path / "shot.nc")
+    assert held.identical(shot)
+    again = mitransient_lidar.render(tmp_path / "shot.nc")
+    np.testing.assert_array_equal(again["waveform_derivative"], shot["waveform_derivative"])
+    with pytest.raises(UserError, match="cannot store the variable"):
+        results.save(shot, tmp_path / "shot.exr")
+
+
+@pytest.mark.slow
+def test_series_of_shots_with_derivatives():
+    """Each shot has its own derivatives, and the waveforms of a series without them."""
+    places = [(0.0, 0.0), (4.0, 1.0)]
+    options = {"positions": places, "passes": 2, "pass_share": 0.1}
+    names = ["attenuation", "bottom_reflectance"]
+    series = mitransient_lidar.render_shots("table1", derivatives=names, **options)
+    plain = mitransient_lidar.render_shots("table1", **options)
+    np.testing.assert_array_equal(series["waveform"], plain["waveform"])
+    assert series["waveform_derivative"].dims == ("shot", "parameter", "pixel", "time")
+    slopes = series["impulse_response_derivative"].sum(("pixel", "time"))
+    assert np.all(slopes.sel(parameter="attenuation") < 0)
+    assert np.all(slopes.sel(parameter="bottom_reflectance") > 0)
+    with pytest.raises(UserError, match="derivatives = 'bottom_depth' must be one of"):
+        mitransient_lidar.render_shots("table1", derivatives=["bottom_depth"], **options)
