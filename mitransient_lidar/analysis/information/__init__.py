@@ -1,0 +1,1 @@
+"""Information of waveforms about parameters: fits."""
