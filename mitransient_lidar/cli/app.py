@@ -19,6 +19,7 @@ from mitransient_lidar._version import __version__
 from mitransient_lidar.cli import (
     campaigns,
     depth_bias,
+    fit,
     flights,
     gates,
     render,
@@ -54,6 +55,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         gates.gates,
         waveforms.waveforms,
         retrieve.retrieve,
+        fit.fit,
     ),
     "Scenes and system": (scenes.instruments, scenes.info, scenes.bench),
 }
