@@ -33,8 +33,11 @@ def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure
         upper.plot(time, np.where(used[pixel] > 0, rows["fitted"][pixel], np.nan), color=colour, linewidth=1.1)
         lower.plot(time, residual[pixel], ".", color=colour, markersize=3)
     peak = float(np.nanmax(rows["fitted"][strongest]))
-    upper.set_yscale("symlog", linthresh=1e-3 * peak, linscale=0.3)
-    upper.set_ylim(-1e-3 * peak, 2 * peak)
+    # Noise would fill the lower decades of a logarithmic axis.
+    noise = float(np.median(np.nan_to_num(rows["measured_stderr"][strongest])))
+    linear = min(max(1e-3 * peak, 3 * noise), 0.3 * peak)
+    upper.set_yscale("symlog", linthresh=linear, linscale=0.5)
+    upper.set_ylim(-linear, 2 * peak)
     upper.set_ylabel(f"waveform ({fitted['measured'].attrs.get('units') or 'any unit'})")
     upper.legend(frameon=False, ncols=2 if strongest.size > 4 else 1)
     lower.set_xlim(time[shown][0], time[shown][-1])
