@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,8 +15,9 @@ import xarray as xr
 from mitransient_lidar.analysis.information.fits import SCALE, TIME_OFFSET, WaveformFit
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import integer, number_list, shown
+from mitransient_lidar.core.validation import integer, shown
 from mitransient_lidar.loading.catalogue import scene_parameters
+from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import MOST_PASSES
@@ -28,8 +28,6 @@ logger = logging.getLogger(__name__)
 
 _PILOT_PASSES, _MOST_PASSES = 16, 256  # of the first render, and most that are chosen
 _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
-
-_INDEXED = re.compile(r"(\w+)\[(\d+)\]")
 
 
 def fit(
@@ -119,7 +117,7 @@ def fit(
     model = _RenderedModel(
         _scene(scene, attributes), params, instrument, names, given or _PILOT_PASSES, _seed(seed, attributes), progress
     )
-    starts = {**model.starts(names, start or {}), **{k: v for k, v in (start or {}).items() if k not in names}}
+    starts = {**model.starts(start or {}), **(start or {})}
     problem = WaveformFit(found, model, starts, bounds, **options)
     if given is None and (ratio := problem.noise_ratio()) > _LARGEST_RATIO:
         needed = math.ceil(_PILOT_PASSES * ratio / _LARGEST_RATIO)
@@ -174,49 +172,16 @@ class _RenderedModel:
             self.progress(Progress(self.done, None, unit="render", elapsed_s=time.perf_counter() - self.began))
         return dataset
 
-    def starts(self, names: Sequence[str], given: Mapping[str, float]) -> dict[str, float]:
-        """Return the starts of parameters, from the scene where they are not given.
-
-        Raises
-        ------
-        UserError
-            If the scene has no such parameter, or no number for it.
-        """
-        return {name: given[name] if name in given else self._own(name) for name in names}
+    def starts(self, given: Mapping[str, float]) -> dict[str, float]:
+        """Return the starts of the free parameters, by default their values in the scene."""
+        return {name: given.get(name, value_of(self.texts, name)) for name in self.names}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, Any]:
         """Return the parameters of the scene with other values, those of layers in their list."""
-        changed = dict(self.params)
+        texts = self.texts
         for name, value in values.items():
-            base, layer = _split(name)
-            if layer is None:
-                changed[base] = value
-                continue
-            listed = number_list(base, changed.get(base, self.texts.get(base, "")))
-            listed[layer] = value
-            changed[base] = ", ".join(repr(float(one)) for one in listed)
-        return changed
-
-    def _own(self, name: str) -> float:
-        """Return the value of a parameter in the scene."""
-        base, layer = _split(name)
-        if base not in self.texts:
-            raise UserError(f"free = {name!r} must be a parameter of the scene: {', '.join(self.texts)}")
-        try:
-            listed = number_list(base, self.texts[base])
-        except UserError:
-            text = shown(self.texts[base])
-            raise UserError(f"{base} = {text} of the scene is no number to start from: set it, or give start") from None
-        if (layer or 0) >= listed.size or (layer is None and listed.size > 1):
-            layers = ", ".join(f"{base}[{number}]" for number in range(listed.size))
-            raise UserError(f"free = {name!r} must be one of {layers}: the scene has {base} = {self.texts[base]}")
-        return float(listed[layer or 0])
-
-
-def _split(name: str) -> tuple[str, int | None]:
-    """Return the name of a parameter, and the number of the layer that it is for."""
-    found = _INDEXED.fullmatch(name)
-    return (found[1], int(found[2])) if found else (name, None)
+            texts = with_value(texts, name, value)
+        return {**self.params, **{parameter_of(name): texts[parameter_of(name)] for name in values}}
 
 
 def _names(free: Sequence[str]) -> list[str]:

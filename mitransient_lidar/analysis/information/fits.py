@@ -3,12 +3,11 @@
 Scale and time offset of uncalibrated waveforms are parameters like the others, not projected out, so that bounds,
 weights and the covariance treat all parameters alike. They start at the time of the largest correlation with the model
 and at the scale of linear least squares. Positive parameters are fitted as logarithms: from starts of half and of 1.5
-times the truth of an exponential column and a bottom echo, that takes 7 evaluations of the model, plain values 7 and 8.
+times the truth of an exponential column and a bottom echo, that takes 6 renders each, with plain values 6 and 7.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -25,17 +24,16 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import limits, unit_of
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, integer
 
-logger = logging.getLogger(__name__)
-
 #: A function that returns a render, with derivatives, of values of the free parameters.
 Model = Callable[[Mapping[str, float]], xr.Dataset]
 
 SCALE, TIME_OFFSET = "scale", "time_offset_ns"
 
 _WINDOW = 10.0  # model bins by which the time offset may change before samples in use are chosen anew
-_MOST_ROUNDS = 6  # of weights that follow the model
+_MOST_ROUNDS = 8  # of weights that follow the model
 _SETTLED = 0.05  # standard errors by which parameters may still change in the last round
-_TOLERANCE = 1e-5  # relative change of the sum of squares, and of steps, that ends a round
+_SMALLEST_STEP = 0.02  # standard errors; smaller steps are not rendered
+_TOLERANCE = 1e-3  # relative change of the sum of squares that ends a round
 
 
 @dataclass(frozen=True)
@@ -146,6 +144,9 @@ class WaveformFit:
         self.renders = 0
         self._kept: dict[tuple[float, ...], Prediction] = {}
         self.units: dict[str, str] = {}
+        # Values and Jacobian [standard deviations] of the last accepted step, and why others were not tried.
+        self._accepted: tuple[FloatArray, FloatArray] | None = None
+        self._refusal, self._exhausted = "", False
         aligned = self._align({name: float(value) for name, value in starts.items()})
         self.free = free_parameters(aligned, bounds)
         self.starts = aligned
@@ -194,9 +195,10 @@ class WaveformFit:
         self._limit = integer("most_renders", most_renders, 2, 10_000)
         lower = np.array([free.internal(free.low) for free in self.free])
         upper = np.array([free.internal(free.high) for free in self.free])
-        values, rounds, settled, status = dict(self.starts), 0, False, 0
+        values, rounds, settled = dict(self.starts), 0, False
         while not settled and rounds < _MOST_ROUNDS and self.renders < most_renders:
             rounds += 1
+            self._refusal = ""
             used = self._used(values)
             weights = self._weights(values, used)
             ends = lower.copy(), upper.copy()
@@ -210,23 +212,15 @@ class WaveformFit:
                 method="trf",
                 x_scale="jac",
                 ftol=_TOLERANCE,
-                xtol=_TOLERANCE,
+                xtol=1e-12,
                 gtol=1e-12,
                 max_nfev=most_renders,
             )
-            former, values, status = values, self._named(solution.x), solution.status
+            former, values = values, self._named(solution.x)
             errors = self._errors(values, used, scale_errors)
             change = np.array([values[name] - former[name] for name in values])
             settled = bool(np.all(np.abs(change) <= _SETTLED * np.nan_to_num(errors.stderr, nan=np.inf)))
-            settled |= not self._follows_model()
-        converged = settled and status > 0 and self.renders <= most_renders
-        return self._dataset(values, used, errors, rounds, converged)
-
-    def _follows_model(self) -> bool:
-        """Return whether the weights or the samples in use depend on the parameters."""
-        if TIME_OFFSET in self.nuisances or self.found.receiver is not None:
-            return True
-        return any(np.any(kept.model_variance > 0) for kept in self._kept.values())
+        return self._dataset(values, used, errors, rounds, settled and not self._exhausted)
 
     def _prediction(self, values: Mapping[str, float]) -> Prediction:
         """Return the samples of the model, from one of the last renders if its values are the same."""
@@ -305,25 +299,39 @@ class WaveformFit:
         return np.where(weighted, 1 / np.sqrt(np.where(weighted, variance, 1.0)), 0.0)
 
     def _residuals(self, x: FloatArray, weights: FloatArray, used: BoolArray) -> FloatArray:
-        """Return the weighted differences, NaN where the scene is impossible or too many renders were made.
+        """Return the weighted differences, or NaN, after which the optimiser takes a smaller step.
 
-        The optimiser then takes a smaller step.
+        That is where the scene is impossible, too many renders were made, or the step is too small to matter: the last
+        steps are within the noise that common random numbers leave, and would cost a render each.
         """
         values = self._named(x)
-        if self._key(values) not in self._kept and self.renders >= self._limit:
-            return np.full(np.count_nonzero(used), np.nan)
+        unknown = np.full(np.count_nonzero(used), np.nan)
+        if self._key(values) not in self._kept:
+            self._exhausted |= self.renders >= self._limit
+            if self._exhausted or (self._accepted is not None and self._step(x) < _SMALLEST_STEP):
+                return unknown
         try:
             mean = self._at(values)[0]
         except UserError as error:
-            logger.debug("a step was refused: %s", error)
-            return np.full(np.count_nonzero(used), np.nan)
+            self._refusal = str(error)
+            return unknown
         return np.asarray((weights * (mean - np.nan_to_num(self.found.values)))[used])
+
+    def _step(self, x: FloatArray) -> float:
+        """Return the change of the model by a step in standard deviations, which is its length in standard errors."""
+        assert self._accepted is not None
+        start, jacobian = self._accepted
+        return float(np.linalg.norm(jacobian @ (x - start)))
 
     def _jacobian(self, x: FloatArray, weights: FloatArray, used: BoolArray) -> FloatArray:
         values = self._named(x)
         inner = [values[free.name] if free.is_logarithm else 1.0 for free in self.free]
-        derivative = self._at(values)[1]
-        return np.asarray(((weights * derivative)[:, used] * np.array(inner)[:, None]).T)
+        mean, derivative, _, noise = self._at(values)
+        jacobian = np.asarray(((weights * derivative)[:, used] * np.array(inner)[:, None]).T)
+        # Unknown errors are those of the residuals.
+        spread = 1.0 if noise is not None else float(np.std((self.found.values - mean)[used])) or 1.0
+        self._accepted = x.copy(), jacobian / spread
+        return jacobian
 
     def _named(self, x: FloatArray) -> dict[str, float]:
         return {free.name: free.value(float(one)) for free, one in zip(self.free, x, strict=True)}
@@ -410,6 +418,8 @@ class WaveformFit:
         units = [self.units.get(name) or _unit(name) for name in names]
         messages = [] if converged else [f"the fit has not converged in {self.renders} renders"]
         messages += errors.messages(names, np.array(list(values.values())))
+        if self._refusal:
+            messages.append(f"steps were refused, at which the fit may have ended: {self._refusal}")
         if noise is None:
             messages.append("the errors of the waveforms are unknown: they are taken from the residuals")
         return xr.Dataset(

@@ -129,16 +129,18 @@ def test_noise_of_the_model_widens_the_covariance():
     np.testing.assert_allclose(share, np.sqrt(0.5), rtol=1e-6)
 
 
-def test_exact_waveforms_are_fitted_exactly_with_few_renders():
+def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
+    """Steps of less than 0.02 standard errors are not rendered."""
     fitted = fit(closed_form(TRUTH), noise=0.001)
-    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-6)
-    assert fitted.attrs["renders"] < 12
+    assert distance(fitted) < 0.02**2
+    assert fitted.attrs["renders"] < 10
+    assert fitted.attrs["converged"]
     assert fitted["parameter_units"].values.tolist() == ["1/m", "1/m", "1"]
     np.testing.assert_array_equal(fitted["start"], list(WRONG.values()))
     np.testing.assert_allclose(np.diag(fitted["correlation"]), 1)
     lines = describe_fit(fitted)
     assert lines[1].split()[0] == "attenuation"
-    assert float(lines[1].split()[1]) == pytest.approx(0.2)
+    assert float(lines[1].split()[1]) == pytest.approx(0.2, rel=1e-3)
     assert lines[-1] == f"{fitted.attrs['renders']} renders"
     heading, rows = table_rows(fitted)
     assert heading[:3] == ("parameter", "unit", "value")
@@ -165,8 +167,8 @@ def test_errors_are_taken_from_residuals_where_they_are_unknown():
     data = noisy(0.002, np.random.default_rng(6))
     known, unknown = fit(data), fit(data.drop_vars("waveform_stderr"))
     factor = np.sqrt(known.attrs["chi_squared"] / known.attrs["expected"])
-    np.testing.assert_allclose(unknown["stderr"], factor * known["stderr"], rtol=1e-3)
-    np.testing.assert_allclose(fit(data, scale_errors=True)["stderr"], unknown["stderr"], rtol=1e-3)
+    np.testing.assert_allclose(unknown["stderr"], factor * known["stderr"], rtol=3e-3)
+    np.testing.assert_allclose(fit(data, scale_errors=True)["stderr"], unknown["stderr"], rtol=3e-3)
     assert np.isnan(unknown.attrs["probability"])
     assert any("errors of the waveforms are unknown" in text for text in unknown.attrs["messages"])
 
@@ -208,7 +210,22 @@ def test_impossible_steps_are_shortened_and_the_fit_goes_on():
     starts = {"attenuation": 0.3, "scattering": 0.01, "bottom_reflectance": 0.02}
     fitted = fit(closed_form(TRUTH), starts, model=model, noise=0.002)
     assert refused
+    assert fitted.attrs["converged"]
     np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-4)
+
+
+def test_a_fit_that_ends_at_refused_values_says_so():
+    """The truth has an attenuation of 0.2, and the scene refuses more than 0.15."""
+
+    def model(values):
+        if values["attenuation"] > 0.15:
+            raise UserError("attenuation must not exceed 0.15")
+        return closed_form(values)
+
+    fitted = fit(closed_form(TRUTH), model=model, noise=0.002)
+    assert fitted["value"][0] <= 0.15
+    text = "steps were refused, at which the fit may have ended: attenuation must not exceed 0.15"
+    assert text in fitted.attrs["messages"]
 
 
 def test_few_renders_end_without_convergence():
