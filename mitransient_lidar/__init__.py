@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
     from mitransient_lidar.studies.detection import detect
     from mitransient_lidar.studies.estimate import estimate
+    from mitransient_lidar.studies.fit import fit
 
 #: Functions by the modules that are imported when they are first used.
 _FUNCTIONS = {
@@ -77,6 +78,7 @@ _FUNCTIONS = {
     "depth_uncertainty": ("studies.depth_uncertainty", "depth_uncertainty"),
     "detect": ("studies.detection", "detect"),
     "estimate": ("studies.estimate", "estimate"),
+    "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
     "instrument_names": ("loading.instruments", "instrument_names"),
     "read_instrument": ("loading.instruments", "read_instrument"),
@@ -99,6 +101,7 @@ __all__ = [
     "depth_uncertainty",
     "detect",
     "estimate",
+    "fit",
     "fly",
     "instrument_names",
     "open",

@@ -20,6 +20,7 @@ from mitransient_lidar.cli import (
     bounds,
     campaigns,
     depth_bias,
+    fit,
     flights,
     gates,
     render,
@@ -56,6 +57,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         gates.gates,
         waveforms.waveforms,
         retrieve.retrieve,
+        fit.fit,
     ),
     "Scenes and system": (scenes.instruments, scenes.info, scenes.bench),
 }

@@ -1,1 +1,1 @@
-"""Information of records about the parameters of a scene."""
+"""Information of records about the parameters of a scene: bounds of errors, and fits."""

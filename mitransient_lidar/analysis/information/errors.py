@@ -1,0 +1,180 @@
+"""Errors of fitted parameters, for errors of samples that neighbours share, and the chi-squared of a fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitransient_lidar.core.validation import BoolArray, FloatArray
+
+_DEGENERATE = 0.999  # correlation of two parameters above which only one combination of them is known
+_SMALLEST = 1e-14  # eigenvalue of the scaled normal matrix, below which a combination of parameters is unknown
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of parameters.
+
+    Attributes
+    ----------
+    covariance
+        Shape (parameter, parameter); NaN for parameters that are at a bound or without influence, and for the others
+        with these fixed.
+    by_model
+        Standard errors by the Monte Carlo of the model alone, shape (parameter,).
+    influence
+        Change of the waveforms per unit of each parameter in standard deviations, shape (parameter,).
+    held
+        Whether a parameter is at a bound.
+    chi_squared, expected, freedom
+        Sum of the squared residuals, its mean, and the degrees of freedom of the chi-squared distribution, scaled to
+        this mean, that has its variance.
+    """
+
+    covariance: FloatArray
+    by_model: FloatArray
+    influence: FloatArray
+    held: BoolArray
+    chi_squared: float
+    expected: float
+    freedom: float
+
+    @property
+    def stderr(self) -> FloatArray:
+        """Standard errors, shape (parameter,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlations, shape (parameter, parameter)."""
+        return np.asarray(self.covariance / np.outer(self.stderr, self.stderr))
+
+    @property
+    def reduced(self) -> float:
+        """Chi-squared over its mean."""
+        return self.chi_squared / self.expected if self.expected > 0 else math.nan
+
+    @property
+    def probability(self) -> float:
+        """Probability of a larger chi-squared."""
+        from scipy.stats import chi2
+
+        return float(chi2.sf(self.reduced * self.freedom, self.freedom))
+
+    def messages(self, names: Sequence[str], values: FloatArray) -> list[str]:
+        """Return sentences on parameters that the waveforms do not determine."""
+        found = []
+        for name, value, influence, held in zip(names, values, self.influence, self.held, strict=True):
+            if held:
+                found.append(
+                    f"{name} is at its bound {value:g}: its error is unknown, and those of others hold with it fixed"
+                )
+            elif influence == 0:
+                found.append(f"{name} has no influence on the waveforms: it is unknown")
+            elif value != 0 and influence * abs(value) < 1:
+                found.append(
+                    f"{name} has little influence on the waveforms: even with all others known, its standard error "
+                    f"would be {1 / influence:.3g}"
+                )
+        correlation = self.correlation
+        for i in range(len(names)):
+            for j in range(i):
+                if abs(correlation[i, j]) > _DEGENERATE:
+                    found.append(
+                        f"{names[j]} and {names[i]} cannot be told apart: their correlation is "
+                        f"{correlation[i, j]:.5f}, only a combination of them is known"
+                    )
+        return found
+
+
+def estimate_errors(
+    residuals: FloatArray,
+    derivatives: FloatArray,
+    noise: tuple[FloatArray, FloatArray],
+    model: tuple[FloatArray, FloatArray],
+    held: BoolArray,
+    scaled: bool,
+    known_noise: bool = True,
+) -> Errors:
+    """Return the errors of the solution of a weighted least-squares problem.
+
+    Parameters
+    ----------
+    residuals
+        Differences in standard deviations, shape (pixel, time), 0 where a sample is not used.
+    derivatives
+        Derivatives of the model in standard deviations per unit of each parameter, shape (parameter, pixel, time).
+    noise, model
+        Errors of the waveforms and of the Monte Carlo of the model: standard deviations in those of the difference,
+        shape (pixel, time), 0 where a sample is not used, and correlations by the distance in samples, shape (lags,).
+    held
+        Parameters at a bound, which are fixed, shape (parameter,).
+    scaled
+        Whether to multiply the covariance by the reduced chi-squared.
+    known_noise
+        Whether the errors of the waveforms are known. If not, all are the same, differences are in the unit of the
+        waveforms, `noise` is 1, and the covariance is multiplied by the reduced chi-squared in any case.
+
+    Notes
+    -----
+    With the weighted derivatives J and the covariance C of the weighted differences, the covariance of the parameters
+    is (J^T J)^-1 J^T C J (J^T J)^-1, which is (J^T J)^-1 for independent errors. The chi-squared has the mean tr(Q C)
+    and the variance 2 tr(Q C Q C) with Q = 1 - J (J^T J)^-1 J^T, those of a scaled chi-squared distribution
+    (F. E. Satterthwaite, Biometrics Bulletin 2, 110 (1946), doi:10.2307/3002019).
+    """
+    influence = np.sqrt(np.sum(derivatives**2, axis=(1, 2)))
+    known = (influence > 0) & ~held
+    count = int(known.sum())
+    scaled_derivatives = derivatives[known] / influence[known, None, None]
+    flat = scaled_derivatives.reshape(count, -1)
+    eigenvalues, vectors = np.linalg.eigh(flat @ flat.T)
+    inverse = (vectors / np.maximum(eigenvalues, _SMALLEST)) @ vectors.T
+    # Residuals, from which unknown errors are taken, hold those of the model, too.
+    kinds = [noise, model] if known_noise else [noise]
+    parts = [
+        inverse @ (_correlated(scaled_derivatives, *errors).reshape(count, -1) @ flat.T) @ inverse
+        for errors in (noise, model)
+    ]
+    # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
+    kept = eigenvalues > _SMALLEST * count
+    basis = ((vectors[:, kept] / np.sqrt(eigenvalues[kept])).T @ flat).reshape(-1, *residuals.shape)
+    image = sum((_correlated(basis, *errors) for errors in kinds), np.zeros_like(basis))
+    projected = image.reshape(len(basis), -1) @ basis.reshape(len(basis), -1).T
+    expected = sum(float(np.sum(deviation**2)) for deviation, _ in kinds) - float(np.trace(projected))
+    variance = 2 * (_trace_of_square(kinds) - 2 * float(np.sum(image**2)) + float(np.sum(projected**2)))
+    chi_squared = float(np.sum(residuals**2))
+    factor = chi_squared / expected if (scaled or not known_noise) and expected > 0 else 1.0
+    place, unit = np.ix_(known, known), np.outer(influence[known], influence[known])
+    covariance = np.full((held.size, held.size), np.nan)
+    covariance[place] = factor * sum(parts[: len(kinds)], np.zeros_like(inverse)) / unit
+    by_model = np.full(held.size, np.nan)
+    by_model[known] = np.sqrt(np.maximum(np.diag(parts[1]), 0)) / influence[known]
+    freedom = 2 * expected**2 / variance if variance > 0 else math.nan
+    return Errors(covariance, by_model, influence, held, chi_squared, expected, freedom)
+
+
+def _correlated(vectors: FloatArray, deviation: FloatArray, correlation: FloatArray) -> FloatArray:
+    """Return vectors, shape (..., pixel, time), times the covariance of errors."""
+    scaled = vectors * deviation
+    lags = correlation[: scaled.shape[-1]]
+    total = lags[0] * scaled
+    for lag in range(1, lags.size):
+        total[..., lag:] += lags[lag] * scaled[..., :-lag]
+        total[..., :-lag] += lags[lag] * scaled[..., lag:]
+    return np.asarray(total * deviation)
+
+
+def _trace_of_square(kinds: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+    """Return the trace of the square of the covariance of all kinds of errors together."""
+    pixels, count = kinds[0][0].shape
+    total = 0.0
+    for lag in range(min(count, max(correlation.size for _, correlation in kinds))):
+        element = np.zeros((pixels, count - lag))
+        for deviation, correlation in kinds:
+            if lag < correlation.size:
+                element += correlation[lag] * deviation[:, lag:] * deviation[:, : count - lag]
+        total += (1 if lag == 0 else 2) * float(np.sum(element**2))
+    return total

@@ -1,0 +1,490 @@
+"""Weighted nonlinear least squares of waveforms, with exact derivatives of the model.
+
+Scale and time offset of uncalibrated waveforms are parameters like the others, not projected out, so that bounds,
+weights and the covariance treat all parameters alike. They start at the time of the largest correlation with the model
+and at the scale of linear least squares. Positive parameters are fitted as logarithms: from starts of half and of 1.5
+times the truth of an exponential column and a bottom echo, that takes 6 renders each, with plain values 6 and 7.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar.analysis.information.errors import Errors, estimate_errors
+from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.ranges import limits, unit_of
+from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, integer
+
+#: A function that returns a render, with derivatives, of values of the free parameters.
+Model = Callable[[Mapping[str, float]], xr.Dataset]
+
+SCALE, TIME_OFFSET = "scale", "time_offset_ns"
+
+_WINDOW = 10.0  # model bins by which the time offset may change before samples in use are chosen anew
+_MOST_ROUNDS = 8  # of weights that follow the model
+_SETTLED = 0.05  # standard errors by which parameters may still change in the last round
+_SMALLEST_STEP = 0.02  # standard errors; smaller steps are not rendered
+_TOLERANCE = 1e-3  # relative change of the sum of squares that ends a round
+
+
+@dataclass(frozen=True)
+class Free:
+    """Free parameter: start, and lowest and highest value; fitted as its logarithm where it is positive."""
+
+    name: str
+    start: float
+    low: float
+    high: float
+
+    @property
+    def is_logarithm(self) -> bool:
+        """Whether the parameter is positive, so that its logarithm is fitted and steps are relative."""
+        return self.low >= 0 and self.start > 0
+
+    def internal(self, value: float) -> float:
+        """Return what is fitted instead of a value."""
+        if not self.is_logarithm:
+            return value
+        return math.log(value) if value > 0 else -math.inf
+
+    def is_bound(self, value: float) -> bool:
+        """Return whether a value is one of the bounds within the accuracy of a fit."""
+        return any(abs(value - end) <= max(1e-3 * abs(end), 1e-6 * abs(self.start)) for end in self._finite_ends)
+
+    @property
+    def _finite_ends(self) -> list[float]:
+        return [end for end in (self.low, self.high) if math.isfinite(end)]
+
+    def value(self, internal: float) -> float:
+        """Return the value of what is fitted."""
+        return math.exp(internal) if self.is_logarithm else internal
+
+
+def free_parameters(starts: Mapping[str, float], bounds: Mapping[str, tuple[float, float]] | None = None) -> list[Free]:
+    """Return free parameters with their bounds, by default the range of their names, or 0 to 1 for reflectances.
+
+    Raises
+    ------
+    UserError
+        If bounds are those of no free parameter or do not increase, or a start is not between them.
+    """
+    given = dict(bounds or {})
+    found = []
+    for name, start in starts.items():
+        base = re.sub(r"\[\d+\]$", "", name)
+        usual = (0.0, 1.0) if base.endswith("_reflectance") else limits(base) or (-math.inf, math.inf)
+        low, high = given.pop(name, (0.0, math.inf) if name == SCALE else usual)
+        if not low < high:
+            raise UserError(f"bounds of {name} = {low:g}, {high:g} must increase")
+        if not low <= finite(f"start of {name}", start) <= high:
+            raise UserError(f"start of {name} = {start:g} must lie between {low:g} and {high:g}")
+        found.append(Free(name, float(start), float(low), float(high)))
+    if given:
+        raise UserError(f"bounds of {next(iter(given))}: it is not one of the free parameters {', '.join(starts)}")
+    return found
+
+
+class WaveformFit:
+    """Fit of the parameters of a model to waveforms.
+
+    Parameters
+    ----------
+    found
+        The waveforms.
+    model
+        Returns ``waveform``, optionally ``waveform_stderr``, and ``waveform_derivative`` over (parameter, pixel, time)
+        or (parameter, row, column, time) for values of the parameters. The same values give the same waveform.
+    starts
+        Starts of the parameters of the model, and optionally of ``scale`` and ``time_offset_ns``.
+    bounds
+        Lowest and highest values by name; see `free_parameters`.
+    free_scale, free_time
+        Whether scale and time offset of the waveforms are unknown, by default only those of uncalibrated waveforms.
+
+    Raises
+    ------
+    UserError
+        If a start or bounds are invalid, there is nothing to fit, no sample lies within the time of the model, or the
+        waveforms have no light where the model has.
+    """
+
+    def __init__(
+        self,
+        found: Measured,
+        model: Model,
+        starts: Mapping[str, float],
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        *,
+        free_scale: bool | None = None,
+        free_time: bool | None = None,
+    ) -> None:
+        self.found, self.model = found, model
+        nuisances = {SCALE: free_scale, TIME_OFFSET: free_time}
+        self.nuisances = [name for name, free in nuisances.items() if (not found.calibrated if free is None else free)]
+        self.names = [name for name in starts if name not in nuisances]
+        if fixed := [name for name in starts if name in nuisances and name not in self.nuisances]:
+            raise UserError(f"start of {fixed[0]}: it is fixed")
+        if not self.names:
+            raise UserError("free = '' must name at least one parameter of the scene")
+        if found.receiver is not None and self.nuisances:
+            raise UserError(f"{self.nuisances[0]} of a recorded signal is that of its receiver: it cannot be free")
+        # Invalid starts and bounds are refused before the first render.
+        later = {name: 1.0 for name in self.nuisances if name not in starts}
+        early = {name: ends for name, ends in (bounds or {}).items() if name not in later}
+        free_parameters({**starts, **later}, early)
+        self.renders = 0
+        self._kept: dict[tuple[float, ...], Prediction] = {}
+        self.units: dict[str, str] = {}
+        # Values and Jacobian [standard deviations] of the last accepted step, and why others were not tried.
+        self._accepted: tuple[FloatArray, FloatArray] | None = None
+        self._refusal, self._exhausted = "", False
+        aligned = self._align({name: float(value) for name, value in starts.items()})
+        self.free = free_parameters(aligned, bounds)
+        self.starts = aligned
+
+    def forget(self) -> None:
+        """Forget the renders so far, after a change of the model."""
+        self._kept.clear()
+
+    def noise_ratio(self) -> float:
+        """Return the variance of the model's Monte Carlo over that of the waveforms, at the starts.
+
+        The median over the samples that carry information, 0 where the errors of the waveforms are unknown.
+        """
+        values = self.starts
+        used = self._used(values)
+        mean, slopes, by_model, noise = self._at(values)
+        if noise is None:
+            return 0.0
+        carrying = used & (noise > 0) & (np.abs(slopes).max(axis=0) > 0) & (mean**2 > noise)
+        return float(np.median(by_model[carrying] / noise[carrying])) if carrying.any() else 0.0
+
+    def run(self, *, most_renders: int = 60, scale_errors: bool = False) -> xr.Dataset:
+        """Fit and return the table of parameters and the fitted waveforms.
+
+        Parameters
+        ----------
+        most_renders
+            Number of renders after which the fit ends without convergence, 2 to 10000.
+        scale_errors
+            Whether to multiply covariances by the reduced chi-squared, as is done where errors are unknown.
+
+        Returns
+        -------
+        xarray.Dataset
+            Over ``parameter``, each in the unit of ``parameter_units``: ``value``, ``stderr``, ``stderr_by_model``
+            (part by the Monte Carlo of the model), ``start``, ``low`` and ``high`` (bounds) and ``at_bound``;
+            ``covariance`` and ``correlation`` over (parameter, other_parameter). Over the dimensions of the waveforms:
+            ``measured``, ``measured_stderr``, ``fitted``, ``fitted_stderr`` (Monte Carlo of the model), ``residual`` in
+            standard deviations of both, and ``used`` (1 for samples that were fitted). Attributes: ``chi_squared``,
+            its mean ``expected`` and ``freedom`` (for errors that neighbours share, too), ``probability`` of a larger
+            one, ``renders``, ``rounds``, ``converged``, and ``messages``, sentences on what the waveforms do not
+            determine.
+        """
+        from scipy.optimize import least_squares
+
+        self._limit = integer("most_renders", most_renders, 2, 10_000)
+        lower = np.array([free.internal(free.low) for free in self.free])
+        upper = np.array([free.internal(free.high) for free in self.free])
+        values, rounds, settled = dict(self.starts), 0, False
+        while not settled and rounds < _MOST_ROUNDS and self.renders < most_renders:
+            rounds += 1
+            self._refusal = ""
+            used = self._used(values)
+            weights = self._weights(values, used)
+            ends = lower.copy(), upper.copy()
+            self._narrow(ends, values)
+            start = np.array([free.internal(values[free.name]) for free in self.free])
+            solution = least_squares(
+                partial(self._residuals, weights=weights, used=used),
+                np.clip(start, *ends),
+                jac=partial(self._jacobian, weights=weights, used=used),
+                bounds=ends,
+                method="trf",
+                x_scale="jac",
+                ftol=_TOLERANCE,
+                xtol=1e-12,
+                gtol=1e-12,
+                max_nfev=most_renders,
+            )
+            former, values = values, self._named(solution.x)
+            errors = self._errors(values, used, scale_errors)
+            change = np.array([values[name] - former[name] for name in values])
+            settled = bool(np.all(np.abs(change) <= _SETTLED * np.nan_to_num(errors.stderr, nan=np.inf)))
+        return self._dataset(values, used, errors, rounds, settled and not self._exhausted)
+
+    def _prediction(self, values: Mapping[str, float]) -> Prediction:
+        """Return the samples of the model, from one of the last renders if its values are the same."""
+        key = self._key(values)
+        if key not in self._kept:
+            dataset = self.model(dict(zip(self.names, key, strict=True)))
+            self.renders += 1
+            # A step that is refused leads back to the values before it.
+            self._kept = dict([*self._kept.items()][-1:]) | {key: predict(self.found, dataset, self.names)}
+            if "parameter_units" in dataset.coords:
+                units = dict(zip(dataset["parameter"].values.tolist(), dataset["parameter_units"].values, strict=True))
+                self.units = {str(name): str(unit) for name, unit in units.items()}
+        return self._kept[key]
+
+    def _key(self, values: Mapping[str, float]) -> tuple[float, ...]:
+        """Return the values of the parameters of the model."""
+        return tuple(values[name] for name in self.names)
+
+    def _at(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray | None]:
+        """Return what is expected at the times of the waveforms.
+
+        Mean and variance by Monte Carlo, shape (pixel, time), derivatives by all free parameters, shape (parameter,
+        pixel, time), and variance of the waveforms, None if unknown.
+        """
+        model = self._prediction(values)
+        scale, offset = values.get(SCALE, 1.0), values.get(TIME_OFFSET, 0.0)
+        times = self.found.time_ns - offset
+        noise = model.noise_variance
+        if TIME_OFFSET not in values and np.array_equal(times, model.time_ns):
+            mean, slopes, by_model, change = model.mean, model.derivative, model.model_variance, np.zeros(())
+        else:
+            from scipy.interpolate import CubicSpline
+
+            # A pulse of a few bins is smooth: an interpolation by lines would flatten its peaks.
+            outside = (times < model.time_ns[0]) | (times > model.time_ns[-1])
+            spline = CubicSpline(model.time_ns, model.mean, axis=-1)
+            mean, change = (np.where(outside, 0.0, one(times)) for one in (spline, spline.derivative()))
+            slopes = np.where(outside, 0.0, CubicSpline(model.time_ns, model.derivative, axis=-1)(times))
+            by_model = _interpolated(times, model.time_ns, model.model_variance)
+            noise = None if noise is None else _interpolated(times, model.time_ns, noise)
+        rows = dict(zip(self.names, scale * slopes, strict=True)) | {SCALE: mean, TIME_OFFSET: -scale * change}
+        derivative = np.array([rows[name] for name in values])
+        if self.found.stderr is not None:
+            noise = np.nan_to_num(self.found.stderr) ** 2
+        elif noise is not None:
+            noise = noise / self.found.shots
+        return scale * mean, derivative, scale**2 * by_model, noise
+
+    def _used(self, values: Mapping[str, float]) -> BoolArray:
+        """Return which samples are fitted: those within the model for any offset that the round may reach."""
+        model = self._prediction(values)
+        times = self.found.time_ns - values.get(TIME_OFFSET, 0.0)
+        margin = self._window(model) if TIME_OFFSET in values else 0.0
+        rounding = 1e-6 * float(model.time_ns[1] - model.time_ns[0]) if model.time_ns.size > 1 else 0.0
+        inside = (times >= model.time_ns[0] + margin - rounding) & (times <= model.time_ns[-1] - margin + rounding)
+        known = np.isfinite(self.found.values)
+        if self.found.stderr is not None:
+            known &= np.isfinite(self.found.stderr)
+        used = known & inside
+        if not model.valid.all():
+            nearest = np.clip(np.searchsorted(model.time_ns, times - rounding), 0, model.time_ns.size - 1)
+            used &= model.valid[:, nearest]
+        if np.count_nonzero(used) <= len(values):
+            raise UserError(
+                f"the waveforms have {np.count_nonzero(used)} samples from {times[0]:g} to {times[-1]:g} ns within the "
+                f"record of the scene, {model.time_ns[0]:g} to {model.time_ns[-1]:g} ns: there must be more than "
+                f"{len(values)} with a known error"
+            )
+        return np.asarray(used)
+
+    def _weights(self, values: Mapping[str, float], used: BoolArray) -> FloatArray:
+        """Return 1 over the standard deviation of the difference of waveforms and model, 0 where it is not used."""
+        _, _, by_model, noise = self._at(values)
+        variance = np.ones_like(by_model) if noise is None else by_model + noise
+        weighted = used & (variance > 0)
+        return np.where(weighted, 1 / np.sqrt(np.where(weighted, variance, 1.0)), 0.0)
+
+    def _residuals(self, x: FloatArray, weights: FloatArray, used: BoolArray) -> FloatArray:
+        """Return the weighted differences, or NaN, after which the optimiser takes a smaller step.
+
+        That is where the scene is impossible, too many renders were made, or the step is too small to matter: the last
+        steps are within the noise that common random numbers leave, and would cost a render each.
+        """
+        values = self._named(x)
+        unknown = np.full(np.count_nonzero(used), np.nan)
+        if self._key(values) not in self._kept:
+            self._exhausted |= self.renders >= self._limit
+            if self._exhausted or (self._accepted is not None and self._step(x) < _SMALLEST_STEP):
+                return unknown
+        try:
+            mean = self._at(values)[0]
+        except UserError as error:
+            self._refusal = str(error)
+            return unknown
+        return np.asarray((weights * (mean - np.nan_to_num(self.found.values)))[used])
+
+    def _step(self, x: FloatArray) -> float:
+        """Return the change of the model by a step in standard deviations, which is its length in standard errors."""
+        assert self._accepted is not None
+        start, jacobian = self._accepted
+        return float(np.linalg.norm(jacobian @ (x - start)))
+
+    def _jacobian(self, x: FloatArray, weights: FloatArray, used: BoolArray) -> FloatArray:
+        values = self._named(x)
+        inner = [values[free.name] if free.is_logarithm else 1.0 for free in self.free]
+        mean, derivative, _, noise = self._at(values)
+        jacobian = np.asarray(((weights * derivative)[:, used] * np.array(inner)[:, None]).T)
+        # Unknown errors are those of the residuals.
+        spread = 1.0 if noise is not None else float(np.std((self.found.values - mean)[used])) or 1.0
+        self._accepted = x.copy(), jacobian / spread
+        return jacobian
+
+    def _named(self, x: FloatArray) -> dict[str, float]:
+        return {free.name: free.value(float(one)) for free, one in zip(self.free, x, strict=True)}
+
+    def _narrow(self, ends: tuple[FloatArray, FloatArray], values: Mapping[str, float]) -> None:
+        """Narrow the bounds of the time offset to those that the samples in use allow."""
+        for index, free in enumerate(self.free):
+            if free.name == TIME_OFFSET:
+                margin = self._window(self._prediction(values))
+                ends[0][index] = max(ends[0][index], values[TIME_OFFSET] - margin)
+                ends[1][index] = min(ends[1][index], values[TIME_OFFSET] + margin)
+
+    def _window(self, model: Prediction) -> float:
+        """Return the largest change of the time offset in a round [ns]."""
+        return _WINDOW * float(model.time_ns[-1] - model.time_ns[0]) / max(model.time_ns.size - 1, 1)
+
+    def _align(self, starts: dict[str, float]) -> dict[str, float]:
+        """Return the starts with those of the time offset and of the scale, which follow from the first render."""
+        values = np.nan_to_num(self.found.values)
+        if TIME_OFFSET in self.nuisances and TIME_OFFSET not in starts:
+            starts[TIME_OFFSET] = _best_offset(self.found.time_ns, values, self._prediction(starts))
+        if SCALE in self.nuisances and SCALE not in starts:
+            mean, _, _, noise = self._at({**starts, SCALE: 1.0})
+            weight = np.where(np.isfinite(self.found.values), 1.0, 0.0)
+            if noise is not None:
+                weight = np.divide(weight, noise, out=np.zeros_like(mean), where=noise > 0)
+            scale = float(np.sum(weight * mean * values)) / max(float(np.sum(weight * mean**2)), 1e-300)
+            if not scale > 0:
+                raise UserError("the waveforms have no light where the scene has: they must rise with the light")
+            starts[SCALE] = scale
+        return starts
+
+    def _errors(self, values: Mapping[str, float], used: BoolArray, scale_errors: bool) -> Errors:
+        """Return the errors of values."""
+        mean, derivative, by_model, noise = self._at(values)
+        weights = self._weights(values, used)
+        model = self._prediction(values)
+        step, own_step = (float(np.median(np.diff(times))) for times in (self.found.time_ns, model.time_ns))
+        distance = np.arange(0, model.correlation.size * own_step, step) / own_step
+        lags = np.interp(distance, np.arange(model.correlation.size), model.correlation, right=0.0)
+        return estimate_errors(
+            weights * (np.nan_to_num(self.found.values) - mean),
+            weights * derivative,
+            (weights if noise is None else weights * np.sqrt(noise), self.found.correlation),
+            (weights * np.sqrt(by_model), lags),
+            np.array([free.is_bound(values[free.name]) for free in self.free]),
+            scale_errors,
+            known_noise=noise is not None,
+        )
+
+    def _dataset(
+        self, values: Mapping[str, float], used: BoolArray, errors: Errors, rounds: int, converged: bool
+    ) -> xr.Dataset:
+        """Return the result of `run`."""
+        mean, _, by_model, noise = self._at(values)
+        weights = self._weights(values, used)
+        names = list(values)
+        found = self.found
+        residual = np.where(weights > 0, weights * (np.nan_to_num(found.values) - mean), np.nan)
+        stderr = np.full(mean.shape, np.nan) if noise is None else np.sqrt(noise)
+        if noise is None:
+            residual = residual / math.sqrt(errors.reduced) if errors.reduced > 0 else residual
+        samples = {
+            "measured": (found.values, "measured waveform"),
+            "measured_stderr": (stderr, "standard error of the measured waveform"),
+            "fitted": (mean, "fitted waveform"),
+            "fitted_stderr": (np.sqrt(by_model), "standard error of the fitted waveform by Monte Carlo"),
+        }
+        arrays = {name: found.labelled(array, text) for name, (array, text) in samples.items()}
+        arrays["residual"] = found.labelled(residual, "measured less fitted, in standard deviations")
+        arrays["used"] = found.labelled((weights > 0).astype(np.int8), "sample that was fitted")
+        for name in ("residual", "used"):
+            arrays[name].attrs["units"] = "1"
+        vectors = {
+            "value": np.array(list(values.values())),
+            "stderr": errors.stderr,
+            "stderr_by_model": errors.by_model,
+            "start": np.array([free.start for free in self.free]),
+            "low": np.array([free.low for free in self.free]),
+            "high": np.array([free.high for free in self.free]),
+            "at_bound": errors.held.astype(np.int8),
+        }
+        matrices = {"covariance": errors.covariance, "correlation": errors.correlation}
+        units = [self.units.get(name) or _unit(name) for name in names]
+        messages = [] if converged else [f"the fit has not converged in {self.renders} renders"]
+        messages += errors.messages(names, np.array(list(values.values())))
+        if self._refusal:
+            messages.append(f"steps were refused, at which the fit may have ended: {self._refusal}")
+        if noise is None:
+            messages.append("the errors of the waveforms are unknown: they are taken from the residuals")
+        return xr.Dataset(
+            {
+                **{name: ("parameter", vector) for name, vector in vectors.items()},
+                **{name: (("parameter", "other_parameter"), matrix) for name, matrix in matrices.items()},
+                **arrays,
+            },
+            {"parameter": names, "other_parameter": names, "parameter_units": ("parameter", units)},
+            {
+                "chi_squared": errors.chi_squared,
+                "expected": errors.expected,
+                "freedom": errors.freedom,
+                "probability": math.nan if noise is None else errors.probability,
+                "renders": self.renders,
+                "rounds": rounds,
+                "converged": int(converged),
+                "messages": messages,
+            },
+        )
+
+
+def _unit(name: str) -> str:
+    """Return the unit of a parameter by its name."""
+    return unit_of(re.sub(r"\[\d+\]$", "", name)) or "1"
+
+
+def _interpolated(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
+    """Return rows of values at other times, linear between the known ones, and 0 outside."""
+    return np.array([np.interp(times, known, row, left=0.0, right=0.0) for row in values])
+
+
+def _best_offset(times: FloatArray, values: npt.ArrayLike, model: Prediction) -> float:
+    """Return the time [ns] that waveforms, shape (pixel, time), are later than a model, by their correlation."""
+    step = float(np.median(np.diff(model.time_ns)))
+    grid = np.arange(times[0], times[-1] + 0.5 * step, step)
+    total: FloatArray | float = 0.0
+    for row, mean in zip(np.asarray(values), model.mean, strict=True):
+        sampled = np.interp(grid, times, row)
+        total = total + np.correlate(sampled, mean, "full")
+    lag = int(np.argmax(total)) - (model.time_ns.size - 1)
+    return float(grid[0] + lag * step - model.time_ns[0])
+
+
+def describe_fit(fitted: xr.Dataset) -> list[str]:
+    """Return the lines of a table of a fit: value, standard error and start of each parameter, and its quality."""
+    lines = [f"{'parameter':<24}{'value':>13}{'error':>11}{'start':>13}  unit"]
+    for name in fitted["parameter"].values:
+        one = fitted.sel(parameter=name)
+        error = f"{float(one['stderr']):>11.3g}" if np.isfinite(one["stderr"]) else f"{'unknown':>11}"
+        text = f"{name:<24}{float(one['value']):>13.6g}{error}{float(one['start']):>13.6g}  "
+        text += one["parameter_units"].item()
+        lines.append(text + (" (at its bound)" if int(one["at_bound"]) else ""))
+    chi = fitted.attrs
+    text = f"chi-squared {chi['chi_squared']:.4g}, expected {chi['expected']:.4g}"
+    if np.isfinite(chi["probability"]):
+        text += f"; a larger one has the probability {chi['probability']:.3g}"
+    return [*lines, text, f"{chi['renders']} renders", *chi["messages"]]
+
+
+def table_rows(fitted: xr.Dataset) -> tuple[Sequence[str], list[list[object]]]:
+    """Return the columns and rows of a table of the parameters of a fit, as for a CSV file."""
+    columns = ("value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
+    rows: list[list[object]] = []
+    for name in fitted["parameter"].values:
+        one = fitted.sel(parameter=name)
+        rows.append([str(name), one["parameter_units"].item(), *(one[column].item() for column in columns)])
+    return ("parameter", "unit", *columns), rows

@@ -1,0 +1,351 @@
+"""Measured or simulated waveforms that a model is fitted to, and what a render predicts for them."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from mitransient_lidar import results
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.validation import FloatArray, positive, shown
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
+
+_TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
+_STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
+_SATURATED = 1e-3  # probability of saturation above which a sample is left out
+
+
+@dataclass(frozen=True)
+class ReceiverSettings:
+    """Receiver that recorded a signal: chain, optical density of the filter and background [W] of each pixel."""
+
+    chains: tuple[ReceiverChain, ...]
+    optical_densities: FloatArray
+    backgrounds: FloatArray
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Waveforms to fit.
+
+    Attributes
+    ----------
+    values
+        Samples, shape (pixel, time), with the pixels of an imager in row-major order; NaN where there is none.
+    stderr
+        Their standard errors in the same unit, of the same shape; None where they are unknown or those of the model.
+    time_ns
+        Times of the samples [ns], shape (time,), increasing strictly.
+    correlation
+        Correlation of the errors of samples that are 0, 1, ... apart, shape (lags,); 1 for lag 0.
+    template
+        Array with dimensions, coordinates and attributes of the waveforms.
+    calibrated
+        Whether values and times are those of a model, so that neither scale nor offset are unknown.
+    receiver, shots
+        Receiver of a signal, None for waveforms, and number of records whose mean it is.
+    """
+
+    values: FloatArray
+    stderr: FloatArray | None
+    time_ns: FloatArray
+    correlation: FloatArray
+    template: xr.DataArray
+    calibrated: bool = True
+    receiver: ReceiverSettings | None = None
+    shots: int = 1
+
+    @property
+    def pixel_dims(self) -> tuple[str, ...]:
+        """Dimensions before ``time``."""
+        return tuple(str(dim) for dim in self.template.dims[:-1])
+
+    def labelled(self, values: npt.ArrayLike, name: str) -> xr.DataArray:
+        """Return values of shape (pixel, time) with the dimensions and coordinates of the waveforms."""
+        unit = self.template.attrs.get("units", "")
+        array = np.reshape(values, self.template.shape)
+        return self.template.copy(data=array).assign_attrs({"units": unit, "long_name": name})
+
+
+class Prediction(NamedTuple):
+    """Samples of a model, at its own times."""
+
+    time_ns: FloatArray  #: Shape (time,).
+    mean: FloatArray  #: In the unit of the waveforms before any scale, shape (pixel, time).
+    derivative: FloatArray  #: Per unit of each parameter, shape (parameter, pixel, time).
+    model_variance: FloatArray  #: Of the model's Monte Carlo, shape (pixel, time).
+    noise_variance: FloatArray | None  #: Of a record of the receiver, shape (pixel, time); None without one.
+    valid: npt.NDArray[np.bool_]  #: Samples that are not saturated, shape (pixel, time).
+    correlation: FloatArray  #: Of the Monte Carlo errors by the distance in samples, shape (lags,).
+
+
+def measured(
+    source: xr.Dataset | str | os.PathLike[str],
+    *,
+    noise: float | None = None,
+    receiver: str | os.PathLike[str] | ReceiverChain | None = None,
+) -> Measured:
+    """Return the waveforms of a result, of a recorded signal, or of a table.
+
+    Parameters
+    ----------
+    source
+        A result with ``waveform``, or with the ``signal`` of `analysis.receiver.detect_waveforms`, whose records are
+        averaged; its EXR or NetCDF file; or a CSV file with the column ``time_ns``, one column for each pixel in any
+        unit, and optionally columns ``NAME_stderr`` with their standard errors.
+    noise
+        Standard deviation of every sample of waveforms, above 0 and in their unit, instead of their own.
+    receiver
+        Receiver of a signal, as of `detect_waveforms`; by default the one that its attributes name.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read, there is more than one shot of a series, the receiver is unknown, or a value is out
+        of range.
+    """
+    given = None if noise is None else positive("noise", noise)
+    is_table = not isinstance(source, xr.Dataset) and Path(source).suffix.lower() not in (".nc", ".exr")
+    if not isinstance(source, xr.Dataset) and not is_table:
+        source = results.open(source, signals=True)
+    if isinstance(source, xr.Dataset) and "signal" in source:
+        if given is not None:
+            raise UserError(f"noise = {given:g} is that of the receiver of a signal: leave it out")
+        return _of_signal(source, receiver)
+    if receiver is not None:
+        raise UserError("receiver is that of a recorded signal, and the waveforms are none: leave it out")
+    if not isinstance(source, xr.Dataset):
+        return _with_noise(_read_csv(Path(source)), given)
+    dims = results.record_dims(source, "waveform")
+    values = _by_pixel(source["waveform"], dims)
+    stderr = _by_pixel(source["waveform_stderr"], dims) if "waveform_stderr" in source else None
+    found = Measured(values, stderr, _times(source), correlation(source.attrs), source["waveform"])
+    return _with_noise(found, given)
+
+
+def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Prediction:
+    """Return what a render with derivatives predicts for the pixels of waveforms, behind their receiver if any.
+
+    Derivatives behind a receiver are central differences of its closed form in the direction of the derivative.
+
+    Raises
+    ------
+    UserError
+        If the render has other pixels, lacks a derivative, or holds values that are not finite.
+    """
+    dataset = _same_pixels(found, dataset)
+    dims = (*found.pixel_dims, "time")
+    light = _by_pixel(dataset["waveform"], dims)
+    if "waveform_derivative" not in dataset:
+        raise UserError("the model has no variable waveform_derivative: it must give the derivatives by its parameters")
+    known = [str(name) for name in dataset["parameter"].values]
+    if missing := [name for name in parameters if name not in known]:
+        raise UserError(f"the model has no derivative by {missing[0]}, only by {', '.join(known)}")
+    wanted = dataset["waveform_derivative"].sel(parameter=parameters).transpose("parameter", *dims)
+    slopes = np.asarray(wanted.values, dtype=np.float64).reshape(len(parameters), *light.shape)
+    error = _by_pixel(dataset["waveform_stderr"], dims) if "waveform_stderr" in dataset else np.zeros_like(light)
+    for name, array in (("waveform", light), ("waveform_derivative", slopes)):
+        if not np.isfinite(array).all():
+            raise UserError(
+                f"{name} of the model has {np.count_nonzero(~np.isfinite(array))} values that are not finite"
+            )
+    error = np.nan_to_num(error)
+    times, lags = _times(dataset), correlation(dataset.attrs)
+    if found.receiver is None:
+        return Prediction(times, light, slopes, error**2, None, np.ones(light.shape, dtype=bool), lags)
+    return _recorded(found.receiver, light, slopes, error, times, results.time_axis(dataset).bin_width_ns, lags)
+
+
+def _recorded(
+    receiver: ReceiverSettings,
+    light: FloatArray,
+    slopes: FloatArray,
+    error: FloatArray,
+    times: FloatArray,
+    width: float,
+    lags: FloatArray,
+) -> Prediction:
+    """Return the mean record of light, shape (pixel, time), with derivatives and errors, by the receiver's closed form.
+
+    Errors of neighbouring bins of a render agree in sign, so that they are propagated as one change of the light.
+    """
+    largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=0)
+    reach = np.divide(_STEP * light.max(), largest, out=np.zeros_like(largest), where=largest > 0)
+    parts = []
+    for pixel, (chain, density, sky) in enumerate(
+        zip(receiver.chains, receiver.optical_densities, receiver.backgrounds, strict=True)
+    ):
+        filtered, background = 10.0**-density, 10.0**-density * sky
+        steps = reach[:, pixel] * slopes[:, pixel]
+        own = light[pixel : pixel + 1]
+        lit = np.concatenate([own, own + error[pixel], own + steps, own - steps])
+        expected = chain.expected(filtered * np.maximum(lit, 0), width, np.full(len(lit), background))
+        count = len(steps)
+        rise = expected.mean[2 : 2 + count] - expected.mean[2 + count :]
+        slope = np.divide(rise, 2 * reach[:, pixel], out=np.zeros_like(rise), where=reach[:, pixel] > 0)
+        one = expected.mean[0], slope, (expected.mean[1] - expected.mean[0]) ** 2, expected.variance[0]
+        parts.append((*one, expected.saturation[0] < _SATURATED))
+    mean, slope, by_model, variance, valid = zip(*parts, strict=True)
+    stride = receiver.chains[0].stride(width)
+    return Prediction(
+        times[::stride],
+        np.array(mean),
+        np.stack(slope, axis=1),
+        np.array(by_model),
+        np.array(variance),
+        np.array(valid),
+        lags[::stride],
+    )
+
+
+def correlation(attributes: Any) -> FloatArray:
+    """Return the correlation of the errors of bins of a render by their distance in bins, shape (lags,).
+
+    The pulse smooths the errors of bins, so that neighbours agree. The attribute ``error_inflation`` holds the standard
+    deviation of means of n = 1, 2, 4, ... bins over that of independent bins, f(n)^2 = 1 + 2 sum (1 - k/n) r(k) over
+    the lags 0 < k < n. It is solved for r constant between these numbers of bins. Without it, bins are independent.
+    """
+    bins, inflation = (np.atleast_1d(attributes.get(name, ())) for name in ("error_inflation_bins", "error_inflation"))
+    found = [1.0]
+    for count, factor in zip(bins[1:].astype(int), inflation[1:], strict=True):
+        known, new = np.arange(1, len(found)), np.arange(len(found), count)
+        rest = float(factor) ** 2 - 1 - 2 * float(np.sum((1 - known / count) * found[1:]))
+        found += [float(np.clip(rest / (2 * np.sum(1 - new / count)), -1, 1))] * new.size
+    return np.array(found)
+
+
+def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
+    """Return the mean of the records of a signal, whose errors are those of its receiver."""
+    results.record_dims(dataset, "signal", shots=True)
+    if "signal_mean" in dataset and "shot" in dataset["signal_mean"].dims:
+        raise UserError("the signals are those of a series of shots: select one shot with isel(shot=...)")
+    values = dataset["signal"].mean("shot", keep_attrs=True) if "shot" in dataset["signal"].dims else dataset["signal"]
+    dims = tuple(str(dim) for dim in values.dims)
+    pixels = [str(name) for name in dataset["pixel"].values] if "pixel" in dims else []
+    count = math.prod(dataset.sizes[dim] for dim in dims[:-1])
+    name = given if given is not None else dataset.attrs.get("receiver")
+    if name is None:
+        raise UserError("the signal does not name its receiver, which is a chain of its own: give it with receiver")
+    known = receiver_named(name)
+    lists = {
+        key: np.broadcast_to(np.asarray(dataset.attrs.get(key, usual), dtype=np.float64), (count,))
+        for key, usual in (("gain", 1.0), ("optical_density", 0.0), ("background_power_w", 0.0))
+    }
+    plain = [known.of(pixel).chain for pixel in pixels] or [known.default.chain] * count
+    chains = tuple(
+        chain if gain == 1 else chain.with_gain(float(gain)) for chain, gain in zip(plain, lists["gain"], strict=True)
+    )
+    settings = ReceiverSettings(chains, lists["optical_density"], lists["background_power_w"])
+    step = results.time_axis(dataset).bin_width_ns
+    shots = int(dataset.sizes.get("shot", 1)) if "shot" in dataset["signal"].dims else 1
+    return Measured(
+        _by_pixel(values, dims),
+        None,
+        _times(dataset),
+        _response_correlation(chains[0], step, int(dataset.sizes["time"])),
+        values,
+        receiver=settings,
+        shots=shots,
+    )
+
+
+def _response_correlation(chain: ReceiverChain, step_ns: float, count: int) -> FloatArray:
+    """Return the correlation of the noise of samples that are `step_ns` apart, behind the amplifier's low-pass."""
+    low_pass = chain.low_pass(step_ns)
+    weights = low_pass.weights
+    whole = np.correlate(weights, weights, "full")[weights.size - 1 :: low_pass.parts][:count]
+    return np.asarray(whole / whole[0])
+
+
+def _same_pixels(found: Measured, dataset: xr.Dataset) -> xr.Dataset:
+    """Return the pixels of a model that are those of waveforms, by their names; a single pixel may have any name."""
+    if "waveform" not in dataset:
+        raise UserError("the model has no variable waveform")
+    own = tuple(str(dim) for dim in dataset["waveform"].dims if dim != "time")
+    if own != found.pixel_dims:
+        raise UserError(f"the scene has pixels over ({', '.join(own)}), the waveforms over {found.pixel_dims}")
+    if own == ("pixel",):
+        wanted = [str(name) for name in found.template["pixel"].values]
+        names = [str(name) for name in dataset["pixel"].values]
+        if len(wanted) == len(names) == 1:
+            return dataset
+        if missing := [name for name in wanted if name not in names]:
+            raise UserError(f"the scene has no pixel {missing[0]}: its pixels are {', '.join(names)}")
+        return dataset.isel(pixel=[names.index(name) for name in wanted])
+    sizes = tuple(dataset.sizes[dim] for dim in own)
+    if sizes != found.template.shape[:-1]:
+        raise UserError(f"the scene has {sizes} rows and columns, the waveforms {found.template.shape[:-1]}")
+    return dataset
+
+
+def _with_noise(found: Measured, noise: float | None) -> Measured:
+    """Return waveforms with a constant error instead of their own."""
+    if noise is None:
+        return found
+    return replace(found, stderr=np.full(found.values.shape, noise), correlation=np.ones(1))
+
+
+def _by_pixel(array: xr.DataArray, dims: tuple[str, ...]) -> FloatArray:
+    """Return an array of the given dimensions in the shape (pixel, time)."""
+    values = np.asarray(array.transpose(*dims).values, dtype=np.float64)
+    return values.reshape(-1, values.shape[-1])
+
+
+def _times(dataset: xr.Dataset) -> FloatArray:
+    return np.asarray(dataset["time"].values, dtype=np.float64)
+
+
+def _read_csv(path: Path) -> Measured:
+    """Read a table of waveforms; see `measured`."""
+    lines = [line for line in csv.reader(read_text(path).splitlines()) if any(cell.strip() for cell in line)]
+    heading = [name.strip() for name in lines[0]] if lines else []
+    if _TIME not in heading or len(heading) < 2:
+        raise UserError(f"{path} must begin with a heading of {_TIME} and names of pixels, separated by commas")
+    if twice := [name for name in heading if heading.count(name) > 1]:
+        raise UserError(f"{path} has two columns {twice[0]!r}: every column must have a name of its own")
+    rows = []
+    for number, line in enumerate(lines[1:], start=2):
+        if len(line) != len(heading):
+            raise UserError(f"{path}, row {number} has {len(line)} values but must have {len(heading)}")
+        rows.append([_number(path, number, name, cell) for name, cell in zip(heading, line, strict=True)])
+    if len(rows) < 2:
+        raise UserError(f"{path} has {len(rows)} rows of numbers: it must have 2 or more")
+    columns = dict(zip(heading, np.array(rows).T, strict=True))
+    times = columns.pop(_TIME)
+    for index in np.flatnonzero(~(np.diff(times) > 0))[:1]:
+        raise UserError(f"{path} has {_TIME} = {times[index]:g}, {times[index + 1]:g}: it must increase strictly")
+    pixels = [name for name in columns if not (name.endswith(_STDERR) and name.removesuffix(_STDERR) in columns)]
+    errors = [columns.get(f"{name}{_STDERR}") for name in pixels]
+    known = [error for error in errors if error is not None]
+    if known and len(known) < len(pixels):
+        lacking = next(name for name, error in zip(pixels, errors, strict=True) if error is None)
+        raise UserError(f"{path} has errors of some pixels alone: the column {lacking}{_STDERR} is missing")
+    for name, error in zip(pixels, known, strict=False):
+        if np.any(error <= 0):
+            raise UserError(f"{path} has {name}{_STDERR} = {np.nanmin(error):g}: it must be greater than 0")
+    values = np.array([columns[name] for name in pixels])
+    coords = {"pixel": ("pixel", np.array(pixels, dtype=str)), "time": ("time", times, {"units": "ns"})}
+    template = xr.DataArray(values, coords, ("pixel", "time"))
+    return Measured(values, np.array(known) if known else None, times, np.ones(1), template, calibrated=False)
+
+
+def _number(path: Path, row: int, name: str, cell: str) -> float:
+    """Return a cell of a table as a number, NaN where it is empty."""
+    text = cell.strip() or ("" if name == _TIME else "nan")
+    try:
+        number = float(text)
+    except ValueError:
+        raise UserError(f"{path}, row {row}: {name} = {shown(cell)} must be a number") from None
+    if math.isinf(number):
+        raise UserError(f"{path}, row {row}: {name} = {number} must be finite")
+    return number

@@ -1,0 +1,213 @@
+"""Fit of a scene's parameters to measured or simulated waveforms, by renders with exact derivatives."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from mitransient_lidar.analysis.information.fits import SCALE, TIME_OFFSET, WaveformFit
+from mitransient_lidar.analysis.information.measured import measured
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer, shown
+from mitransient_lidar.loading.catalogue import scene_parameters
+from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
+from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.rendering.options import MOST_PASSES
+from mitransient_lidar.rendering.passes import Progress, ProgressCallback
+from mitransient_lidar.rendering.render import render
+
+logger = logging.getLogger(__name__)
+
+_PILOT_PASSES, _MOST_PASSES = 16, 256  # of the first render, and most that are chosen
+_LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
+
+
+def fit(
+    source: xr.Dataset | str | os.PathLike[str],
+    scene: str | os.PathLike[str] | Callable[[Mapping[str, float]], xr.Dataset] | None = None,
+    free: Sequence[str] = (),
+    *,
+    params: Mapping[str, Any] | None = None,
+    instrument: str | None = None,
+    start: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    free_scale: bool | None = None,
+    free_time: bool | None = None,
+    noise: float | None = None,
+    receiver: str | os.PathLike[str] | ReceiverChain | None = None,
+    scale_errors: bool = False,
+    passes: int | None = None,
+    seed: int | None = None,
+    most_renders: int = 60,
+    progress: ProgressCallback | None = None,
+) -> xr.Dataset:
+    """Fit parameters of a scene to waveforms by weighted nonlinear least squares.
+
+    Parameters
+    ----------
+    source
+        A result, a recorded signal, or a CSV file; see `analysis.information.measured.measured`.
+    scene
+        Name or path of the scene, by default that of the result; or a function that returns a render with derivatives
+        for values of the free parameters (`analysis.information.fits.WaveformFit`).
+    free
+        Names of the free parameters, such as ``attenuation``, ``attenuation[1]`` of the second layer, or
+        ``bottom_reflectance``.
+    params, instrument
+        Other values of the scene's parameters, and instrument that replaces its lidar; see `rendering.render.render`.
+    start
+        Starts of free parameters, by default their values in the scene; also of ``scale`` and ``time_offset_ns``.
+    bounds
+        Lowest and highest values of free parameters, by default their physical ranges.
+    free_scale, free_time
+        Whether the scale and the time offset [ns] of the waveforms are free parameters, by default only those of a CSV
+        file, whose unit and time zero are unknown.
+    noise
+        Standard deviation of every sample, above 0, in the unit of the waveforms, instead of their own errors.
+    receiver
+        Receiver of a recorded signal, by default the one that it names.
+    scale_errors
+        Whether to multiply the covariance by the reduced chi-squared.
+    passes
+        Passes of each render, 2 to 10^9; by default as many as make the median variance by the Monte Carlo of the model
+        a tenth of that of the waveforms, 16 to 256.
+    seed
+        Seed of all renders, so that they share their random numbers; by default 1, or for a result its own plus 1.
+    most_renders
+        Renders after which the fit ends without convergence, 2 to 10000.
+    progress
+        Called with a `rendering.passes.Progress` after every render.
+
+    Returns
+    -------
+    xarray.Dataset
+        See `analysis.information.fits.WaveformFit.run`; with the attributes ``scene``, ``passes`` and ``seed`` of a
+        rendered model.
+
+    Raises
+    ------
+    UserError
+        If the waveforms, the scene, a parameter or an option is invalid; or the seed is that of the result, whose noise
+        the model would repeat.
+    """
+    names = _names(free)
+    if unknown := [name for name in start or {} if name not in (*names, SCALE, TIME_OFFSET)]:
+        raise UserError(f"start of {unknown[0]}: it is not one of the free parameters {', '.join(names)}")
+    if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in (".nc", ".exr"):
+        from mitransient_lidar import results
+
+        source = results.open(source, signals=True)
+    found = measured(source, noise=noise, receiver=receiver)
+    options: dict[str, Any] = {"free_scale": free_scale, "free_time": free_time}
+    if callable(scene):
+        if missing := [name for name in names if name not in (start or {})]:
+            raise UserError(f"start of {missing[0]} is missing: a model that is a function needs all starts")
+        problem = WaveformFit(found, scene, dict(start or {}), bounds, **options)
+        return problem.run(most_renders=most_renders, scale_errors=scale_errors)
+    given = None if passes is None else integer("passes", passes, 2, MOST_PASSES)
+    attributes = source.attrs if isinstance(source, xr.Dataset) else {}
+    model = _RenderedModel(
+        _scene(scene, attributes), params, instrument, names, given or _PILOT_PASSES, _seed(seed, attributes), progress
+    )
+    starts = {**model.starts(start or {}), **(start or {})}
+    problem = WaveformFit(found, model, starts, bounds, **options)
+    if given is None and (ratio := problem.noise_ratio()) > _LARGEST_RATIO:
+        needed = math.ceil(_PILOT_PASSES * ratio / _LARGEST_RATIO)
+        if needed > _MOST_PASSES:
+            logger.warning(
+                "a Monte Carlo error small against that of the waveforms takes %d passes, %d are rendered: passes = %d "
+                "would give smaller errors",
+                needed,
+                _MOST_PASSES,
+                needed,
+            )
+        model.passes = min(needed, _MOST_PASSES)
+        problem.forget()
+    fitted = problem.run(most_renders=most_renders, scale_errors=scale_errors)
+    return fitted.assign_attrs({"scene": model.name, "passes": model.passes, "seed": model.seed})
+
+
+class _RenderedModel:
+    """Renders of a scene by values of its free parameters, all with the same random numbers."""
+
+    def __init__(
+        self,
+        scene: str | os.PathLike[str] | SceneRecord,
+        params: Mapping[str, Any] | None,
+        instrument: str | None,
+        names: Sequence[str],
+        passes: int,
+        seed: int,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self.scene, self.params, self.instrument = scene, dict(params or {}), instrument
+        self.names, self.passes, self.seed, self.progress = list(names), passes, seed, progress
+        own = scene.parameters if isinstance(scene, SceneRecord) else scene_parameters(scene)
+        self.name = scene.name if isinstance(scene, SceneRecord) else Path(scene).stem
+        self.texts = {**own, **{name: str(value) for name, value in self.params.items()}}
+        self.done, self.began = 0, time.perf_counter()
+
+    def __call__(self, values: Mapping[str, float]) -> xr.Dataset:
+        """Render the scene with other values of the free parameters; a Ctrl-C ends the fit."""
+        dataset: xr.Dataset = render(
+            self.scene,
+            params=self.with_values(values),
+            instrument=self.instrument,
+            passes=self.passes,
+            seed=self.seed,
+            derivatives=self.names,
+        )
+        if dataset.attrs.get("interrupted"):
+            raise KeyboardInterrupt
+        self.done += 1
+        if self.progress is not None:
+            self.progress(Progress(self.done, None, unit="render", elapsed_s=time.perf_counter() - self.began))
+        return dataset
+
+    def starts(self, given: Mapping[str, float]) -> dict[str, float]:
+        """Return the starts of the free parameters, by default their values in the scene."""
+        return {name: given.get(name, value_of(self.texts, name)) for name in self.names}
+
+    def with_values(self, values: Mapping[str, float]) -> dict[str, Any]:
+        """Return the parameters of the scene with other values, those of layers in their list."""
+        texts = self.texts
+        for name, value in values.items():
+            texts = with_value(texts, name, value)
+        return {**self.params, **{parameter_of(name): texts[parameter_of(name)] for name in values}}
+
+
+def _names(free: Sequence[str]) -> list[str]:
+    """Return the names of the free parameters, each once."""
+    names = [free] if isinstance(free, str) else list(free)
+    if not names or not all(names):
+        raise UserError(f"free = {shown(names)} must name one or more parameters of the scene")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UserError(f"free = {shown(names)} names {twice[0]} twice")
+    return names
+
+
+def _scene(scene: str | os.PathLike[str] | None, attributes: Mapping[str, Any]) -> str | os.PathLike[str] | SceneRecord:
+    """Return the scene, or that of a result."""
+    if scene is not None:
+        return scene
+    if not attributes:
+        raise UserError("scene is missing: waveforms of a table do not hold theirs")
+    return SceneRecord.from_attributes(attributes)
+
+
+def _seed(seed: int | None, attributes: Mapping[str, Any]) -> int:
+    """Return the seed of the renders, another one than that of a result."""
+    own = attributes.get("seed")
+    if seed is None:
+        return 1 if own is None else int(own) + 1
+    if own is not None and seed == own:
+        raise UserError(f"seed = {seed} is that of the result: the model would repeat its noise, choose another seed")
+    return seed

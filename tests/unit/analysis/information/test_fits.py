@@ -1,0 +1,293 @@
+"""Fits of a waveform in closed form: values, stated errors and their distribution, nuisances, and invalid input."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from closed_form_waveform import BIN, TIME, TRUTH, closed_form, noisy
+from scipy.stats import chi2, kstest
+from significance import FALSE_ALARM, largest_z
+
+from mitransient_lidar.analysis.information.fits import WaveformFit, describe_fit, table_rows
+from mitransient_lidar.analysis.information.measured import measured
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.core.errors import UserError
+
+#: Starts that are wrong by half.
+WRONG = {name: value * factor for (name, value), factor in zip(TRUTH.items(), (0.5, 1.5, 0.5), strict=True)}
+
+
+def fit(source, starts=None, bounds=None, model=closed_form, noise=None, **options):
+    runs = {key: options.pop(key) for key in ("most_renders", "scale_errors") if key in options}
+    found = measured(source, noise=noise)
+    return WaveformFit(found, model, WRONG if starts is None else starts, bounds, **options).run(**runs)
+
+
+def distance(fitted, truth=TRUTH):
+    """Return the squared distance of the estimates from the truth in standard errors, by the stated covariance."""
+    names = list(truth)
+    error = fitted["value"].sel(parameter=names).values - np.array(list(truth.values()))
+    return error @ np.linalg.solve(fitted["covariance"].sel(parameter=names, other_parameter=names).values, error)
+
+
+def assert_chi_squared(distances, freedom):
+    """Check mean and distribution of squared distances against those of chi-squared."""
+    distances = np.array(distances)
+    error = np.sqrt(2 * freedom / distances.size)
+    assert abs(distances.mean() - freedom) < largest_z(10**4) * error, distances.mean()
+    assert kstest(distances, chi2(freedom).cdf).pvalue > FALSE_ALARM
+
+
+@pytest.mark.slow
+def test_errors_of_200_fits_have_the_stated_covariance():
+    random = np.random.default_rng(1)
+    fits = [fit(noisy(0.002, random)) for _ in range(200)]
+    assert all(one.attrs["converged"] for one in fits)
+    assert_chi_squared([distance(one) for one in fits], len(TRUTH))
+    # The chi-squared of the fits, whose probabilities are uniform.
+    freedom = TIME.size - len(TRUTH)
+    assert fits[0].attrs["expected"] == pytest.approx(freedom)
+    assert fits[0].attrs["freedom"] == pytest.approx(freedom)
+    assert kstest([one.attrs["probability"] for one in fits], "uniform").pvalue > FALSE_ALARM
+
+
+@pytest.mark.slow
+def test_errors_that_neighbours_share_widen_the_covariance():
+    """Errors smoothed over five samples, known by `error_inflation`: independent errors would be half as large."""
+    random = np.random.default_rng(2)
+    kernel = np.ones(5) / np.sqrt(5)
+    lags = 1 - np.arange(5) / 5
+    bins = [1, 2, 4, 8, 16, 32]
+    inflation = [np.sqrt(1 + 2 * sum((1 - k / n) * lags[k] for k in range(1, min(n, 5)))) for n in bins]
+    true = closed_form(TRUTH)["waveform"]
+    fits = []
+    for _ in range(150):
+        errors = 0.002 * np.convolve(random.normal(size=TIME.size + 4), kernel, "valid")
+        data = {"waveform": true + errors, "waveform_stderr": xr.full_like(true, 0.002)}
+        attributes = {**BIN, "error_inflation_bins": bins, "error_inflation": inflation}
+        fits.append(fit(xr.Dataset(data, attrs=attributes)))
+    assert_chi_squared([distance(one) for one in fits], len(TRUTH))
+    assert fits[0].attrs["freedom"] < 0.5 * TIME.size
+    scores = np.array([one.attrs["chi_squared"] for one in fits]) - fits[0].attrs["expected"]
+    spread = fits[0].attrs["expected"] * np.sqrt(2 / fits[0].attrs["freedom"])
+    assert abs(scores.mean()) < largest_z(10**4) * spread / np.sqrt(len(fits))
+
+
+@pytest.mark.slow
+def test_unknown_scale_and_offset_are_recovered(tmp_path):
+    """Counts that a CSV file holds at times of its own, 0.8 ns apart and 500.3 ns early; scattering is the scale's."""
+    random = np.random.default_rng(3)
+    times = np.arange(12.0, 150.0, 0.8)
+    truth = {"attenuation": 0.2, "bottom_reflectance": 0.1, "scale": 5000.0, "time_offset_ns": -500.3}
+    starts = {"attenuation": 0.3, "bottom_reflectance": 0.05}
+    distances = []
+    for _ in range(60):
+        counts = 5000 * closed_form(TRUTH, times)["waveform"].values[0] + random.normal(0, 10, times.size)
+        lines = (f"{time - 500.3:.6f},{count:.9g},10" for time, count in zip(times, counts, strict=True))
+        (tmp_path / "counts.csv").write_text("\n".join(["time_ns,apd,apd_stderr", *lines]))
+        fitted = fit(tmp_path / "counts.csv", starts)
+        distances.append(distance(fitted, truth))
+    assert_chi_squared(distances, len(truth))
+    assert fitted["used"].values.sum() > 0.8 * times.size
+    assert fitted["measured"].sizes == {"pixel": 1, "time": times.size}
+
+
+@pytest.mark.slow
+def test_errors_of_records_of_a_receiver_are_those_of_its_closed_form():
+    """Records of 40 shots behind an avalanche photodiode, whose bandwidth correlates neighbouring samples."""
+    light = closed_form(TRUTH, pixels=("a", "b"), power=3e-7)
+    recorded = detect_waveforms(light, "apd", shots=40 * 60, seed=4)
+    distances, probabilities = [], []
+    for number in range(60):
+        found = recorded.isel(shot=slice(40 * number, 40 * number + 40)).assign_attrs(shots=40)
+
+        def model(values):
+            return closed_form(values, pixels=("a", "b"), power=3e-7)
+
+        fitted = fit(found, model=model)
+        distances.append(distance(fitted))
+        probabilities.append(fitted.attrs["probability"])
+    assert_chi_squared(distances, len(TRUTH))
+    assert kstest(probabilities, "uniform").pvalue > FALSE_ALARM
+
+
+@pytest.mark.slow
+def test_noise_of_the_model_widens_the_covariance():
+    """A model with the error of the data: the same for all values, as by common random numbers."""
+    random = np.random.default_rng(5)
+    distances = []
+    for _ in range(100):
+        errors = random.normal(0, 0.002, TIME.size)
+
+        def model(values, errors=errors):
+            exact = closed_form(values)
+            return exact.assign(waveform=exact["waveform"] + errors, waveform_stderr=0 * exact["waveform"] + 0.002)
+
+        fitted = fit(noisy(0.002, random), model=model)
+        distances.append(distance(fitted))
+    assert_chi_squared(distances, len(TRUTH))
+    share = fitted["stderr_by_model"] / fitted["stderr"]
+    np.testing.assert_allclose(share, np.sqrt(0.5), rtol=1e-6)
+
+
+def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
+    """Steps of less than 0.02 standard errors are not rendered."""
+    fitted = fit(closed_form(TRUTH), noise=0.001)
+    assert distance(fitted) < 0.02**2
+    assert fitted.attrs["renders"] < 10
+    assert fitted.attrs["converged"]
+    assert fitted["parameter_units"].values.tolist() == ["1/m", "1/m", "1"]
+    np.testing.assert_array_equal(fitted["start"], list(WRONG.values()))
+    np.testing.assert_allclose(np.diag(fitted["correlation"]), 1)
+    lines = describe_fit(fitted)
+    assert lines[1].split()[0] == "attenuation"
+    assert float(lines[1].split()[1]) == pytest.approx(0.2, rel=1e-3)
+    assert lines[-1] == f"{fitted.attrs['renders']} renders"
+    heading, rows = table_rows(fitted)
+    assert heading[:3] == ("parameter", "unit", "value")
+    assert [row[0] for row in rows] == list(TRUTH)
+
+
+def test_covariance_is_the_inverse_of_the_information():
+    fitted = fit(closed_form(TRUTH), TRUTH, noise=0.002)
+    slopes = closed_form(TRUTH)["waveform_derivative"].values[:, 0] / 0.002
+    np.testing.assert_allclose(fitted["covariance"], np.linalg.inv(slopes @ slopes.T), rtol=1e-6)
+
+
+def test_bounds_are_kept():
+    fitted = fit(closed_form(TRUTH), bounds={"attenuation": (0.05, 0.15)}, noise=0.002)
+    assert 0.1499 <= fitted["value"].sel(parameter="attenuation") <= 0.15
+    assert fitted["at_bound"].values.tolist() == [1, 0, 0]
+    assert np.isnan(fitted["stderr"].values).tolist() == [True, False, False]
+    assert any(text.startswith("attenuation is at its bound 0.15") for text in fitted.attrs["messages"])
+    assert "unknown" in describe_fit(fitted)[1]
+
+
+def test_errors_are_taken_from_residuals_where_they_are_unknown():
+    """The reduced chi-squared is the variance of the noise, known to 11 % from 160 samples."""
+    data = noisy(0.002, np.random.default_rng(6))
+    known, unknown = fit(data), fit(data.drop_vars("waveform_stderr"))
+    factor = np.sqrt(known.attrs["chi_squared"] / known.attrs["expected"])
+    np.testing.assert_allclose(unknown["stderr"], factor * known["stderr"], rtol=3e-3)
+    np.testing.assert_allclose(fit(data, scale_errors=True)["stderr"], unknown["stderr"], rtol=3e-3)
+    assert np.isnan(unknown.attrs["probability"])
+    assert any("errors of the waveforms are unknown" in text for text in unknown.attrs["messages"])
+
+
+def test_degenerate_and_idle_parameters_are_named():
+    """A second scattering of the same effect, and a parameter without any."""
+
+    def model(values):
+        exact = closed_form({**TRUTH, "scattering": values["scattering"] + values["twin"]})
+        slope = exact["waveform_derivative"].sel(parameter="scattering")
+        slopes = np.stack([slope, slope, 0 * slope])
+        data = {"waveform": exact["waveform"], "waveform_derivative": (("parameter", "pixel", "time"), slopes)}
+        return xr.Dataset(data, {"parameter": ["scattering", "twin", "idle"]}, exact.attrs)
+
+    starts = {"scattering": 0.05, "twin": 0.05, "idle": 1.0}
+    fitted = fit(closed_form(TRUTH), starts, model=model, noise=0.002)
+    assert float(fitted["value"][:2].sum()) == pytest.approx(0.15, rel=1e-5)
+    messages = " ".join(fitted.attrs["messages"])
+    assert "scattering and twin cannot be told apart" in messages
+    assert "idle has no influence" in messages
+    assert np.isnan(fitted["stderr"].values[2])
+
+
+def test_a_parameter_of_little_influence_is_named():
+    fitted = fit(closed_form(TRUTH), TRUTH, noise=2.0)
+    assert any("bottom_reflectance has little influence" in text for text in fitted.attrs["messages"])
+
+
+def test_impossible_steps_are_shortened_and_the_fit_goes_on():
+    """A scene whose scattering must not exceed its attenuation, as of renders; a full first step does."""
+    refused = []
+
+    def model(values):
+        if values["scattering"] > values["attenuation"]:
+            refused.append(values)
+            raise UserError("scattering must not exceed attenuation")
+        return closed_form(values)
+
+    starts = {"attenuation": 0.3, "scattering": 0.01, "bottom_reflectance": 0.02}
+    fitted = fit(closed_form(TRUTH), starts, model=model, noise=0.002)
+    assert refused
+    assert fitted.attrs["converged"]
+    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-4)
+
+
+def test_a_fit_that_ends_at_refused_values_says_so():
+    """The truth has an attenuation of 0.2, and the scene refuses more than 0.15."""
+
+    def model(values):
+        if values["attenuation"] > 0.15:
+            raise UserError("attenuation must not exceed 0.15")
+        return closed_form(values)
+
+    fitted = fit(closed_form(TRUTH), model=model, noise=0.002)
+    assert fitted["value"][0] <= 0.15
+    text = "steps were refused, at which the fit may have ended: attenuation must not exceed 0.15"
+    assert text in fitted.attrs["messages"]
+
+
+def test_few_renders_end_without_convergence():
+    fitted = fit(closed_form(TRUTH), noise=0.002, most_renders=3)
+    assert fitted.attrs["renders"] == 3
+    assert not fitted.attrs["converged"]
+    assert fitted.attrs["messages"][0] == "the fit has not converged in 3 renders"
+
+
+def test_some_pixels_are_fitted_by_their_names():
+    data = noisy(0.002, np.random.default_rng(7), pixels=("a", "b", "c")).isel(pixel=[2, 0])
+
+    def model(values):
+        return closed_form(values, pixels=("a", "b", "c"))
+
+    fitted = fit(data, model=model)
+    assert fitted["fitted"]["pixel"].values.tolist() == ["c", "a"]
+    assert abs(fitted["residual"]).max() < 6
+    with pytest.raises(UserError, match="the scene has no pixel c: its pixels are a, b"):
+        fit(data, model=lambda values: closed_form(values, pixels=("a", "b")))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"starts": {**TRUTH, "bottom_reflectance": 1.2}},
+            "start of bottom_reflectance = 1.2 must lie between 0 and 1",
+        ),
+        ({"starts": {**TRUTH, "attenuation": np.nan}}, "start of attenuation = nan must be finite"),
+        ({"starts": {"scale": 1.0}}, "start of scale: it is fixed"),
+        ({"starts": {}}, "free = '' must name at least one parameter"),
+        ({"starts": {"depth": 3.0}}, "no derivative by depth, only by attenuation, scattering, bottom_reflectance"),
+        ({"bounds": {"attenuation": (0.4, 0.3)}}, "bounds of attenuation = 0.4, 0.3 must increase"),
+        ({"bounds": {"scattered": (0, 1)}}, "bounds of scattered: it is not one of the free parameters attenuation"),
+        ({"noise": 0}, "noise = 0 must be greater than 0"),
+        ({"most_renders": 1}, "most_renders = 1 must lie between 2 and 10000"),
+        (
+            {"model": lambda values: closed_form(values, TIME + 500)},
+            "have 0 samples from 0 to 159 ns within the record",
+        ),
+        ({"model": lambda values: closed_form(values).drop_vars("waveform_derivative")}, "no variable waveform_deriv"),
+        ({"model": lambda values: np.inf * closed_form(values)}, "waveform of the model has 160 values"),
+    ],
+)
+def test_invalid_input_is_refused(options, message):
+    with pytest.raises(UserError, match=message):
+        fit(noisy(0.002, np.random.default_rng(8)), **options)
+
+
+def test_samples_without_value_or_error_are_left_out(tmp_path):
+    lines = [
+        f"{time},{light:.9g},0.002" for time, light in zip(TIME, closed_form(TRUTH)["waveform"][0].values, strict=True)
+    ]
+    lines[50], lines[60] = "50,,0.002", "60,7,"
+    (tmp_path / "gaps.csv").write_text("\n".join(["time_ns,single,single_stderr", *lines]))
+    fitted = fit(tmp_path / "gaps.csv", free_scale=False, free_time=False)
+    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=1e-5)
+    assert np.flatnonzero(fitted["used"][0] == 0).tolist() == [50, 60]
+    assert fitted.attrs["expected"] == pytest.approx(TIME.size - 2 - len(TRUTH))
+
+
+def test_dark_waveforms_of_unknown_scale_are_refused():
+    with pytest.raises(UserError, match="the waveforms have no light where the scene has"):
+        fit(-1 * closed_form(TRUTH)[["waveform"]].assign_attrs(BIN), free_scale=True, noise=0.1)

@@ -1,0 +1,118 @@
+"""Reading of waveforms to fit: results, signals and tables, and their errors."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from closed_form_waveform import TRUTH, closed_form, noisy
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.information.measured import correlation, measured, predict
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.results.netcdf import dump
+
+TABLE = "time_ns,a,a_stderr,b,b_stderr\n1.0,2,0.1,4,0.2\n1.5,3,0.1,,0.2\n2.5,5,0.1,6,0.2\n"
+
+
+def test_a_table_has_pixels_errors_and_missing_values(tmp_path):
+    (tmp_path / "some.csv").write_text(TABLE)
+    found = measured(tmp_path / "some.csv")
+    np.testing.assert_array_equal(found.time_ns, [1, 1.5, 2.5])
+    np.testing.assert_array_equal(found.values, [[2, 3, 5], [4, np.nan, 6]])
+    np.testing.assert_array_equal(found.stderr, [[0.1] * 3, [0.2] * 3])
+    assert found.template["pixel"].values.tolist() == ["a", "b"]
+    assert not found.calibrated
+    np.testing.assert_array_equal(measured(tmp_path / "some.csv", noise=3).stderr, np.full((2, 3), 3))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "must begin with a heading of time_ns"),
+        ("t,a\n1,2\n2,3", "must begin with a heading of time_ns"),
+        ("time_ns,a,a\n1,2,3\n2,3,4", "two columns 'a'"),
+        ("time_ns,a\n1,2", "has 1 rows of numbers: it must have 2 or more"),
+        ("time_ns,a\n1,2\n2", "row 3 has 1 values but must have 2"),
+        ("time_ns,a\n1,2\n2,x", "row 3: a = 'x' must be a number"),
+        ("time_ns,a\n1,2\n,3", "row 3: time_ns = '' must be a number"),
+        ("time_ns,a\n1,2\n2,inf", "row 3: a = inf must be finite"),
+        ("time_ns,a\n2,2\n1,3", "time_ns = 2, 1: it must increase strictly"),
+        ("time_ns,a,b,a_stderr\n1,2,3,1\n2,2,3,1", "the column b_stderr is missing"),
+        ("time_ns,a,a_stderr\n1,2,1\n2,2,0", "a_stderr = 0: it must be greater than 0"),
+    ],
+)
+def test_invalid_tables_are_refused(text, message, tmp_path):
+    (tmp_path / "some.csv").write_text(text)
+    with pytest.raises(UserError, match=message):
+        measured(tmp_path / "some.csv")
+
+
+def test_a_result_has_its_own_errors(tmp_path):
+    data = noisy(0.01, np.random.default_rng(1))
+    light = data.assign(impulse_response=data["waveform"], impulse_response_stderr=data["waveform_stderr"])
+    results.save(light, tmp_path / "result.nc")
+    found = measured(tmp_path / "result.nc")
+    np.testing.assert_array_equal(found.values, data["waveform"])
+    np.testing.assert_array_equal(found.stderr, data["waveform_stderr"])
+    assert found.calibrated
+    with pytest.raises(UserError, match="receiver is that of a recorded signal"):
+        measured(light, receiver="apd")
+    with pytest.raises(UserError, match="no variable waveform"):
+        measured(xr.Dataset({"energy": data["waveform"]}))
+
+
+def test_a_signal_is_the_mean_of_its_records(tmp_path):
+    recorded = detect_waveforms(closed_form(TRUTH, power=3e-7), "apd", shots=5, background_power=1e-9)
+    dump(recorded, tmp_path / "signals.nc", {})
+    found = measured(tmp_path / "signals.nc")
+    np.testing.assert_allclose(found.values, recorded["signal"].mean("shot"))
+    assert found.shots == 5
+    assert found.receiver.backgrounds.tolist() == [1e-9]
+    with pytest.raises(UserError, match=r"noise = 0\.1 is that of the receiver"):
+        measured(recorded, noise=0.1)
+    del recorded.attrs["receiver"]
+    with pytest.raises(UserError, match="the signal does not name its receiver"):
+        measured(recorded)
+
+
+@pytest.mark.parametrize("receiver", ["apd", "pmt_log", "spad"])
+def test_predictions_behind_a_receiver_are_its_closed_form(receiver):
+    """Mean and variance are those of the record, and derivatives differences of means of other parameters."""
+    light = closed_form(TRUTH, power=3e-7)
+    recorded = detect_waveforms(light, receiver, background_power=1e-9)
+    found = measured(recorded)
+    one = predict(found, light, list(TRUTH))
+    np.testing.assert_allclose(one.mean, recorded["signal_mean"])
+    np.testing.assert_allclose(np.sqrt(one.noise_variance), recorded["signal_deviation"])
+    for number, name in enumerate(TRUTH):
+        means = [
+            detect_waveforms(closed_form({**TRUTH, name: factor * TRUTH[name]}, power=3e-7), receiver,
+                             background_power=1e-9)["signal_mean"].values
+            for factor in (1.001, 0.999)
+        ]  # fmt: skip
+        slope = (means[0] - means[1]) / (0.002 * TRUTH[name])
+        np.testing.assert_allclose(one.derivative[number], slope, atol=2e-3 * np.abs(slope).max())
+
+
+def test_correlations_have_the_inflation_that_they_follow_from():
+    """The inflation of means of 1 to 64 bins of a render of `table1`, with a pulse of 5 ns."""
+    bins, inflation = [1, 2, 4, 8, 16, 32, 64], [1.0, 1.398, 1.894, 2.385, 2.653, 2.819, 2.958]
+    lags = correlation({"error_inflation_bins": bins, "error_inflation": inflation})
+    assert lags.size == 64
+    for count, expected in zip(bins, inflation, strict=True):
+        k = np.arange(1, count)
+        assert np.sqrt(1 + 2 * np.sum((1 - k / count) * lags[1:count])) == pytest.approx(expected)
+    np.testing.assert_array_equal(correlation({}), [1])
+
+
+def test_pixels_of_another_scene_are_refused():
+    found = measured(closed_form(TRUTH, pixels=("a", "b"))[["waveform"]])
+    image = closed_form(TRUTH)["waveform"].isel(pixel=0, drop=True).expand_dims(row=[0, 1], column=[0, 1])
+    with pytest.raises(UserError, match=r"the scene has pixels over \(row, column\)"):
+        predict(found, xr.Dataset({"waveform": image}), list(TRUTH))
+    with pytest.raises(UserError, match="the scene has no pixel a: its pixels are red"):
+        predict(found, closed_form(TRUTH, pixels=("red",)), list(TRUTH))
+    with pytest.raises(UserError, match=r"the scene has \(2, 1\) rows and columns, the waveforms \(2, 2\)"):
+        predict(
+            measured(xr.Dataset({"waveform": image})), xr.Dataset({"waveform": image.isel(column=[0])}), list(TRUTH)
+        )

@@ -1,0 +1,169 @@
+"""Fits of scenes with replaced renders: values of parameters and layers, seeds, passes, and the command."""
+
+import csv
+
+import numpy as np
+import pytest
+import xarray as xr
+from closed_form_waveform import TRUTH, closed_form, noisy
+from command_line import assert_refused, run
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.rendering.passes import Progress
+from mitransient_lidar.results.netcdf import dump
+from mitransient_lidar.studies import fit as study
+
+NAMES = ["attenuation", "bottom_reflectance"]
+
+
+@pytest.fixture
+def renders(monkeypatch):
+    """Options of all renders, which return the waveform in closed form with an error of 0.006 / sqrt(passes)."""
+    found = []
+
+    def render(scene, *, params, derivatives, passes, **options):
+        found.append({"scene": scene, "params": params, "passes": passes, **options})
+        values = {name: float(params[name]) for name in derivatives}
+        exact = closed_form(values, pixels=("red",)).sel(parameter=list(derivatives))
+        return exact.assign(waveform_stderr=xr.full_like(exact["waveform"], 0.006 / np.sqrt(passes)))
+
+    monkeypatch.setattr(study, "render", render)
+    return found
+
+
+@pytest.fixture
+def table(tmp_path):
+    """A CSV file of counts, 3000 a watt, at times of their own."""
+    random = np.random.default_rng(1)
+    light = closed_form(TRUTH)
+    counts = 3000 * light["waveform"].values[0] + random.normal(0, 6, light.sizes["time"])
+    rows = [f"{time + 12.25},{count:.6g},6" for time, count in zip(light["time"].values, counts, strict=True)]
+    path = tmp_path / "counts.csv"
+    path.write_text("\n".join(["time_ns,apd,apd_stderr", *rows]))
+    return path
+
+
+def test_starts_are_those_of_the_scene_and_seeds_differ_from_the_result(renders):
+    data = noisy(0.01, np.random.default_rng(2), pixels=("red",)).assign_attrs(seed=5)
+    states = []
+    fitted = mitransient_lidar.fit(data, "table1", NAMES, params={"wind_speed": 2}, progress=states.append)
+    assert fitted["start"].values.tolist() == [0.3, 0.1]
+    assert renders[0] == {
+        "scene": "table1",
+        "params": {"wind_speed": 2, "attenuation": "0.3", "bottom_reflectance": "0.1"},
+        "passes": 16,
+        "seed": 6,
+        "instrument": None,
+    }
+    assert {one["seed"] for one in renders} == {6}
+    assert len(renders) == fitted.attrs["renders"] == states[-1].done
+    assert isinstance(states[0], Progress)
+    assert fitted.attrs["scene"] == "table1"
+    error = fitted["value"].values - [TRUTH[name] for name in NAMES]
+    assert np.abs(error / fitted["stderr"]).max() < 6
+    with pytest.raises(UserError, match="seed = 5 is that of the result"):
+        mitransient_lidar.fit(data, "table1", NAMES, seed=5)
+
+
+@pytest.mark.parametrize(("deviation", "passes"), [(0.01, 16), (0.003, 40), (0.0005, 256)])
+def test_passes_make_the_error_of_the_model_small_against_the_data(deviation, passes, renders, caplog):
+    """A variance of (0.006)^2 / passes is at most a tenth of that of the data, up to 256 passes."""
+    data = noisy(deviation, np.random.default_rng(3), pixels=("red",))
+    fitted = mitransient_lidar.fit(data, "table1", NAMES)
+    assert fitted.attrs["passes"] == passes
+    assert renders[-1]["passes"] == passes
+    assert ("takes 1440 passes, 256 are rendered" in caplog.text) == (passes == 256)
+    assert mitransient_lidar.fit(data, "table1", NAMES, passes=4).attrs["passes"] == 4
+
+
+def test_values_of_layers_are_set_in_their_list():
+    model = study._RenderedModel("fig15_2x2", {"wind_speed": 3}, None, ["attenuation[1]"], 4, 1, None)
+    assert model.starts({}) == {"attenuation[1]": 0.5}
+    assert model.with_values({"attenuation[1]": 0.4}) == {"wind_speed": 3, "attenuation": "0.9, 0.4"}
+    assert model.with_values({"attenuation[0]": 1.0, "attenuation[1]": 0.4})["attenuation"] == "1.0, 0.4"
+
+
+@pytest.mark.parametrize(
+    ("free", "options", "message"),
+    [
+        (["bottom_deep"], {}, "parameter 'bottom_deep' is not one of the scene: did you mean bottom_depth"),
+        ([], {}, "must name one or more parameters"),
+        (["attenuation", "attenuation"], {}, "names attenuation twice"),
+        (
+            ["attenuation"],
+            {"params": {"attenuation": "0.9, 0.5"}},
+            r"name one of its elements attenuation\[0\]",
+        ),
+        (["attenuation[2]"], {}, r"parameter attenuation\[2\]: the index must be 0 to 0"),
+        (["bin_count"], {}, "parameter bin_count = 'auto' is not a number"),
+        (["attenuation"], {"passes": 1}, "passes = 1 must lie between 2 and"),
+        (["attenuation"], {"free_scale": True, "start": {"scale": -1}}, "start of scale = -1 must lie between 0 and"),
+        (["attenuation"], {"start": {"attenuatoin": 1}}, "start of attenuatoin: it is not one of the free"),
+    ],
+)
+def test_invalid_parameters_are_refused(free, options, message, renders):
+    data = noisy(0.01, np.random.default_rng(4), pixels=("red",))
+    with pytest.raises(UserError, match=message):
+        mitransient_lidar.fit(data, "table1", free, **options)
+
+
+def test_scenes_that_are_unknown_are_refused():
+    data = noisy(0.01, np.random.default_rng(5))
+    with pytest.raises(UserError, match="the result does not hold its scene"):
+        mitransient_lidar.fit(data, None, NAMES)
+    with pytest.raises(UserError, match="start of bottom_reflectance is missing"):
+        mitransient_lidar.fit(data, closed_form, NAMES, start={"attenuation": 0.2})
+
+
+def test_a_function_is_a_model():
+    fitted = mitransient_lidar.fit(closed_form(TRUTH), closed_form, list(TRUTH), start=TRUTH, noise=0.01)
+    np.testing.assert_allclose(fitted["value"], list(TRUTH.values()))
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_table_a_file_and_a_figure(renders, table, tmp_path):
+    options = ["--start", "attenuation=0.25", "--bounds", "bottom_reflectance=0.01:0.5", "--passes", 32]
+    done = run("fit", table, "--scene", "table1", "--free", ",".join(NAMES), *options, "-o", tmp_path / "out", "-q")
+    assert done.exit_code == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert [line.split("/")[-1] for line in lines[:3]] == ["fit.nc", "fit.csv", "fit.png"]
+    assert [line.split()[0] for line in lines[4:8]] == [*NAMES, "time_offset_ns", "scale"]
+    with (tmp_path / "out" / "fit.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    with xr.open_dataset(tmp_path / "out" / "fit.nc", engine="h5netcdf") as fitted:
+        assert [float(row["value"]) for row in rows] == fitted["value"].values.tolist()
+        truth = np.array([0.2, 0.1, 12.25, 3000])
+        assert np.abs((fitted["value"].values - truth) / fitted["stderr"].values).max() < 6
+        assert fitted["low"].values[1] == 0.01
+    assert (tmp_path / "out" / "fit.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--free", "depth"], "parameter 'depth' is not one of the scene"),
+        (["--free", ""], "must name one or more parameters"),
+        (["--free", "attenuation", "--start", "attenuation"], "--start attenuation is not of the form name=value."),
+        (["--free", "attenuation", "--start", "attenuation=x"], "--start attenuation = 'x' must be a number"),
+        (["--free", "attenuation", "--bounds", "attenuation=1"], "attenuation=1 is not of the form name=low:high."),
+        (["--free", "attenuation", "--receiver", "apd"], "receiver is that of a recorded signal"),
+        (["--free", "attenuation", "--noise", "-1"], "noise = -1 must be greater than 0"),
+    ],
+)
+def test_the_command_refuses_invalid_options(options, message, table, tmp_path):
+    done = run("fit", table, "--scene", "table1", *options, "-o", tmp_path / "out", "-q")
+    assert_refused(done, message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_refuses_files_that_it_cannot_read(tmp_path):
+    free = ["--scene", "table1", "--free", "attenuation", "-q"]
+    assert_refused(run("fit", tmp_path / "none.csv", *free), "none.csv")
+    assert_refused(run("fit", tmp_path / "none.nc", *free), "none.nc")
+    dump(closed_form(TRUTH)[["waveform_derivative"]], tmp_path / "other.nc", {})
+    assert_refused(run("fit", tmp_path / "other.nc", *free), "other.nc")
+
+
+def test_a_table_needs_a_scene(table):
+    assert_refused(run("fit", table, "--free", "attenuation", "-q"), "scene is missing")
