@@ -160,7 +160,7 @@ def test_fits_of_counts_scatter_as_the_bound(record_property):
         fits[number] = height, rate
     error = fits - truth
     squares = np.einsum("ia,ab,ib->", error, information, error)
-    record_property("chi2_per_freedom", squares / 800)
+    record_property("chi2_per_freedom", float(squares / 800))
     assert squares < largest_chi2(800)
     # The scatter is no smaller, either: sums of 800 squares have the standard error sqrt(2 / 800).
     assert squares > 800 * (1 - largest_z(800) * np.sqrt(2 / 800))
@@ -193,14 +193,14 @@ def test_fits_of_an_avalanche_photodiode_scatter_as_the_bound(record_property):
     # One step of least squares from the truth: the light is linear within the error.
     error = np.linalg.solve(slopes @ weights @ slopes.T, slopes @ weights @ (samples - mean(*truth)).T).T
     squares = np.einsum("ia,ab,ib->", error, found["information"].values, error)
-    record_property("chi2_per_freedom", squares / 800)
+    record_property("chi2_per_freedom", float(squares / 800))
     share = float(found["variance_share"].max())
     assert share < 0.015
     # 20 000 records and 60 samples leave the weights 0.3 % short of the best.
     assert abs(squares / 800 - 1) < largest_z(800) * np.sqrt(2 / 800) + share + 0.003
     diagonal = slopes / np.var(other, axis=0) @ slopes.T
     ratio = np.sqrt(np.diagonal(np.linalg.inv(diagonal)) / np.diagonal(np.linalg.inv(found["information"].values)))
-    record_property("bound_without_correlation", ratio)
+    record_property("bound_without_correlation", float(ratio))
     assert np.all((ratio > 0.7) & (ratio < 0.8))
 
 
