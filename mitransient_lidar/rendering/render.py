@@ -201,7 +201,6 @@ def _render(
     if components:
         renderer = renderer.by_origin()
     lidar: LidarScene = renderer.scene
-    session.tell_record()
     from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
     from mitransient_lidar.rendering.differences import Differences
     from mitransient_lidar.rendering.reweighting import cases
@@ -210,6 +209,7 @@ def _render(
     moved = [one.name for one in parameters if one.perturbation is None]
     differences = Differences(session, chosen, moved, renderer=renderer) if moved else None
     reweighted = cases(renderer, reweight)
+    session.tell_record()
     changes = perturbations(parameters) + [one for case in reweighted for one in (case.perturbation, case.squared)]
     if changes:
         renderer = renderer.perturbed(changes)

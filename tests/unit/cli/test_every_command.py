@@ -189,6 +189,20 @@ def test_series_of_shots_from_end_to_end(scene, tmp_path):
 
 
 @pytest.mark.slow
+def test_derivatives_and_a_fit(scene, result, tmp_path):
+    """The fit of a result to its own scene, and what its light says about the free parameters."""
+    options = [*FLAT, "--passes", 2, "--derivatives", "bottom_reflectance", "--derivatives", "target_depth"]
+    check(run("render", scene, *options, "-o", tmp_path, "-q"), tmp_path)
+    assert (tmp_path / "small_derivatives.png").stat().st_size > 0
+    assert_refused(run("render", scene, "--derivatives", "target_dept"), "did you mean target_depth?")
+    check(run("fit", result, "--free", "bottom_reflectance", "--passes", 4, "-o", tmp_path, "-q"), tmp_path)
+    assert {"fit.nc", "fit.csv", "fit.png"} <= {path.name for path in tmp_path.iterdir()}
+    name, value, stderr = (tmp_path / "fit.csv").read_text().splitlines()[1].split(",")[:3]
+    assert name == "bottom_reflectance"
+    assert float(value) == pytest.approx(0.1, abs=6 * float(stderr) + 0.01)
+
+
+@pytest.mark.slow
 def test_comparison_of_a_result_with_itself(result):
     done = run("compare", result, result)
     assert done.exit_code == 0, done.stderr
@@ -201,7 +215,17 @@ def test_command_without_a_result(command, tmp_path, monkeypatch):
 
 
 def test_every_command_is_run():
-    tested = {*SCENE_COMMANDS, *RESULT_COMMANDS, *OTHER_COMMANDS, "render", "shots", "compare", "depth-bias", "tpu"}
+    tested = {
+        *SCENE_COMMANDS,
+        *RESULT_COMMANDS,
+        *OTHER_COMMANDS,
+        "render",
+        "shots",
+        "compare",
+        "depth-bias",
+        "tpu",
+        "fit",
+    }
     names = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     groups = {group.name for group in app.registered_groups}
     # The benchmark measures for minutes; its tests replace the renders. tests/system runs campaigns and flights.
