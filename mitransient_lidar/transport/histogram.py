@@ -139,7 +139,8 @@ class TransientHistogram:
         # Kernels are compiled for the sizes of small arrays to which they add: records of similar length share them.
         size = 2 * self._count
         self._sums = dr.zeros(mi.Int64, 1 << (size - 1).bit_length() if size < dr.expand_threshold() else size)
-        self._invalid = dr.zeros(mi.UInt32, self._count)
+        # Marks of energies, and of perturbations that are not finite.
+        self._invalid = dr.zeros(mi.UInt32, self._each * (2 if self.perturbations.count else 1))
 
     def evaluate(self) -> None:
         """Compute the sums."""
@@ -163,18 +164,23 @@ class TransientHistogram:
     def add_at(self, pixel: mi.UInt32, number: mi.UInt32, energy: mi.Float, active: mi.Bool, sums: Sums) -> None:
         """Add energy to time bin or gate `number` of a pixel."""
         index = pixel * self._length + number
-        self._add_share(index, energy, active)
-        for channel, perturbed in enumerate(self.perturbations.channels(energy, sums), 1):
-            self._add_share(index + channel * opaque_index(self._each), perturbed, active)
-
-    def _add_share(self, index: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
         valid = dr.isfinite(energy)
         dr.scatter(self._invalid, mi.UInt32(1), index, active & ~valid)
+        self._add_share(index, energy, active & valid)
+        if not sums:
+            return
+        perturbed = self.perturbations.channels(energy, sums)
+        finite = valid & dr.isfinite(sum(perturbed, mi.Float(0)))
+        dr.scatter(self._invalid, mi.UInt32(1), index + opaque_index(self._each), active & ~finite)
+        for channel, change in enumerate(perturbed, 1):
+            self._add_share(index + channel * opaque_index(self._each), change, active & finite)
+
+    def _add_share(self, index: mi.UInt32, energy: mi.Float, active: mi.Bool) -> None:
         # Units themselves are too small for single precision where pulses are weak.
         share = energy * self._per_emitted
         small = (dr.abs(share) if self.perturbations.count else share) < _COARSEST_FINE * 2.0**-_COARSE_BITS
         units = mi.Int64(dr.round(share * dr.select(small, 2.0 ** (_COARSE_BITS + _FINE_BITS), 2.0**_COARSE_BITS)))
-        dr.scatter_add(self._sums, units, index + dr.select(small, self._fine_sums, 0), active & valid)
+        dr.scatter_add(self._sums, units, index + dr.select(small, self._fine_sums, 0), active)
 
     def energy(self) -> np.ndarray:
         """Return the energy [J] as float64, shape `shape`; NaN where a value was added that is not finite."""
@@ -188,7 +194,8 @@ class TransientHistogram:
         """Return energies or their derivatives as float64, shape (channel, *shape)."""
         sums = np.array(self._sums)[: 2 * self._count].reshape(2, -1, self._each)[:, chosen]
         found = sums[0] * self._units[0] + sums[1] * self._units[1]
-        found[np.array(self._invalid).reshape(-1, self._each)[chosen] > 0] = np.nan
+        invalid = np.array(self._invalid).reshape(-1, self._each) > 0
+        found[:, invalid[0 if chosen.start == 0 else -1]] = np.nan
         return np.asarray(found.reshape(-1, *self.shape))
 
     def rounded_energy(self) -> np.ndarray:

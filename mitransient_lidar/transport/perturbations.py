@@ -79,6 +79,25 @@ class Perturbation:
     ripples: tuple[mi.BSDF, mi.BSDF, float] | None = None
 
 
+class SumStore:
+    """Sums of `count` perturbations for a number of paths, in packets of four that are read together."""
+
+    def __init__(self, size: int, count: int) -> None:
+        self._count = count
+        self.packets = [dr.empty(mi.Float, 4 * size) for _ in range(-(-count // 4))]
+
+    def write(self, sums: Sums, place: mi.UInt32, active: Any) -> None:
+        """Store sums."""
+        padded = [*sums, *[mi.Float(0)] * (-len(sums) % 4)]
+        for number, packet in enumerate(self.packets):
+            dr.scatter(packet, mi.Vector4f(*padded[4 * number : 4 * number + 4]), place, active)
+
+    def read(self, place: mi.UInt32, active: Any = True) -> Sums:
+        """Return sums."""
+        found = [value for packet in self.packets for value in dr.gather(mi.Vector4f, packet, place, active)]
+        return found[: self._count]
+
+
 class _Layer:
     """A `LayerChange` as numbers that kernels read from memory."""
 
@@ -88,7 +107,8 @@ class _Layer:
         self.travels = change.per_metre != 0
         self.scatters = change.per_event != 0 or change.by_angle is not None
         self._per_metre, self._per_event = opaque(change.per_metre), opaque(change.per_event)
-        self._by_angle = None if change.by_angle is None else aligned(mi.Float, change.by_angle.astype(np.float32))
+        #: Number of the tables among which that of this change is, or None.
+        self.tables: int | None = None
 
     def along(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
         """Return the addition of segments: depth of the start [m], downward component, length [m]."""
@@ -100,18 +120,42 @@ class _Layer:
         first, second = (dr.clip((edge - depth) / slope, 0, length) for edge in (self._top, self._bottom))
         return self._per_metre * dr.abs(second - first)
 
-    def at_event(self, depth: mi.Float, cell: mi.UInt32, fraction: mi.Float) -> mi.Float:
-        """Return the addition of scattering events: depth [m], and place among the nodes."""
-        found = self._per_event
-        if self._by_angle is not None:
-            low, high = (dr.gather(mi.Float, self._by_angle, cell + step) for step in (0, 1))
-            found = found + dr.lerp(low, high, fraction)
+    def at_event(self, depth: mi.Float, by_angle: Sequence[mi.Float]) -> mi.Float:
+        """Return the addition of scattering events: depth [m], and values of the tables there."""
+        found = self._per_event if self.tables is None else self._per_event + by_angle[self.tables]
         if self._limits == (-np.inf, np.inf):
             return found
-        return dr.select(self._contains(depth), found, 0)
+        return dr.select(self.contains(depth), found, 0)
 
-    def _contains(self, depth: mi.Float) -> mi.Bool:
+    def contains(self, depth: mi.Float) -> mi.Bool:
+        """Return whether depths [m] are in the layer."""
         return (depth >= self._top) & (depth < self._bottom)
+
+
+class _Tables:
+    """Tables by scattering angle of changes between different depths, of which one holds at each."""
+
+    def __init__(self) -> None:
+        self._changes: list[tuple[LayerChange, _Layer]] = []
+        self._values = mi.Float()
+
+    def takes(self, change: LayerChange) -> bool:
+        """Return whether a change has other depths than all of these."""
+        return all(change.top >= other.bottom or change.bottom <= other.top for other, _ in self._changes)
+
+    def add(self, change: LayerChange, layer: _Layer) -> None:
+        """Add the table of a change."""
+        self._changes.append((change, layer))
+        tables = [one.by_angle for one, _ in self._changes if one.by_angle is not None]
+        self._values = aligned(mi.Float, np.concatenate(tables).astype(np.float32))
+
+    def at(self, depth: mi.Float, cell: mi.UInt32, fraction: mi.Float) -> mi.Float:
+        """Return the values of the tables at depths [m], for a place among the nodes."""
+        start = mi.UInt32(0)
+        for number, (_, layer) in enumerate(self._changes[1:], 1):
+            start = dr.select(layer.contains(depth), mi.UInt32(number * DEFAULT_COUNT), start)
+        low, high = (dr.gather(mi.Float, self._values, start + cell + step) for step in (0, 1))
+        return dr.lerp(low, high, fraction)
 
 
 class Perturbations:
@@ -127,7 +171,20 @@ class Perturbations:
         self.perturbations = tuple(perturbations)
         self._layers = [[_Layer(change) for change in one.layers] for one in self.perturbations]
         self._solids = [[(solid, opaque(addition)) for solid, addition in one.solids] for one in self.perturbations]
-        self._by_angle = any(change.by_angle is not None for one in self.perturbations for change in one.layers)
+        self._tables: list[_Tables] = []
+        for one, layers in zip(self.perturbations, self._layers, strict=True):
+            for change, layer in zip(one.layers, layers, strict=True):
+                if change.by_angle is not None:
+                    layer.tables = self._group(change)
+                    self._tables[layer.tables].add(change, layer)
+
+    def _group(self, change: LayerChange) -> int:
+        """Return the number of the first tables that take a change, or of new ones."""
+        for number, tables in enumerate(self._tables):
+            if tables.takes(change):
+                return number
+        self._tables.append(_Tables())
+        return len(self._tables) - 1
 
     @property
     def count(self) -> int:
@@ -163,17 +220,18 @@ class Perturbations:
         """
         if not sums:
             return sums
-        cell, fraction = mi.UInt32(0), mi.Float(0)
-        if self._by_angle:
+        by_angle: list[mi.Float] = []
+        if self._tables:
             s = dr.maximum(half_angle(before, after), np.exp(DEFAULT_LOG_S0))
             place = (dr.log(s) - DEFAULT_LOG_S0) * ((DEFAULT_COUNT - 1) / -DEFAULT_LOG_S0)
             cell = dr.minimum(mi.UInt32(dr.maximum(place, 0)), DEFAULT_COUNT - 2)
             fraction = place - mi.Float(cell)
+            by_angle = [tables.at(depth, cell, fraction) for tables in self._tables]
         found = []
         for total, layers in zip(sums, self._layers, strict=True):
             for layer in layers:
                 if layer.scatters:
-                    addition = layer.at_event(depth, cell, fraction)
+                    addition = layer.at_event(depth, by_angle)
                     addition = addition if share is None else addition * share
                     total = total + dr.select(mi.Bool(active), addition, 0)
             found.append(total)

@@ -10,7 +10,7 @@ import mitsuba as mi
 from mitransient_lidar.transport.merging.patches import Patch
 from mitransient_lidar.transport.opaque import opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.perturbations import Perturbations, Sums
+from mitransient_lidar.transport.perturbations import Perturbations, Sums, SumStore
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes
 
@@ -87,7 +87,7 @@ class PhotonMap:
         # Two arrays: a second write to the same one would compute all photons again.
         self._course, self._rest = mi.Float(), mi.Float()
         self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
-        self._sums: Sums = []
+        self._sums = SumStore(self.count, 0)
 
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
         """Store the photons in the order of their buckets, with their cells' tags."""
@@ -103,10 +103,9 @@ class PhotonMap:
         dr.scatter(self._rest, rest, place, self._kept)
         if self._label is not None:
             dr.scatter(self._label, photon.label, place, self._kept)
-        self._sums = [dr.empty(mi.Float, self.count) for _ in photon.sums]
-        for stored, total in zip(self._sums, photon.sums, strict=True):
-            dr.scatter(stored, total, place, self._kept)
-        dr.eval(self._course, self._rest, self._end, self._label, self._sums)
+        self._sums = SumStore(self.count, len(photon.sums))
+        self._sums.write(photon.sums, place, self._kept)
+        dr.eval(self._course, self._rest, self._end, self._label, self._sums.packets)
         self._bucket = self._found = self._rank = self._counts = mi.UInt32()
         self._kept = mi.Bool()
 
@@ -133,7 +132,7 @@ class PhotonMap:
         z = dr.sqrt(dr.maximum(1 - x * x - y * y, 0))
         z = dr.select(up, z, -z)
         label = mi.UInt32(0) if self._label is None else dr.gather(mi.UInt32, self._label, index, active)
-        sums = [dr.gather(mi.Float, one, index, active) for one in self._sums]
+        sums = self._sums.read(index, active)
         photon = Photon(mi.Vector3f(x, y, z), length, weight, dr.abs(summed), position, edge, label, sums)
         return photon, dr.reinterpret_array(mi.UInt32, tag)
 
@@ -160,9 +159,8 @@ class PhotonBuffer:
         self._place = dr.zeros(mi.Float, 4 * photons)
         self._connectable = dr.zeros(mi.Float, 4 * photons)
         self._connectable_label = dr.zeros(mi.UInt32, photons if classes.labels_orders else 1)
-        count = perturbations.count
-        self._sums = [dr.empty(mi.Float, capacity) for _ in range(count)]
-        self._connectable_sums = [dr.empty(mi.Float, photons) for _ in range(count)]
+        self._sums = SumStore(capacity, perturbations.count)
+        self._connectable_sums = SumStore(photons, perturbations.count)
 
     def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool, connectable: mi.Bool) -> None:
         """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
@@ -179,14 +177,14 @@ class PhotonBuffer:
             label = self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals)
             dr.scatter(self._label, label, slot, keep)
             dr.scatter(self._connectable_label, label, path.lane, connectable)
-        for stored, connected, total in zip(self._sums, self._connectable_sums, path.sums, strict=True):
-            dr.scatter(stored, total, slot, keep)
-            dr.scatter(connected, total, path.lane, connectable)
+        self._sums.write(path.sums, slot, keep)
+        self._connectable_sums.write(path.sums, path.lane, connectable)
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, or None, and their number, stored or not."""
         dr.eval(self._stored, self._patch, self._lane, self._record, self._weight, self._label)
-        dr.eval(self._connectable, self._place, self._connectable_label, self._sums, self._connectable_sums)
+        dr.eval(self._connectable, self._place, self._connectable_label)
+        dr.eval(self._sums.packets, self._connectable_sums.packets)
         wanted = int(self._stored[0])
         if wanted == 0:
             return None, 0
@@ -200,7 +198,7 @@ class PhotonBuffer:
         photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.labels_orders)
         label = dr.gather(mi.UInt32, self._label, index) if self._classes.labels_orders else mi.UInt32(0)
         weight, first = dr.gather(mi.Vector2f, self._weight, index)
-        sums, zero = [dr.gather(mi.Float, one, index) for one in self._sums], mi.Float(0)
+        sums, zero = self._sums.read(index), mi.Float(0)
         photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, first, label, sums), tag)
         return photons, wanted
 
@@ -209,6 +207,6 @@ class PhotonBuffer:
         x, y, z, length = dr.gather(mi.Vector4f, self._connectable, index)
         weight, px, py, pz = dr.gather(mi.Vector4f, self._place, index)
         label = dr.gather(mi.UInt32, self._connectable_label, index) if self._classes.labels_orders else mi.UInt32(0)
-        sums, zero = [dr.gather(mi.Float, one, index) for one in self._connectable_sums], mi.Float(0)
+        sums, zero = self._connectable_sums.read(index), mi.Float(0)
         photon = Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, mi.Float(1), label, sums)
         return mi.Point3f(px, py, pz), photon

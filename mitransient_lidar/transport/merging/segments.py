@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.perturbations import Sums
+from mitransient_lidar.transport.perturbations import Sums, SumStore
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
@@ -80,7 +80,7 @@ class SegmentBuffer:
         self._start = dr.empty(mi.Float, 4 * capacity)
         self._direction = dr.empty(mi.Float, 4 * capacity)
         self._weight = dr.empty(mi.Float, 4 * capacity)
-        self._sums = [dr.empty(mi.Float, capacity) for _ in range(self._perturbations.count)]
+        self._sums = SumStore(capacity, self._perturbations.count)
         self._first = mi.UInt32()
         self._slot = mi.UInt32()
 
@@ -97,8 +97,7 @@ class SegmentBuffer:
         dr.scatter(self._direction, direction, slot, keep)
         weight = mi.Vector4f(path.weight, path.mis_partial_sum, path.inverse, path.surface_length)
         dr.scatter(self._weight, weight, slot, keep)
-        for stored, total in zip(self._sums, path.sums, strict=True):
-            dr.scatter(stored, total, slot, keep)
+        self._sums.write(path.sums, slot, keep)
         path.points += number
         dr.scatter(self._of_path, path.points, path.lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
@@ -106,7 +105,7 @@ class SegmentBuffer:
     def finalize(self) -> tuple[int, int]:
         """Assign numbers to the points; return their number and that of the segments, stored or not."""
         dr.eval(self._stored, self._of_path, self._place, self._label, self._start, self._direction, self._weight)
-        dr.eval(self._sums)
+        dr.eval(self._sums.packets)
         end = dr.cumsum(self._of_path)
         last = dr.arange(mi.UInt32, self._shots) * self._paths + (self._paths - 1)
         self.first_points[1:] = np.array(dr.gather(mi.UInt32, end, last))
@@ -161,5 +160,5 @@ class SegmentBuffer:
             edge,
             dr.gather(mi.UInt32, self._label, segment),
             surface_length,
-            self._perturbations.along([dr.gather(mi.Float, one, segment) for one in self._sums], -z, -dz, along),
+            self._perturbations.along(self._sums.read(segment), -z, -dz, along),
         )

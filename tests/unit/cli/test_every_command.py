@@ -189,17 +189,20 @@ def test_series_of_shots_from_end_to_end(scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_derivatives_and_a_fit(scene, result, tmp_path):
-    """The fit of a result to its own scene, and what its light says about the free parameters."""
-    options = [*FLAT, "--passes", 2, "--derivatives", "bottom_reflectance", "--derivatives", "target_depth"]
+def test_derivatives_and_a_fit(scene, tmp_path):
+    """The fit of a result to its own scene."""
+    options = [*FLAT, "--passes", 16, "--derivatives", "bottom_reflectance", "--derivatives", "target_depth"]
     check(run("render", scene, *options, "-o", tmp_path, "-q"), tmp_path)
     assert (tmp_path / "small_derivatives.png").stat().st_size > 0
     assert_refused(run("render", scene, "--derivatives", "target_dept"), "did you mean target_depth?")
-    check(run("fit", result, "--free", "bottom_reflectance", "--passes", 4, "-o", tmp_path, "-q"), tmp_path)
+    check(
+        run("fit", tmp_path / "small.nc", "--free", "bottom_reflectance", "--passes", 16, "-o", tmp_path, "-q"),
+        tmp_path,
+    )
     assert {"fit.nc", "fit.csv", "fit.png"} <= {path.name for path in tmp_path.iterdir()}
-    name, value, stderr = (tmp_path / "fit.csv").read_text().splitlines()[1].split(",")[:3]
+    name, _, value, stderr, *_ = (tmp_path / "fit.csv").read_text().splitlines()[1].split(",")
     assert name == "bottom_reflectance"
-    assert float(value) == pytest.approx(0.1, abs=6 * float(stderr) + 0.01)
+    assert float(value) == pytest.approx(0.1, abs=6 * float(stderr))
 
 
 @pytest.mark.slow
