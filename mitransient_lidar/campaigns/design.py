@@ -107,6 +107,9 @@ class Campaign:
         Longest time for the passes of each run [s], None for any. A run that it ends has other bits elsewhere.
     keep
         What the store holds, of `KEPT`.
+    derivatives
+        Names of parameters by which the waveforms are differentiated, as for `render_shots`; kept as
+        ``waveform_derivative``.
     receiver
         Receiver chain of every pixel, whose noisy ``signal`` is kept as well; `gain`, `optical_density` (numbers or
         'auto') and `background_power_w` are those of `analysis.receiver.detect_waveforms`.
@@ -127,6 +130,7 @@ class Campaign:
     max_time: float | None = None
     keep: tuple[str, ...] = ("waveform", "truth")
     instrument: str | None = None
+    derivatives: tuple[str, ...] = ()
     receiver: str | None = None
     gain: float | Literal["auto"] = 1.0
     optical_density: float | Literal["auto"] = 0.0
@@ -170,6 +174,7 @@ class Campaign:
             max_time=None if given.get("max_time") is None else positive("max_time", given["max_time"]),
             keep=_kept(given.get("keep", ["waveform", "truth"])),
             instrument=given.get("instrument"),
+            derivatives=_names("derivatives", given.get("derivatives", [])),
             receiver=given.get("receiver"),
             gain=gain if gain == "auto" else positive("gain", gain),
             optical_density=density if density == "auto" else in_range("optical_density", density, 0, 12),
@@ -354,6 +359,14 @@ def _kept(given: Any) -> tuple[str, ...]:
         if name not in KEPT:
             raise UserError(f"keep holds {shown(name)}: allowed are {', '.join(KEPT)}")
     return tuple(name for name in KEPT if name in names)
+
+
+def _names(option: str, given: Any) -> tuple[str, ...]:
+    """Check a list of names."""
+    names = [given] if isinstance(given, str) else given
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
+        raise UserError(f"{option} = {shown(given)} must be a list of names")
+    return tuple(names)
 
 
 def _section(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:

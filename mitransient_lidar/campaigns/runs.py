@@ -164,6 +164,7 @@ class RunRenderer:
             "target_error": campaign.target_error,
             "max_time": campaign.max_time,
             "components": "components" in campaign.keep,
+            "derivatives": list(campaign.derivatives) or None,
             "first_seed": int(random.integers(2**40)),
             "axis": self.axis,
             "describe_sea": False,
@@ -237,6 +238,8 @@ class RunRenderer:
         names = [name for name, kind in (("waveform", "waveform"), ("waveform_stderr", "stderr")) if kind in keep]
         if "components" in keep:
             names += ["waveform_by_origin"] + (["waveform_by_origin_stderr"] if "stderr" in keep else [])
+        if self.campaign.derivatives:
+            names += ["waveform_derivative"] + (["waveform_derivative_stderr"] if "stderr" in keep else [])
         for name in names:
             about = {key: value for key, value in series[name].attrs.items() if key != "ancillary_variables"}
             yield name, _single(series[name].assign_attrs(about))
@@ -260,7 +263,9 @@ class RunRenderer:
         from mitransient_lidar.analysis.waveforms.echo_table import ECHOES
 
         recorded = self.record(number, series)
-        names = [name for name in ("pixel", "angle_x", "angle_y", "time", "origin") if name in series.coords]
+        names = [
+            name for name in ("pixel", "angle_x", "angle_y", "time", "origin", "parameter") if name in series.coords
+        ]
         found = {
             name: Array(tuple(map(str, series[name].dims)), series[name].values, _plain(series[name].attrs))
             for name in names

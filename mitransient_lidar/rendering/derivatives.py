@@ -33,6 +33,9 @@ MOST_PARAMETERS = 64
 #: Estimate of derivatives by parameters of which paths have no sums.
 DIFFERENCES = "central differences"
 
+#: Divergence of the laser.
+DIVERGENCE = "divergence_mrad"
+
 #: Slope variance of the ripples, and the relative step of its numerical derivative.
 RIPPLES, _RIPPLE_STEP = "ripple_variance", 0.02
 
@@ -112,6 +115,7 @@ def known_names(scene: LidarScene) -> list[str]:
             count = layers.column.count
             names += [name] if count == 1 else [f"{name}[{layer}]" for layer in range(count)]
         names += ["phase_g"] if layers.kind == "hg" and not layers.nested else []
+    names += [DIVERGENCE] if _is_gaussian(scene.transmitter) else []
     names += [RIPPLES] if _rippled(scene) else []
     return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in scene.solids)]
 
@@ -131,6 +135,9 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
         raise UserError(f"{option} = {shown(name)} must be one of {', '.join(known)}{more}{hint}")
     if solid is not None:
         return [_reflectance(name, solid)]
+    if name == DIVERGENCE and name in known:
+        value = 1e3 * scene.transmitter.divergence
+        return [Parameter(name, value, "mrad", Perturbation(beam=1 / value))]
     if name == RIPPLES and name in known:
         return [_ripples(scene)]
     if name == "phase_g":
@@ -148,6 +155,12 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
         )
         for layer in layers
     ]
+
+
+def _is_gaussian(transmitter: Any) -> bool:
+    """Return whether both widths of a Gaussian beam follow from its divergence."""
+    across = getattr(transmitter, "parameters", {}).get("divergence_across_mrad")
+    return transmitter.beam_profile == "gaussian" and not across
 
 
 def _rippled(scene: LidarScene) -> list[Any]:

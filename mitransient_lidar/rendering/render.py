@@ -98,11 +98,11 @@ def render(
     derivatives
         Names of parameters by which the light is differentiated, from the paths that it takes: ``attenuation``,
         ``scattering`` and ``backscattering`` of the water [1/m], each with the other two held fixed, in layered water
-        of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; and ``<id>_reflectance`` of
-        diffuse solids, such as ``bottom_reflectance``; and ``ripple_variance``, the slope variance of the sea's
-        ripples, without the change of `transport.ripple_focusing`. Derivatives by other numbers of the scene, such as
-        ``bottom_depth`` or ``divergence_mrad``, are central differences on common random numbers, which take two more
-        renders each (`differences.Differences`).
+        of each layer or, as ``scattering[1]``, of one; ``phase_g`` of ``hg`` functions; ``<id>_reflectance`` of diffuse
+        solids, such as ``bottom_reflectance``; ``divergence_mrad`` of Gaussian beams; and ``ripple_variance``, the
+        slope variance of the sea's ripples, without the change of `transport.ripple_focusing`. Derivatives by other
+        numbers of the scene, such as ``bottom_depth`` or ``off_nadir_deg``, are central differences on common random
+        numbers, which take two more renders each (`differences.Differences`).
     reweight
         Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
         whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.

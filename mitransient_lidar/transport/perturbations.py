@@ -70,6 +70,9 @@ class Perturbation:
     ripples
         For a derivative, ripples of the sea with a parameter below and above its value, and the difference of these two
         values; None where they do not change.
+    beam
+        For a derivative, the change of the logarithm of the widths of a Gaussian beam with a parameter; None where they
+        do not change.
     """
 
     layers: tuple[LayerChange, ...] = ()
@@ -77,6 +80,7 @@ class Perturbation:
     finite: bool = False
     focusing: FloatArray | None = None
     ripples: tuple[mi.BSDF, mi.BSDF, float] | None = None
+    beam: float | None = None
 
 
 class SumStore:
@@ -245,6 +249,13 @@ class Perturbations:
                 total = total + dr.select(mi.Bool(active) & (shape == mi.ShapePtr(solid)), addition, 0)
             found.append(total)
         return found
+
+    def at_laser(self, sums: Sums, profile: Any, angle_x: mi.Float, angle_y: mi.Float) -> Sums:
+        """Return sums of paths that leave the laser, of a beam profile, at tangent-plane angles [rad]."""
+        return [
+            total if one.beam is None else total + profile.width_slope(angle_x, angle_y) * opaque(one.beam)
+            for total, one in zip(sums, self.perturbations, strict=True)
+        ]
 
     def at_sea(self, sums: Sums, si: mi.SurfaceInteraction3f, outgoing: mi.Vector3f, active: mi.Bool) -> Sums:
         """Return sums beyond the sea surface, in a direction of the frame of the interaction."""

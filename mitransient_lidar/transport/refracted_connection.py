@@ -291,6 +291,8 @@ def perturbed_to_laser(
     line = StraightConnection.to_laser(scene, point)
     at_sea = active & scene.is_surface(si.shape)
     sums = scene.perturbations.at_sea(sums, si, si.to_local(line.direction), at_sea)
+    angle_x, angle_y, _ = scene.relative(scene.transmitter_pose).tangent(point)
+    sums = scene.perturbations.at_laser(sums, scene.transmitter.profile, angle_x, angle_y)
     if not scene.submerged:
         return sums
     return scene.perturbations.along(sums, -point.z, -line.direction.z, line.distance)

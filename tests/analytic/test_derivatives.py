@@ -33,9 +33,10 @@ def lidar(lidar_scene):
 
     def prepare(integrator, names=(), classes=None, water=None, **options):
         pose = {"off_nadir_deg": 0.0, **options.pop("pose", {})}
+        beam = {**pose, **options.pop("tx", {})}
         loaded = lidar_scene(
             integrator={"type": integrator, "paths_per_pass": SMALL},
-            tx=pose,
+            tx=beam,
             rx={**pose, "layout": "1x1", "field_of_view_mrad": 30},
             film={"time_start_ns": 1320.0, "bin_count": 160, **options.pop("film", {})},
             water=water or FIXED,
@@ -124,6 +125,24 @@ def test_ripple_variance_of_an_echo_at_nadir(lidar, integrator):
     assert parameter.value == pytest.approx(0.01)
     energy, changes = (values.reshape(3, 160)[0].sum() for values in one_pass(renderer.by_origin()))
     assert -1 - 1e-3 < parameter.value * changes / energy < -0.95
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_divergence_of_a_beam_that_overfills_the_view(lidar, integrator):
+    """Of a bottom in water that only absorbs, E is in proportion to 1 - exp(-R^2 / (2 sigma^2)).
+
+    The view sees a half angle R of 15 mrad of a beam of sigma 15 mrad; cosines and lengths change that by 1e-3.
+    """
+    water = {"attenuation": 0.3, "scattering": 0.0, "backscattering": 0.0}
+    sea = {"slope_variance": "2e-5"}
+    renderer, (parameter,) = lidar(integrator, ["divergence_mrad"], water=water, sea=sea, tx={"divergence_mrad": 30.0})
+    assert parameter.value == pytest.approx(30)
+    passes = (one_pass(renderer.by_origin(), seed) for seed in range(16))
+    # Of the bottom.
+    found = np.array([[values.reshape(3, 160)[2].sum() for values in one] for one in passes])
+    share = np.exp(-0.5) / (1 - np.exp(-0.5))
+    # d ln E / d ln sigma, from both sums of each pass.
+    significance.assert_equal(-30 * found[:, 1:] / found[:, :1].mean(), np.array([share]), error=0.03, bias=0.004)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

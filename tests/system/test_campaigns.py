@@ -38,6 +38,7 @@ QUICK = {
 FULL = {
     "target_error": 0.6,
     "keep": ["waveform", "stderr", "components", "echoes", "truth"],
+    "derivatives": ["attenuation", "target_reflectance"],
     "receiver": "apd",
     "gain": "auto",
     "parameters": {"scattering": "0.6 * attenuation"},
@@ -111,6 +112,10 @@ def test_everything_that_can_be_kept(tmp_path):
         assert np.isfinite(done[name].values).any(), name
     assert done["waveform"].dims == ("run", "shot", "pixel", "time")
     assert done["origin"].values.tolist() == ["surface", "water", "target", "bottom"]
+    assert done["parameter"].values.tolist() == ["attenuation", "target_reflectance"]
+    slopes = done["waveform_derivative"].sum(("pixel", "time"))
+    assert np.all(slopes.sel(parameter="attenuation") < 0)
+    assert np.all(slopes.sel(parameter="target_reflectance") > 0)
     # Inputs as coordinates; the truth follows from them.
     np.testing.assert_allclose(done["scattering"], 0.6 * np.array([0.2, 0.35]))
     assert set(done["waveform"].coords) >= {

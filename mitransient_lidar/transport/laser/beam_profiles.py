@@ -105,6 +105,11 @@ class GaussianBeam(_Ellipse):
         steepness, peak = 0.5 / self.along**2, 0.5 / (np.pi * self.along**2 * self._ratio)
         return opaque(peak) * dr.exp(-opaque(steepness) * (x * x + y * y))
 
+    def width_slope(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the derivative of the logarithm of the density by that of the widths, their ratio held fixed."""
+        x, y = self._to_circle(angle_x, angle_y)
+        return (x * x + y * y) * opaque(1 / self.along**2) - 2
+
     def sample(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to points by Box and Muller's transform."""
         # 1 - u lies in (0, 1], so that the logarithm is finite.

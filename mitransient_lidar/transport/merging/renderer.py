@@ -326,6 +326,7 @@ class MergingRenderer(PassRenderer):
         angles, energy = self._beam.sample(lanes.number, self.photons, rng)
         offset = opaque(layout.spacing) * rng.next_float32()
         path = RandomWalkPath.start(scene, scene.transmitter_pose, angles, energy, offset)
+        path.sums = scene.perturbations.at_laser(path.sums, scene.transmitter.profile, angles.x, angles.y)
         walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates.of(lanes))
 
         def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
