@@ -167,6 +167,7 @@ def test_file_that_is_not_text(tmp_path):
         ({"scene": None}, "scene = None must be"),
         ({"colour": 1}, "'colour' is no key of a campaign"),
         ({"keep": ["waveform", "light"]}, "keep holds 'light'"),
+        ({"derivatives": [3]}, r"derivatives = \[3\] must be a list of names"),
         ({"keep": []}, r"keep = \[\] must be a list"),
         ({"target_error": 0}, "target_error = 0"),
         ({"max_time": -1}, "max_time = -1 must be greater than 0"),
