@@ -10,11 +10,13 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range
-from mitransient_lidar.rendering.derivatives import path_parameters
+from mitransient_lidar.rendering.derivatives import Parameter, path_parameters
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
 from mitransient_lidar.transport.water_changes import COEFFICIENTS, changed_factors, layer_change
 
 if TYPE_CHECKING:
+    import mitsuba as mi
+
     from mitransient_lidar.transport.passes import PassRenderer
 
 #: Largest number of cases of a render, each of which sums two perturbations.
@@ -68,7 +70,8 @@ def check_share(label: str, share: float) -> None:
 def _case(renderer: PassRenderer, values: dict[str, Any]) -> Case:
     scene = renderer.scene
     known = {one.name: one for one in path_parameters(renderer, list(values), "reweight")}
-    if other := [name for name in values if name not in known or name == "phase_g"]:
+    of_case = [name for name, one in known.items() if name.partition("[")[0] in COEFFICIENTS or _solids(one)]
+    if other := [name for name in values if name not in of_case]:
         raise UserError(f"reweight: {other[0]} must be a coefficient of one layer, as scattering[0], or a reflectance")
     label = ", ".join(f"{name} = {finite(name, value):g}" for name, value in values.items())
     by_layer: dict[int, dict[str, float]] = {}
@@ -79,9 +82,7 @@ def _case(renderer: PassRenderer, values: dict[str, Any]) -> Case:
             by_layer.setdefault(int(rest.rstrip("]") or 0), {})[stem] = float(value)
             continue
         ratio = in_range(name, value, 1e-6, 1.0) / known[name].value
-        change = known[name].perturbation
-        assert change is not None
-        solids.append((change.solids[0][0], float(np.log(ratio))))
+        solids += [(solid, float(np.log(ratio))) for solid in _solids(known[name])]
     layers = tuple(layer_change(scene.water, layer, changed) for layer, changed in by_layer.items())
     focusing = renderer.focusing
     factors = None if focusing is None or not by_layer else changed_factors(focusing, scene.water, by_layer)
@@ -93,6 +94,11 @@ def _case(renderer: PassRenderer, values: dict[str, Any]) -> Case:
         focusing=None if focusing is None or factors is None else factors**2 / focusing.factors,
     )
     return Case(label, single, twice)
+
+
+def _solids(parameter: Parameter) -> list[mi.Shape]:
+    """Return the solids whose reflectance a parameter is."""
+    return [] if parameter.perturbation is None else [solid for solid, _ in parameter.perturbation.solids]
 
 
 def _doubled(change: LayerChange) -> LayerChange:

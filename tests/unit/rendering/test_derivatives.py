@@ -101,6 +101,7 @@ def test_cases_of_other_values(renderer):
         ({"scattering[1]": 0.1}, r"scattering\[1\]: the layer has scattering = 0"),
         ({"attenuation[0]": 0.2}, "scattering = 0.3 must not exceed attenuation = 0.2"),
         ({"bottom_reflectance": 1.5}, "bottom_reflectance = 1.5 must lie between"),
+        ({"divergence_mrad": 9}, "reweight: divergence_mrad must be a coefficient of one layer"),
         ({"colour": 1}, "reweight = 'colour' must be one of"),
     ],
 )
