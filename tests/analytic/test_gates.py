@@ -86,8 +86,8 @@ def test_non_finite_energy_is_reported(lidar_scene, monkeypatch, caplog, share):
     scene = gated(lidar_scene)
     add = TransientHistogram.add_at
 
-    def spoil(self, pixel, number, energy, active):
-        add(self, pixel, number, dr.select(pixel == 1, dr.nan, energy), active)
+    def spoil(self, pixel, number, energy, active, sums):
+        add(self, pixel, number, dr.select(pixel == 1, dr.nan, energy), active, sums)
 
     monkeypatch.setattr(TransientHistogram, "add_at", spoil)
     result = render(scene, gigabytes=1e-9 * share * HISTOGRAM, passes=2)
