@@ -159,7 +159,7 @@ def test_derivatives_are_limits_of_reweighted_light(lidar, integrator, name):
     assert scale > 0
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     "changed",
     [
@@ -185,6 +185,7 @@ def test_reweighted_light_is_that_of_the_other_scene(lidar, integrator, changed)
     significance.assert_same(*in_bins, error=0.1 if integrator == "lidar_volpath" else 0.03, bias=0.003)
 
 
+@pytest.mark.long
 def test_mean_cosine(lidar):
     """Henyey-Greenstein functions: the change by g from 0.85 to 0.87, against a scene of 0.87 and the limit."""
     water = {"attenuation": 0.4, "scattering": 0.3, "backscattering": 0.0, "phase_function": "hg", "phase_g": 0.86}

@@ -44,6 +44,7 @@ def in_bins(samples, bins=8):
     return samples[:, : count * bins].reshape(len(samples), count, bins).sum(axis=2)
 
 
+@pytest.mark.long
 def test_bottom_reflectance_against_the_scene_without_its_light():
     """Light that meets a dark bottom is in proportion to its reflectance."""
     dark = 0.02
