@@ -59,7 +59,7 @@ def sweep(
     Parameters
     ----------
     campaign
-        A TOML file, or a dict of its contents; see docs/campaigns.md.
+        A TOML file, or a dict of its contents; see docs/guide/campaigns.md.
     store
         Folder of the store. One that holds the same campaign is completed.
     workers

@@ -41,7 +41,7 @@ def sweep(
     """Render a campaign of many runs.
 
     Runs take other values of the scene's parameters, on the cores of this machine or on a Dask cluster, into one Zarr
-    store. After an interruption, the same command goes on. docs/campaigns.md describes the file.
+    store. After an interruption, the same command goes on. docs/guide/campaigns.md describes the file.
     """
     _check_alternatives(workers, scheduler, row, show)
     if row is not None:

@@ -34,7 +34,7 @@ def fly(
 
     Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr of all pulses, and prints
     the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on.
-    docs/flights.md describes the file.
+    docs/guide/flights.md describes the file.
     """
     folder = output or Path(Path(flight).stem)
     check_writable(folder, [])

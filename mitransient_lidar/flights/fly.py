@@ -46,7 +46,7 @@ def fly(
     Parameters
     ----------
     flight
-        A TOML file, the name of a shipped flight, or a dict of its contents; see docs/flights.md.
+        A TOML file, the name of a shipped flight, or a dict of its contents; see docs/guide/flights.md.
     folder
         Folder of the files: the store ``flight.zarr``, ``points.laz``, ``waveforms.las`` and ``waveforms.wdp``.
     workers, scheduler

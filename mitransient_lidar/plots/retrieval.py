@@ -26,7 +26,7 @@ def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | No
 
     Examples
     --------
-    ``docs/slope.png``, in about eight minutes on two cores::
+    ``docs/images/slope.png``, in about eight minutes on two cores::
 
         found = {}
         for layout in ("2x2", "1x4"):

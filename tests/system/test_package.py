@@ -70,4 +70,4 @@ def test_readme_commands_name_what_exists():
     ci = (ROOT / ".ci" / "run").read_text()
     (command,) = (line for line in text.splitlines() if line.startswith("python3") and "pytest" in line)
     assert command in ci
-    assert (ROOT / "docs" / "table1.png").is_file()
+    assert (ROOT / "docs" / "images" / "table1.png").is_file()

@@ -10,7 +10,7 @@ from command_line import run
 
 import mitransient_lidar
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "guide"
 SCENE = DOCS / "survey_lidar.xml"
 
 

@@ -30,7 +30,7 @@ def prepared(scene, params, integrator):
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("scene", "integrator"),
-    [("docs/survey_lidar.xml", "lidar_merging"), ("table1", "lidar_merging"), ("table1", "lidar_volpath")],
+    [("docs/guide/survey_lidar.xml", "lidar_merging"), ("table1", "lidar_merging"), ("table1", "lidar_volpath")],
 )
 def test_batches_give_what_single_shots_do(scene, integrator):
     """Places of a sea of 6 m/s, one of them 280 m away, over a slope with sand waves and over a level bottom.
@@ -84,7 +84,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator):
     ]
     given = [looking(*shot) for shot in shots]
     passes = {"lidar_merging": 16, "lidar_volpath": 24}[integrator]
-    renderer = prepared("docs/survey_lidar.xml", params, integrator)
+    renderer = prepared("docs/guide/survey_lidar.xml", params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
     stacked = Pose(*(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left")))
@@ -98,7 +98,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator):
     later = (poses.extra_range(renderer.scene) - lengths) / 0.299792458
     for pose, delay, found in zip(given, later, together, strict=True):
         session = open_scene(
-            "docs/survey_lidar.xml", params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]}
+            "docs/guide/survey_lidar.xml", params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]}
         )
         session.scene.emitters()[0].pose = pose
         session.sensor.receiver = replace(session.sensor.receiver, pose=pose)

@@ -306,7 +306,7 @@ def test_failed_creation_leaves_nothing(path, monkeypatch):
 
 
 def test_lines_of_the_documentation_make_a_batch(tmp_path, monkeypatch):
-    text = (Path(__file__).parents[3] / "docs" / "campaigns.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "guide" / "campaigns.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     arrays = {
         "signal": Array(("pixel", "time"), np.zeros((2, 4), dtype=np.float32), {}),

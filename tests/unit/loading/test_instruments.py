@@ -221,7 +221,7 @@ def table():
 
 
 def test_the_documentation_lists_the_instruments():
-    text = (Path(__file__).parents[3] / "docs" / "instruments.md").read_text("utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "guide" / "instruments.md").read_text("utf-8")
     for part in table():
         assert part in text
 
