@@ -10,7 +10,7 @@ from mitransient_lidar.plugins.bases import LidarIntegrator, recorded
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.volpath import VolpathOptions, VolpathRenderer
 
@@ -126,7 +126,7 @@ class LidarMerging(LidarIntegrator):
             When the scene lacks a part or has one that is not supported.
         """
         axis = None if layout_of is None else layout_of.scene.axis
-        lidar = LidarScene.from_scene(scene, sensor, receiver, axis=axis)
+        lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
         classes = classes or PathClasses()
         if lidar.water is None:
             # Without water all light is connected.

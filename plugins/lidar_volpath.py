@@ -9,7 +9,7 @@ from mitransient_lidar.core.validation import in_range, integer
 from mitransient_lidar.plugins.bases import LidarIntegrator, recorded
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.volpath import CONNECTIONS, VolpathOptions, VolpathRenderer
 
@@ -104,7 +104,7 @@ class LidarVolpath(VolpathIntegrator):
     ) -> VolpathRenderer:
         """Return the renderer of passes of a scene, as `LidarMerging.prepare`; it has no cells, and always connects."""
         axis = None if layout_of is None else layout_of.scene.axis
-        lidar = LidarScene.from_scene(scene, sensor, receiver, axis=axis)
+        lidar = find_lidar_scene(scene, sensor, receiver, axis=axis)
         return VolpathRenderer(lidar, classes or PathClasses(), self.paths_per_pass, self.options)
 
 

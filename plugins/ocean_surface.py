@@ -14,6 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Instrument, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import fill_mesh, recorded
+from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.nested_objects import create_object
 
 
@@ -157,10 +158,11 @@ class OceanSurface(mi.Mesh):
 
         self._use(SeaSurface.read(get, is_placeholder=self._waits))
         children = [child for _, child in props.objects()]
-        water = next((child for child in children if isinstance(child, mi.Medium)), None)
+        media = (getattr(child, "water", None) for child in children if isinstance(child, mi.Medium))
+        water = next((medium for medium in media if isinstance(medium, Water)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
         if self.has_ripples:
-            props["ripples"] = self._ripples(getattr(water, "refractive_index", 1.34))
+            props["ripples"] = self._ripples(1.34 if water is None else water.refractive_index)
         elif self.sea.slope_series is not None:
             raise UserError("slope_distribution = 'gram_charlier' is one of ripples, which a nested bsdf replaces")
         # Facet normals, not interpolated ones, have the slope variance of the mesh and conserve energy.

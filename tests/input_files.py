@@ -113,10 +113,10 @@ def scene(folder: Path) -> Path:
 def load(path: Path) -> None:
     """Load a scene, and plan the record of its lidar."""
     from mitransient_lidar.rendering.session import open_scene
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(path, None)
-    LidarScene.from_scene(session.scene, session.sensor)
+    find_lidar_scene(session.scene, session.sensor)
 
 
 def gates(name: str) -> Callable[[Path], Path]:

@@ -313,10 +313,10 @@ class RunRenderer:
 
     def own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
         """Return the automatic time bins of a run."""
-        from mitransient_lidar.transport.scene import LidarScene
+        from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         session = open_scene(self.scene, {**self.campaign.fixed, **values})
-        return LidarScene.from_scene(session.scene, session.sensor).axis
+        return find_lidar_scene(session.scene, session.sensor).axis
 
 
 def record_of(campaign: Campaign) -> SceneRecord:

@@ -188,10 +188,10 @@ def _truth(flown: Flown, plan: FlightPlan, points: xr.Dataset) -> dict[str, Any]
     """Return what is known of points: height of the sea in the beam or of the highest solid there, and of the pulse."""
     from mitransient_lidar.rendering.session import open_scene
     from mitransient_lidar.rendering.shot_truth import solids_below
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     session = open_scene(flown.store.renderer().scene, dict(plan.parameters))
-    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    lidar = find_lidar_scene(session.scene, session.sensor)
     height, target = solids_below(lidar, points["x"].values, points["y"].values)
     shot, dry = points["shot"].values, points["kind"].values == PointClass.SURFACE
     known = {name: flown.values(name)[shot] for name in _TRUTH}

@@ -374,12 +374,12 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
     """
     from mitransient_lidar.rendering.describe import axis_on_bottom
     from mitransient_lidar.rendering.shot_truth import solids_below
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
     angle, height, *aim = _lidar_of(inputs)
     params = {**plan.parameters, "off_nadir_deg": angle, "altitude": height, "aim_x": aim[0], "aim_y": aim[1]}
     session = open_scene(record, params)
-    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    lidar = find_lidar_scene(session.scene, session.sensor)
     if lidar.receiver.pixels.grid is not None:
         raise UserError(f"scene {plan.scene} has an imager: a flight needs a receiver whose pixels are a list")
     poses = _shot_poses(lidar, inputs)
@@ -402,7 +402,7 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
     shifts = [(float(dx), float(dy)) for dx, dy in poses.places[chosen] - poses.places[0]]
     film = session.sensor.film()
     if not film.is_fixed:
-        own = LidarScene.from_scene(session.scene, session.sensor, shifts=shifts).axis
+        own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
         first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
         return TimeAxis.covering(first, last, own.bin_width_ns)
     sine = np.sin(np.radians(angle)) / lidar.refractive_index

@@ -77,7 +77,7 @@ def load(
     """
     import mitsuba as mi
 
-    from mitransient_lidar.transport.scene import fit_seas
+    from mitransient_lidar.transport.scene_parts import fit_seas
 
     check_params(params)
     if isinstance(scene, mi.Scene):

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.plugin_types import SeaSurface, Transmitter
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Largest number of parameters of a render.
@@ -140,9 +141,10 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
         return [Parameter(name, value, "mrad", Perturbation(beam=1 / value))]
     if name == RIPPLES and name in known:
         return [_ripples(scene)]
+    water = scene.required_water
     if name == "phase_g":
-        return [Parameter(name, scene.water.layers.phase_g, "1", mean_cosine_derivative(scene.water, focusing))]
-    column = scene.water.layers.column
+        return [Parameter(name, water.layers.phase_g, "1", mean_cosine_derivative(water, focusing))]
+    column = water.layers.column
     layers = range(column.count) if match["layer"] is None else [int(match["layer"])]
     if layers[-1] >= column.count:
         raise UserError(f"{option}: {name} must have the number of a layer, 0 to {column.count - 1}")
@@ -151,22 +153,20 @@ def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[
             stem if column.count == 1 else f"{stem}[{layer}]",
             float(getattr(column, stem)[layer]),
             "1/m",
-            coefficient_derivative(scene.water, stem, layer, focusing),
+            coefficient_derivative(water, stem, layer, focusing),
         )
         for layer in layers
     ]
 
 
-def _is_gaussian(transmitter: Any) -> bool:
+def _is_gaussian(transmitter: Transmitter) -> bool:
     """Return whether both widths of a Gaussian beam follow from its divergence."""
-    across = getattr(transmitter, "parameters", {}).get("divergence_across_mrad")
-    return transmitter.beam_profile == "gaussian" and not across
+    return transmitter.beam_profile == "gaussian" and not transmitter.parameters.get("divergence_across_mrad")
 
 
-def _rippled(scene: LidarScene) -> list[Any]:
+def _rippled(scene: LidarScene) -> list[SeaSurface]:
     """Return the sea surfaces of a scene whose ripples have a variance."""
-    surfaces = [one for one in scene.surfaces if getattr(one, "has_ripples", False)]
-    return [one for one in surfaces if sum(one.ripple_variance) > 0]
+    return [sea for sea in scene.seas if sea.has_ripples and sum(sea.ripple_variance) > 0]
 
 
 def _ripples(scene: LidarScene) -> Parameter:

@@ -83,9 +83,9 @@ def _case(renderer: PassRenderer, values: dict[str, Any]) -> Case:
             continue
         ratio = in_range(name, value, 1e-6, 1.0) / known[name].value
         solids += [(solid, float(np.log(ratio))) for solid in _solids(known[name])]
-    layers = tuple(layer_change(scene.water, layer, changed) for layer, changed in by_layer.items())
+    layers = tuple(layer_change(scene.required_water, layer, changed) for layer, changed in by_layer.items())
     focusing = renderer.focusing
-    factors = None if focusing is None or not by_layer else changed_factors(focusing, scene.water, by_layer)
+    factors = None if focusing is None or not by_layer else changed_factors(focusing, scene.required_water, by_layer)
     single = Perturbation(layers, tuple(solids), finite=True, focusing=factors)
     twice = Perturbation(
         tuple(_doubled(layer) for layer in layers),

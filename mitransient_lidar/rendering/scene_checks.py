@@ -16,10 +16,10 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.rendering.echo_window import EchoProbe, SolidEcho
 from mitransient_lidar.transport.opaque import is_one_of, opaque_point
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.records import total_reflection_ns
 from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
-from mitransient_lidar.transport.sensor.records import total_reflection_ns
 from mitransient_lidar.transport.snell import refract
 
 logger = logging.getLogger(__name__)

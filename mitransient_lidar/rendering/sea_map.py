@@ -14,6 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitransient_lidar.transport.plugin_types import Transmitter
     from mitransient_lidar.transport.pose import Pose
 
 #: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
@@ -59,7 +60,9 @@ class SeaMap:
         """Return the map of a scene; reject one without waves."""
         from scipy.ndimage import gaussian_filter
 
-        sea = next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
+        from mitransient_lidar.transport.scene_parts import seas_of
+
+        sea = next((found.sea for found in seas_of(scene)), None)
         if sea is None or not math.isfinite(sea.cell_size):
             raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
         transmitter = transmitter_of(scene)
@@ -105,15 +108,17 @@ class SeaMap:
         return shots
 
 
-def transmitter_of(scene: mi.Scene) -> mi.Emitter:
+def transmitter_of(scene: mi.Scene) -> Transmitter:
     """Return the transmitter of a scene; raise UserError without one, or without a receiver."""
-    transmitter = next((emitter for emitter in scene.emitters() if hasattr(emitter, "pulse_energy")), None)
+    from mitransient_lidar.transport.plugin_types import Transmitter
+
+    transmitter = next((emitter for emitter in scene.emitters() if isinstance(emitter, Transmitter)), None)
     if transmitter is None or not scene.sensors():
         raise UserError("the scene needs a lidar_transmitter and a multipixel_receiver to find shots for")
     return transmitter
 
 
-def footprint(transmitter: mi.Emitter) -> tuple[float, float, float]:
+def footprint(transmitter: Transmitter) -> tuple[float, float, float]:
     """Return the beam's azimuth [rad], and its spread on the mean sea level along and across it [m]."""
     pose: Pose = transmitter.pose
     across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))

@@ -120,8 +120,8 @@ class ShotBatches:
         self._seconds = math.inf
         response = lidar.receiver.optics.response_time_ns
         self._kernel = lidar.transmitter.pulse.kernel(lidar.axis.bin_width_ns, response)
-        waves = [shape for shape in lidar.surfaces if np.isfinite(getattr(shape, "cell_size", np.nan))]
-        level = [shape for shape in lidar.surfaces if np.isinf(getattr(shape, "cell_size", np.nan))]
+        waves = [sea for sea in lidar.seas if np.isfinite(sea.cell_size)]
+        level = [sea for sea in lidar.seas if np.isinf(sea.cell_size)]
         going = [*level, *companions]
         fixed = [shape for shape in lidar.mitsuba_scene.shapes() if not any(shape is one for one in [*waves, *going])]
         self._seas = [SeaPatches(shape) for shape in waves]

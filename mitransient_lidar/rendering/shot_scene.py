@@ -55,7 +55,7 @@ class ShotScene:
         from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
         from mitransient_lidar.rendering.scene_checks import check_scene
         from mitransient_lidar.rendering.shot_batches import check_size
-        from mitransient_lidar.transport.scene import LidarScene
+        from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
         self._scene, self._params, self._target, self._components = scene, params, target, components
         self._derivatives = derivatives
@@ -63,7 +63,7 @@ class ShotScene:
         self.session = self._open(self._at(*self._place))
         self._integrator = choose_integrator(self.session.scene, None)
         shifts = [(float(x), float(y)) for x, y in places - places[0]]
-        own = LidarScene.from_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
+        own = find_lidar_scene(self.session.scene, self.session.sensor, shifts=shifts).axis
         self._axis = own if axis is None else _checked_axis(axis, own)
         if check:
             self.session.tell_record(self._axis)

@@ -123,7 +123,9 @@ def solids_below(
 
 def sea_of(scene: mi.Scene) -> Any:
     """Return the sea of an ``ocean_surface``, None without one."""
-    return next((shape.sea for shape in scene.shapes() if hasattr(shape, "sea")), None)
+    from mitransient_lidar.transport.scene_parts import seas_of
+
+    return next((found.sea for found in seas_of(scene)), None)
 
 
 def footprint_means(sea: Any, transmitter: Any, x: float, y: float, turn: float = 0.0) -> tuple[float, float, float]:

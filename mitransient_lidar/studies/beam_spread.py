@@ -124,9 +124,9 @@ def beam_spread(
         raise UserError(f"depths = {wanted[0]:g} m must be greater than 0")
     session = open_scene(scene, params)
     from mitransient_lidar.transport.plane_crossings import CrossingTracer
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
-    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    lidar = find_lidar_scene(session.scene, session.sensor)
     lidar.transmitter.pose.require_above_sea()
     if lidar.water is None:
         raise UserError("the scene has no water: give its surface a layered_water as interior medium")

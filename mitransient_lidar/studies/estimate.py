@@ -106,10 +106,10 @@ def estimate(
     from mitransient_lidar.rendering.describe import describe_scene, with_lines_of_sight
     from mitransient_lidar.rendering.echo_window import error_window, probe_echoes
     from mitransient_lidar.transport.ripple_focusing import RippleFocusing
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
     from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
-    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    lidar = find_lidar_scene(session.scene, session.sensor)
     model = _model(lidar)
     session.tell_record()
     sampler = SensorSampler(lidar.receiver, lidar.transmitter)
@@ -146,9 +146,7 @@ def _model(lidar: LidarScene) -> EchoEstimate:
     from mitransient_lidar.transport.medium.water_phases import table_of
 
     lidar.transmitter.pose.require_above_sea()
-    water, pose, pixels = lidar.water, lidar.receiver.pose, lidar.receiver.pixels
-    if water is None:
-        raise UserError("the scene has no water: give its surface a layered_water as interior medium")
+    water, pose, pixels = lidar.required_water, lidar.receiver.pose, lidar.receiver.pixels
     if water.plume is not None:
         raise UserError("the scene has bubbles, which an estimate lacks: plume_scattering must be 0")
     if len(water.index_layers.boundaries):
@@ -175,7 +173,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     """Return the depth of the bottom, or of the last light [m], and its reflectance."""
     import mitsuba as mi
 
-    column = lidar.water.column
+    column = lidar.required_water.column
     if not lidar.bottoms:
         darkest = _DARK / max(float((column.absorption + column.backscattering).min()), 1e-3)
         return min(darkest, 1e-9 * C0 / 2 * (lidar.axis.end_ns - lidar.axis.start_ns)), 0.0
@@ -204,7 +202,7 @@ def _below(lidar: LidarScene, point: mi.Point3f) -> mi.SurfaceInteraction3f:
 
 def _slopes(lidar: LidarScene) -> tuple[FloatArray, Callable[[FloatArray], FloatArray] | None]:
     """Return the covariance of the sea's slopes away from nadir and to the left, shape (2, 2), and their series."""
-    sea = getattr(lidar.surfaces[0], "sea", None)
+    sea = next((found.sea for found in lidar.seas), None)
     if sea is None:
         return np.diag([0.5 * lidar.slope_variance] * 2), None
     variances = np.add(sea.resolved_variance, sea.ripple_variance)
@@ -225,7 +223,7 @@ def _slopes(lidar: LidarScene) -> tuple[FloatArray, Callable[[FloatArray], Float
 
 def _enhancement(lidar: LidarScene, deepest: float) -> Callable[[FloatArray, FloatArray], FloatArray] | None:
     """Return the enhancement of echoes by all slopes of the sea; None where they are independent on both ways."""
-    sea = getattr(lidar.surfaces[0], "sea", None)
+    sea = next((found.sea for found in lidar.seas), None)
     if sea is None or sea.focusing_spectrum is None:
         return None
     structure, _ = slope_structures(sea.focusing_spectrum, sum(sea.resolved_variance), sum(sea.ripple_variance))

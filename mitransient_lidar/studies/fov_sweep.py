@@ -100,9 +100,9 @@ def fov_sweep(
     if fields.size == 0 or fields[0] <= 0:
         raise UserError(f"fov_mrad = {fields.tolist()} must hold at least one angle, each greater than 0")
     session = open_scene(scene, _with_widest(scene, params, float(fields[-1])))
-    from mitransient_lidar.transport.scene import LidarScene
+    from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
-    lidar = LidarScene.from_scene(session.scene, session.sensor)
+    lidar = find_lidar_scene(session.scene, session.sensor)
     geometry, edge = _geometry(lidar, 0.5e-3 * float(fields[-1]))
     column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
     water = _water(lidar, float(min_depth), float(max_depth))

@@ -88,11 +88,11 @@ class PathStep:
         """Return where the next segment ends: at a scattering event, a boundary of index layers, or a surface."""
         scene, no = self.scene, mi.Bool(False)
         in_water = mi.Bool(path.in_water)
-        if scene.water is None:
+        if scene.water is None or self.flight is None:
             si = scene.ray_intersect(path.ray(), path.active)
             return Vertex(si, si.t, si.t, no, no, no, in_water, no, no)
         wet = path.active & path.in_water
-        distance = scene.water.free_flight(self.flight, path, rng)
+        distance = scene.water.free_flight(self.flight, path.point, path.direction, rng)
         end = dr.fma(path.direction.z, distance, path.point.z)
         clear = wet & scene.is_clear(path.point.z) & scene.is_clear(end)
         si = scene.ray_intersect(path.ray(), path.active & ~clear)
@@ -126,7 +126,7 @@ class PathStep:
         mei.sh_frame = mi.Frame3f(mei.wi)
         mei.t = dr.select(scattered, mi.Float(1), dr.inf)
         water = self.scene.water
-        if water is None:
+        if water is None or self.flight is None:
             return ScatteringEvent(mei, None, mi.UInt32(0))
         scatterer = water.scatterer_at(self.flight, path.point, rng)
         return ScatteringEvent(mei, water.phases.at(scatterer), scatterer)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
+from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
@@ -109,7 +109,7 @@ class Crossings:
     are counted; `longest` is the optical length in the water after which paths end [m].
     """
 
-    def __init__(self, water: Any, depths: FloatArray, capacity: int, longest: float = np.inf) -> None:
+    def __init__(self, water: Water, depths: FloatArray, capacity: int, longest: float = np.inf) -> None:
         self.capacity = capacity
         self._water = water
         self._longest = opaque(longest)
@@ -229,17 +229,17 @@ class CrossingTracer:
         self._segments = _SEGMENTS
         sine = np.sqrt(1 - scene.transmitter.pose.axis[2] ** 2) / scene.refractive_index
         longest = _LONGEST_WAY * depths[-1] / np.sqrt(1 - sine**2)
-        absorption = scene.water.column.absorption.min()
+        absorption = scene.required_water.column.absorption.min()
         if absorption > 0:
             longest = min(longest, -np.log(_SMALLEST_REST) / absorption)
-        self._longest = float(longest * scene.water.index_layers.group_index.max())
+        self._longest = float(longest * scene.required_water.index_layers.group_index.max())
 
     def trace(self, seed: int, number: int) -> tuple[PlaneCrossings, float]:
         """Return the crossings of a pass, and the share of the energy that passes outside the surface mesh."""
         scene, pose, count = self._scene, self._scene.transmitter.pose, self._photons
         while True:
             rng = pass_streams(seed, number, count)
-            segments = Crossings(scene.water, self._depths, int(self._segments * count), self._longest)
+            segments = Crossings(scene.required_water, self._depths, int(self._segments * count), self._longest)
             angles, energy = self._beam.sample(dr.arange(mi.UInt32, count), count, rng)
             sent = np.broadcast_to(np.array(energy, dtype=np.float64), count)
             path = CrossingPath.of(RandomWalkPath.start(scene, pose, angles, energy, mi.Float(0)))

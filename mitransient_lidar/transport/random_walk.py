@@ -127,8 +127,8 @@ class RandomWalk:
         rates: EstimateRates | None = None,
     ) -> None:
         self.scene, self._rates = scene, rates
-        self._water, self._path_end = scene.water, opaque(path_end - scene.reference_length)
-        self._step = PathStep(scene, scene.water.scattering_flight, mode)
+        self._water, self._path_end = scene.required_water, opaque(path_end - scene.reference_length)
+        self._step = PathStep(scene, self._water.scattering_flight, mode)
         self._destination, self._to_go = destination.point, scene.relative(destination)
 
     def run(
@@ -205,7 +205,7 @@ class RandomWalk:
         event = step.scattering_event(path, vertex.scattered, rng)
         context = mi.PhaseFunctionContext()
         natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)
-        b_p = self._water.coefficient(step.flight, event.scatterer) * weight[0] * pdf
+        b_p = self._water.coefficient(self._water.scattering_flight, event.scatterer) * weight[0] * pdf
         inverse = dr.select(vertex.scattered, dr.rcp(b_p), 0)
         if self._rates is not None:
             path.mis_partial_sum += inverse * (self._rates.volume(path.point) + self._rates.in_water * edge)

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.perturbations import Sums
@@ -224,17 +223,17 @@ class TopLayerRay:
 def trace_to_top_layer(scene: WaterScene, ray: mi.Ray3f, layer: mi.UInt32, active: mi.Bool) -> TopLayerRay:
     """Trace rays from under water up to the top index layer."""
     traced = TopLayerRay(ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(1), scene.perturbations.start())
-    layers: IndexLayers | None = scene.index_layers
-    if layers is None:
+    if scene.water is None:
         return traced
+    water, layers = scene.water, scene.water.index_layers
     for number in range(layers.count - 1, 0, -1):
         here = active & (layer == number) & (traced.ray.d.z > 0)
         segment = mi.Ray3f(traced.ray.o, traced.ray.d)
         distance = dr.maximum((-segment.o.z - opaque(layers.boundaries[number - 1])) / segment.d.z, 0)
         segment.maxt = distance
         blocked = scene.ray_test(segment, here)
-        optical_depth = scene.water.optical_depth(segment.o, segment.d, distance)
-        absorption = scene.water.absorption_flight.optical_depth(-segment.o.z, -segment.d.z, distance)
+        optical_depth = water.optical_depth(segment.o, segment.d, distance)
+        absorption = water.absorption_flight.optical_depth(-segment.o.z, -segment.d.z, distance)
         above = mi.UInt32(number - 1)
         direction, ratio, passes = layers.refract(segment.d, mi.UInt32(number), above)
         traced.optical_length += dr.select(here, distance * layers.group(mi.UInt32(number)), 0)
@@ -277,7 +276,7 @@ class StraightConnection:
         irradiance = scene.transmitter.intensity_at(*relative.tangent(point)) / dr.square(distance)
         length = relative.distance(point)
         if scene.submerged:
-            irradiance *= dr.exp(-scene.water.optical_depth(point, direction, distance))
+            irradiance *= dr.exp(-scene.required_water.optical_depth(point, direction, distance))
             length += opaque(scene.group_index - 1) * distance
         return cls(direction, irradiance, distance, length)
 

@@ -90,11 +90,11 @@ class RippleFocusing:
     @classmethod
     def of_scene(cls, scene: LidarScene) -> RippleFocusing | None:
         """Return the factors of a lidar above a sea whose spectrum is known; None for others."""
-        seas = [sea for surface in scene.surfaces if (sea := getattr(surface, "sea", None)) is not None]
+        seas = scene.seas
         transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
         if scene.water is None or scene.submerged or len(seas) != 1 or receiver.axis[2] >= 0:
             return None
-        sea = seas[0]
+        sea = seas[0].sea
         if sea.focusing_spectrum is None:
             return None
         structures = slope_structures(sea.focusing_spectrum, sum(sea.resolved_variance), sum(sea.ripple_variance))

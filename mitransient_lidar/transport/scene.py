@@ -1,10 +1,9 @@
-"""The parts of a loaded scene that the integrators need, found and checked once."""
+"""The parts of a scene as paths meet them; `transport.scene_parts` finds them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -14,20 +13,14 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.sea.resolution import Instrument
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
+from mitransient_lidar.transport.plugin_types import SeaSurface, Transmitter
 from mitransient_lidar.transport.pose import Pose, RelativePose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
-from mitransient_lidar.transport.sensor.records import fitted_record, submerged_record
-
-#: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
-_UNKNOWN_SLOPE_VARIANCE = 0.04
-
-#: Vertical component of an axis under water above which it looks up.
-_SMALLEST_RISE = 0.1
 
 #: Height above all shapes from which paths start there instead of at the lidar, and height of these points [m].
 _FAR, _CLEARANCE = 1e4, 1.0
@@ -83,7 +76,7 @@ class WaterScene:
     receiver
         Pose, aperture and pixels of the sensor.
     water
-        The ``layered_water``, or None in a scene without water.
+        Its water, or None in a scene without water.
     surfaces
         Shapes that bound the water, with it as interior medium.
     slope_variance
@@ -98,7 +91,7 @@ class WaterScene:
 
     mitsuba_scene: mi.Scene
     receiver: Receiver
-    water: Any
+    water: Water | None
     surfaces: list[mi.Shape]
     slope_variance: float
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
@@ -120,7 +113,12 @@ class WaterScene:
     @property
     def solids(self) -> list[mi.Shape]:
         """All shapes that do not bound the water: bottoms and targets."""
-        return _solids(self.mitsuba_scene, self.surfaces)
+        return solids_of(self.mitsuba_scene, self.surfaces)
+
+    @property
+    def seas(self) -> list[SeaSurface]:
+        """The ``ocean_surface`` shapes that bound the water."""
+        return [surface for surface in self.surfaces if isinstance(surface, SeaSurface)]
 
     @property
     def bottoms(self) -> list[mi.Shape]:
@@ -166,12 +164,19 @@ class WaterScene:
         """
         sizes = [
             max(surface.cell_size, _FACET_PER_WAVE * surface.beam_wave)
-            if hasattr(surface, "beam_wave")
+            if isinstance(surface, SeaSurface)
             else float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
             if surface.is_mesh()
         ]
         return min(sizes, default=np.inf)
+
+    @property
+    def required_water(self) -> Water:
+        """The water, of a scene that has one."""
+        if self.water is None:
+            raise UserError("the scene has no water: give its surface a layered_water as interior medium")
+        return self.water
 
     @property
     def refractive_index(self) -> float:
@@ -299,7 +304,7 @@ class LidarScene(WaterScene):
         Pose of the transmitter in each shot, where they differ.
     """
 
-    transmitter: Any
+    transmitter: Transmitter
     axis: TimeAxis
     gates: GatePlan | None
     transmitter_poses: Pose | None = field(default=None, kw_only=True)
@@ -325,49 +330,6 @@ class LidarScene(WaterScene):
         """Length from laser to receiver by the reference point [m], which all lengths of paths leave out."""
         return float(sum(self.relative(each.pose).range for each in (self.transmitter, self.receiver)))
 
-    @classmethod
-    def from_scene(
-        cls,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        receiver: Receiver | None = None,
-        shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),),
-        axis: TimeAxis | None = None,
-    ) -> LidarScene:
-        """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
-
-        A record of automatic time bins is that of `axis`, or holds the light of all positions of the lidar, above water
-        displaced by `shifts` (x, y) [m].
-
-        Raises
-        ------
-        UserError
-            When a part is missing, not supported, or there are several where one is allowed.
-        """
-        fit_seas(scene)
-        receiver = receiver or find_receiver(sensor)
-        film = sensor.film()
-        if not hasattr(film, "time_start_ns"):
-            raise UserError("film: the lidar integrators need a time_gated_film inside the sensor")
-        emitters = [emitter for emitter in scene.emitters() if not hasattr(emitter, "daylight")]
-        transmitters = [emitter for emitter in emitters if hasattr(emitter, "pulse_energy")]
-        if len(transmitters) != 1 or len(emitters) != 1:
-            raise UserError(
-                f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
-                "allowed is exactly one lidar_transmitter, besides sun and sky"
-            )
-        water, surfaces, variance = find_water(scene)
-        parts = WaterScene(scene, receiver, water, surfaces, variance)
-        submerged = _check_place(parts, transmitters[0])
-        if not submerged:
-            _check_cells(surfaces, transmitters[0])
-        if axis is None and not film.is_fixed:
-            # The record is that of the sensor, whatever replaces its receiver; the scene may have been edited.
-            own = replace(parts, receiver=find_receiver(sensor))
-            found = (own, transmitters[0], film)
-            film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
-        return cls(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
-
 
 def _turned(vector: Vector, turn: mi.Vector2f) -> Vector:
     """Return vectors or points turned about the vertical, by angles with this cosine and sine."""
@@ -375,153 +337,6 @@ def _turned(vector: Vector, turn: mi.Vector2f) -> Vector:
     return type(vector)(dr.fma(cos, x, -sin * y), dr.fma(sin, x, cos * y), z)
 
 
-def find_receiver(sensor: mi.Sensor) -> Receiver:
-    """Return the receiver of a sensor plugin; raise UserError when the sensor has none."""
-    receiver = getattr(sensor, "receiver", None)
-    if not isinstance(receiver, Receiver):
-        raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
-    return receiver
-
-
-def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
-    """Set the automatic values of each ``ocean_surface`` from the lasers and receivers of the scene, once.
-
-    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
-    the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
-    """
-    instruments = []
-    for emitter in (model or scene).emitters():
-        if hasattr(emitter, "pulse_energy") and (place := _seen_sea(emitter.pose)):
-            spreads = emitter.angular_spread, emitter.widest_angular_spread
-            instruments.append(Instrument.laser(*place, spreads))
-        elif hasattr(emitter, "pulse_energy"):
-            instruments.append(_without_sea(emitter.pose))
-    for sensor in (model or scene).sensors():
-        receiver = getattr(sensor, "receiver", None)
-        if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
-            pixels = receiver.pixels
-            side = float(np.sqrt(pixels.area / pixels.count))
-            instruments.append(Instrument.receiver(*place, pixels.field_of_view, side))
-    if any([shape.fit(instruments) for shape in scene.shapes() if hasattr(shape, "ripple_variance")]):
-        scene.parameters_changed([])
-
-
-def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
-    """Return where the axis meets the mean sea level [m], the height above or below it [m], and its slope [rad].
-
-    The slope is the angle from the vertical. None for a pose under water that does not look up.
-    """
-    height, off_vertical = abs(float(pose.origin[2])), pose.off_nadir_deg
-    if not pose.submerged:
-        spot = pose.ground_point()
-    elif pose.axis[2] > _SMALLEST_RISE:
-        spot, off_vertical = pose.origin + pose.axis * (height / float(pose.axis[2])), 180.0 - off_vertical
-    else:
-        return None
-    return (float(spot[0]), float(spot[1])), height, float(np.deg2rad(min(off_vertical, 89.9)))
-
-
-def _without_sea(pose: Pose) -> Instrument:
-    """Return an instrument that needs no waves: those above it when it looks down under water."""
-    place = float(pose.origin[0]), float(pose.origin[1])
-    return Instrument(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
-
-
-def find_water(scene: mi.Scene) -> tuple[Any, list[mi.Shape], float]:
-    """Return water, surfaces and slope variance of a scene, see `WaterScene`.
-
-    The slope variance is that of the roughest surface, or a typical one without ``ocean_surface``.
-
-    Raises
-    ------
-    UserError
-        When a medium is not supported or in the wrong place, or there are several.
-    """
-    surfaces: list[mi.Shape] = []
-    waters: list[mi.Medium] = []
-    for shape in scene.shapes():
-        if not shape.is_medium_transition():
-            continue
-        if shape.exterior_medium() is not None:
-            raise UserError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
-        water = shape.interior_medium()
-        if not hasattr(water, "flight"):
-            raise UserError(f"shape {shape.id()!r}: its interior medium must be layered_water")
-        surfaces.append(shape)
-        if not any(water is other for other in waters):
-            waters.append(water)
-    for shape in scene.shapes():
-        if hasattr(shape, "ripple_variance") and shape not in surfaces:
-            raise UserError(f"ocean_surface {shape.id()!r}: needs a layered_water as its interior medium")
-    if len(waters) > 1:
-        raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
-    for water in waters:
-        _check_layers(scene, surfaces, water)
-    variances = [shape.slope_variance for shape in surfaces if getattr(shape, "has_ripples", False)]
-    return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
-
-
-def _solids(scene: mi.Scene, surfaces: list[mi.Shape]) -> list[mi.Shape]:
+def solids_of(scene: mi.Scene, surfaces: list[mi.Shape]) -> list[mi.Shape]:
     """Return the shapes that are not among the surfaces of the water."""
     return [shape for shape in scene.shapes() if not any(shape is surface for surface in surfaces)]
-
-
-def _check_place(scene: WaterScene, transmitter: Any) -> bool:
-    """Return whether laser and receiver are under water.
-
-    Refuse both on the sea level, on different sides of the sea, or in layers of different indices.
-    """
-    heights = [float(each.pose.origin[2]) for each in (transmitter, scene.receiver)]
-    if min(heights) > 0:
-        return False
-    if max(heights) >= 0 or scene.water is None:
-        raise UserError(
-            f"altitude: transmitter and receiver at z = {heights[0]:g} m and {heights[1]:g} m must both be above the "
-            "mean sea level z = 0, or both under water"
-        )
-    if scene.index_layers is not None and scene.index_layers.count > 1:
-        raise UserError("refractive_index changes with depth: a lidar under water needs one index")
-    trough = min(float(surface.bbox().min.z) for surface in scene.surfaces)
-    for each in (transmitter, scene.receiver):
-        origin = opaque_point(each.pose.origin)
-        above = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, 1)))
-        if each.pose.origin[2] > trough and not (above.is_valid() & scene.is_surface(above.shape))[0]:
-            raise UserError(
-                f"altitude = {each.pose.origin[2]:g} must be below the surface of the waves, whose lowest trough is at "
-                f"{trough:.3g} m"
-            )
-    return True
-
-
-def _check_cells(surfaces: list[mi.Shape], transmitter: Any) -> None:
-    """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
-    spot = transmitter.pose.ground_point()
-    footprint = 2 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
-    for surface in surfaces:
-        cell = getattr(surface, "cell_size", np.inf)
-        if np.isfinite(cell) and cell > footprint:
-            raise UserError(
-                f"cell_size = {cell:.3g} m is coarser than the beam's footprint on the sea, {footprint:.3g} m: "
-                "it must be finer, or 'auto'"
-            )
-
-
-def _check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Any) -> None:
-    """Refuse water layers below all solids, and index layers that begin within the waves."""
-    lowest = min((float(solid.bbox().min.z) for solid in _solids(scene, surfaces)), default=-np.inf)
-    for solid in _solids(scene, surfaces):
-        if float(solid.bbox().min.z) == lowest >= 0:
-            raise UserError(
-                f"shape {solid.id()!r} at z = {lowest:g} m is the lowest one: a bottom must lie below the mean sea "
-                "level, at a depth greater than 0"
-            )
-    deepest = float(water.column.layer_tops[-1])
-    if not water.from_profile and -deepest <= lowest:
-        raise UserError(f"layer_tops = {deepest:g} m is a layer below the bottom: it must be less than {-lowest:g} m")
-    trough = min(float(surface.bbox().min.z) for surface in surfaces)
-    for boundary in water.index_layers.boundaries[:1]:
-        if -boundary >= trough:
-            raise UserError(
-                f"refractive_index changes at {boundary:g} m, within the waves: "
-                f"it must do so below their troughs, {-trough:.3g} m"
-            )

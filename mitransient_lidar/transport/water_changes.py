@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -11,6 +10,8 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0, PowerLawTable
+from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.medium.water_phases import LayerPhases
 from mitransient_lidar.transport.perturbations import LayerChange, Perturbation
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 
@@ -27,7 +28,7 @@ _FOCUSING_STEP = 0.02
 _NEGLIGIBLE = 1e-6
 
 
-def coefficient_derivative(water: Any, name: str, layer: int, focusing: RippleFocusing | None = None) -> Perturbation:
+def coefficient_derivative(water: Water, name: str, layer: int, focusing: RippleFocusing | None = None) -> Perturbation:
     """Return the derivative by a coefficient of a layer, with the other coefficients held fixed.
 
     With lengths L and n scattering events in the layer, the derivative of the logarithm of a contribution is -L by c;
@@ -64,7 +65,7 @@ def coefficient_derivative(water: Any, name: str, layer: int, focusing: RippleFo
     return Perturbation((LayerChange(top, bottom, by_angle=by_angle),), focusing=by_ripples)
 
 
-def layer_change(water: Any, layer: int, changed: Mapping[str, float]) -> LayerChange:
+def layer_change(water: Water, layer: int, changed: Mapping[str, float]) -> LayerChange:
     """Return the change of a layer to other coefficients [1/m], as the logarithm of a ratio of contributions.
 
     Raises
@@ -89,12 +90,12 @@ def layer_change(water: Any, layer: int, changed: Mapping[str, float]) -> LayerC
     return LayerChange(*_limits(column.layer_tops, layer), per_metre, per_event, by_angle)
 
 
-def changed_factors(focusing: RippleFocusing, water: Any, changed: Mapping[int, Mapping[str, float]]) -> FloatArray:
+def changed_factors(focusing: RippleFocusing, water: Water, changed: Mapping[int, Mapping[str, float]]) -> FloatArray:
     """Return the factors of ripples with other coefficients [1/m] of some layers."""
     return focusing.factors_of(*_changed_water(water.layers, changed))
 
 
-def mean_cosine_derivative(water: Any, focusing: RippleFocusing | None = None) -> Perturbation:
+def mean_cosine_derivative(water: Water, focusing: RippleFocusing | None = None) -> Perturbation:
     """Return the derivative by the mean cosine of the function ``hg`` of all layers; raise UserError for others."""
     layers = water.layers
     if layers.kind != "hg" or layers.nested:
@@ -122,7 +123,7 @@ def _limits(tops: FloatArray, layer: int) -> tuple[float, float]:
     return top, float(tops[layer + 1]) if layer + 1 < len(tops) else np.inf
 
 
-def _log_derivative(layers: Any, layer: int, name: str, value: float) -> FloatArray | None:
+def _log_derivative(layers: LayerPhases, layer: int, name: str, value: float) -> FloatArray | None:
     """Return the derivative of ln p by a parameter at the nodes of `LayerChange`; None where it is 0."""
     step = _STEP * abs(value)
     if step == 0:
@@ -132,7 +133,9 @@ def _log_derivative(layers: Any, layer: int, name: str, value: float) -> FloatAr
     return found if np.abs(found).max() * abs(value) > _NEGLIGIBLE else None
 
 
-def _changed_water(layers: Any, changed: Mapping[int, Mapping[str, float]]) -> tuple[WaterColumn, list[PowerLawTable]]:
+def _changed_water(
+    layers: LayerPhases, changed: Mapping[int, Mapping[str, float]]
+) -> tuple[WaterColumn, list[PowerLawTable]]:
     """Return layers and their phase functions with other values of some."""
     column = layers.column
     values = {name: np.array(getattr(column, name)) for name in COEFFICIENTS}
@@ -152,7 +155,7 @@ def _of_phase(given: Mapping[str, float]) -> dict[str, float]:
 
 
 def _focusing_derivative(
-    focusing: RippleFocusing | None, layers: Any, layer: int, name: str, value: float
+    focusing: RippleFocusing | None, layers: LayerPhases, layer: int, name: str, value: float
 ) -> FloatArray | None:
     """Return the derivative of the factors of ripples by a coefficient; None where there are none."""
     if focusing is None or value == 0:

@@ -23,7 +23,7 @@ from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.plane_crossings import CrossingTracer
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 #: A pencil that goes straight down into water without refraction.
 MATCHED = {"refractive_index": 1.0001, "group_index": 1.0}
@@ -39,7 +39,7 @@ def system(lidar_scene):
     def build(water, tx=PENCIL, **options):
         water = {"backscattering": 0.0, **water}
         scene = lidar_scene(tx=tx, rx=VIEW, sea=LARGE_SEA, water=water, **options)
-        return LidarScene.from_scene(scene, scene.sensors()[0])
+        return find_lidar_scene(scene, scene.sensors()[0])
 
     return build
 

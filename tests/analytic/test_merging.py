@@ -12,7 +12,7 @@ from mitransient_lidar.transport.merging.patches import SolidPatches, solids_of_
 from mitransient_lidar.transport.merging.region import Region, SurfaceHeights, beam_entries
 from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.rng import pass_streams
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 MERGING = {"type": "lidar_merging"}
@@ -71,7 +71,7 @@ def test_same_seed_same_bits_and_pixels_sum_to_the_whole(lidar_scene, passes):
 @pytest.fixture
 def wavy_sea(lidar_scene):
     scene = lidar_scene(integrator=MERGING, sea=WAVES)
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     return lidar, region
 
@@ -94,7 +94,7 @@ def test_points_are_as_dense_above_a_bottom_that_lies_higher_than_a_trough_elsew
     pose = {"altitude": 20.0, "off_nadir_deg": 0.0}
     sea = {"spectrum": "elfouhaily", "wind_speed": 10.0}
     scene = lidar_scene(integrator=MERGING, tx=pose, rx=pose, sea=sea, bottom=1.25)
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     assert min(float(surface.bbox().min.z) for surface in lidar.surfaces) < -1.25
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     assert region.track_length(lidar) == pytest.approx(1.25, rel=0.01)
@@ -124,7 +124,7 @@ def test_beds_are_found_where_refracted_light_is(lidar_scene):
     sand = {"type": "seabed", "slope_x_deg": 20.0, "size": 100.0}
     narrow = {"tx": {"divergence_mrad": 0.1}, "rx": {"field_of_view_mrad": 0.3}}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"bottom": sand}, **narrow)
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     heights = SurfaceHeights(lidar, Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter)), 8.0)
     down = mi.Ray3f(mi.Point3f(2.0, 0.1, -0.5), mi.Vector3f(0, 0, -1))
     true = float(lidar.mitsuba_scene.ray_intersect(down).p.z[0])
@@ -141,7 +141,7 @@ def test_region_and_axis_follow_the_waves(lidar_scene):
         rx={**pose, "field_of_view_mrad": 0.4},
         sea={"spectrum": "elfouhaily", "wind_speed": 12.0, "slope_variance": "cox_munk"},
     )
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     axis = lidar.transmitter.pose.axis
     ray = mi.Ray3f(mi.Point3f(lidar.transmitter.pose.origin), mi.Vector3f(axis))
     met = np.array(scene.ray_intersect(ray).p)[:, 0]
@@ -195,7 +195,7 @@ def test_inverse_share_counts_edges_in_full(lidar_scene):
     """Points uniform on a plate: for each patch the mean inverse share times the share of the points is 1."""
     half = 0.31
     scene = lidar_scene(integrator=MERGING, extra={"target": plate(0.1, 0.05, -4.0, half)})
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     width, count = 0.1, 2**18
     rings, shift = BeamRings(lidar.transmitter.pose, 1.0, 1.34), mi.Point2f(0.37, 0.61)
@@ -329,7 +329,7 @@ def two_levels(tmp_path):
 def test_levels_of_one_mesh_are_distinguished(lidar_scene, two_levels):
     flat = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(500)}
     scene = lidar_scene(integrator=MERGING, bottom=None, extra={"levels": two_levels, "flat": flat})
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     region = Region.of_scene(lidar, SensorSampler(lidar.receiver, lidar.transmitter))
     assert [shape.id() for shape in solids_of_several_levels(lidar, region)] == ["levels"]
 

@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.water.phase import henyey_greenstein
 from mitransient_lidar.rendering.echo_window import lines_of_sight, probe_echoes
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 GROUP = 1.34
 #: Pulse energy and area of the aperture with all losses [J m^2]: a factor of n^2 would be 1.8 or 0.56.
@@ -132,7 +132,7 @@ def test_both_integrators_agree_under_water(build, passes, case):
 def test_lines_of_sight_give_depths_below_the_mean_sea_level(build, angle, beside):
     """A point at 8 m below a lidar at 3 m, or the surface above it; a receiver aside meets it at its own distance."""
     scene = build(-3.0, angle, rx={"aim_y": beside, "field_of_view_mrad": 400.0}, tx={"divergence_mrad": 0.1})
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     found = lines_of_sight(lidar)
     depth = 8.0 if angle < 90 else 0.0
     way = abs(depth - 3.0) / abs(np.cos(np.radians(angle)))
@@ -146,13 +146,13 @@ def test_records_end_where_the_sea_reflects_the_beam(build):
     distance = 3.0 / np.cos(np.radians(60))
     due = 2e9 * GROUP * distance / C0
     scene = build(-3.0, 120.0, tx={"divergence_mrad": 0.1}, rx={"field_of_view_mrad": 1.0}, bins="auto")
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     assert lidar.axis.start_ns == START
     assert due - 2 < lidar.axis.end_ns <= due
     with pytest.raises(UserError, match=r"^time_start_ns = 9 .* must end by 5\d\.\d ns, when the sea reflects beam"):
         mitransient_lidar.render(build(-3.0, 120.0), passes=2)
     scene = build(-3.0, 135.0, bins="auto")
-    assert LidarScene.from_scene(scene, scene.sensors()[0]).axis.end_ns > 2e9 * GROUP * 3 / np.cos(np.pi / 4) / C0 + 12
+    assert find_lidar_scene(scene, scene.sensors()[0]).axis.end_ns > 2e9 * GROUP * 3 / np.cos(np.pi / 4) / C0 + 12
 
 
 @pytest.mark.slow

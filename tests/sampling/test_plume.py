@@ -65,7 +65,7 @@ def test_events_are_shared_by_water_and_bubbles_as_they_attenuate():
             **{"type": "layered_water", "layer_tops": "0, 2", "attenuation": "0.5, 0.9", "scattering": "0.3, 0.6"},
             **{"backscattering": "0.006, 0.012", "plume_scattering": 1.5, "plume_x": 10.0, "plume_depth": 3.0},
         }
-    )
+    ).water
     count = 2**18
     for flight, upper, lower in ((water.flight, 0.5, 0.9), (water.scattering_flight, 0.3, 0.6)):
         for depth, number, coefficient in ((1.0, 0, upper), (2.5, 1, lower)):

@@ -32,7 +32,7 @@ def test_water_and_particles_are_mixed_by_their_scattering():
     """A share taken of the backscattering, or water added to b instead of being part of it, shows at 90 degrees."""
     water = mi.load_dict(
         {"type": "layered_water", "scattering": 0.05, "backscattering": 0.0016, "water_scattering": 0.002}
-    )
+    ).water
     expected = (0.048 * particles(0.0006 / 0.048) + 0.002 * water_phase_function(THETA)) / 0.05
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
 
@@ -47,7 +47,7 @@ def test_waters_by_name_have_molecules_and_particles(kind, value):
     scattered = found.scattering - molecules
     ratio = (found.backscattering - molecules / 2) / scattered
     expected = (scattered * particles(ratio) + molecules * water_phase_function(THETA)) / found.scattering
-    water = mi.load_dict({"type": "layered_water", kind: value})
+    water = mi.load_dict({"type": "layered_water", kind: value}).water
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=3e-3)
     assert water.phases.phases[0].backscatter_ratio == pytest.approx(found.backscatter_ratio, rel=3e-3)
 
@@ -55,14 +55,14 @@ def test_waters_by_name_have_molecules_and_particles(kind, value):
 @pytest.mark.parametrize(("kind", "value"), NAMED)
 @pytest.mark.parametrize("own", [{"phase_function": "petzold"}, {"phase": {"type": "petzold"}}])
 def test_given_phase_functions_include_the_molecules_of_waters_by_name(kind, value, own):
-    water = mi.load_dict({"type": "layered_water", kind: value, **own})
+    water = mi.load_dict({"type": "layered_water", kind: value, **own}).water
     plain = values(mi.load_dict({"type": "petzold"}))
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), plain, rtol=1e-6)
 
 
 def test_molecules_of_layers_by_name_follow_their_wavelength():
     texts = {"layer_tops": "0, 4", "chlorophyll": "0.1, 3", "wavelength_nm": 450}
-    water = mi.load_dict({"type": "layered_water", **texts})
+    water = mi.load_dict({"type": "layered_water", **texts}).water
     for layer, concentration in enumerate(("0.1", "3")):
         found = water_of("chlorophyll", concentration, 450)
         part = found.water_scattering / found.scattering
@@ -76,7 +76,7 @@ def test_molecules_of_layers_by_name_follow_their_wavelength():
     "own", [{}, {"phase_function": "petzold"}, {"phase_function": "hg"}, {"phase": {"type": "rayleigh"}}]
 )
 def test_chi_changes_what_is_near_180_degrees(own):
-    plain, changed = (mi.load_dict({"type": "layered_water", **own, **chi}) for chi in ({}, {"chi_p": 0.5}))
+    plain, changed = (mi.load_dict({"type": "layered_water", **own, **chi}).water for chi in ({}, {"chi_p": 0.5}))
     before, after = (values(water.phases.at(mi.UInt32(0))) for water in (plain, changed))
     # Up to 150 degrees all but unchanged; at 180 degrees bb/(2 pi chi).
     np.testing.assert_allclose(after[:6], before[:6], rtol=3e-3)
@@ -94,7 +94,7 @@ def test_chi_changes_what_is_near_180_degrees(own):
 
 def test_chi_is_that_of_particles_in_each_layer():
     parts = {"layer_tops": "0, 2", "chi_p": "0.4, 2", "water_scattering": 0.002}
-    water = mi.load_dict({"type": "layered_water", **parts})
+    water = mi.load_dict({"type": "layered_water", **parts}).water
     for layer, chi in enumerate((0.4, 2.0)):
         one = water.phases.at(mi.UInt32([layer] * len(THETA)))
         # bb = 0.006 and b = 0.15 1/m, of which molecules have 0.001 and 0.002.
@@ -105,7 +105,7 @@ def test_chi_is_that_of_particles_in_each_layer():
 def test_samples_follow_chi():
     """Those beyond 170 degrees, by z-test: their share, and the mean of 1 / density over their solid angle."""
     count, edge = 2**21, np.radians(170)
-    phase = mi.load_dict({"type": "layered_water", "chi_p": 0.2, "backscattering": 0.03}).phases.at(mi.UInt32(0))
+    phase = mi.load_dict({"type": "layered_water", "chi_p": 0.2, "backscattering": 0.03}).water.phases.at(mi.UInt32(0))
     rng = mi.PCG32(count, initstate=11 + significance.seed_shift)
     mei = dr.zeros(mi.MediumInteraction3f, count)
     mei.wi = mi.Vector3f(0, 0, -1)
@@ -125,19 +125,21 @@ def test_samples_follow_chi():
 @pytest.mark.parametrize("nested", [{"type": "hg", "g": 0.9}, {"type": "petzold"}])
 def test_any_phase_function_is_mixed_with_the_water(nested):
     plain = values(mi.load_dict(nested))
-    water = mi.load_dict({"type": "layered_water", "scattering": 0.1, "water_scattering": 0.02, "phase": nested})
+    water = mi.load_dict({"type": "layered_water", "scattering": 0.1, "water_scattering": 0.02, "phase": nested}).water
     expected = 0.8 * plain + 0.2 * water_phase_function(THETA)
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), expected, rtol=2e-3)
 
 
 def test_water_without_particles_scatters_as_water():
     pure = {"scattering": 0.002, "backscattering": 0.001, "water_scattering": 0.002}
-    water = mi.load_dict({"type": "layered_water", **pure})
+    water = mi.load_dict({"type": "layered_water", **pure}).water
     np.testing.assert_allclose(values(water.phases.at(mi.UInt32(0))), water_phase_function(THETA), rtol=1e-3)
 
 
 def test_each_layer_has_its_function_in_the_table():
-    water = mi.load_dict({"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"})
+    water = mi.load_dict(
+        {"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": "0.006, 0.003, 0.006"}
+    ).water
     many = water.phases.at(mi.UInt32([0, 1, 2]))
     assert isinstance(many, NumberedPhase)
     assert many.functions.count == 2
@@ -150,7 +152,7 @@ def test_samples_of_the_table_follow_each_function():
     """Backscatter ratio and value by z-test: a wrong offset into the table would take a neighbour's segments."""
     ratios = (0.04, 0.01, 0.02)
     backscattering = ", ".join(str(0.15 * ratio) for ratio in ratios)
-    water = mi.load_dict({"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": backscattering})
+    water = mi.load_dict({"type": "layered_water", "layer_tops": "0, 1, 2", "backscattering": backscattering}).water
     count = 2**20
     for layer, ratio in enumerate(ratios):
         rng = mi.PCG32(count, initstate=3 + significance.seed_shift)
@@ -174,7 +176,7 @@ def test_functions_without_a_common_table_are_called_by_pointer():
             "phase_0": {"type": "hg", "g": 0.9},
             "phase_1": {"type": "petzold"},
         }
-    )
+    ).water
     theta = np.radians([1.0, 90.0])
     found = values(water.phases.at(mi.UInt32([0, 1])), theta)
     expected = closed_form.henyey_greenstein(theta[0], 0.9), closed_form.petzold_average_particle()(theta[1])

@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.echo_window import probe_echoes
 from mitransient_lidar.rendering.session import open_scene
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
 
 FEW = {"type": "lidar_volpath", "paths_per_pass": 4096}
@@ -40,7 +40,7 @@ QUICK = [{"altitude": 400}, {"bottom_depth": 30}, {"altitude": 15, "off_nadir_de
 
 def prepared(scene, params=None):
     session = open_scene(scene, params)
-    return LidarScene.from_scene(session.scene, session.sensor)
+    return find_lidar_scene(session.scene, session.sensor)
 
 
 def beside(offset, film=None):

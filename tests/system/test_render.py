@@ -87,7 +87,7 @@ def test_scene_takes_every_phase_function_and_the_parameters_reach_the_plugins(p
     (surface,) = (shape for shape in scene.shapes() if hasattr(shape, "ripple_variance"))
     assert surface.slope_variance == pytest.approx(0.02)
     assert surface.ripple_variance[0] == surface.ripple_variance[1]
-    assert surface.interior_medium().column.count == 2
+    assert surface.interior_medium().water.column.count == 2
     assert parameters["layer_tops"] == "0, 3"
 
 

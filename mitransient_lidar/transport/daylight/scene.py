@@ -9,7 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.scene import WaterScene, find_receiver, find_water, fit_seas
+from mitransient_lidar.transport.plugin_types import Daylight, Transmitter
+from mitransient_lidar.transport.scene import WaterScene
+from mitransient_lidar.transport.scene_parts import find_receiver, find_water, fit_seas
 
 #: Largest angle between the sun and the sun of a clear sky [deg].
 _SAME_DIRECTION_DEG = 0.05
@@ -41,13 +43,12 @@ class DaylightScene(WaterScene):
         receiver = find_receiver(sensor)
         found: dict[str, mi.Emitter] = {}
         for emitter in scene.emitters():
-            kind = getattr(emitter, "daylight", None)
-            if kind is None and not hasattr(emitter, "pulse_energy"):
+            if isinstance(emitter, Daylight):
+                if emitter.daylight in found:
+                    raise UserError(f"emitters: the scene has more than one {emitter.daylight}; allowed is one")
+                found[emitter.daylight] = emitter
+            elif not isinstance(emitter, Transmitter):
                 raise UserError("emitters: passive imaging allows sun, sky and lidar_transmitter; there is another one")
-            if kind in found:
-                raise UserError(f"emitters: the scene has more than one {kind}; allowed is one")
-            if kind is not None:
-                found[kind] = emitter
         if not found:
             raise UserError("emitters: passive imaging needs a sun or a sky, and the scene has neither")
         sun, sky = found.get("sun"), found.get("sky")

@@ -73,8 +73,8 @@ class RefractedProfile:
         # Displacement for each metre of depth and unit of slope, along and across the azimuth of the beam, with the
         # scale of `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
-        self._scattering = opaque(float(scene.water.column.scattering.max()) / cosine)
-        ripples = 0.5 * max((sum(getattr(surface, "ripple_variance", ())) for surface in scene.surfaces), default=0.0)
+        self._scattering = opaque(float(scene.required_water.column.scattering.max()) / cosine)
+        ripples = 0.5 * max((sum(sea.ripple_variance) for sea in scene.seas), default=0.0)
         self._spreads, self._shifts = ([opaque(value) for value in values] for values in (spreads, shifts))
         self._growths = [opaque(shift * math.sqrt(ripples)) for shift in shifts]
         #: Depth at which the sea's slopes double the variance [m].

@@ -63,7 +63,7 @@ class ConnectionRates:
         There are connections if they are `wanted`, but not in water with bubbles or several refractive indices, nor for
         lidars under water.
         """
-        water = scene.water
+        water = scene.required_water
         connected = wanted and water.plume is None and water.index_layers.count == 1 and not scene.submerged
         rate = 1 / (_POINTS_PER_CONNECTION * photons) if connected else 0.0
         return cls(cells, opaque(rate / points_per_path), opaque(rate), connected)
@@ -109,7 +109,7 @@ class WaterConnections:
         self, scene: LidarScene, record: PassRecord, rates: ConnectionRates, points: SegmentBuffer, shots: Shots
     ) -> None:
         self.scene, self.record, self.rates = scene, record, rates
-        self._water, self._points, self._shots = scene.water, points, shots
+        self._water, self._points, self._shots = scene.required_water, points, shots
 
     def _pairs(self, first_partners: IntArray, stream: int) -> _Pairs:
         """Return some of the points, and random partners; those of each shot begin at the given numbers."""

@@ -67,7 +67,7 @@ def merge_in_water(
     volume V each pair adds beta s w s' / V times scattering coefficient and phase function, weighted among all merges
     and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
     """
-    water, perturbations = scene.water, scene.perturbations
+    water, perturbations = scene.required_water, scene.perturbations
     bucket, cell, volume = cells.locate(points.point, points.direction)
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi = points.point, -points.direction

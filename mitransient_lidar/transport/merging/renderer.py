@@ -179,7 +179,7 @@ class MergingLayout:
         finest = options.point_spacing or reach / _POINTS_PER_PATH
         is_image = scene.receiver.pixels.count >= IMAGE_PIXELS
         spacing = options.point_spacing or reach / (_POINTS_PER_IMAGE_PATH if is_image else _POINTS_PER_PATH)
-        column = scene.water.column
+        column = scene.required_water.column
         thickness = _THICKNESS_PER_SPACING * finest
         attenuation, scattering = float(column.attenuation.max()), float(column.scattering.max())
         if attenuation > 0:

@@ -67,7 +67,7 @@ class SegmentBuffer:
     def __init__(
         self, scene: LidarScene, classes: PathClasses, spacing: float, paths: int, capacity: int, shots: int = 1
     ) -> None:
-        self._water, self._perturbations, self._classes = scene.water, scene.perturbations, classes
+        self._water, self._perturbations, self._classes = scene.required_water, scene.perturbations, classes
         self._paths, self._shots = paths, shots
         #: Number of points before those of each shot, and of all.
         self.first_points = np.zeros(shots + 1, np.uint32)

@@ -13,7 +13,7 @@ FLAT = {"spectrum": "flat"}
 def load(scene="table1", **params):
     """Return the water, the transmitter and the parameters of a shipped scene."""
     loaded, _, parameters = load_scene(scene, {**FLAT, **params})
-    water = next(shape.interior_medium() for shape in loaded.shapes() if hasattr(shape, "sea"))
+    water = next(shape.interior_medium().water for shape in loaded.shapes() if hasattr(shape, "sea"))
     return water, next(each for each in loaded.emitters() if hasattr(each, "pulse")), parameters
 
 

@@ -12,7 +12,7 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading import scenes, variants
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10], [0, 0, 0, 1]])
 CIRCLE = {"type": "pixel_fov", "field_of_view_mrad": 10.0}
@@ -211,7 +211,7 @@ def test_overlapping_pixels_are_warned_of_and_names_must_differ(caplog):
 def test_defaults_are_the_published_system():
     transmitter = mi.load_dict({"type": "lidar_transmitter"})
     receiver = mi.load_dict({"type": "multipixel_receiver"}).receiver
-    water = mi.load_dict({"type": "layered_water"})
+    column = mi.load_dict({"type": "layered_water"}).water.column
     assert (transmitter.pulse_energy, transmitter.divergence, transmitter.pulse.fwhm_ns) == (5e-3, 10e-3, 5.0)
     assert transmitter.optical_efficiency == 0.9
     optics = receiver.optics
@@ -219,7 +219,6 @@ def test_defaults_are_the_published_system():
     assert optics.two_way_atmospheric_transmittance == 0.9
     assert receiver.pixels.layout == "2x2"
     np.testing.assert_allclose(transmitter.pose.origin, [-200 * np.tan(np.radians(20)), 0, 200])
-    column = water.column
     assert (column.attenuation[0], column.scattering[0], column.backscattering[0]) == (0.3, 0.15, 0.006)
 
 
@@ -311,7 +310,7 @@ WRONG_SCENES = [
 def test_scenes_that_are_no_lidar_scenes_are_refused(parts, message):
     loaded = scene(**parts)
     with pytest.raises(ValueError, match=message):
-        LidarScene.from_scene(loaded, loaded.sensors()[0])
+        find_lidar_scene(loaded, loaded.sensors()[0])
 
 
 def test_users_bsdf_wins_and_ripples_take_the_waters_index():

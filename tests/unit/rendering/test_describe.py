@@ -10,7 +10,7 @@ import pytest
 from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.rendering.describe import axis_on_bottom, describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.snell import refract
 
 HALF = 15.0  # mrad
@@ -19,7 +19,7 @@ TRIANGLE = {"type": "pixel_fov", "shape": "polygon", "vertices_mrad": "20 0, 26 
 
 
 def described(scene):
-    return describe_layout(LidarScene.from_scene(scene, scene.sensors()[0]))
+    return describe_layout(find_lidar_scene(scene, scene.sensors()[0]))
 
 
 def lines(text):
@@ -95,7 +95,7 @@ def test_upright_plate_is_a_line(lidar_scene):
 
 def traced_axis(scene):
     """Return where the receiver's axis meets the sea and then a solid, with the scene's own facets and normals [m]."""
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     pose = lidar.receiver.pose
     down = mi.Vector3f(pose.axis.tolist())
     first = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose.origin.tolist()), down))
@@ -137,7 +137,7 @@ def test_bottom_is_every_wide_solid_and_no_other(lidar_scene):
     mine = {"type": "sphere", "center": [1.0, 0, -4], "radius": 0.5}
     extra = {"far": far, "near": near, "pipe": pipe, "mine": mine}
     narrow = lidar_scene(bottom=None, extra=extra, rx={"field_of_view_mrad": 1.0})
-    scene = LidarScene.from_scene(narrow, narrow.sensors()[0])
+    scene = find_lidar_scene(narrow, narrow.sensors()[0])
     assert sorted(solid.id() for solid in scene.bottoms) == ["far", "near"]
     assert sorted(solid.id() for solid in scene.targets) == ["mine", "pipe"]
     # Past mine and pipe, on either side of the step, and beside everything.
@@ -145,7 +145,7 @@ def test_bottom_is_every_wide_solid_and_no_other(lidar_scene):
     np.testing.assert_allclose(points[:, 2], [-8, -8, -6, np.nan], atol=1e-3)
     np.testing.assert_allclose(points[0, :2], [2.1119, 0], atol=1e-3)
     wide = lidar_scene(bottom=None, extra={"mine": mine})
-    assert LidarScene.from_scene(wide, wide.sensors()[0]).bottoms == []
+    assert find_lidar_scene(wide, wide.sensors()[0]).bottoms == []
 
 
 def test_index_layers_bend_the_axis(lidar_scene):

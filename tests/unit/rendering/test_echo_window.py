@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.rendering.echo_window import lines_of_sight
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 N, GROUP = 1.34, 1.364
 METRE = 1e9 / C0  # time of a metre in air [ns]
@@ -15,7 +15,7 @@ METRE = 1e9 / C0  # time of a metre in air [ns]
 
 def sights(build, tx=None, rx=None):
     scene = build(tx=tx, rx=rx, water={"group_index": GROUP})
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     return lines_of_sight(lidar), lidar
 
 

@@ -17,7 +17,7 @@ from mitransient_lidar.rendering import passive
 from mitransient_lidar.results.radiance import save_radiance
 from mitransient_lidar.transport.daylight.renderer import DaylightLight
 from mitransient_lidar.transport.daylight.sampling import pixel_solid_angles
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels
 
@@ -188,7 +188,7 @@ def test_daylight_does_not_touch_the_laser():
     first, second = (mitransient_lidar.render(no_none(parts), passes=2)["impulse_response"] for parts in (day, night))
     np.testing.assert_allclose(first, second, rtol=1e-5)
     loaded = mi.load_dict({"type": "scene", **no_none(day)})
-    assert LidarScene.from_scene(loaded, loaded.sensors()[0]).transmitter.pulse_energy > 0
+    assert find_lidar_scene(loaded, loaded.sensors()[0]).transmitter.pulse_energy > 0
     # And the laser does not light a picture.
     dark = render({**day, "integrator": PASSIVE})
     np.testing.assert_allclose(dark["radiance"], render(scene("2x2"))["radiance"], rtol=1e-10)

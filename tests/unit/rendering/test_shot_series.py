@@ -18,7 +18,7 @@ from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.rendering.shot_scene import ShotScene
 from mitransient_lidar.transport.pose import Pose
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 FLAT = {"spectrum": "flat", "surface_size": 60}
 PLANE = {"spectrum": "flat"}
@@ -77,7 +77,7 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
     bottom = {"type": "rectangle", "to_world": turned, "bsdf": {"type": "diffuse"}}
     small = {"type": "sphere", "center": [0.0, 0.0, -4.0], "radius": 0.5, "bsdf": {"type": "diffuse"}}
     scene = lidar_scene(integrator={"type": "lidar_merging"}, bottom=None, extra={"floor": bottom, "target": small})
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     truth = shot_truth.truth_coordinates(shot_truth.sea_of(scene), lidar, ShotPoses(np.array([*PLACES, (400.0, 0.0)])))
     depth, below = (truth[f"true_bottom_depth{end}"][1] for end in ("", "_below_surface"))
     sine = math.sin(math.radians(20)) / 1.34
@@ -93,7 +93,7 @@ def test_truth_of_a_flat_sea_over_a_slope(lidar_scene):
 def test_depth_below_the_surface_of_a_wave(lidar_scene, monkeypatch):
     """The wave of 0.3 m is damped over the footprint in closed form; the beam's standard deviations are 5 mrad."""
     scene = lidar_scene(integrator={"type": "lidar_merging"})
-    lidar = LidarScene.from_scene(scene, scene.sensors()[0])
+    lidar = find_lidar_scene(scene, scene.sensors()[0])
     monkeypatch.setattr(shot_truth, "sea_of", lambda _: Wave(0.4, 0.0))
     truth = shot_truth.truth_coordinates(shot_truth.sea_of(scene), lidar, ShotPoses(np.array(PLACES)))
     along = lidar.transmitter.widest_angular_spread * 200 / math.cos(math.radians(20)) ** 2
@@ -122,7 +122,7 @@ def test_depth_below_the_surface_of_a_wave(lidar_scene, monkeypatch):
 )
 def test_coefficients_of_waters_by_name(water, depth, expected):
     medium = mi.load_dict({"type": "layered_water", **{name: str(value) for name, value in water.items()}})
-    found = shot_truth.water_means(medium, np.array(depth))
+    found = shot_truth.water_means(medium.water, np.array(depth))
     for name, value in expected.items():
         np.testing.assert_allclose(found[name], value, rtol=3e-3)
     np.testing.assert_allclose(found["true_absorption"] + found["true_scattering"], found["true_attenuation"])
@@ -133,7 +133,7 @@ def test_backscattering_is_that_of_the_phase_function_that_is_rendered():
     water = {"attenuation": "1", "scattering": "0.8", "backscattering": "0.1", "phase_function": "hg", "phase_g": 0.9}
     medium = mi.load_dict({"type": "layered_water", **water})
     share = (1 - 0.9) / (2 * 0.9) * ((1 + 0.9) / math.sqrt(1 + 0.9**2) - 1)
-    assert shot_truth.water_means(medium, np.array([5.0]))["true_backscattering"][0] == pytest.approx(
+    assert shot_truth.water_means(medium.water, np.array([5.0]))["true_backscattering"][0] == pytest.approx(
         0.8 * share, rel=1e-3
     )
 

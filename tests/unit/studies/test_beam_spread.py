@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
 from mitransient_lidar.studies.beam_spread import beam_spread, describe_spread
 from mitransient_lidar.transport.plane_crossings import CrossingTracer
-from mitransient_lidar.transport.scene import LidarScene
+from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 QUICK = {"passes": 2, "photons": 4096}
 
@@ -167,7 +167,7 @@ def test_beam_outside_the_surface_is_reported(lidar_scene, caplog):
 @pytest.mark.slow
 def test_more_room_gives_the_same_light(lidar_scene):
     scene = lidar_scene()
-    system = LidarScene.from_scene(scene, scene.sensors()[0])
+    system = find_lidar_scene(scene, scene.sensors()[0])
     tracers = [CrossingTracer(system, np.array([1.0, 3.0, 7.0]), 4096) for _ in range(2)]
     tracers[1]._legs = 0.1
     lights = [tracer.trace(4, 0)[0] for tracer in tracers]

@@ -168,7 +168,7 @@ def test_pure_sea_water_renders():
     names = ("attenuation", "scattering", "backscattering")
     values = {name: options[name] for name in names}
     water = mi.load_dict({"type": "layered_water", **values, "water_scattering": options["water_scattering"]})
-    assert water.phases.phases[0].backscatter_ratio == pytest.approx(0.5, rel=1e-4)
+    assert water.water.phases.phases[0].backscatter_ratio == pytest.approx(0.5, rel=1e-4)
     with pytest.raises(RuntimeError, match="backscatter_ratio"):
         mi.load_dict({"type": "layered_water", **values})
 

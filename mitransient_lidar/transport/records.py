@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +17,9 @@ from mitransient_lidar.physics.lidar.system_attenuation import system_attenuatio
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.plugin_types import GatedFilm, Transmitter
 from mitransient_lidar.transport.rng import unit_points
+from mitransient_lidar.transport.scene import WaterScene
 
 #: Rays of beam and view from which the record of a lidar under water follows.
 _RECORD_RAYS = 1024
@@ -34,11 +35,11 @@ _QUIET_BINS, _LONGEST_NS = 10, 100.0
 
 
 def fitted_record(
-    scene: Any, transmitter: Any, film: Any, shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),)
+    scene: WaterScene, transmitter: Transmitter, film: GatedFilm, shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),)
 ) -> tuple[TimeAxis, str]:
     """Return time bins of a film for all light that returns, and what the last light comes from.
 
-    `scene` is a `transport.scene.WaterScene`. `shifts` are horizontal displacements of the lidar [m]: the bins hold the
+    `shifts` are horizontal displacements of the lidar [m]: the bins hold the
     light of all its positions.
 
     Raises
@@ -66,7 +67,7 @@ def fitted_record(
     return TimeAxis.covering(start, limits[1] + tail, *fixed), end
 
 
-def _quiet_until(scene: Any, transmitter: Any) -> float:
+def _quiet_until(scene: WaterScene, transmitter: Transmitter) -> float:
     """Return the end [ns] of what echo detection takes as the baseline of noise (`analysis.waveforms.records`)."""
     pose, field = transmitter.pose, scene.receiver.pixels.field_of_view
     spot = pose.ground_point()
@@ -79,7 +80,7 @@ def _quiet_until(scene: Any, transmitter: Any) -> float:
     return float(1e9 / C0 * (arrival - 0.5 * field * slope) - 2 * width_ns)
 
 
-def submerged_record(scene: Any, transmitter: Any, film: Any) -> tuple[TimeAxis, str]:
+def submerged_record(scene: WaterScene, transmitter: Transmitter, film: GatedFilm) -> tuple[TimeAxis, str]:
     """Return time bins of a film of a lidar under water, and what the last light comes from.
 
     The record begins with the light scattered at the lidar. It ends after the farthest echo of beam and view, with a
@@ -92,7 +93,7 @@ def submerged_record(scene: Any, transmitter: Any, film: Any) -> tuple[TimeAxis,
     UserError
         If the bins are too many.
     """
-    column = scene.water.column
+    column = scene.required_water.column
     hits = _first_hits(scene, transmitter)
     ranges = [np.array(dr.select(si.is_valid(), si.t, dr.inf), dtype=np.float64) for si in hits]
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
@@ -115,7 +116,7 @@ def submerged_record(scene: Any, transmitter: Any, film: Any) -> tuple[TimeAxis,
     return axis, end
 
 
-def total_reflection_ns(scene: Any, transmitter: Any) -> float:
+def total_reflection_ns(scene: WaterScene, transmitter: Transmitter) -> float:
     """Return when light of a lidar under water first meets the sea beyond its critical angle, and comes back [ns].
 
     Infinite where that happens to less than a tenth of beam and of view. What lies beyond is seen by reflection alone,
@@ -132,7 +133,7 @@ def total_reflection_ns(scene: Any, transmitter: Any) -> float:
     return min(found)
 
 
-def _first_hits(scene: Any, transmitter: Any) -> list[mi.SurfaceInteraction3f]:
+def _first_hits(scene: WaterScene, transmitter: Transmitter) -> list[mi.SurfaceInteraction3f]:
     """Return what rays of view and beam meet first."""
     points = unit_points(_RECORD_RAYS)
     return [
@@ -144,7 +145,7 @@ def _first_hits(scene: Any, transmitter: Any) -> list[mi.SurfaceInteraction3f]:
     ]
 
 
-def _lidar_view(scene: Any, transmitter: Any, shift: tuple[float, float]) -> LidarView:
+def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
     """Return the geometry of a lidar, displaced horizontally [m], over the level sea of a scene."""
     pixels, blur, pose = scene.receiver.pixels, scene.receiver.blur, scene.receiver.pose
     sides = getattr(pixels, "sides", (pixels.field_of_view, pixels.field_of_view))

@@ -1,0 +1,131 @@
+"""The water that paths meet: layers, bubbles, and what scatters in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
+from mitransient_lidar.transport.medium.free_flight import LayeredFlight
+from mitransient_lidar.transport.medium.index_layers import IndexLayers
+from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases
+from mitransient_lidar.transport.opaque import opaque
+
+
+@dataclass(frozen=True, eq=False)
+class Water:
+    """Water in horizontal layers, with or without bubbles behind a ship.
+
+    Attributes
+    ----------
+    column
+        Coefficients of the layers; neighbours of equal properties are joined.
+    layers
+        The layers as given, and their phase functions for changed coefficients.
+    phases
+        Phase functions of the layers, and last of the bubbles.
+    index_layers
+        Runs of layers of one refractive and one group index.
+    water_scattering
+        Scattering by water molecules of each layer, a part of b [1/m]; 0 where it is not known.
+    plume
+        Bubbles, or None.
+    from_profile
+        Whether the layers approximate a profile from a file.
+    flight, scattering_flight, absorption_flight
+        Free flights by attenuation, scattering and absorption.
+    """
+
+    column: WaterColumn
+    layers: LayerPhases
+    phases: ScattererPhases
+    index_layers: IndexLayers
+    water_scattering: np.ndarray
+    plume: BubblePlume | None = None
+    from_profile: bool = False
+    flight: LayeredFlight = field(init=False)
+    scattering_flight: LayeredFlight = field(init=False)
+    absorption_flight: LayeredFlight = field(init=False)
+
+    def __post_init__(self) -> None:
+        column, none = self.column, np.zeros(self.column.count)
+        flights = {
+            "flight": column,
+            "scattering_flight": replace(column, attenuation=column.scattering),
+            "absorption_flight": WaterColumn(column.layer_tops, column.absorption, none, none),
+        }
+        for name, of in flights.items():
+            object.__setattr__(self, name, LayeredFlight(of))
+
+    @property
+    def refractive_index(self) -> float:
+        """Refractive index below the sea surface."""
+        return float(self.index_layers.refractive_index[0])
+
+    @property
+    def group_index(self) -> float:
+        """Group index below the sea surface."""
+        return float(self.index_layers.group_index[0])
+
+    @property
+    def majorant(self) -> float:
+        """Largest attenuation anywhere [1/m]."""
+        return float(np.max(self.column.attenuation)) + (self.plume.scattering if self.plume else 0)
+
+    @property
+    def plume_phase(self) -> mi.PhaseFunction | None:
+        """Phase function of the bubbles."""
+        return None if self.plume is None else self.phases.phases[-1]
+
+    def free_flight(self, flight: LayeredFlight, point: mi.Point3f, direction: mi.Vector3f, rng: mi.PCG32) -> mi.Float:
+        """Draw the distance to the next event of `flight`, or of the bubbles [m]."""
+        distance = flight.distance(-point.z, -direction.z, -dr.log(1 - rng.next_float32()))
+        if self.plume is None:
+            return distance
+        return dr.minimum(distance, self.plume.distance(point, direction, -dr.log(1 - rng.next_float32())))
+
+    def optical_depth(self, point: mi.Point3f, direction: mi.Vector3f, length: mi.Float) -> mi.Float:
+        """Return the optical depth of a segment [1], bubbles included."""
+        through = self.flight.optical_depth(-point.z, -direction.z, length)
+        return through if self.plume is None else through + self.plume.optical_depth(point, direction, length)
+
+    def scatterer_at(self, flight: LayeredFlight, point: mi.Point3f, rng: mi.PCG32) -> mi.UInt32:
+        """Draw the scatterer at the end of a flight: the number of the layer, or the number of layers for a bubble."""
+        layer = flight.layer_at(-point.z)
+        if self.plume is None:
+            return layer
+        bubbles = self.plume.scattering_at(point)
+        is_bubble = rng.next_float32() * (bubbles + flight.attenuation(layer)) < bubbles
+        return dr.select(is_bubble, mi.UInt32(self.column.count), layer)
+
+    def is_water(self, scatterer: mi.UInt32) -> mi.Bool:
+        """Return whether scatterers are layers of water, not bubbles."""
+        return scatterer < self.column.count
+
+    def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32) -> mi.Float:
+        """Return the coefficient of a scatterer in `flight` [1/m]."""
+        if self.plume is None:
+            return flight.attenuation(scatterer)
+        layer = dr.minimum(scatterer, self.column.count - 1)
+        return dr.select(scatterer == self.column.count, opaque(self.plume.scattering), flight.attenuation(layer))
+
+    def albedo(self, scatterer: mi.UInt32) -> mi.Float:
+        """Return the single-scattering albedo of a scatterer; bubbles absorb nothing."""
+        if self.plume is None:
+            return self.flight.albedo(scatterer)
+        layer = dr.minimum(scatterer, self.column.count - 1)
+        return dr.select(scatterer == self.column.count, mi.Float(1), self.flight.albedo(layer))
+
+    def coefficients_at(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float]:
+        """Return attenuation and scattering at points [1/m], bubbles included."""
+        layer = self.flight.layer_at(-point.z)
+        attenuation = self.flight.attenuation(layer)
+        scattering = self.flight.albedo(layer) * attenuation
+        if self.plume is None:
+            return attenuation, scattering
+        bubbles = self.plume.scattering_at(point)
+        return attenuation + bubbles, scattering + bubbles

@@ -1,0 +1,83 @@
+"""What the transport needs of plugins, which lie in a layer above it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import mitsuba as mi
+
+from mitransient_lidar.physics.lidar.gate_train import GatePlan
+from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.sea import sea_surface
+from mitransient_lidar.physics.sea.resolution import Instrument
+from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
+from mitransient_lidar.transport.pose import Pose
+
+
+@runtime_checkable
+class Transmitter(Protocol):
+    """The emitter ``lidar_transmitter``: energies [J], rms angles of the beam [rad]."""
+
+    pose: Pose
+    parameters: dict[str, Any]
+    wavelength_nm: float
+    pulse_energy: float
+    optical_efficiency: float
+    energy: float
+    pulse: Pulse
+    beam_profile: str
+    profile: BeamProfile
+    divergence: float
+    angular_spread: float
+    widest_angular_spread: float
+
+    def intensity_at(self, angle_x: mi.Float, angle_y: mi.Float, cos_axis: mi.Float) -> mi.Float:
+        """Return the radiant intensity [J/sr] at a tangent-plane point whose direction has a cosine with the axis."""
+
+    def tangent_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
+        """Return the share of the energy per tangent-plane area [1/rad^2]."""
+
+    def sample_tangent(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map uniform numbers in the unit square to tangent-plane points distributed as the beam's energy."""
+
+
+@runtime_checkable
+class Daylight(Protocol):
+    """The emitters ``sun`` and ``sky``."""
+
+    daylight: str
+
+
+@runtime_checkable
+class SeaSurface(Protocol):
+    """The shape ``ocean_surface``: slope variances, lengths [m]."""
+
+    sea: sea_surface.SeaSurface
+    has_ripples: bool
+    ripple_variance: tuple[float, float]
+    slope_variance: float
+    cell_size: float
+    beam_wave: float
+
+    def fit(self, instruments: Sequence[Instrument]) -> bool:
+        """Choose the automatic values for the lasers and receivers of the scene, once; return whether any changed."""
+
+    def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
+        """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""
+
+
+@runtime_checkable
+class GatedFilm(Protocol):
+    """The film ``time_gated_film``."""
+
+    is_fixed: bool
+    bin_width_ns: float
+    time_start_ns: float | None
+    bin_count: int | None
+    axis: TimeAxis
+    gates: GatePlan | None
+
+    def fit(self, axis: TimeAxis, end: str) -> None:
+        """Set the time bins of an automatic record, and what ends it."""

@@ -1,0 +1,222 @@
+"""Find and check the parts of a loaded scene that the integrators need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.sea.resolution import Instrument
+from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.transport.opaque import opaque_point
+from mitransient_lidar.transport.plugin_types import Daylight, GatedFilm, SeaSurface, Transmitter
+from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.records import fitted_record, submerged_record
+from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
+from mitransient_lidar.transport.sensor.receiver import Receiver
+
+#: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
+_UNKNOWN_SLOPE_VARIANCE = 0.04
+
+#: Vertical component of an axis under water above which it looks up.
+_SMALLEST_RISE = 0.1
+
+
+def find_lidar_scene(
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    receiver: Receiver | None = None,
+    shifts: Iterable[tuple[float, float]] = ((0.0, 0.0),),
+    axis: TimeAxis | None = None,
+) -> LidarScene:
+    """Find the parts in a loaded scene; sun and sky are ignored. `receiver` replaces the sensor's own.
+
+    A record of automatic time bins is that of `axis`, or holds the light of all positions of the lidar, above water
+    displaced by `shifts` (x, y) [m].
+
+    Raises
+    ------
+    UserError
+        When a part is missing, not supported, or there are several where one is allowed.
+    """
+    fit_seas(scene)
+    receiver = receiver or find_receiver(sensor)
+    film = sensor.film()
+    if not isinstance(film, GatedFilm):
+        raise UserError("film: the lidar integrators need a time_gated_film inside the sensor")
+    emitters = [emitter for emitter in scene.emitters() if not isinstance(emitter, Daylight)]
+    transmitters = [emitter for emitter in emitters if isinstance(emitter, Transmitter)]
+    if len(transmitters) != 1 or len(emitters) != 1:
+        raise UserError(
+            f"emitters: the scene has {len(emitters)} of which {len(transmitters)} are lidar_transmitter; "
+            "allowed is exactly one lidar_transmitter, besides sun and sky"
+        )
+    water, surfaces, variance = find_water(scene)
+    parts = WaterScene(scene, receiver, water, surfaces, variance)
+    submerged = _check_place(parts, transmitters[0])
+    if not submerged:
+        _check_cells(surfaces, transmitters[0])
+    if axis is None and not film.is_fixed:
+        # The record is that of the sensor, whatever replaces its receiver; the scene may have been edited.
+        own = replace(parts, receiver=find_receiver(sensor))
+        found = (own, transmitters[0], film)
+        film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
+    return LidarScene(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
+
+
+def find_receiver(sensor: mi.Sensor) -> Receiver:
+    """Return the receiver of a sensor plugin; raise UserError when the sensor has none."""
+    receiver = getattr(sensor, "receiver", None)
+    if not isinstance(receiver, Receiver):
+        raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
+    return receiver
+
+
+def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
+    """Set the automatic values of each ``ocean_surface`` from the lasers and receivers of the scene, once.
+
+    A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
+    the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
+    """
+    instruments = []
+    for emitter in (model or scene).emitters():
+        if not isinstance(emitter, Transmitter):
+            continue
+        if place := _seen_sea(emitter.pose):
+            spreads = emitter.angular_spread, emitter.widest_angular_spread
+            instruments.append(Instrument.laser(*place, spreads))
+        else:
+            instruments.append(_without_sea(emitter.pose))
+    for sensor in (model or scene).sensors():
+        receiver = getattr(sensor, "receiver", None)
+        if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
+            pixels = receiver.pixels
+            side = float(np.sqrt(pixels.area / pixels.count))
+            instruments.append(Instrument.receiver(*place, pixels.field_of_view, side))
+    if any([sea.fit(instruments) for sea in seas_of(scene)]):
+        scene.parameters_changed([])
+
+
+def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
+    """Return where the axis meets the mean sea level [m], the height above or below it [m], and its slope [rad].
+
+    The slope is the angle from the vertical. None for a pose under water that does not look up.
+    """
+    height, off_vertical = abs(float(pose.origin[2])), pose.off_nadir_deg
+    if not pose.submerged:
+        spot = pose.ground_point()
+    elif pose.axis[2] > _SMALLEST_RISE:
+        spot, off_vertical = pose.origin + pose.axis * (height / float(pose.axis[2])), 180.0 - off_vertical
+    else:
+        return None
+    return (float(spot[0]), float(spot[1])), height, float(np.deg2rad(min(off_vertical, 89.9)))
+
+
+def _without_sea(pose: Pose) -> Instrument:
+    """Return an instrument that needs no waves: those above it when it looks down under water."""
+    place = float(pose.origin[0]), float(pose.origin[1])
+    return Instrument(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
+
+
+def seas_of(scene: mi.Scene) -> list[SeaSurface]:
+    """Return the ``ocean_surface`` shapes of a scene."""
+    return [shape for shape in scene.shapes() if isinstance(shape, SeaSurface)]
+
+
+def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
+    """Return water, surfaces and slope variance of a scene, see `WaterScene`.
+
+    The slope variance is that of the roughest surface, or a typical one without ``ocean_surface``.
+
+    Raises
+    ------
+    UserError
+        When a medium is not supported or in the wrong place, or there are several.
+    """
+    surfaces: list[mi.Shape] = []
+    waters: list[Water] = []
+    for shape in scene.shapes():
+        if not shape.is_medium_transition():
+            continue
+        if shape.exterior_medium() is not None:
+            raise UserError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
+        water = getattr(shape.interior_medium(), "water", None)
+        if not isinstance(water, Water):
+            raise UserError(f"shape {shape.id()!r}: its interior medium must be layered_water")
+        surfaces.append(shape)
+        if not any(water is other for other in waters):
+            waters.append(water)
+    for shape in solids_of(scene, surfaces):
+        name = shape.id()
+        if isinstance(shape, SeaSurface):
+            raise UserError(f"ocean_surface {name!r}: needs a layered_water as its interior medium")
+    if len(waters) > 1:
+        raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
+    for water in waters:
+        _check_layers(scene, surfaces, water)
+    variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaSurface) and sea.has_ripples]
+    return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
+
+
+def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
+    """Return whether laser and receiver are under water.
+
+    Refuse both on the sea level, on different sides of the sea, or in layers of different indices.
+    """
+    heights = [float(each.pose.origin[2]) for each in (transmitter, scene.receiver)]
+    if min(heights) > 0:
+        return False
+    if max(heights) >= 0 or scene.water is None:
+        raise UserError(
+            f"altitude: transmitter and receiver at z = {heights[0]:g} m and {heights[1]:g} m must both be above the "
+            "mean sea level z = 0, or both under water"
+        )
+    if scene.index_layers is not None and scene.index_layers.count > 1:
+        raise UserError("refractive_index changes with depth: a lidar under water needs one index")
+    trough = min(float(surface.bbox().min.z) for surface in scene.surfaces)
+    for each in (transmitter, scene.receiver):
+        origin = opaque_point(each.pose.origin)
+        above = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, 1)))
+        if each.pose.origin[2] > trough and not (above.is_valid() & scene.is_surface(above.shape))[0]:
+            raise UserError(
+                f"altitude = {each.pose.origin[2]:g} must be below the surface of the waves, whose lowest trough is at "
+                f"{trough:.3g} m"
+            )
+    return True
+
+
+def _check_cells(surfaces: list[mi.Shape], transmitter: Transmitter) -> None:
+    """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
+    spot = transmitter.pose.ground_point()
+    footprint = 2 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    for surface in surfaces:
+        if isinstance(surface, SeaSurface) and footprint < surface.cell_size < np.inf:
+            raise UserError(
+                f"cell_size = {surface.cell_size:.3g} m is coarser than the beam's footprint on the sea, "
+                f"{footprint:.3g} m: it must be finer, or 'auto'"
+            )
+
+
+def _check_layers(scene: mi.Scene, surfaces: list[mi.Shape], water: Water) -> None:
+    """Refuse water layers below all solids, and index layers that begin within the waves."""
+    lowest = min((float(solid.bbox().min.z) for solid in solids_of(scene, surfaces)), default=-np.inf)
+    for solid in solids_of(scene, surfaces):
+        if float(solid.bbox().min.z) == lowest >= 0:
+            raise UserError(
+                f"shape {solid.id()!r} at z = {lowest:g} m is the lowest one: a bottom must lie below the mean sea "
+                "level, at a depth greater than 0"
+            )
+    deepest = float(water.column.layer_tops[-1])
+    if not water.from_profile and -deepest <= lowest:
+        raise UserError(f"layer_tops = {deepest:g} m is a layer below the bottom: it must be less than {-lowest:g} m")
+    trough = min(float(surface.bbox().min.z) for surface in surfaces)
+    for boundary in water.index_layers.boundaries[:1]:
+        if -boundary >= trough:
+            raise UserError(
+                f"refractive_index changes at {boundary:g} m, within the waves: "
+                f"it must do so below their troughs, {-trough:.3g} m"
+            )
