@@ -154,7 +154,7 @@ def draw_widths(path: Path) -> None:
         half = sigma * np.sqrt(-2 * np.log(level))
         arrow(beam, (-half, level), (half, level), DIM, both=True)
         beam.text(half + 1, level, f"{name}, {2 * half:.1f} mrad", fontsize=9, va="center")
-    beam.set(xlabel="angle from the axis (mrad)", ylabel="irradiance over its peak", xlim=(-16, 38), ylim=(0, 1.08))
+    beam.set(xlabel="angle from the axis (mrad)", ylabel="irradiance over its peak", xlim=(-16, 40), ylim=(0, 1.08))
     beam.set_title("One Gaussian beam and its three widths")
 
     fwhm, width = 5.0, 1.0
