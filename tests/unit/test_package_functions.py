@@ -2,6 +2,7 @@
 
 import inspect
 import pydoc
+from pathlib import Path
 
 import jedi
 import numpy as np
@@ -21,6 +22,14 @@ def test_every_function_has_a_signature_and_documentation(name):
     assert not any(one.kind is one.VAR_KEYWORD for one in parameters if name != "render")
     assert len(inspect.getdoc(function)) > 40
     assert "self" not in inspect.signature(function).parameters
+
+
+def test_citations_name_the_version():
+    root, version = Path(__file__).parents[2], mitransient_lidar.__version__
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text("utf-8")
+    cited = (root / "docs" / "cite.md").read_text("utf-8")
+    assert f"version {version}." in cited
+    assert f"version = {{{version}}}" in cited
 
 
 def test_unknown_functions_are_attribute_errors():
