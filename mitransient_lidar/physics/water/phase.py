@@ -40,7 +40,7 @@ def fournier_forand(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray:
     Notes
     -----
     Fournier and Forand (1994), Ocean Optics XII, Proc. SPIE 2258, 194, in the form of Fournier and Jonasz (1999),
-    Proc. SPIE 3821, 62. Near delta = 1 (theta about 10 degrees) both numerators vanish to second order and are replaced
+    Proc. SPIE 3761, 62. Near delta = 1 (theta about 10 degrees) both numerators vanish to second order and are replaced
     by binomial series in delta - 1.
     """
     nu, scale = _ff_shape(n, mu)
@@ -73,7 +73,7 @@ def fournier_forand_cdf(theta: npt.ArrayLike, n: float, mu: float) -> FloatArray
     Returns
     -------
     ndarray
-        Cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3821, 62.
+        Cumulative fraction, 0 at 0 and 1 at pi. Fournier and Jonasz (1999), Proc. SPIE 3761, 62.
     """
     nu, scale = _ff_shape(n, mu)
     s = _half_angle(theta)

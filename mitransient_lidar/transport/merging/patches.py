@@ -235,7 +235,7 @@ class SolidPatches:
         """Return an estimate of 1 / (covered share of the patch's square), for patches cut by edges.
 
         The mean of the number of random points in the square up to the first one on the patch (Booth 2007,
-        doi:10.1080/2151237X.2007.10129248).
+        Nucl. Sci. Eng. 156, 403).
         """
         if not self._bounded:
             return mi.Float(1)
