@@ -29,7 +29,7 @@ extensions = [
     "command_pages",
     "catalogue_pages",
 ]
-exclude_patterns = ["extensions", "README.md", "gallery"]
+exclude_patterns = ["extensions", "gallery", "templates"]
 templates_path = ["templates"]
 default_role = "py:obj"
 
