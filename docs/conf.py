@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 from pathlib import Path
@@ -16,6 +17,8 @@ import mitransient_lidar  # noqa: E402  (before mitsuba: it finds LLVM for Dr.Ji
 project = "mitransient-lidar"
 author = copyright = "The developers of mitransient-lidar"
 version = release = mitransient_lidar.__version__
+
+_mathjax = importlib.util.find_spec("sphinx-mathjax-offline")
 
 extensions = [
     "myst_parser",
@@ -39,7 +42,8 @@ myst_heading_anchors = 4
 
 # Python API.
 autosummary_generate = True
-autodoc_default_options = {"members": True, "member-order": "bysource"}
+# The aliases of types, which autodoc takes for classes, have no signature.
+autodoc_default_options = {"members": True, "member-order": "bysource", "exclude-members": "Moments, Scattered"}
 autodoc_typehints = "none"
 numpydoc_show_class_members = False
 # Parameters that do not exist, and sections that are unknown or in another order, of the functions that the package
@@ -74,9 +78,12 @@ suppress_warnings = ["toc.not_readable"]
 
 html_theme = "pydata_sphinx_theme"
 html_title = "mitransient-lidar"
-html_static_path = ["static"]
+# MathJax is part of the site, so that formulas appear without a network. Its package is no extension that is safe for
+# parallel builds, but holds the files.
+mathjax_path = "mathjax/tex-chtml.js"
+html_static_path = ["static", *(f"{folder}/static" for folder in _mathjax.submodule_search_locations)]
 html_css_files = ["site.css"]
-html_show_sourcelink = False
+html_copy_source = False
 html_sidebars = {"index": [], "install": []}
 html_theme_options = {
     "header_links_before_dropdown": 8,

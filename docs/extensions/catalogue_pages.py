@@ -93,5 +93,6 @@ def _list_of_sources(description: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text in which Markdown sees no markup of its own."""
-    return re.sub(r"([*_<$\[\]])", r"\\\1", text)
+    """Return text in which Markdown sees no markup but links for DOIs."""
+    escaped = re.sub(r"([*_<$\[\]])", r"\\\1", text)
+    return re.sub(r"doi:(10\.\S*[^\s.,;)])", r"[doi:\1](https://doi.org/\1)", escaped)

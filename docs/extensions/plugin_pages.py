@@ -122,7 +122,9 @@ def _page(plugin: Plugin) -> str:
     text, xml_block, _ = rest.partition(".. code-block:: xml")
     assert xml_block, f"{plugin.name}: no example in XML"
     # The table of parameters comes first; it has a class for the style sheet.
-    text = f"Parameters\n----------\n\n.. rst-class:: parameters\n\n{text.strip()}\n"
+    tables, rule, prose = text.strip().rpartition("==\n")
+    prose = re.sub(r"doi:(10\.\S*[^\s.,;)])", r"`doi:\1 <https://doi.org/\1>`__", prose)
+    text = f"Parameters\n----------\n\n.. rst-class:: parameters\n\n{tables}{rule}{prose}\n"
     tabs = "".join(
         f"   .. tab-item:: {title}\n\n      .. code-block:: {language}\n\n"
         + textwrap.indent(example(plugin.manual, language), " " * 9)
