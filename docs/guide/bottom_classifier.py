@@ -2,8 +2,8 @@
 
 ``python docs/guide/bottom_classifier.py bottoms.zarr -o bottom_classifier.png``, for the campaign of
 ``docs/guide/campaigns.md``; needs scikit-learn. Waveforms without a bottom are the same ones less their bottom's part,
-recorded with noise of their own.
-Both methods are compared on runs that the classifier has never seen, at the same rate of false alarms.
+recorded with noise of their own. Both methods are compared on runs that the classifier has never seen, at the same rate
+of false alarms.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def render(
         ``llvm_ad_mono`` or ``cuda_ad_mono``; by default the active one, or the fastest that works here.
     progress
         Called with a `passes.Progress` after every pass.
-    others
+    **others
         Options of `shot_series.render_shots` or `passive.render_passive`, for results of these.
 
     Returns
@@ -126,16 +126,16 @@ def render(
         the same dimensions, and the coordinate ``effective_share``. After Ctrl-C it includes the completed
         passes, and the attribute ``interrupted`` is 1. Of a result, as of the function that rendered it.
 
+    Raises
+    ------
+    UserError
+        If the scene, the result, a parameter or an option is invalid, or no light returns.
+
     Notes
     -----
     Standard errors come from the spread of the passes. Intervals by Student's t with one degree of freedom less than
     the attribute ``passes`` have their nominal coverage where the error is below a tenth of the value. Where it is 20
     to 40 %, 95 % intervals of 8 passes hold the mean in 91 to 93 % of the bins, and where it is larger, in fewer.
-
-    Raises
-    ------
-    UserError
-        If the scene, the result, a parameter or an option is invalid, or no light returns.
     """
     derivatives = [derivatives] if isinstance(derivatives, str) else derivatives
     options = {name: value for name, value in locals().items() if name in RenderOptions.__dataclass_fields__}

@@ -181,7 +181,7 @@ class LinearDetector:
         return self.gain * events + leakage, [self.gain**2 * self.excess_noise * events + leakage]
 
     def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
-        """Draw charges in electrons per bin, shape (shots, *events.shape)."""
+        """Draw charges in electrons per bin, shape ``(shots, *events.shape)``."""
         count = random.poisson(events, (shots, *events.shape))
         charge = _multiplied(count, self.gain, self.excess_noise - 1, random)
         if leakage := _electrons(self.leakage_current_na, bin_width_ns):
@@ -263,7 +263,7 @@ class SiliconPhotomultiplier:
         return self.gain * primaries * family, covariances
 
     def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
-        """Draw charges in electrons per bin, shape (shots, *events.shape)."""
+        """Draw charges in electrons per bin, shape ``(shots, *events.shape)``."""
         dead = dead_time.dead_bins(self.recovery_time_ns, bin_width_ns)
         per_cell = events / self.cells
         count = dead_time.sample_cells(per_cell, self.cells, dead, shots, random)
@@ -333,7 +333,7 @@ class SinglePhotonDetector:
         return self.channels * fired, [self.channels * one for one in covariances]
 
     def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
-        """Draw counts per bin, 0 to the number of channels, shape (shots, *events.shape)."""
+        """Draw counts per bin, 0 to the number of channels, shape ``(shots, *events.shape)``."""
         dead, own = dead_time.dead_bins(self.dead_time_ns, bin_width_ns), events / self.channels
         count = np.zeros((shots, *events.shape))
         for _ in range(self.channels):

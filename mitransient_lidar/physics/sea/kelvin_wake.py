@@ -77,7 +77,7 @@ def kelvin_wake(
         a = k0 L sec(theta)/2, V(t) = integral_0^1 (1 - s^2) exp(-t s) ds = 1/t - 2/t^3 + 2 exp(-t) (1/t^2 + 1/t^3),
 
     j1 the spherical Bessel function; this is the form of Tuck, Scullen and Lazauskas (2002). The hull's wave
-    resistance is (pi/2) rho U^2 integral |A|^2 cos(theta)^3 dtheta (Newman 1977), Michell's integral.
+    resistance is ``(pi/2) rho U^2 integral |A|^2 cos(theta)^3 dtheta`` (Newman 1977), Michell's integral.
 
     Only these free waves are included, not the local elevation about the hull, so that heights next to the hull are
     rough. Ahead of the middle of the ship the integral yields mirrored, negated waves, which are removed; the others

@@ -104,7 +104,7 @@ class MatchedSpectrum(CosineSpectrum):
     -----
     With the fractions 1/2 +- Delta/4 of the slope variance k^2 S, factors s_u and s_c give
     S' = S (s_u (1/2 + Delta/4) + s_c (1/2 - Delta/4)) and Delta' = 2 (s_u (1/2 + Delta/4) - s_c (1/2 - Delta/4)) S/S',
-    clipped to |Delta'| <= 1 so that no wave has a negative density; s_u and s_c are found with the clipping.
+    clipped to ``|Delta'| <= 1`` so that no wave has a negative density; s_u and s_c are found with the clipping.
     """
 
     spectrum: CosineSpectrum

@@ -154,7 +154,7 @@ class AxialSpectrum(WaveSpectrum):
 
 
 class CosineSpectrum(AxialSpectrum):
-    """Spectrum with the angular density (1 + Delta cos 2 phi)/(2 pi), |Delta| <= 1, defined by S(k) and Delta(k)."""
+    """Spectrum with the angular density (1 + Delta cos 2 phi)/(2 pi), Delta -1 to 1, defined by S(k) and Delta(k)."""
 
     def directional(self, kx: npt.ArrayLike, ky: npt.ArrayLike) -> FloatArray:
         """Directional spectrum Psi [m^4]; see `WaveSpectrum.directional`. It is 0 at the origin."""

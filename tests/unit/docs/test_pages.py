@@ -1,0 +1,58 @@
+"""Pages of the documentation: all are in a table of contents, and their relative links lead to files."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mitransient_lidar.loading.variants import PLUGIN_MODULES
+
+ROOT = Path(__file__).parents[3]
+DOCS = ROOT / "docs"
+#: What the build of the site writes, by the first part of a path below docs.
+GENERATED = [line.removeprefix("/docs/") for line in (ROOT / ".gitignore").read_text().splitlines() if "/docs/" in line]
+#: Folders of sources that are no pages by themselves.
+_SOURCES = ("gallery", "templates", "images")
+
+
+def is_generated(path: Path) -> bool:
+    return path.is_relative_to(DOCS) and path.relative_to(DOCS).as_posix().startswith(tuple(GENERATED))
+
+
+def pages() -> list[Path]:
+    """Return the pages that are written by hand."""
+    found = [path for suffix in ("md", "rst") for path in DOCS.rglob(f"*.{suffix}")]
+    return [page for page in found if page.relative_to(DOCS).parts[0] not in _SOURCES and not is_generated(page)]
+
+
+def contents(page: Path) -> list[Path]:
+    """Return the entries of the tables of contents of a page, as files without a suffix."""
+    blocks = re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    lines = [line.strip() for block in blocks for line in block.splitlines()]
+    return [page.parent / line for line in lines if line and not line.startswith(":")]
+
+
+def test_every_page_is_in_one_table_of_contents() -> None:
+    entries = [entry.resolve() for page in pages() for entry in contents(page)]
+    assert len(entries) == len(set(entries))
+    listed = {page for page in pages() if page.with_suffix("") in entries}
+    assert set(pages()) - listed == {DOCS / "index.md"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *pages()],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
+def test_relative_links_lead_to_files(page: Path) -> None:
+    text = re.sub(r"^( *)```.*?^\1```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    targets = re.findall(r"\]\(<?([^)\s#>]+)[^)]*\)", text)
+    files = [(page.parent / target).resolve() for target in targets if not re.match(r"\w+:", target)]
+    missing = [file for file in files if not (file.is_file() or is_generated(file))]
+    assert missing == []
+
+
+def test_every_plugin_has_a_picture() -> None:
+    names = {name.rpartition(".")[2] for name in PLUGIN_MODULES} - {"bases", "tabulated"}
+    pictures = {path.stem for path in (DOCS / "images" / "plugins").glob("*.png")}
+    assert names == {name.removesuffix("_angles") for name in pictures}
