@@ -59,6 +59,6 @@ if __name__ == "__main__":
     plt.show()
 
 # %%
-# **What to see.** Left, four records of the campaign: deep bottoms in turbid water are weak. Right, what the shipped
-# detector makes of all records: it finds them too deep by up to one or two decimetres, within the errors that it states
-# (bars of one standard deviation), as scattered light arrives late.
+# **What to see.** Left, four runs of the campaign: deep bottoms in turbid water are weak. Right, what the shipped
+# detector makes of all records: most depths are some centimetres to a decimetre too deep, as scattered light arrives
+# late. Bars are the errors that it states, one standard deviation of noise and method.

@@ -40,5 +40,5 @@ for field in found.field_of_view.values:
     print(f"{field:g} mrad: K = {value:.3f} +- {error:.3f} 1/m")
 
 # %%
-# **What to see.** The wider the view, the slower the column decays: from nearly c where the spot in view is a small
+# **What to see.** The wider the view, the slower the column decays: from close to c where the spot in view is a small
 # part of a scattering length, to nearly the absorption where it is larger.

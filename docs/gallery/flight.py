@@ -1,19 +1,19 @@
 """A flight and its point cloud
 ============================
 
-A scanner on a drone, 75 m above a sandy slope with a cube on it. Every pulse is rendered in its own pose over moving
-waves and recorded; echoes become points with their uncertainty, in LAS files.
+A circular scanner on a drone, 75 m above a slope. Every pulse is rendered in its own pose and recorded; echoes
+become points with their uncertainty, in LAS files.
 """
 
 import tempfile
 
 import matplotlib.pyplot as plt
-import numpy as np
 
 import mitransient_lidar
 
 # %%
-# A flight is a TOML file or a dict; ``mitransient-lidar fly drone_strip`` renders the shipped one. Here are 96 pulses.
+# A flight is a TOML file or a dict; ``mitransient-lidar fly palmer`` renders a shipped one. Here are 64 pulses, at 14
+# degrees from nadir, over a level sea with ripples.
 
 FLIGHT = {
     "scene": "flight",
@@ -21,13 +21,23 @@ FLIGHT = {
     "corrections": "auto",
     "target_error": 0.2,
     "still_sea": True,
-    "parameters": {"jerlov": "1C", "wind_speed": 3, "bottom_depth": 4, "cube_depth": 3.5, "spectrum": "flat"},
-    "platform": {
-        **{"kind": "lines", "start": [-2.0, 0.0], "heading_deg": 90.0, "speed": 4.0, "height": 75.0, "duration_s": 1.0},
-        "noise": {"roll_deg": 0.5, "pitch_deg": 0.5, "yaw_deg": 1.0, "correlation_s": 0.5},
+    "parameters": {
+        **{"jerlov": "1C", "spectrum": "flat", "bottom_depth": 4, "bottom_slope_x_deg": 3},
+        **{"bottom_ripple_height": 0, "cube_size": 0.5},
     },
-    "scanner": {"kind": "oscillating", "half_angle_deg": 15.0, "rate_hz": 4.0},
-    "pulses": {"rate_hz": 96.0, "most": 96},
+    "platform": {
+        **{
+            "kind": "lines",
+            "start": [-5.0, 0.0],
+            "heading_deg": 90.0,
+            "speed": 10.0,
+            "height": 75.0,
+            "duration_s": 1.0,
+        },
+        "noise": {"roll_deg": 0.2, "pitch_deg": 0.2, "yaw_deg": 0.5, "correlation_s": 0.5},
+    },
+    "scanner": {"kind": "palmer", "nadir_angle_deg": 14.0, "rate_hz": 2.0},
+    "pulses": {"rate_hz": 64.0, "most": 64},
 }
 
 SURFACE, BOTTOM = 41, 40  # classes of LAS for water surface and bottom
@@ -47,9 +57,13 @@ if __name__ == "__main__":
         stated = float(own.vertical_uncertainty.median())
         print(f"{name}: {own.z.size} points, rms error {100 * rms:.1f} cm, stated {100 * stated:.1f} cm")
         left.plot(own.x, own.y, ".", color=colour, label=name)
-        right.plot(own.y, own.z, ".", color=colour)
+        right.errorbar(own.x, own.z, own.vertical_uncertainty, fmt=".", color=colour, linewidth=0.7)
     left.set(xlabel="east (m)", ylabel="north (m)", aspect="equal")
     left.legend(frameon=False, fontsize="small")
-    right.set(xlabel="north (m)", ylabel="height (m)")
+    right.set(xlabel="east (m)", ylabel="height (m)")
     plt.show()
-    print(f"{int(np.count_nonzero(points.true_target))} points on the cube")
+
+# %%
+# **What to see.** Left, the points on the sea, and those on the bottom, which are refracted towards the axis of the
+# circles. Right, from the side: the points on the level sea at 0, and the bottom that rises by 3 degrees towards the
+# east, with XX. Bars are the stated standard uncertainty.

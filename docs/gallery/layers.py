@@ -50,7 +50,6 @@ lower.set(xlabel="time (ns)", ylabel="decay of the power (1/m)", xlim=(1425, 148
 plt.show()
 
 # %%
-# **What to see.** Both columns are straight lines, the lower one less steep. The brightness falls by a third at the
-# boundary, where the lower water scatters less, and this shows as a peak of the decay: first in the near pixels
-# (blue, black), some nanoseconds later in the far ones. The peak of the single pixel lies between, and is wider than
-# that of a near pixel.
+# **What to see.** Above and below the boundary the power decays evenly, below more slowly. At the boundary it falls
+# to half, as the lower water scatters less, and this is a peak of the decay: first in the near pixels (blue, black),
+# four nanoseconds later in the far ones. The peak of the single pixel lies between, and is lower and wider.

@@ -34,12 +34,16 @@ for axis, (density, record) in zip(axes, records.items(), strict=True):
     axis.plot(record.time, expected, color="tab:red", linewidth=1, label="closed form")
     axis.set(ylabel="counts a bin", title=f"optical density {density}")
     print(f"density {density}: {float(counts.sum()):.2f} counts a shot, in closed form {float(expected.sum()):.2f}")
+    late = {"light": shot.waveform.isel(pixel=0), "counts": expected}
+    peaks = {name: float(one.sel(time=slice(1455, 1470)).idxmax("time")) for name, one in late.items()}
+    print(f"    peak at the bottom: light {peaks['light']:.2f} ns, counts {peaks['counts']:.2f} ns")
 axes[1].set(xlabel="time (ns)", xlim=(1405, 1490))
 axes[1].legend(frameon=False)
 plt.show()
 
 # %%
 # **What to see.** Through the weaker filter the first photon of every shot comes with the first light of the surface.
-# The counter is then dead for 30 ns, counts once more in the middle of the column, and again 30 ns later: three
-# groups that show the dead time and not the sea. Through the stronger one surface and bottom are where they should
-# be, and still fewer counts follow the surface, as many shots have counted it.
+# The counter is then dead for 30 ns, counts once more in the column, and again 30 ns later: three groups that show
+# the dead time and not the sea. Through the stronger one surface and bottom are two peaks, with few counts after the
+# surface, as many shots have just counted it. The bottom is still too early, since the first photon of its echo
+# counts.

@@ -27,7 +27,7 @@ figure, axes = plt.subplots(1, 3, figsize=(7, 3), sharey=True, layout="constrain
 for axis, (layout, shot) in zip(axes, shots.items(), strict=True):
     for pixel, colour in zip(shot.pixel.values, pixel_colours(shot.sizes["pixel"]), strict=True):
         axis.semilogy(shot.time, 1e6 * shot.waveform.sel(pixel=pixel), color=colour, label=str(pixel), linewidth=1)
-    axis.set(title=layout, xlabel="time (ns)", xlim=(1405, 1520), ylim=(1e-2, 500))
+    axis.set(title=layout, xlabel="time (ns)", xlim=(1405, 1520), ylim=(0.1, 500))
     axis.legend(frameon=False, fontsize="small")
 axes[0].set_ylabel("power (µW)")
 plt.show()
