@@ -57,13 +57,13 @@ if __name__ == "__main__":
         stated = float(own.vertical_uncertainty.median())
         print(f"{name}: {own.z.size} points, rms error {100 * rms:.1f} cm, stated {100 * stated:.1f} cm")
         left.plot(own.x, own.y, ".", color=colour, label=name)
-        right.errorbar(own.x, own.z, own.vertical_uncertainty, fmt=".", color=colour, linewidth=0.7)
+        right.plot(own.x, own.z, ".", color=colour)
     left.set(xlabel="east (m)", ylabel="north (m)", aspect="equal")
     left.legend(frameon=False, fontsize="small")
     right.set(xlabel="east (m)", ylabel="height (m)")
     plt.show()
 
 # %%
-# **What to see.** Left, the points on the sea, and those on the bottom, which are refracted towards the axis of the
-# circles. Right, from the side: the points on the level sea at 0, and the bottom that rises by 3 degrees towards the
-# east, with XX. Bars are the stated standard uncertainty.
+# **What to see.** Left, the points on the sea, and those on the bottom, which lie outside them, as the beams go on
+# outwards in the water. Right, from the side: the points on the level sea at 0, and the bottom that rises by 3
+# degrees towards the east. In the west, where it is deepest, some pulses find no bottom.

@@ -22,7 +22,7 @@ def printed(tmp_path_factory):
         env={**os.environ, "MPLBACKEND": "Agg"},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     assert not list(folder.iterdir())
