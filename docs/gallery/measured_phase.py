@@ -75,6 +75,6 @@ right.legend(frameon=False, fontsize="small")
 plt.show()
 
 # %%
-# **What to see.** Left the table, over four decades. Right, the column with it is darker than with the Fournier-Forand
-# function, in proportion to backscattering at angles near 180 degrees; the bottom echoes, which take only forward
-# scattering, are nearly the same.
+# **What to see.** Left the table, over four decades. Right, the column with it has only 0.6 of the light of that with
+# the Fournier-Forand function, though both have nearly the same bb/b: a lidar sees the function near 180 degrees,
+# where the table is low. The bottom echoes, which take forward scattering alone, are nearly the same.
