@@ -21,7 +21,7 @@ found = mitransient_lidar.bounds(
     over={"layout": ["1x1", "2x2", "1x4"]},
     receiver="apd",
     gain="auto",
-    renders=3,
+    renders=2,
     passes=2,
     seed=1,
 )
@@ -42,5 +42,4 @@ plt.show()
 
 # %%
 # **What to see.** The strips across the range know attenuation and scattering better than 2x2 pixels, and these
-# better than one pixel. Pixels that see different parts of the water tell absorbed light from scattered light. For
-# the reflectance of the bottom the layout matters little.
+# better than one pixel. For the reflectance of the bottom the layout matters little.

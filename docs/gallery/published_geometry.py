@@ -28,7 +28,7 @@ for axis, (layout, shot) in zip(axes, shots.items(), strict=True):
     for pixel, colour in zip(shot.pixel.values, pixel_colours(shot.sizes["pixel"]), strict=True):
         axis.semilogy(shot.time, 1e6 * shot.waveform.sel(pixel=pixel), color=colour, label=str(pixel), linewidth=1)
     axis.set(title=layout, xlabel="time (ns)", xlim=(1405, 1520), ylim=(0.1, 500))
-    axis.legend(frameon=False, fontsize="small")
+    axis.legend(frameon=False, fontsize="small", loc="lower center")
 axes[0].set_ylabel("power (µW)")
 plt.show()
 

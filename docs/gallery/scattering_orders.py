@@ -38,6 +38,7 @@ for when, name in ((1429, "1 m"), (1458, "4 m"), (1477, "the bottom")):
     print(f"near {name}: orders 0 and 1 have {few:.0f} %, orders above 5 {many:.0f} % of the light")
 
 # %%
-# **What to see.** Light without scattering is the surface echo. Light scattered once is the brightest part just below
-# the surface and decays with c; each further order begins later and decays more slowly. From 4 m on most light has
-# been scattered six times or more, and so has nearly all of the bottom echo: the whole decays far more slowly than c.
+# **What to see.** Light without scattering is the surface echo, and a trace of the bottom. Light scattered once is
+# the brightest part just below the surface and decays with c; each further order begins later and decays more slowly.
+# From 4 m on most light has been scattered six times or more, and so has four fifths of the bottom echo: the whole
+# decays far more slowly than c.
