@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import mitransient_lidar
 
 # %%
-# A flight is a TOML file or a dict; ``mitransient-lidar fly palmer`` renders a shipped one. Here are 64 pulses, at 14
+# A flight is a TOML file or a dict; ``mitransient-lidar fly palmer`` renders a shipped one. Here are 48 pulses, at 14
 # degrees from nadir, over a level sea with ripples.
 
 FLIGHT = {
@@ -37,7 +37,7 @@ FLIGHT = {
         "noise": {"roll_deg": 0.2, "pitch_deg": 0.2, "yaw_deg": 0.5, "correlation_s": 0.5},
     },
     "scanner": {"kind": "palmer", "nadir_angle_deg": 14.0, "rate_hz": 2.0},
-    "pulses": {"rate_hz": 64.0, "most": 64},
+    "pulses": {"rate_hz": 48.0, "most": 48},
 }
 
 SURFACE, BOTTOM = 41, 40  # classes of LAS for water surface and bottom
