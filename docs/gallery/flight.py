@@ -65,5 +65,5 @@ if __name__ == "__main__":
 
 # %%
 # **What to see.** Left, the points on the sea, and those on the bottom, which lie outside them, as the beams go on
-# outwards in the water. Right, from the side: the points on the level sea at 0, and the bottom that rises by 3
-# degrees towards the east. In the west, where it is deepest, some pulses find no bottom.
+# outwards in the water. Right, from the side: the points on the level sea at 0, and the bottom that rises by 3 degrees
+# towards the east. About a fifth of the pulses find no bottom.
