@@ -1,0 +1,44 @@
+"""Attenuation of the column and the field of view
+===============================================
+
+A narrow receiver loses light that is scattered even a little: its column decays almost with the beam attenuation c. A
+wide one keeps that light in view, and its column decays with about the absorption.
+"""
+
+import matplotlib.pyplot as plt
+
+import mitransient_lidar  # noqa: F401  (before mitsuba: it finds LLVM for Dr.Jit)
+from mitransient_lidar.studies.fov_sweep import fov_sweep
+
+# %%
+# A narrow beam of 0.5 mrad on level water of c = 0.3 1/m and a = 0.15 1/m, nearly without ripples, which would refract
+# light out of a narrow view as well.
+
+SCENE = {"divergence_mrad": 0.5, "bottom_depth": 12, "spectrum": "flat", "slope_variance": 2e-5}
+found = fov_sweep("table1", [1, 5, 20, 80], SCENE, passes=4, seed=1)
+
+# %%
+# K is half the decay of the power along the path in the water.
+
+figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
+axis.errorbar(found.scaled_radius, found.effective_attenuation, found.effective_attenuation_stderr, fmt="o-", capsize=3)
+axis.axhline(found.attrs["attenuation"], color="0.5", linestyle="--")
+axis.axhline(found.attrs["absorption"], color="0.5", linestyle=":")
+axis.text(1, found.attrs["attenuation"] + 0.004, "attenuation c", ha="center")
+axis.text(1, found.attrs["absorption"] + 0.004, "absorption a", ha="center")
+axis.set(
+    xscale="log",
+    xlabel="c times radius of the spot in view",
+    ylabel="attenuation of the column K (1/m)",
+    ylim=(0.13, 0.32),
+)
+plt.show()
+
+for field in found.field_of_view.values:
+    one = found.sel(field_of_view=field)
+    value, error = float(one.effective_attenuation), float(one.effective_attenuation_stderr)
+    print(f"{field:g} mrad: K = {value:.3f} +- {error:.3f} 1/m")
+
+# %%
+# **What to see.** The wider the view, the slower the column decays: from close to c where the spot in view is a small
+# part of a scattering length, to nearly the absorption where it is larger.
