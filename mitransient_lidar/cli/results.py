@@ -136,8 +136,12 @@ def record(
             help="Optical density of a filter before the detector, or auto; by default the receiver's, or 0.",
         ),
     ] = None,
-    shots: Annotated[int, typer.Option(help="Number of records of each waveform, with independent noise.")] = 1,
-    background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
+    shots: Annotated[
+        int, typer.Option(help="Number of records of each waveform with independent noise, at least 1.")
+    ] = 1,
+    background_power_w: Annotated[
+        float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
+    ] = 0.0,
     seed: Seed = 0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")
