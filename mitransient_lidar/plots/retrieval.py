@@ -138,8 +138,8 @@ def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
         ax.locator_params(nbins=6)
         drawing.add_grid(ax)
     bars = Line2D([], [], color=_COLOURS["along"], marker=".", label="estimates, ±1 standard error")
-    truth = Line2D([], [], color="0.5", linewidth=0.9, label="truth")
-    figure.legend(handles=[bars, truth], loc="outside lower center", ncols=2, frameon=False)
+    line = Line2D([], [], color="0.5", linewidth=0.9, label="truth")
+    figure.legend(handles=[bars, line], loc="outside lower center", ncols=2, frameon=False)
     figure.suptitle(drawing.titled(found.attrs, f"{found.sizes['shot']} shots"))
     return drawing.save(figure, path)
 

@@ -341,8 +341,8 @@ def _colour_maps() -> dict[str, str]:
 
 def _attributes(stack: xr.Dataset) -> list[list[str]]:
     """Return names and values of the attributes, without texts of the scene, its files, objects and outlines."""
-    long = ("scene_xml", "scene_dict", "scene_files", "plugin_parameters")
-    long += ("pixel_outlines", "beam_outlines", "target_outlines")
+    long = {"scene_xml", "scene_dict", "scene_files", "plugin_parameters"}
+    long |= {"pixel_outlines", "beam_outlines", "target_outlines"}
     return [[str(name), _readable(value)] for name, value in stack.attrs.items() if name not in long]
 
 

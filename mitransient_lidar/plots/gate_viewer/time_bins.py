@@ -39,7 +39,7 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
     values = dataset[name]
     error = dataset.get(RECORDS[name], values * np.nan).broadcast_like(values)
     if dims[0] == "shot":
-        error = np.sqrt((error**2).sum("shot", skipna=False)) / values.sizes["shot"]
+        error = (error**2).sum("shot", skipna=False) ** 0.5 / values.sizes["shot"]
         values = values.mean("shot")
     pixels = [dim for dim in dims if dim not in ("shot", "time")]
     own = {key: one for key, one in dataset.coords.items() if not {"shot", "origin", "parameter", "case"} & {*one.dims}}

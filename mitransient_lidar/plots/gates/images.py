@@ -129,7 +129,7 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
     figure.set_layout_engine("none")
     kind: type[AbstractMovieWriter] = PillowWriter if suffix == ".gif" else FFMpegWriter
     writer = kind(fps=_FRAMES_PER_SECOND)
-    program = {} if suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
+    program: dict[Any, Any] = {} if suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
     with replacing(path) as temporary:
         try:
             with matplotlib.rc_context(program), writer.saving(figure, os.fspath(temporary), _FRAME_DPI):
@@ -226,7 +226,7 @@ def _draw_sheet(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
         ax.locator_params(nbins=4)
     # Below a colour bar of all images, the layout leaves too little room for the label.
     room = _LABEL_ROOM / figure.get_figheight()
-    figure.get_layout_engine().set(rect=(0, room, 1, 1 - room))
+    figure.set_layout_engine("constrained", rect=(0, room, 1, 1 - room))
     figure.supxlabel(drawing.ANGLE_Y_LABEL, fontsize=10)
     figure.supylabel(drawing.ANGLE_X_LABEL, fontsize=10)
     figure.suptitle(_title(stack, len(shown)), fontsize=12)

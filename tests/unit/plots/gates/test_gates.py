@@ -356,3 +356,14 @@ def test_wrong_files_and_datasets(tmp_path):
         animate_gates(make(pixels=True), tmp_path / "a.gif")
     with pytest.raises(UserError, match="No such file"):
         plot_gates(make(1), tmp_path / "missing" / "a.png")
+
+
+def test_the_label_of_a_sheet_is_below_its_ticks():
+    angle_x, angle_y = np.meshgrid(np.linspace(15, -15, 8), np.linspace(15, -15, 8), indexing="ij")
+    stack = make(12, energy=np.ones((ROWS, COLUMNS, 12))).isel(row=[0] * 8, column=[0] * 8)
+    stack = stack.assign_coords(angle_x=(("row", "column"), angle_x), angle_y=(("row", "column"), angle_y))
+    figure = plot_gates(stack)
+    FigureCanvasAgg(figure).draw()
+    ticks = [text.get_window_extent() for ax in figure.axes for text in ax.get_xticklabels() if text.get_text()]
+    label = next(text for text in figure.texts if text.get_text().startswith("to the left")).get_window_extent()
+    assert label.y1 < min(box.y0 for box in ticks if box.y0 > 0)
