@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.flights.fly import fly
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+    from mitransient_lidar.plots.viewer import view
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shot_series import render_shots
     from mitransient_lidar.studies.bounds import bounds
@@ -89,6 +90,7 @@ _FUNCTIONS = {
     "scene_names": ("loading.catalogue", "scene_names"),
     "scene_parameters": ("loading.catalogue", "scene_parameters"),
     "sweep": ("campaigns.sweep", "sweep"),
+    "view": ("plots.viewer", "view"),
     "waveforms": ("analysis.waveforms.echo_table", "extract"),
 }
 
@@ -113,6 +115,7 @@ __all__ = [
     "scene_names",
     "scene_parameters",
     "sweep",
+    "view",
     "waveforms",
 ]
 

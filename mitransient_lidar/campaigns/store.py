@@ -41,7 +41,7 @@ _LOG = logging.getLogger(__name__)
 PLANNED, DONE, FAILED = 0, 1, 2
 
 #: Fewest and most runs of a shard, and the number of shards that a campaign has if its runs allow.
-_FEWEST, _MOST, _SHARDS = 64, 1024, 16
+_FEWEST, _MOST, _SHARDS = 8, 1024, 16
 
 #: Largest size of a shard in memory [bytes], by default.
 _MOST_BYTES = 2**29

@@ -69,7 +69,7 @@ def sweep(
         this package, and the store at the same path.
     shard_size
         Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
-        64 to 1024, and fewer where a shard would take more than half a gigabyte.
+        8 to 1024, and fewer where a shard would take more than half a gigabyte.
     retry_failed
         Whether to render runs that have failed, too.
     progress

@@ -51,6 +51,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.water,
     ),
     "Analyse results": (
+        results.view,
         results.plot,
         results.compare,
         results.record,

@@ -10,7 +10,7 @@ import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_writable, write_netcdf
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import RECEIVERS, Define, Quiet, Scene, Seed, number_or_auto, parameters
+from mitransient_lidar.cli.options import OUTPUT, RECEIVERS, Define, Quiet, Scene, Seed, number_or_auto, parameters
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite
 
@@ -41,7 +41,9 @@ def bounds(
     optical_density: Annotated[
         str | None, typer.Option(help="Optical density of a filter, or auto for the least without saturation.")
     ] = None,
-    background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
+    background_power_w: Annotated[
+        float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
+    ] = 0.0,
     nuisance: Annotated[
         list[str] | None,
         typer.Option(
@@ -50,12 +52,14 @@ def bounds(
             "Repeatable.",
         ),
     ] = None,
-    renders: Annotated[int, typer.Option(help="Independent renders of each design; 3 or more give errors.")] = 4,
-    passes: Annotated[int, typer.Option(help="Number of independent passes of each render.")] = 16,
+    renders: Annotated[
+        int, typer.Option(help="Independent renders of each design, 2 to 1000; 3 or more give errors.")
+    ] = 4,
+    passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 2 to 100 000.")] = 16,
     seed: Seed = 0,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc and .csv.")
-    ] = Path("bounds.png"),
+    ] = OUTPUT / "bounds.png",
     quiet: Quiet = False,
 ) -> None:
     """Compute the least errors of parameters from a shot, and rank designs.

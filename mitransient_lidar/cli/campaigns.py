@@ -25,12 +25,14 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine, by default one for each core.")
+        int | None, typer.Option(help="Processes on this machine, 1 to 1024; by default one for each core.")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
     ] = None,
-    shard_size: Annotated[int | None, typer.Option(help="Runs that one process renders and writes.")] = None,
+    shard_size: Annotated[
+        int | None, typer.Option(help="Runs that one process renders and writes, 1 to 1 000 000.")
+    ] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Render runs that have failed again.")] = False,
     row: Annotated[int | None, typer.Option(help="Render the run of this number alone, to a NetCDF file.")] = None,
     show: Annotated[

@@ -9,7 +9,7 @@ import typer
 
 from mitransient_lidar.cli.files import announced, check_suffix, check_targets, check_writable, write_netcdf
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import RECEIVERS, Define, Quiet, Seed, numbers, parameters
+from mitransient_lidar.cli.options import OUTPUT, RECEIVERS, Define, Quiet, Seed, numbers, parameters
 from mitransient_lidar.core.errors import UserError
 
 
@@ -24,8 +24,8 @@ def depth_bias(
     depths: Annotated[str, typer.Option(metavar="M", help="Depths of the bottom.")] = "3,6,10",
     scene: Annotated[str, typer.Option(help="Scene whose sea, water and bottom count.")] = "table1",
     receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's.")] = None,
-    shots: Annotated[int, typer.Option(help="Random places of a sea with waves.")] = 12,
-    records: Annotated[int, typer.Option(help="Records with noise of each place.")] = 5,
+    shots: Annotated[int, typer.Option(help="Random places of a sea with waves, 2 to 10 000.")] = 12,
+    records: Annotated[int, typer.Option(help="Records with noise of each place, 1 to 10 000.")] = 5,
     corrections: Annotated[
         str | None,
         typer.Option(
@@ -34,7 +34,7 @@ def depth_bias(
     ] = None,
     seed: Seed = 1,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="NetCDF file; INSTRUMENT_depths.nc by default.")
+        Path | None, typer.Option("-o", "--output", help="NetCDF file; output/INSTRUMENT_depths.nc by default.")
     ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="PNG, PDF or SVG file of the biases of all estimators against the angle.")
@@ -47,7 +47,7 @@ def depth_bias(
     receiver, measures the depths, and prints share found, bias, spread and stated error of the estimator gaussian [cm].
     The file holds all estimators; waveforms --correct takes it.
     """
-    target = output or Path(f"{instrument}_depths.nc")
+    target = output or OUTPUT / f"{instrument}_depths.nc"
     check_suffix("--output", target, ".nc")
     check_targets(target.parent, [target], scene)
     if figure is not None:
@@ -106,8 +106,8 @@ def tpu(
     scene: Annotated[str, typer.Option(help="Scene whose sea, water and bottom count.")] = "table1",
     receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's.")] = None,
     estimator: Annotated[str, typer.Option(help="Estimator of depths, as of waveforms.")] = "gaussian",
-    shots: Annotated[int, typer.Option(help="Random places of a sea with waves.")] = 12,
-    records: Annotated[int, typer.Option(help="Records with noise of each place.")] = 4,
+    shots: Annotated[int, typer.Option(help="Random places of a sea with waves, 2 to 10 000.")] = 12,
+    records: Annotated[int, typer.Option(help="Records with noise of each place, 1 to 10 000.")] = 4,
     corrections: Annotated[
         str,
         typer.Option(metavar="FILE", help="Table of depth-bias to also correct the depths by, auto or none."),
@@ -116,7 +116,7 @@ def tpu(
     position_m: Annotated[float, typer.Option(help="Standard deviation of the horizontal position, each axis.")] = 0.05,
     height_m: Annotated[float, typer.Option(help="Standard deviation of the height of the sea surface.")] = 0.05,
     seed: Seed = 1,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = Path(),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
     """Determine the vertical and horizontal uncertainty of an instrument's soundings.

@@ -10,7 +10,7 @@ import typer
 
 from mitransient_lidar.cli.files import announced, check_targets, write_netcdf
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import Define, Instrument, Quiet, parameters
+from mitransient_lidar.cli.options import OUTPUT, Define, Instrument, Quiet, parameters
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import finite
@@ -54,10 +54,10 @@ def fit(
         bool, typer.Option("--scale-errors", help="Multiply the covariance by the reduced chi-squared.")
     ] = False,
     passes: Annotated[
-        int | None, typer.Option(help="Passes of each render; by default by the errors of the waveforms.")
+        int | None, typer.Option(help="Passes of each render, 2 to 10^9; by default by the errors of the waveforms.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all renders; by default not that of the result.")] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = Path(),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters of a scene to waveforms.

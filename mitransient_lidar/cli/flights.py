@@ -9,7 +9,7 @@ import typer
 
 from mitransient_lidar.cli.files import check_writable
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import Quiet
+from mitransient_lidar.cli.options import OUTPUT, Quiet
 
 
 def fly(
@@ -17,16 +17,17 @@ def fly(
         str, typer.Argument(metavar="FLIGHT", help="TOML file of a flight, or the name of a shipped one.")
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; that of FLIGHT's name.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; output/FLIGHT by default."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine, by default one for each core.")
+        int | None, typer.Option(help="Processes on this machine, 1 to 1024; by default one for each core.")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
     ] = None,
     shard_size: Annotated[
-        int | None, typer.Option(help="Pulses that one process renders and writes; by default 512.")
+        int | None, typer.Option(help="Pulses that one process renders and writes, at least 1; by default 512.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -36,7 +37,7 @@ def fly(
     the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on.
     docs/guide/flights.md describes the file.
     """
-    folder = output or Path(Path(flight).stem)
+    folder = output or OUTPUT / Path(flight).stem
     check_writable(folder, [])
     from mitransient_lidar.campaigns.store import Store
     from mitransient_lidar.flights.fly import STORE

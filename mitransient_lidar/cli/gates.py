@@ -24,13 +24,13 @@ def gates(
     ] = None,
     width_ns: Annotated[float | None, typer.Option(help="Width of a gate between half heights [ns].")] = None,
     step_ns: Annotated[float | None, typer.Option(help="Time from gate to gate [ns]; by default the width.")] = None,
-    count: Annotated[int, typer.Option(help="Number of gates.")] = 1,
+    count: Annotated[int, typer.Option(help="Number of gates, 1 to 100 000.")] = 1,
     rise_ns: Annotated[float, typer.Option(help="10-90 % time of the rising edge [ns].")] = 0.0,
     fall_ns: Annotated[float, typer.Option(help="90-10 % time of the falling edge [ns].")] = 0.0,
     profile: Annotated[
         Path | None, typer.Option(help="Measured gate instead of width and edges: columns time [ns], transmission.")
     ] = None,
-    pulses: Annotated[int, typer.Option(help="Pulses accumulated in a gate.")] = 1,
+    pulses: Annotated[int, typer.Option(help="Pulses accumulated in a gate, 1 to 10^9.")] = 1,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the files; by default that of STACK.")
     ] = None,
@@ -39,7 +39,7 @@ def gates(
         bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
     ] = False,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie; needs ffmpeg.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
 ) -> None:

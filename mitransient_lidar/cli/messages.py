@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _INVALID_INPUT = 2  # exit code
 _MOST_PIXELS = 12  # listed in the summary
+_REPORT_S = 15.0  # between two lines of progress
 
 
 @contextlib.contextmanager
@@ -58,7 +59,10 @@ def exit_if_interrupted(dataset: xr.Dataset) -> None:
 
 @contextlib.contextmanager
 def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """Show log messages on stderr, and on a terminal a progress bar; yield the function that updates the bar."""
+    """Show log messages and progress on stderr; yield the function that takes the progress.
+
+    On a terminal it is a bar; elsewhere, as in a pipe or a log, a line every 15 s.
+    """
     import logging
 
     logger = logging.getLogger("mitransient_lidar")
@@ -79,7 +83,11 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
     try:
         description = TextColumn("{task.description}", table_column=Column(no_wrap=False, ratio=1))
         columns = (SpinnerColumn(), description, BarColumn(bar_width=16), TimeElapsedColumn())
-        with ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        if not console.is_terminal:
+            with _lines_of_progress() as show_line:
+                yield show_line
+            return
+        with ProgressBar(*columns, console=console, transient=True) as bar:
             task = bar.add_task("preparing", total=None)
 
             def show(state: Progress) -> None:
@@ -89,6 +97,29 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
             yield show
     finally:
         logger.removeHandler(handler)
+
+
+@contextlib.contextmanager
+def _lines_of_progress() -> Iterator[Callable[[Progress], None]]:
+    """Print the latest progress and the elapsed time as a line every 15 s, whether or not there is news."""
+    import threading
+    import time
+
+    began, finished = time.monotonic(), threading.Event()
+    latest: list[Progress] = []
+
+    def report() -> None:
+        while not finished.wait(_REPORT_S):
+            text = progress_line(latest[-1]) if latest else "preparing"
+            typer.echo(f"{text}, {time.monotonic() - began:.0f} s so far", err=True)
+
+    thread = threading.Thread(target=report, daemon=True)
+    thread.start()
+    try:
+        yield lambda state: latest.__setitem__(slice(None), [state])
+    finally:
+        finished.set()
+        thread.join()
 
 
 def progress_line(state: Progress) -> str:

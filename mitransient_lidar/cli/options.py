@@ -28,8 +28,13 @@ SceneOrResult = Annotated[
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
 ]
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers, at least 0.")]
+MaxTime = Annotated[
+    float | None, typer.Option(help="Stop before this many seconds, with fewer passes (greater than 0).")
+]
 DrawingOnly = Annotated[Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")]
+#: Default folder of the files that a command renders.
+OUTPUT = Path("output")
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and errors.")]
 
 #: Help of an option for the receiver.

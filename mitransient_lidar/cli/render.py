@@ -10,7 +10,7 @@ import typer
 
 from mitransient_lidar.cli.files import GateFiles, announced, check_targets, scene_of
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting, summarise
-from mitransient_lidar.cli.options import Define, Instrument, Quiet, SceneOrResult, parameters, render_options
+from mitransient_lidar.cli.options import OUTPUT, Define, Instrument, Quiet, SceneOrResult, parameters, render_options
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
@@ -27,12 +27,12 @@ Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the fil
 def render(
     scene: SceneOrResult,
     define: Define = None,
-    output: Folder = Path("."),
+    output: Folder = OUTPUT,
     instrument: Instrument = None,
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates; needs ffmpeg.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
     **options: Any,
@@ -110,8 +110,10 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
 def passive(
     scene: SceneOrResult,
     define: Define = None,
-    output: Folder = Path("."),
-    frames: Annotated[int | None, typer.Option(help="Number of frames of an animation, 1 by default.")] = None,
+    output: Folder = OUTPUT,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of frames of an animation, at least 1, which is the default.")
+    ] = None,
     frame_step: Annotated[float | None, typer.Option(help="Time between frames [s], 0.1 by default.")] = None,
     filter_width_nm: Annotated[
         float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")

@@ -1,7 +1,8 @@
-"""Commands that draw, record and compare results."""
+"""Commands that show, draw, record and compare results."""
 
 from __future__ import annotations
 
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _DIFFERENT = 1
+_PAGE_MB = 200.0
 
 
 def plot(
@@ -62,6 +64,50 @@ def plot(
     typer.echo(target)
 
 
+def view(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="EXR or NetCDF file of a result, a gate stack or recorded signals.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="HTML file to write; by default a temporary one.")
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    shot: Annotated[int | None, typer.Option(help="Number of a shot of a series; by default the mean of all.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Show a result in the browser: a map of the pixels at each time, and the waveforms of those that are clicked.
+
+    Writes a page that needs no network, prints its path, and opens it. Gates are shown where FILE has them.
+    """
+    if output is not None:
+        check_suffix("--output", output, ".html")
+    from mitransient_lidar.plots.viewer import view as page_of
+
+    with reporting(quiet):
+        dataset = _open_any(file)
+        page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=_PAGE_MB)
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    path = page.save(output)
+    typer.echo(path)
+    if browser and not webbrowser.open(path.resolve().as_uri()):
+        typer.echo("no browser was found: open the page in one.", err=True)
+
+
+def _open_any(path: Path) -> xr.Dataset:
+    """Read a result, a gate stack or recorded signals."""
+    from mitransient_lidar.analysis.waveforms.records import open_waveforms
+    from mitransient_lidar.results.gate_files import open_stack
+
+    try:
+        return open_waveforms(path)
+    except UserError as error:
+        try:
+            return open_stack(path)
+        except UserError:
+            raise error from None
+
+
 def _shot(dataset: xr.Dataset, number: int, file: Path) -> xr.Dataset:
     """Return one shot of a series."""
     if "shot" not in dataset.dims:
@@ -90,8 +136,12 @@ def record(
             help="Optical density of a filter before the detector, or auto; by default the receiver's, or 0.",
         ),
     ] = None,
-    shots: Annotated[int, typer.Option(help="Number of records of each waveform, with independent noise.")] = 1,
-    background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
+    shots: Annotated[
+        int, typer.Option(help="Number of records of each waveform with independent noise, at least 1.")
+    ] = 1,
+    background_power_w: Annotated[
+        float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
+    ] = 0.0,
     seed: Seed = 0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="NetCDF file to write; FILE_recorded.nc by default.")

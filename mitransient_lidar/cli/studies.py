@@ -11,10 +11,12 @@ import typer
 from mitransient_lidar.cli.files import check_figure, check_suffix, check_targets, scene_of, write_figure
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import (
+    OUTPUT,
     RECEIVERS,
     Define,
     DrawingOnly,
     Instrument,
+    MaxTime,
     Quiet,
     Scene,
     SceneOrResult,
@@ -28,11 +30,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
 TargetId = Annotated[str, typer.Option(help="Id of the shape that is the target.")]
-Passes = Annotated[int, typer.Option(help="Number of independent passes of each render.")]
 Figure = Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc.")]
-OptionalFigure = Annotated[
-    Path | None, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write, and the data as .nc.")
-]
 
 
 def find_shots(
@@ -41,10 +39,12 @@ def find_shots(
     at: Annotated[
         list[str] | None, typer.Option(metavar="X,Y", help="A place [m], instead of a search. Repeatable.")
     ] = None,
-    slope_sigmas: Annotated[float, typer.Option(help="Slopes to find, in standard deviations.")] = 2.0,
-    count: Annotated[int, typer.Option(help="Places of each kind.")] = 1,
-    output: DrawingOnly = None,
+    slope_sigmas: Annotated[float, typer.Option(help="Slopes to find, in standard deviations, greater than 0.")] = 2.0,
+    count: Annotated[int, typer.Option(help="Places of each kind, 1 to 100.")] = 1,
+    output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")] = OUTPUT
+    / "find_shots.png",
     waveforms: Annotated[bool, typer.Option("--waveforms/--no-waveforms", help="Also render the shots.")] = True,
+    quiet: Quiet = False,
 ) -> None:
     """Find places of the sea where the beam meets given slopes.
 
@@ -56,17 +56,19 @@ def find_shots(
     from mitransient_lidar.plots.studies.find_shots import plot_found_shots
     from mitransient_lidar.studies import find_shots as study
 
-    if places:
-        found = study.shots_at(scene, places, params)
-    else:
-        found = study.find_shots(scene, params, slope_sigmas=slope_sigmas, count=count)
+    with reporting(quiet):
+        if places:
+            found = study.shots_at(scene, places, params)
+        else:
+            found = study.find_shots(scene, params, slope_sigmas=slope_sigmas, count=count)
+        rendered = study.render_found_shots(scene, found, params, waveforms=waveforms)
     typer.echo(f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}")
     for shot in found:
         along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
         typer.echo(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
-    if output is not None:
-        plot_found_shots(study.render_found_shots(scene, found, params, waveforms=waveforms), output)
-        typer.echo(output)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    plot_found_shots(rendered, output)
+    typer.echo(output)
 
 
 @render_options(
@@ -78,7 +80,9 @@ def find_shots(
 def shots(
     scene: SceneOrResult,
     define: Define = None,
-    count: Annotated[int | None, typer.Option(help="Number of shots at random places, 20 by default.")] = None,
+    count: Annotated[
+        int | None, typer.Option(help="Number of shots at random places, 2 to 100 000; 20 by default.")
+    ] = None,
     at: Annotated[
         list[str] | None, typer.Option(metavar="X,Y", help="Place of a shot [m], instead of random ones. Repeatable.")
     ] = None,
@@ -90,7 +94,7 @@ def shots(
         bool, typer.Option("--move-target", help="Keep the target's place relative to the aim of each shot.")
     ] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of random places, 1 by default.")] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = Path("shots.nc"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = OUTPUT / "shots.nc",
     quiet: Quiet = False,
     **options: Any,
 ) -> None:
@@ -132,9 +136,12 @@ def shots(
 def shot_statistics(
     scene: Scene,
     define: Define = None,
-    count: Annotated[int, typer.Option(help="Number of shots.")] = 200,
+    count: Annotated[int, typer.Option(help="Number of shots, 2 to 100 000.")] = 200,
+    max_time: Annotated[
+        float | None, typer.Option(help="Stop before this many seconds, with fewer shots (greater than 0).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of their places.")] = 1,
-    output: Figure = Path("shot_statistics.png"),
+    output: Figure = OUTPUT / "shot_statistics.png",
     quiet: Quiet = False,
 ) -> None:
     """Correlate the echoes of random shots with the sea's slopes."""
@@ -143,7 +150,9 @@ def shot_statistics(
     from mitransient_lidar.studies import shot_statistics as study
 
     with reporting(quiet) as progress:
-        shots = study.shot_statistics(scene, parameters(define), count=count, seed=seed, progress=progress)
+        shots = study.shot_statistics(
+            scene, parameters(define), count=count, seed=seed, max_time=max_time, progress=progress
+        )
     write_figure(shots, output, plot_shot_statistics)
     for name, value in study.slope_correlations(shots).items():
         typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
@@ -154,10 +163,12 @@ def target_signal(
     define: Define = None,
     target_id: TargetId = "target",
     grid: Annotated[int, typer.Option(help="Places of the target along each axis, 1 to 15.")] = 1,
-    max_offset: Annotated[float, typer.Option(help="Largest offset of these places along each axis [m].")] = 2.0,
-    passes: Passes = 64,
+    max_offset: Annotated[
+        float, typer.Option(help="Largest offset of these places along each axis [m], greater than 0.")
+    ] = 2.0,
+    passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 16 to 100 000.")] = 64,
     seed: Seed = 0,
-    output: OptionalFigure = None,
+    output: Figure = OUTPUT / "target_signal.png",
     quiet: Quiet = False,
 ) -> None:
     """Measure the signal of a target in each pixel.
@@ -184,21 +195,27 @@ def detect(
     scene: Scene,
     define: Define = None,
     receiver: Annotated[str, typer.Option(help=RECEIVERS)] = "apd",
-    pfa: Annotated[float, typer.Option(help="Probability of false alarm.")] = 1e-3,
-    pd: Annotated[float, typer.Option(help="Required probability of detection.")] = 0.9,
+    pfa: Annotated[float, typer.Option(help="Probability of false alarm, 1e-12 to 0.5.")] = 1e-3,
+    pd: Annotated[
+        float, typer.Option(help="Required probability of detection, above that of false alarm and below 1.")
+    ] = 0.9,
     depths: Annotated[
         str | None, typer.Option(metavar="D1,D2,...", help="Further depths of the target [m], increasing.")
     ] = None,
-    shots: Annotated[int, typer.Option(help="Number of simulated shots with and without the target.")] = 10_000,
+    shots: Annotated[
+        int, typer.Option(help="Number of simulated shots with and without the target, 100 to 100 000.")
+    ] = 10_000,
     clutter: Annotated[
         int, typer.Option(help="Number of seas whose differences count as noise; 0: one known sea.")
     ] = 0,
-    renders: Annotated[int, typer.Option(help="Renders of one sea; their spread gives the intervals.")] = 4,
+    renders: Annotated[int, typer.Option(help="Renders of one sea, 3 to 1000; their spread gives the intervals.")] = 4,
     target_id: TargetId = "target",
-    background_power_w: Annotated[float, typer.Option(help="Power of the daylight on each pixel [W].")] = 0.0,
-    passes: Passes = 16,
+    background_power_w: Annotated[
+        float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
+    ] = 0.0,
+    passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 16 to 100 000.")] = 16,
     seed: Seed = 0,
-    output: Figure = Path("detection.png"),
+    output: Figure = OUTPUT / "detection.png",
     quiet: Quiet = False,
 ) -> None:
     """Compute how well a target is detected.
@@ -235,9 +252,10 @@ def beam_spread(
     scene: Scene,
     depths: Annotated[str, typer.Option(metavar="D1,D2,...", help="Depths below the mean sea level [m].")],
     define: Define = None,
-    passes: Passes = 8,
+    passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 2 to 10 000.")] = 8,
+    max_time: MaxTime = None,
     seed: Seed = 0,
-    output: Figure = Path("beam_spread.png"),
+    output: Figure = OUTPUT / "beam_spread.png",
     quiet: Quiet = False,
 ) -> None:
     """Measure the spread of the laser's light at depths.
@@ -249,8 +267,9 @@ def beam_spread(
     from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
     from mitransient_lidar.studies import beam_spread as study
 
+    options: dict[str, Any] = {"passes": passes, "max_time": max_time, "seed": seed}
     with reporting(quiet) as progress:
-        found = study.beam_spread(scene, wanted, parameters(define), passes=passes, seed=seed, progress=progress)
+        found = study.beam_spread(scene, wanted, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_beam_spread)
     if not quiet:
         _print(study.describe_spread(found))
@@ -260,9 +279,9 @@ def estimate(
     scene: Scene,
     define: Define = None,
     instrument: Instrument = None,
-    paths: Annotated[int, typer.Option(help="Number of paths of the light.")] = 2**13,
+    paths: Annotated[int, typer.Option(help="Number of paths of the light, 64 to 2^22.")] = 2**13,
     seed: Seed = 0,
-    output: OptionalFigure = None,
+    output: Figure = OUTPUT / "estimate.png",
 ) -> None:
     """Estimate the waveforms in a second, over a level sea and without targets.
 
@@ -285,9 +304,9 @@ def fov_sweep(
     ] = "2,5,10,20,50,100",
     min_depth: Annotated[float, typer.Option(help="Depth where the slope of the signal begins [m].")] = 1.0,
     max_depth: Annotated[float, typer.Option(help="Depth where it ends [m].")] = 5.0,
-    passes: Passes = 48,
+    passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 4 to 10 000.")] = 48,
     seed: Seed = 0,
-    output: Figure = Path("fov_sweep.png"),
+    output: Figure = OUTPUT / "fov_sweep.png",
     quiet: Quiet = False,
 ) -> None:
     """Measure the water's attenuation for several fields of view."""
@@ -306,10 +325,11 @@ def fov_sweep(
 def scattering_orders(
     scene: Scene,
     define: Define = None,
-    orders: Annotated[int, typer.Option(help="Number of orders to separate.")] = 8,
-    passes: Passes = 32,
+    orders: Annotated[int, typer.Option(help="Number of orders to separate, 1 to 62.")] = 8,
+    passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 2 to 100 000.")] = 32,
+    max_time: MaxTime = None,
     seed: Seed = 0,
-    output: OptionalFigure = None,
+    output: Figure = OUTPUT / "scattering_orders.png",
     quiet: Quiet = False,
 ) -> None:
     """Separate the received light by the number of scatterings.
@@ -320,7 +340,7 @@ def scattering_orders(
     from mitransient_lidar.plots.studies.scattering_orders import plot_scattering_orders
     from mitransient_lidar.studies import scattering_orders as study
 
-    options: dict[str, Any] = {"orders": orders, "passes": passes, "seed": seed}
+    options: dict[str, Any] = {"orders": orders, "passes": passes, "max_time": max_time, "seed": seed}
     with reporting(quiet) as progress:
         found = study.scattering_orders(scene, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_scattering_orders)

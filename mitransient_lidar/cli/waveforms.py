@@ -33,10 +33,10 @@ def waveforms(
         ),
     ] = None,
     threshold: Annotated[
-        float, typer.Option(help="Standard deviations of the noise above which a signal counts.")
+        float, typer.Option(help="Standard deviations of the noise above which a signal counts, greater than 0.")
     ] = 5.0,
     contrast: Annotated[float, typer.Option(help="Share of the signal that an echo in the water must add.")] = 0.05,
-    layers: Annotated[int, typer.Option(help="Number of changes in the column to test for.")] = 0,
+    layers: Annotated[int, typer.Option(help="Number of changes in the column to test for, 0 to 8.")] = 0,
     mean_surface: Annotated[
         bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
     ] = False,

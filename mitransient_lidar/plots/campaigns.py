@@ -94,8 +94,11 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     values, time = np.asarray(records, dtype=np.float64), records[records.dims[-1]].values
     # Records of other heights side by side: each relative to its own peak.
     peaks = values.max(axis=1, keepdims=True)
-    values = np.maximum(values / np.where(peaks > 0, peaks, 1), 1 / _DYNAMIC_RANGE[name])
+    values = values / np.where(peaks > 0, peaks, 1)
+    # A logarithmic axis has no values below 0, and lower ones would be drawn as a level.
+    values[values < 1 / _DYNAMIC_RANGE[name]] = np.nan
     ax.set_yscale("log")
+    ax.set_ylim(1 / _DYNAMIC_RANGE[name], 2)
     for run, line, colour in zip(runs, values, drawing.pixel_colours(len(runs) + 11)[::-1], strict=False):
         ax.plot(time, line, color=colour, linewidth=0.9, label=f"run {run}")
     ax.set_xlabel(drawing.TIME_LABEL)

@@ -22,8 +22,7 @@ def plot_comparison(
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
     time = first["time"].values
     palette = drawing.pixel_colours(len(outcome.z))
-    for result, style in ((first, "-"), (second, "--")):
-        label = str(result.attrs.get("integrator", "")) or str(result.attrs.get("scene", ""))
+    for result, style, label in zip((first, second), ("-", "--"), _labels(first, second), strict=True):
         power, error = _by_pixel(result, "waveform"), 2 * _by_pixel(result, "waveform_stderr")
         for i, colour in enumerate(palette):
             curve = {"color": colour, "linestyle": style, "linewidth": 0.9, "label": "_" if i else label}
@@ -39,13 +38,22 @@ def plot_comparison(
     for level in (-outcome.limit, outcome.limit):
         lower.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
     largest = 1.5 * max(outcome.limit, outcome.largest)
-    lower.set(ylim=(-largest, largest), xlabel=drawing.TIME_LABEL, ylabel="difference (standard errors)")
+    lower.set(ylim=(-largest, largest), xlabel=drawing.TIME_LABEL, ylabel="difference\n(standard errors)")
     for ax in (upper, lower):
         drawing.add_grid(ax)
     text = f"{outcome.bin_count} bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f} standard errors"
     text += f" (limit of chance {outcome.limit:.1f})"
     figure.suptitle(drawing.titled(first.attrs, text), fontsize="medium")
     return drawing.save(figure, path)
+
+
+def _labels(first: xr.Dataset, second: xr.Dataset) -> list[str]:
+    """Return labels of two results: the first of their attributes in which they differ."""
+    for name in ("integrator", "scene", "instrument", "variant", "passes", "seed"):
+        values = [str(result.attrs.get(name, "")) for result in (first, second)]
+        if values[0] != values[1] and all(values):
+            return [value if name in ("integrator", "scene", "instrument") else f"{name} {value}" for value in values]
+    return ["first result", "second result"]
 
 
 def _by_pixel(result: xr.Dataset, name: str) -> FloatArray:

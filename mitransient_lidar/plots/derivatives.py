@@ -24,7 +24,8 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     """Draw how much the waveform of all pixels changes where a parameter grows, with its standard error.
 
     A panel for each parameter, below the waveform: the change in percent for 1 % more of the parameter, where the
-    power is at least a thousandth of the largest. Errors of pixels are added in quadrature.
+    power is at least a thousandth of the largest. Pixels share photons, so that the error of their sum is unknown; the
+    band of several pixels is an upper bound, the sum of their errors.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     pixels = [dim for dim in dataset["waveform"].dims if dim != "time"]
     power = dataset["waveform"].sum(pixels).values
     slopes = dataset[name].sum(pixels).transpose("parameter", "time").values
-    variance = (dataset[f"{name}_stderr"] ** 2).sum(pixels).transpose("parameter", "time").values
+    errors = dataset[f"{name}_stderr"].sum(pixels).transpose("parameter", "time").values
     parameters = [str(one) for one in dataset["parameter"].values][:_MOST]
     lit = power > _SMALLEST * np.nanmax(power, initial=0.0)
     factor, prefix = drawing.si_prefix(float(np.nanmax(power, initial=0.0)) or 1.0)
@@ -55,7 +56,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     for number, (parameter, ax) in enumerate(zip(parameters, panels[1:], strict=True)):
         value = float(dataset["parameter_value"].values[number])
         scale = np.where(lit, (value or 1.0) / np.where(lit, power, 1.0), np.nan)
-        change, spread = slopes[number] * scale, np.sqrt(variance[number]) * np.abs(scale)
+        change, spread = slopes[number] * scale, errors[number] * np.abs(scale)
         time, colour = dataset["time"].values, f"C{number % 10}"
         ax.axhline(0, color="0.6", linewidth=0.8)
         ax.fill_between(time, change - spread, change + spread, color=colour, alpha=0.35, linewidth=0)
@@ -68,5 +69,7 @@ def plot_derivatives(dataset: xr.Dataset, path: drawing.FilePath | None = None) 
     for ax in panels:
         ax.set_xlim(drawing.time_limits(dataset))
         drawing.add_grid(ax, hide=("right", "top"))
-    figure.suptitle("change of the received power with parameters of the scene", fontsize="large")
+    bands = "standard errors" if dataset["waveform"].isel(time=0).size == 1 else "upper bounds of standard errors"
+    text = f"change of the received power with parameters of the scene; bands: {bands}"
+    figure.suptitle(text, fontsize="medium")
     return drawing.save(figure, path)

@@ -170,7 +170,9 @@ def _draw_plane(ax: Axes, dataset: xr.Dataset, ground: _Ground, plane: _Plane, h
     else:
         seen = _draw_field(ax, attributes, ground)
     lit = _draw_beam(ax, attributes, ground)
-    height = _set_limits(ax, seen, lit)
+    lines = [_target_line(target, plane.outline, ground) for target in plane.targets]
+    outlines = [ground.place(line) for line in lines if len(line)]
+    height = _set_limits(ax, seen, lit, np.concatenate([np.zeros((0, 2)), *outlines]))
     _draw_targets(ax, ground, plane)
     for pose, marker, label in ((ground.receiver, "+", "receiver's axis"), (ground.transmitter, "x", "laser's axis")):
         if pose is ground.receiver or ground.axes_differ(plane.z):
@@ -372,14 +374,19 @@ def _once(ax: Axes, label: str) -> str:
     return "_" if label in ax.get_legend_handles_labels()[1] else label
 
 
-def _set_limits(ax: Axes, seen: FloatArray, lit: FloatArray) -> float:
-    """Show the footprints of all pixels, and the beam up to one footprint beyond them; return a height in inches."""
-    seen, lit = (points[np.isfinite(points).all(axis=1)] for points in (seen, lit))
+def _set_limits(ax: Axes, seen: FloatArray, lit: FloatArray, outlines: FloatArray) -> float:
+    """Show the footprints of all pixels, the beam up to one footprint beyond them, and targets up to three.
+
+    Return a height in inches.
+    """
+    seen, lit, outlines = (points[np.isfinite(points).all(axis=1)] for points in (seen, lit, outlines))
     if len(seen) == 0:
         raise UserError("the result has no pixels that look at the sea: it has no layout to draw.")
     low, high = seen.min(axis=0), seen.max(axis=0)
     size = np.maximum(high - low, 1e-3)
     lit = np.clip(lit, low - size, high + size)
+    outlines = np.clip(outlines, low - 3 * size, high + 3 * size)
+    lit = np.concatenate([lit, outlines])
     low, high = np.min([low, *lit], axis=0) - 0.05 * size, np.max([high, *lit], axis=0) + 0.05 * size
     ax.set(xlim=(high[0], low[0]), ylim=(low[1], high[1]))
     aspect = float((high[1] - low[1]) / (high[0] - low[0]))

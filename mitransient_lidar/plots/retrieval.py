@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -131,11 +132,14 @@ def plot_retrieval(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
         x, label = (truth, f"true {one.head}") if varied else (np.arange(len(truth)), "shot")
         ax.errorbar(x, one.values, one.errors, fmt=".", color=_COLOURS["along"], markersize=5, linewidth=0.7)
         middle = float(np.mean(truth[np.isfinite(truth)])) if np.isfinite(truth).any() else 0.0
-        ax.axline((middle if varied else 0.0, middle), slope=float(varied), color="0.5", linewidth=0.9, label="truth")
+        ax.axline((middle if varied else 0.0, middle), slope=float(varied), color="0.5", linewidth=0.9)
         ax.set(xlabel=label, ylabel=f"estimated {one.head}")
         ax.set_title(truth_statistics(one).partition(": ")[2].replace(", rms of", ",\nrms of"), fontsize="small")
-        ax.legend(frameon=False, fontsize="small")
+        ax.locator_params(nbins=6)
         drawing.add_grid(ax)
+    bars = Line2D([], [], color=_COLOURS["along"], marker=".", label="estimates, ±1 standard error")
+    line = Line2D([], [], color="0.5", linewidth=0.9, label="truth")
+    figure.legend(handles=[bars, line], loc="outside lower center", ncols=2, frameon=False)
     figure.suptitle(drawing.titled(found.attrs, f"{found.sizes['shot']} shots"))
     return drawing.save(figure, path)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Patch, Rectangle
+from matplotlib.patches import Circle, Patch, PathPatch, Rectangle
+from matplotlib.path import Path as Line
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
@@ -29,7 +31,8 @@ def plot_waveforms(dataset: xr.Dataset, path: drawing.FilePath | None = None, sc
     Bands are +-1 standard error; of a series of shots, the curve is the mean of the shots, and the band holds 90 % of
     them. Depth is (t - t_surface) c0 / (2 n_g) cos(theta_water), along the line of sight of a single pixel, and on the
     axis of the receiver for several.
-    The depth axis and the layout of the pixels are left out if the result lacks their attributes.
+    Pixels are drawn in the shapes of their outlines; a result of an earlier version shows the cells of its layout, or
+    dots. The depth axis and the pixels are left out if the result lacks their attributes.
 
     Parameters
     ----------
@@ -209,6 +212,10 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
     ax.set_anchor("N")
     angle_x, angle_y = dataset["angle_x"].values, dataset["angle_y"].values
     width = optional_number(attributes, "field_of_view_mrad")
+    outlines = json.loads(attributes.get("pixel_outlines", "[]"))
+    if len(outlines) == len(names) and all(outlines):
+        _draw_outlines(ax, outlines, colours, width)
+        return
     if width is None or width <= 0:
         if len(names) > 1:
             ax.scatter(angle_y, angle_x, c=colours, s=24)
@@ -233,8 +240,32 @@ def _draw_pixels(ax: Axes, dataset: xr.Dataset) -> None:
             cell.set_clip_path(outline)
     edge = 0.56 * width
     ax.set(xlim=(edge, -edge), ylim=(-edge, edge), aspect="equal")
-    for y, text, side in ((edge, "far", "bottom"), (-edge, f"near · {width:g} mrad", "top")):
-        ax.text(0, y, text, ha="center", va=side, fontsize="small", color="0.3")
+    _name_edges(ax, width)
+
+
+def _draw_outlines(ax: Axes, outlines: list[list[list[float]]], colours: list[Any], width: float | None) -> None:
+    """Draw the pixels in the shapes of their outlines, lines angle_x, angle_y, ... of each [mrad]."""
+    corners = []
+    for lines, colour in zip(outlines, colours, strict=True):
+        # One patch of all lines keeps holes open; the first point again closes a line.
+        loops = [np.reshape(line, (-1, 2))[:, ::-1] for line in lines]
+        shape = Line.make_compound_path(*(Line(np.vstack([loop, loop[:1]]), closed=True) for loop in loops))
+        ax.add_patch(PathPatch(shape, facecolor=colour, edgecolor="white", linewidth=0.6, alpha=0.9))
+        corners += loops
+    low, high = (
+        np.min([loop.min(axis=0) for loop in corners], axis=0),
+        np.max([one.max(axis=0) for one in corners], axis=0),
+    )
+    middle, edge = (low + high) / 2, 0.56 * float((high - low).max())
+    ax.set(xlim=(middle[0] + edge, middle[0] - edge), ylim=(middle[1] - edge, middle[1] + edge), aspect="equal")
+    _name_edges(ax, width)
+
+
+def _name_edges(ax: Axes, width: float | None) -> None:
+    """Write which edge is far from nadir, and the width of the field of view [mrad] if known."""
+    near = "near" if width is None else f"near · {width:g} mrad"
+    for y, text, side in ((1, "far", "bottom"), (0, near, "top")):
+        ax.text(0.5, y, text, ha="center", va=side, fontsize="small", color="0.3", transform=ax.transAxes)
 
 
 def _cells(

@@ -13,6 +13,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import TOLERATED_LOSS, open_scene, pass_attributes
 
@@ -67,6 +68,7 @@ def beam_spread(
     params: Mapping[str, Any] | None = None,
     *,
     passes: int = 8,
+    max_time: float | None = None,
     photons: int = 2**16,
     seed: int = 0,
     progress: ProgressCallback | None = None,
@@ -81,6 +83,8 @@ def beam_spread(
         Depths of the planes below the mean sea level [m], above 0 and not below the bottom, in any order.
     passes
         Number of independent passes, 2 to 10 000.
+    max_time
+        Time after which no pass begins [s], above 0; at least two passes are made.
     photons
         Photons of a pass, 1024 to 2^24.
     seed
@@ -116,7 +120,7 @@ def beam_spread(
     Paths end at 50 times the slant distance to the deepest plane, or at a weight below a millionth.
     """
     passes, photons = integer("passes", passes, 2, 10_000), integer("photons", photons, 1024, 2**24)
-    seed = integer("seed", seed, 0, 2**53)
+    seed, options = integer("seed", seed, 0, 2**53), RenderOptions(max_time=max_time)
     wanted = np.unique(finite_array("depths", depths))
     if wanted.size == 0:
         raise UserError("depths must hold at least one depth in metres")
@@ -145,7 +149,7 @@ def beam_spread(
         measured.append([_measure(lidar, *pair, axes) for pair in zip(light, planes, strict=True)])
         return 0.0
 
-    log = run_passes(render_pass, Goal(passes=passes), seed=seed, progress=progress)
+    log = run_passes(render_pass, Goal(passes=passes, max_time=options.max_time), seed=seed, progress=progress)
     missed = float(np.mean(outside))
     if missed > TOLERATED_LOSS:
         logger.warning(

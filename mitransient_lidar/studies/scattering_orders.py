@@ -11,6 +11,7 @@ import xarray as xr
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
 from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
@@ -24,6 +25,7 @@ def scattering_orders(
     *,
     orders: int = 8,
     passes: int = 32,
+    max_time: float | None = None,
     seed: int = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
@@ -42,6 +44,8 @@ def scattering_orders(
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
     passes
         Number of passes, 2 to 100 000.
+    max_time
+        Time after which no pass begins [s], above 0; at least two passes are made.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -60,7 +64,7 @@ def scattering_orders(
         If the scene or a parameter is invalid or out of range.
     """
     orders = integer("orders", orders, 1, MOST_ORDERS)
-    passes = integer("passes", passes, 2, 100_000)
+    passes, options = integer("passes", passes, 2, 100_000), RenderOptions(max_time=max_time)
     session = open_scene(scene, params)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))
@@ -78,7 +82,7 @@ def scattering_orders(
         power.add(waveform(histogram, axis.bin_width_ns, kernel))
         return float(record.edge_loss[0])
 
-    log = run_passes(render_pass, Goal(passes=passes), seed=seed, progress=progress)
+    log = run_passes(render_pass, Goal(passes=passes, max_time=options.max_time), seed=seed, progress=progress)
     warn_of_edge_loss(log.edge_loss_share(float(np.nansum(totals.mean)) * log.count))
     dims = ("pixel", "reversals", "order", "time")
     data = {

@@ -27,6 +27,7 @@ def shot_statistics(
     *,
     count: int = 200,
     seed: int = 1,
+    max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Render shots at random places of one sea and measure their echoes.
@@ -39,6 +40,8 @@ def shot_statistics(
         Number of shots, 2 to 100 000.
     seed
         Seed of the places, at least 0.
+    max_time
+        Time after which no shots begin [s], above 0; the result has fewer shots then.
     progress
         Called with a `passes.Progress` after every shot.
 
@@ -56,7 +59,7 @@ def shot_statistics(
         If the scene is invalid, has no waves or no bottom, the record lacks an echo, or a number is out of range.
     """
     count, seed = integer("count", count, 2, 100_000), integer("seed", seed, 0, 2**53)
-    series = render_shots(scene, params, count=count, passes=_PASSES, seed=seed, progress=progress)
+    series = render_shots(scene, params, count=count, passes=_PASSES, seed=seed, max_time=max_time, progress=progress)
     times = _echo_times(series)
     rows: list[dict[str, Any]] = []
     for number in range(series.sizes["shot"]):

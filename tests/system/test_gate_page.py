@@ -1,21 +1,15 @@
 """Page of gate stacks in a real browser: displayed values, controls, and no access to the network."""
 
-import os
 import re
-import shutil
-import time as clock
 
-import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
-
-from mitransient_lidar.plots.gate_viewer.page import write_page
+from browser_page import PLAIN, expected_colours, needs_browser
 
 METRES_PER_NS = 0.0299792458 * 5 / 1.364 * 0.967  # the depth axis at 20 degrees off nadir
 SURFACE_NS = 1420.0
 SIZE = 64  # rows and columns
-PLAIN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")  # of signs in labels
 PLATE, BALL, SAND = (40, 26), (23, 41), (50, 43)  # pixels on them
 
 
@@ -73,155 +67,17 @@ def scene_of(size, gates=40, seed=3):
     return stack, result
 
 
-BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.slow
-needs_browser = pytest.mark.skipif(
-    # Where CI has installed them, skipping would hide a failure.
-    (BROWSER is None or DRIVER is None) and os.environ.get("BROWSER_TESTS") != "required",
-    reason="chromium and chromedriver are needed",
-)
+
+
+def point_at(page, pixel, **how):
+    """Move the mouse to a pixel, and click there."""
+    page.point("pixels", (pixel[1] + 0.5) / SIZE, (pixel[0] + 0.5) / SIZE, **how)
 
 
 @pytest.fixture(scope="module")
 def scene():
     return scene_of(SIZE)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from selenium import webdriver
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    # A given path of the driver avoids a search and a download.
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    yield driver
-    driver.quit()
-
-
-@pytest.fixture
-def show(browser, tmp_path):
-    """Function that writes the page of a stack and opens it; fails if the browser has logged an error."""
-
-    def open_page(stack, result=None, **options):
-        write_page(stack, tmp_path / "page.html", result, **options)
-        browser.get(f"file://{tmp_path}/page.html")
-        page = Page(browser)
-        page.wait("return document.querySelectorAll('#curve-plot .line').length > 0")
-        return page
-
-    yield open_page
-    assert browser.get_log("browser") == []
-    assert browser.execute_script("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
-
-
-class Page:
-    """Actions of a user on the page, and its visible contents."""
-
-    def __init__(self, browser):
-        self.browser = browser
-        self.run = browser.execute_script
-
-    def wait(self, script):
-        end = clock.monotonic() + 10
-        while not self.run(script):
-            assert clock.monotonic() < end, script
-            clock.sleep(0.02)
-
-    def settle(self):
-        """Wait until changes are drawn: three frames after a change of size."""
-        self.browser.execute_async_script(
-            "const wait = (more) => (more ? requestAnimationFrame(() => wait(more - 1)) : arguments[0]()); wait(3)"
-        )
-
-    def choose(self, **values):
-        for name, value in values.items():
-            self.run(
-                "const control = document.getElementById(arguments[0]);"
-                "if (control.type === 'checkbox') control.checked = arguments[1]; else control.value = arguments[1];"
-                "control.dispatchEvent(new Event('input')); control.dispatchEvent(new Event('change'))",
-                name.replace("_", "-"),
-                value,
-            )
-        self.settle()
-
-    def press(self, key):
-        from selenium.webdriver import ActionChains
-
-        ActionChains(self.browser, duration=0).send_keys(key).perform()
-        self.settle()
-
-    def point(self, name, across, along, click=True, key=None):
-        """Move the mouse to a place given as shares of an element's width and height, and click there."""
-        from selenium.webdriver import ActionChains
-
-        element = self.browser.find_element("id", name)
-        size = element.rect
-        actions = ActionChains(self.browser, duration=0)
-        if key:
-            actions.key_down(key)
-        actions.move_to_element_with_offset(
-            element, round((across - 0.5) * size["width"]), round((along - 0.5) * size["height"])
-        )
-        if click:
-            actions.click()
-        if key:
-            actions.key_up(key)
-        actions.perform()
-        self.settle()
-
-    def point_at(self, pixel, **how):
-        self.point("pixels", (pixel[1] + 0.5) / SIZE, (pixel[0] + 0.5) / SIZE, **how)
-
-    def text(self, name):
-        return self.browser.find_element("id", name).text
-
-    def colours(self, rows, columns):
-        """Return the image's colours, array of shape (row, column, 3), read from the middles of its pixels."""
-        colours = self.run(
-            "const [rows, columns] = arguments, canvas = document.getElementById('pixels'), found = [];"
-            # Chromium warns about repeated reading of a canvas without willReadFrequently.
-            "const copy = new OffscreenCanvas(canvas.width, canvas.height);"
-            "const context = copy.getContext('2d', { willReadFrequently: true }); context.drawImage(canvas, 0, 0);"
-            "const dots = context.getImageData(0, 0, canvas.width, canvas.height);"
-            "for (let r = 0; r < rows; r++) for (let c = 0; c < columns; c++) {"
-            "  const x = Math.floor((c + 0.5) * canvas.width / columns);"
-            "  const y = Math.floor((r + 0.5) * canvas.height / rows);"
-            "  found.push(...dots.data.subarray(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)); }"
-            "return found",
-            rows,
-            columns,
-        )
-        return np.array(colours).reshape(rows, columns, 3)
-
-    def peaks(self):
-        """Return the largest value of every line drawn, read from its value axis."""
-        ticks = self.run(
-            "return [...document.querySelectorAll('#curve-plot .value-tick')]"
-            ".map((tick) => [Number(tick.getAttribute('y')) - 4, tick.textContent])"
-        )
-        ticks = [(y, float(re.sub("^10(?=[⁻⁰¹²³⁴⁵⁶⁷⁸⁹])", "1e", text).translate(PLAIN))) for y, text in ticks]
-        paths = self.run(
-            "return [...document.querySelectorAll('#curve-plot path.line:not(.bars)')]"
-            ".map((line) => line.getAttribute('d'))"
-        )
-        (first, low), (last, high) = ticks[0], ticks[-1]
-        layer_tops = [min(float(y) for y in re.findall(r" ([-\d.]+)", path)) for path in paths]
-        shares = [(top - first) / (last - first) for top in layer_tops]
-        if self.run("return document.getElementById('curve-log').checked"):
-            return [low * (high / low) ** share for share in shares]
-        return [low + (high - low) * share for share in shares]
-
-
-def expected_colours(values, low, high, name, log=False):
-    """Return the colours of values between the lowest and the highest of a map."""
-    values = values.astype(np.float32).astype(float)
-    share = np.log(values / low) / np.log(high / low) if log else (values - low) / (high - low)
-    index = np.clip(np.floor(256 * share), 0, 255).astype(int)
-    return matplotlib.colormaps[name](index, bytes=True)[..., :3]
 
 
 @needs_browser
@@ -285,7 +141,7 @@ def test_left_is_left_as_seen_from_the_lidar(show, scene):
         assert (
             page.colours(SIZE, SIZE) == expected_colours(values, 0, stack["gate_energy"].values.max(), "viridis")
         ).all()
-        page.point_at(PLATE)
+        point_at(page, PLATE)
         assert "angle_x −3.98, angle_y 2.58 mrad" in page.text("reading")
 
 
@@ -295,7 +151,7 @@ def test_records(show, scene):
     power, energy = result["waveform"].values, stack["gate_energy"].values
     page = show(stack, result)
     page.choose(slider=22)
-    page.point_at(PLATE)
+    point_at(page, PLATE)
     assert page.peaks() == pytest.approx([1e9 * power[PLATE].max()], rel=0.01)
     value, error = energy[PLATE][22], stack["gate_energy_stderr"].values[PLATE][22]
     assert page.text("reading").startswith("row 40, column 26 · angle_x −3.98, angle_y 2.58 mrad: ")
@@ -307,8 +163,8 @@ def test_records(show, scene):
 
     # A pinned one stays; what is pointed at is previewed.
     page.press("p")
-    page.point_at(BALL, key="\ue008")
-    page.point_at((32, 32), click=False)
+    point_at(page, BALL, key="\ue008")
+    point_at(page, (32, 32), click=False)
     page.choose(curve_log=False)
     assert page.peaks()[:2] == pytest.approx([1e9 * power[place].max() for place in (PLATE, BALL)], rel=0.01)
     lines = page.text("list").splitlines()
@@ -344,12 +200,12 @@ def test_depths(show, scene):
     page.choose(view="echo", slider=10)
     depth = stack["gate_depth"].values
     for pixel, place in {PLATE: 5.4, BALL: 5.8, SAND: 7.9}.items():
-        page.point_at(pixel, click=False)
+        point_at(page, pixel, click=False)
         shown = float(page.text("reading").split(": ")[1].removesuffix(" m"))
         assert shown == pytest.approx(place, abs=0.4)
         assert np.abs(depth - shown).min() < 0.0051
     page.choose(view="centroid")
-    page.point_at(SAND, click=False)
+    point_at(page, SAND, click=False)
     energy = stack["gate_energy"].values[SAND][10:]
     assert float(page.text("reading").split(": ")[1].removesuffix(" m")) == pytest.approx(
         (energy * depth[10:]).sum() / energy.sum(), abs=0.0051
@@ -398,7 +254,7 @@ def test_blocks(show, scene, limit, block, waveform_block):
     count = SIZE // block
     means = stack["gate_energy"].values.reshape(count, block, count, block, -1).mean((1, 3))
     assert (page.colours(count, count) == expected_colours(means[..., 26], 0, means.max(), "viridis")).all()
-    page.point_at((24, 21))
+    point_at(page, (24, 21))
     rows, columns = (slice(start, start + waveform_block) for start in (24, 20))
     power = result["waveform"].values[rows, columns].mean((0, 1))
     assert page.peaks()[0] == pytest.approx(1e9 * power.max(), rel=0.01)

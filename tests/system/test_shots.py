@@ -142,10 +142,11 @@ def test_invalid_input_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_shots_command_lists_places():
-    done = run("find-shots", "fig09_2x2", "-D", "wind_speed=6", "--at", "1.5,-2", "--at", "3,4")
+def test_shots_command_lists_places(tmp_path):
+    places = ["--at", "1.5,-2", "--at", "3,4", "--no-waveforms", "-o", tmp_path / "shots.png"]
+    done = run("find-shots", "fig09_2x2", "-D", "wind_speed=6", *places)
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
     assert lines[0].split()[:3] == ["kind", "aim_x", "aim_y"]
     assert lines[1].split()[:4] == ["shot", "1", "1.50", "-2.00"]
-    assert len(lines) == 3
+    assert lines[3:] == [str(tmp_path / "shots.png")]

@@ -30,7 +30,7 @@ class CurveView {
     const lines = svg("g", { "clip-path": "url(#inside)" });
     lines.append(this.gateBand(gate), ...curves.map((curve) => this.curve(curve)));
     if (moment !== null) lines.append(svg("path", { class: "moment", d: `M${this.x(moment)} ${ROOM.top}v${this.height}` }));
-    this.plot.replaceChildren(inside, ...this.valueAxis(curves[0].unit), ...this.timeAxes(), lines);
+    this.plot.replaceChildren(inside, ...this.valueAxis(curves[0]), ...this.timeAxes(), lines);
   }
 
   frame() {
@@ -48,12 +48,12 @@ class CurveView {
     return ROOM.top + this.height * (1 - share);
   }
 
-  /** Set the time axis to the gates with a margin, or to the full record. */
+  /** Set the time axis to the window of the echoes, to the gates with a margin, or to the full record. */
   setTimes({ x, half }, whole) {
-    const { gate_start: start, gate_width: width } = this.stack;
+    const { gate_start: start, gate_width: width, window } = this.stack;
     const ends = start.map((time, k) => time + width[k]);
-    const [first, last] = [Math.min(...start), Math.max(...ends)];
-    const margin = half === null ? 0.06 * (last - first) : 0.02 * (last - first);
+    const [first, last] = window || [Math.min(...start), Math.max(...ends)];
+    const margin = window ? 0 : half === null ? 0.06 * (last - first) : 0.02 * (last - first);
     [this.first, this.last] = [first - margin, last + margin];
     if (half !== null || !(whole || this.last < x[0] || this.first > x[x.length - 1])) return;
     const step = this.stack.waveform.step / 2;
@@ -116,14 +116,14 @@ class CurveView {
     return [Math.max(0, first - 1), after < 0 ? x.length : after + 1];
   }
 
-  valueAxis(unit) {
+  valueAxis({ name: quantity, unit }) {
     const { ticks, texts, sign } = tickLabels(this.low, this.high, this.log, this.height / 50, unit);
     const elements = ticks.flatMap((tick, i) => [
       svg("path", { class: "grid", d: `M${ROOM.left} ${this.y(tick)}h${this.width}` }),
       svg("text", { class: "value-tick", x: ROOM.left - 8, y: this.y(tick) + 4, "text-anchor": "end" }, texts[i]),
     ]);
     const turn = `translate(16 ${ROOM.top + this.height / 2}) rotate(-90)`;
-    const name = unit === "W" ? `received power (${sign}W)` : `energy in the gate (${sign}J)`;
+    const name = unit ? `${quantity} (${sign}${unit})` : `${quantity} per bin`;
     elements.push(svg("text", { class: "name", transform: turn, "text-anchor": "middle" }, name));
     return elements;
   }

@@ -41,6 +41,11 @@ async function loadStack() {
     stack.waveform.power = await loadArray("waveform");
     stack.waveform.error = await loadArray("waveform_stderr");
   }
+  if (stack.gate_energy === null) {
+    // The gates of waveforms are their time bins.
+    stack.gate_energy = timeFirst(stack, stack.waveform.power);
+    stack.gate_energy_stderr = timeFirst(stack, stack.waveform.error);
+  }
   stack.depth_name = stack.surface_time ? "depth on the axis" : "depth";
   stack.gate_middle = stack.gate_start.map((start, k) => start + stack.gate_width[k] / 2);
   stack.maps = Object.fromEntries(
@@ -49,12 +54,21 @@ async function loadStack() {
   return stack;
 }
 
+/** Return values of pixels over time as images, one after the other. */
+function timeFirst({ pixels, gates }, values) {
+  const images = new Float32Array(values.length);
+  for (let pixel = 0; pixel < pixels; pixel++) {
+    for (let k = 0; k < gates; k++) images[k * pixels + pixel] = values[pixel * gates + k];
+  }
+  return images;
+}
+
 /** Return the values of a view of the image, their unit, and their errors if known. */
 function picture(stack, view, gate) {
   const { pixels, gates, gate_energy: energy, gate_energy_stderr: error } = stack;
   if (view === "gate") {
     const slice = [gate * pixels, (gate + 1) * pixels];
-    return { values: energy.subarray(...slice), errors: error.subarray(...slice), unit: "J", name: "energy" };
+    return { values: energy.subarray(...slice), errors: error.subarray(...slice), ...stack.quantity };
   }
   // Along its line of sight, each pixel has its own depth at a time.
   const { surface_time: zero, depth_per_ns: scale } = stack;
@@ -72,7 +86,7 @@ function picture(stack, view, gate) {
       sum += energy[k * pixels + pixel];
       moment += energy[k * pixels + pixel] * place[k];
     }
-    if (view === "sum") values[pixel] = sum;
+    if (view === "sum") values[pixel] = stack.sum * sum;
     else values[pixel] = sum > 0 ? depth(pixel, moment / sum) : NaN;
   }
   if (view === "sum") return { values, errors: null, unit: "J", name: "energy" };
@@ -132,14 +146,14 @@ function record(stack, source, pixel) {
   if (source === "gates") {
     const of = (array) => Float32Array.from({ length: stack.gates }, (_, k) => array[k * stack.pixels + pixel]);
     const [y, error] = [of(stack.gate_energy), of(stack.gate_energy_stderr)];
-    return { x: stack.gate_middle, half: stack.gate_width.map((width) => width / 2), y, error, unit: "J" };
+    return { x: stack.gate_middle, half: stack.gate_width.map((width) => width / 2), y, error, ...stack.quantity };
   }
-  const { power, error, block, columns, bins } = stack.waveform;
+  const { power, error, block, columns, bins, unit, name } = stack.waveform;
   stack.waveform.x ||= Array.from({ length: bins }, (_, i) => stack.waveform.time + i * stack.waveform.step);
   const row = Math.floor(Math.floor(pixel / stack.columns) / block);
   const start = (row * columns + Math.floor((pixel % stack.columns) / block)) * bins;
   const of = (array) => array && array.subarray(start, start + bins);
-  return { x: stack.waveform.x, half: null, y: of(power), error: of(error), unit: "W" };
+  return { x: stack.waveform.x, half: null, y: of(power), error: of(error), unit, name };
 }
 
 /** Return the depth at a time, null if unknown. */
@@ -172,7 +186,7 @@ function withUnit(value, unit, error = null) {
   if (!Number.isFinite(value)) return "no value";
   const known = error !== null && Number.isFinite(error);
   if (unit === "m" || unit === "ns") return `${plain(value, 2)} ${unit}`;
-  const { factor, sign } = prefix(Math.max(Math.abs(value), known ? error : 0));
+  const { factor, sign } = unit ? prefix(Math.max(Math.abs(value), known ? error : 0)) : { factor: 1, sign: "" };
   const scaled = value / factor;
   if (!known || error === 0) return `${scaled.toPrecision(3)} ${sign}${unit}`;
   const digits = Math.max(0, Math.min(5, 1 - Math.floor(Math.log10(error / factor))));

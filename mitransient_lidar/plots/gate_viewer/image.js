@@ -2,6 +2,8 @@
 
 const MARGIN = { left: 58, right: 92, top: 6, bottom: 40 };
 const LARGEST_ZOOM = 64;
+const SHAPE_ZOOM = 16; // largest one of pixels with outlines
+const NAMED = 12; // most pixels whose names are drawn in their outlines
 
 /** Return an SVG element with children. */
 function svg(tag, attributes = {}, ...children) {
@@ -46,7 +48,7 @@ function logText(tick) {
 
 /** Return ticks, their texts in a unit with an SI prefix, and the prefix. */
 function tickLabels(low, high, log, count, unit) {
-  const { factor, sign } = unit === "J" || unit === "W" ? prefix(high) : { factor: 1, sign: "" };
+  const { factor, sign } = ["J", "W", "V"].includes(unit) ? prefix(high) : { factor: 1, sign: "" };
   if (log) {
     const ticks = logTicks(low / factor, high / factor);
     return { ticks: ticks.map((tick) => tick * factor), texts: ticks.map(logText), sign };
@@ -66,7 +68,19 @@ class ImageView {
     this.whole = document.createElement("canvas"); // the full image, one dot a pixel
     this.whole.width = stack.columns;
     this.whole.height = stack.rows;
+    this.shapes = stack.shapes && stack.shapes.map((lines) => this.shape(lines));
     this.reset();
+  }
+
+  /** Return the outline of a pixel as a path, whose unit is the width of a column and the height of the row. */
+  shape(lines) {
+    const { left, top, across, along } = this.stack.axes;
+    const path = new Path2D();
+    for (const line of lines) {
+      for (let i = 0; i < line.length; i += 2) path.lineTo((line[i + 1] - left) / across, (top - line[i]) / along);
+      path.closePath();
+    }
+    return path;
   }
 
   reset() {
@@ -78,7 +92,7 @@ class ImageView {
   /** Zoom about a place, given in shares of the visible width and height. */
   zoomBy(factor, across = 0.5, along = 0.5) {
     const { rows, columns } = this.stack;
-    const most = Math.max(1, Math.min(LARGEST_ZOOM, Math.max(rows, columns) / 4));
+    const most = this.stack.shapes ? SHAPE_ZOOM : Math.max(1, Math.min(LARGEST_ZOOM, Math.max(rows, columns) / 4));
     const zoom = Math.max(1, Math.min(most, this.zoom * factor));
     this.left += across * columns * (1 / this.zoom - 1 / zoom);
     this.top += along * rows * (1 / this.zoom - 1 / zoom);
@@ -94,12 +108,18 @@ class ImageView {
     this.top = within(this.top + (along * rows) / this.zoom, rows * (1 - 1 / this.zoom));
   }
 
-  /** Return the index of the pixel at the position of a pointer event. */
+  /** Return the index of the pixel at the position of a pointer event, null beside all outlines. */
   pixelAt(event) {
     const { rows, columns } = this.stack;
     const box = this.canvas.getBoundingClientRect();
-    const column = Math.floor(this.left + ((event.clientX - box.left) / box.width) * (columns / this.zoom));
-    const row = Math.floor(this.top + ((event.clientY - box.top) / box.height) * (rows / this.zoom));
+    const across = this.left + ((event.clientX - box.left) / box.width) * (columns / this.zoom);
+    const along = this.top + ((event.clientY - box.top) / box.height) * (rows / this.zoom);
+    if (this.shapes) {
+      const context = this.whole.getContext("2d");
+      const found = this.shapes.findIndex((path) => context.isPointInPath(path, across, along, "evenodd"));
+      return found < 0 ? null : found;
+    }
+    const [column, row] = [Math.floor(across), Math.floor(along)];
     return Math.max(0, Math.min(rows - 1, row)) * columns + Math.max(0, Math.min(columns - 1, column));
   }
 
@@ -137,11 +157,21 @@ class ImageView {
       const index = 3 * Math.max(0, Math.min(255, Math.floor(256 * share)));
       dots.data.set([map[index], map[index + 1], map[index + 2], 255], 4 * i);
     });
-    this.whole.getContext("2d").putImageData(dots, 0, 0);
     const context = this.canvas.getContext("2d");
-    context.imageSmoothingEnabled = false;
     const seen = [this.stack.columns / this.zoom, this.stack.rows / this.zoom];
-    context.drawImage(this.whole, this.left, this.top, ...seen, 0, 0, this.canvas.width, this.canvas.height);
+    if (this.shapes) {
+      context.scale(this.canvas.width / seen[0], this.canvas.height / seen[1]);
+      context.translate(-this.left, -this.top);
+      this.shapes.forEach((path, i) => {
+        const [red, green, blue, opaque] = dots.data.subarray(4 * i, 4 * i + 4);
+        context.fillStyle = `rgb(${red} ${green} ${blue} / ${opaque / 255})`;
+        context.fill(path, "evenodd");
+      });
+    } else {
+      this.whole.getContext("2d").putImageData(dots, 0, 0);
+      context.imageSmoothingEnabled = false;
+      context.drawImage(this.whole, this.left, this.top, ...seen, 0, 0, this.canvas.width, this.canvas.height);
+    }
     this.drawBar(map);
     this.axes.replaceChildren(
       ...this.imageAxes(), ...this.barAxis(range, log, shown), ...marks.map((mark) => this.mark(mark))
@@ -168,17 +198,28 @@ class ImageView {
     // angle_y falls to the right.
     const ends = [this.left, this.left + columns / zoom].map((column) => axes.left + column * axes.across);
     const across = linearTicks(Math.min(...ends), Math.max(...ends), this.width / 70);
-    if (names) Object.assign(across, { ticks: across.ticks.filter(Number.isInteger), digits: 0 });
+    const isStrip = names && !this.shapes;
+    if (isStrip) Object.assign(across, { ticks: across.ticks.filter(Number.isInteger), digits: 0 });
     for (const tick of across.ticks.filter(seen[0])) {
       elements.push(
         svg("path", { class: "axis", d: `M${x(tick)} ${bottom}v5` }),
-        svg("text", { x: x(tick), y: bottom + 18, "text-anchor": "middle" }, names ? names[tick] : plain(tick, across.digits))
+        svg("text", { x: x(tick), y: bottom + 18, "text-anchor": "middle" }, isStrip ? names[tick] : plain(tick, across.digits))
       );
     }
     const middle = this.x + this.width / 2;
-    const across_name = names ? "pixel" : "to the left, angle_y (mrad)";
+    const across_name = isStrip ? "pixel" : "to the left, angle_y (mrad)";
     elements.push(svg("text", { class: "name", x: middle, y: bottom + 35, "text-anchor": "middle" }, across_name));
-    if (names) return elements;
+    if (isStrip) return elements;
+    if (this.shapes && names.length <= NAMED) {
+      this.stack.shapes.forEach((lines, pixel) => {
+        const limits = lines.map((line) => [0, 1].map((axis) => extremes(line.filter((_, i) => i % 2 === axis))));
+        const [along, across] = limits[0];
+        // Of a pixel with a hole, between the upper edges of both.
+        const height = limits.length > 1 ? (along[1] + limits[1][0][1]) / 2 : (along[0] + along[1]) / 2;
+        const place = { x: x((across[0] + across[1]) / 2), y: y(height) + 4, "text-anchor": "middle" };
+        elements.push(svg("text", { class: "pixel-name", ...place }, names[pixel]));
+      });
+    }
     const upper = axes.top - this.top * axes.along;
     const along = linearTicks(upper - (this.stack.rows / zoom) * axes.along, upper, this.height / 50);
     for (const tick of along.ticks.filter(seen[1])) {
@@ -209,9 +250,22 @@ class ImageView {
     return elements;
   }
 
-  /** Return the frame of a pixel { pixel, colour, kind }, at least a few dots wide. */
+  /** Return the frame of a pixel { pixel, colour, kind }, its outline, or a square at least a few dots wide. */
   mark({ pixel, colour, kind }) {
-    const { rows, columns } = this.stack;
+    const { rows, columns, axes, shapes } = this.stack;
+    if (shapes) {
+      const scale = [(this.width / columns) * this.zoom, (this.height / rows) * this.zoom];
+      const x = (angle) => this.x + ((angle - axes.left) / axes.across - this.left) * scale[0];
+      const y = (angle) => MARGIN.top + ((axes.top - angle) / axes.along - this.top) * scale[1];
+      const line = (points) => {
+        const corners = Array.from({ length: points.length / 2 }, (_, i) => `${x(points[2 * i + 1])} ${y(points[2 * i])}`);
+        return `M${corners.join("L")}Z`;
+      };
+      const box = { x: this.x, y: MARGIN.top, width: this.width, height: this.height };
+      const clip = svg("clipPath", { id: `seen-${kind}-${pixel}` }, svg("rect", box));
+      const outline = { d: shapes[pixel].map(line).join(""), "clip-path": `url(#seen-${kind}-${pixel})` };
+      return svg("g", {}, clip, svg("path", { class: "halo", ...outline }), svg("path", { class: `mark ${kind}`, stroke: colour, ...outline }));
+    }
     const size = [(this.width / columns) * this.zoom, (this.height / rows) * this.zoom];
     const middle = [
       ((pixel % columns) + 0.5 - this.left) * size[0],

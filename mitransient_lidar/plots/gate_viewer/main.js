@@ -1,7 +1,7 @@
 // State of the page, its controls, and redrawing on changes.
 
 const COLOURS = ["#e8590c", "#1c86ee", "#2f9e44", "#b04ad0", "#e03131", "#0f9aa8", "#c99700", "#e64980"];
-const FRAME_MS = 160; // duration of a gate while playing
+const [FRAME_MS, SHORTEST_MS, PLAY_MS] = [160, 40, 20000]; // duration of a gate while playing, at least, and of all gates
 const byId = (id) => document.getElementById(id);
 
 /** Fill in the constant parts of the page, then connect the controls. */
@@ -30,13 +30,18 @@ function fillIn(stack) {
   const facts = Object.fromEntries(stack.attributes);
   const counted = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
   const size = stack.names ? counted(stack.columns, "pixel") : `${stack.rows} × ${stack.columns} pixels`;
-  const parts = [size, counted(stack.gates, "gate")];
+  const parts = [size, counted(stack.gates, stack.slice)];
   if ("pulses" in facts) parts.push(counted(Number(facts.pulses), "pulse"));
   if ("altitude" in facts) parts.push(`altitude ${facts.altitude} m`);
   if ("off_nadir_deg" in facts) parts.push(`${facts.off_nadir_deg}° off nadir`);
   byId("summary").textContent = parts.join(" · ");
-  if (stack.waveform) return;
-  byId("source").value = "gates";
+  if (stack.slice === "time bin") {
+    byId("view").options[0].textContent = `${stack.quantity.name} at the time`;
+    byId("view").options[1].textContent = "energy at this and all later times";
+    byId("range").options[0].textContent = "all times";
+    if (stack.sum === null) byId("view").options[1].remove();
+  } else if (stack.waveform) return;
+  else byId("source").value = "gates";
   byId("source-label").hidden = true;
 }
 
@@ -89,7 +94,8 @@ class Page {
 
   play(on) {
     clearInterval(this.timer);
-    this.timer = on ? setInterval(() => this.setGate((this.gate + 1) % this.stack.gates), FRAME_MS) : null;
+    const duration = Math.max(SHORTEST_MS, Math.min(FRAME_MS, PLAY_MS / this.stack.gates));
+    this.timer = on ? setInterval(() => this.setGate((this.gate + 1) % this.stack.gates), duration) : null;
     byId("play").textContent = on ? "Pause" : "Play";
     byId("play").setAttribute("aria-pressed", String(on));
   }
@@ -161,7 +167,7 @@ class Page {
     byId("slider").value = this.gate;
     byId("slider").setAttribute("aria-valuetext", this.gateText());
     byId("number").textContent = `${this.gate} / ${this.stack.gates - 1}`;
-    byId("caption").textContent = this.gateText(byId("view").value === "gate" ? "Gate" : "From gate");
+    byId("caption").textContent = this.gateText(byId("view").value === "gate" ? "" : "From ");
     const pixel = this.pointed ?? this.selected;
     const error = this.shown.errors && this.shown.errors[pixel];
     const value = withUnit(this.shown.values[pixel], this.shown.unit, error);
@@ -172,7 +178,9 @@ class Page {
     this.drawList();
   }
 
-  gateText(name = "Gate") {
+  gateText(before = "") {
+    const slice = before + this.stack.slice;
+    const name = slice[0].toUpperCase() + slice.slice(1);
     const { gate_start: start, gate_width: width, gate_depth: depth } = this.stack;
     const times = `${plain(start[this.gate], 2)} to ${plain(start[this.gate] + width[this.gate], 2)} ns`;
     return `${name} ${this.gate} · ${times}` + (depth ? ` · ${this.stack.depth_name} ${plain(depth[this.gate], 2)} m` : "");
@@ -253,7 +261,7 @@ function connectImage(page) {
   });
   canvas.addEventListener("pointerup", (event) => {
     if (drag !== null && !drag.moved) {
-      page.selected = page.image.pixelAt(event);
+      page.selected = page.image.pixelAt(event) ?? page.selected;
       if (event.shiftKey) page.pin(page.selected);
       page.update();
     }

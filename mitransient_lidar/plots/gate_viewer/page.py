@@ -1,8 +1,9 @@
-"""Self-contained HTML page that shows a gate stack, without network or installation.
+"""Self-contained HTML page that shows a gate stack or waveforms, without network or installation.
 
 The page shows the image of a gate, steps and plays through the gates, maps depths, and plots the records of selected
-pixels. Its parts are ``page.html``, ``page.css`` and the ``.js`` files. The arrays are embedded as base64 of raw
-deflate data of little-endian float32 numbers: the first bytes of all numbers, then the second ones, ...
+pixels. Of waveforms, the time bins take the place of the gates. Its parts are ``page.html``, ``page.css`` and the
+``.js`` files. The arrays are embedded as base64 of raw deflate data of little-endian float32 numbers: the first bytes
+of all numbers, then the second ones, ...
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots.gate_viewer.time_bins import RECORDS, one_record, time_bins
 from mitransient_lidar.plots.gates.images import known_depths
+from mitransient_lidar.results.dataset import time_axis
 from mitransient_lidar.results.formats import picture_order
 from mitransient_lidar.results.gate_files import check_stack
 
@@ -60,7 +63,27 @@ class _Blocks:
 def write_page(
     stack: xr.Dataset, path: str | os.PathLike[str], result: xr.Dataset | None = None, limit_mb: float = 200.0
 ) -> None:
-    """Write the HTML page that shows a gate stack.
+    """Write the HTML page that shows a gate stack or waveforms.
+
+    An existing file is replaced. The other arguments are those of `page_text`, with its errors.
+
+    Raises
+    ------
+    UserError
+        If the file has another suffix than ``.html`` or cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".html":
+        raise UserError(f"cannot write {path}: the file name must end in .html.")
+    text = page_text(stack, result, limit_mb, name=str(path))
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def page_text(
+    stack: xr.Dataset, result: xr.Dataset | None = None, limit_mb: float = 200.0, *, name: str = "the page"
+) -> str:
+    """Return the text of the HTML page that shows a gate stack or waveforms.
 
     A page that would exceed `limit_mb` shows means over blocks of 2 by 2, 4 by 4, ... pixels, of the waveforms first,
     and a note about it. Since pixels share photons, the error of such a mean is unknown; the page shows its upper
@@ -69,46 +92,55 @@ def write_page(
     Parameters
     ----------
     stack : xarray.Dataset
-        A gate stack: ``gate_energy`` and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with the
-        coordinates ``gate_start`` and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the time of the
-        surface echo is known, ``gate_depth`` [m]. With the lines of sight of a result, depths of pixels are along them,
-        and those of gates and times are on the receiver's axis.
-    path : path
-        HTML file to write. An existing file is replaced.
+        A result with ``waveform`` [W], or a record with ``signal``, over (pixel, time) or (row, column, time), of which
+        the map shows one time bin; of a series of shots, the page shows the mean. Pixels with outlines
+        (``pixel_outlines``) have their shapes.
+
+        Or a gate stack: ``gate_energy`` and ``gate_energy_stderr`` [J] over (row, column, gate) or (pixel, gate), with
+        the coordinates ``gate_start`` and ``gate_width`` [ns], ``angle_x`` and ``angle_y`` [mrad] and, if the time of
+        the surface echo is known, ``gate_depth`` [m]. With the lines of sight of a result, depths of pixels are along
+        them, and those of gates and times are on the receiver's axis.
     result : xarray.Dataset, optional
         A render of the same pixels, whose ``waveform`` [W] is plotted; by default `stack` itself. Without waveforms the
         record of a pixel is its energy in the gates.
     limit_mb : float
         Largest size of the page [MB of 1e6 bytes], above 0.
+    name : str
+        Name of the page in warnings.
 
     Raises
     ------
     UserError
-        If the file has another suffix, `stack` is no gate stack, `result` has other pixels, `limit_mb` is not above 0
-        or too small for the gates of one block (of all pixels, if they form no image), or the file cannot be written.
+        If `stack` has neither gates nor a record in time, `result` has other pixels, or `limit_mb` is not above 0 or
+        too small for the gates of one block (of all pixels, if they form no image).
     """
-    path = Path(path)
-    if path.suffix.lower() != ".html":
-        raise UserError(f"cannot write {path}: the file name must end in .html.")
     positive("limit_mb", limit_mb)
-    gated = check_stack(stack)
-    record = _record(gated, stack if result is None and "waveform" in stack else result)
-    gated = picture_order(gated)
+    record: xr.Dataset | None
+    if is_record := "gate_energy" not in stack and bool({*RECORDS} & {*stack.data_vars}):
+        record = one_record(stack)
+        gated = time_bins(record)
+    else:
+        gated = check_stack(stack)
+        record = _record(gated, stack if result is None and "waveform" in stack else result)
+        gated = picture_order(gated)
     frame = _frame()
     room = 1e6 * limit_mb - sum(len(piece.encode()) for piece in frame) - _room_for_metadata(gated)
-    gates, waveforms = _fit(gated, record, room, limit_mb)
+    gates, waveforms = _fit(gated, record, room, limit_mb, is_record=is_record)
     notes = _notes(gates, waveforms, record is not None, limit_mb)
+    if is_record and "shot" in stack.dims:
+        notes.insert(0, f"The waveforms are means over {stack.sizes['shot']} shots.")
     for note in notes:
-        _LOG.warning("%s: %s", path, note)
+        _LOG.warning("%s: %s", name, note)
     metadata = _metadata(gated, record, gates, waveforms) | {"notes": notes}
+    metadata |= _words(record if is_record else None)
     filled = {
         "policy": _POLICY,
         "title": html.escape(metadata["title"]),
+        "kind": "waveforms" if is_record else "gate stack",
         "data": "\n".join(_data_elements(metadata, gates, waveforms)),
     }
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        # Odd pieces of the frame are names of placeholders.
-        file.writelines(filled[piece] if i % 2 else piece for i, piece in enumerate(frame))
+    # Odd pieces of the frame are names of placeholders.
+    return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(frame))
 
 
 def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
@@ -126,18 +158,28 @@ def _record(stack: xr.Dataset, result: xr.Dataset | None) -> xr.Dataset | None:
     return picture_order(result.assign_coords(known))
 
 
-def _fit(stack: xr.Dataset, record: xr.Dataset | None, room: float, limit_mb: float) -> tuple[_Blocks, _Blocks | None]:
-    """Return gates and waveforms in the smallest blocks that fit into `room` bytes, or None for the waveforms."""
+def _fit(
+    stack: xr.Dataset, record: xr.Dataset | None, room: float, limit_mb: float, *, is_record: bool
+) -> tuple[_Blocks, _Blocks | None]:
+    """Return gates and waveforms in the smallest blocks that fit into `room` bytes, or None for the waveforms.
+
+    Of a record, the gates are its time bins, whose values are those of the waveforms.
+    """
     factors = [1]
     if "pixel" not in stack["gate_energy"].dims:
         while factors[-1] < max(stack.sizes["row"], stack.sizes["column"]):
             factors.append(2 * factors[-1])
     for factor in factors:
-        gates = _encode(stack, (*_GATES, *_SIGHTS), factor)
-        if gates.size <= room:
+        gates = _encode(stack, _SIGHTS if is_record else (*_GATES, *_SIGHTS), factor)
+        if is_record and record is not None:
+            waveforms = _encode(record, _WAVEFORMS, factor)
+            if gates.size + waveforms.size <= room:
+                return gates, waveforms
+        elif gates.size <= room:
             break
     else:
-        raise UserError(f"limit_mb = {limit_mb:g} is too small for this stack, even without waveforms.")
+        without = "" if is_record else ", even without waveforms"
+        raise UserError(f"limit_mb = {limit_mb:g} is too small for this stack{without}.")
     if record is not None:
         for factor in factors[factors.index(gates.factor) :]:
             waveforms = _encode(record, _WAVEFORMS, factor)
@@ -149,6 +191,8 @@ def _fit(stack: xr.Dataset, record: xr.Dataset | None, room: float, limit_mb: fl
 def _encode(dataset: xr.Dataset, names: Sequence[str], factor: int) -> _Blocks:
     """Encode the variables that the dataset has."""
     encoded = {}
+    sizes = (1, dataset.sizes["pixel"]) if "pixel" in dataset.dims else (dataset.sizes["row"], dataset.sizes["column"])
+    rows, columns = (-(-size // factor) for size in sizes)
     for name in names:
         if name not in dataset:
             continue
@@ -157,7 +201,6 @@ def _encode(dataset: xr.Dataset, names: Sequence[str], factor: int) -> _Blocks:
             values = _means(values, factor)
         # The page reads images gate by gate, waveforms pixel by pixel.
         encoded[name] = _base64(values if name in _WAVEFORMS else np.moveaxis(values, -1, 0))
-    rows, columns = values.shape[:2]
     return _Blocks(factor, rows, columns, encoded)
 
 
@@ -210,13 +253,15 @@ def _metadata(
     depth = known_depths(stack)
     # The depth axis is linear in time.
     line = np.polyfit(start + width / 2, depth, 1)[::-1] if depth is not None and len(start) > 1 else None
+    shapes = _shapes(stack, gates)
     metadata = {
-        "title": drawing.scene_name(stack.attrs) or "gate stack",
+        "title": drawing.scene_name(stack.attrs) or "result",
         "rows": gates.rows,
         "columns": gates.columns,
         "block": gates.factor,
         "names": [str(name) for name in stack["pixel"].values] if "pixel" in stack["gate_energy"].dims else None,
-        "axes": _axes(stack, gates),
+        "shapes": shapes,
+        "axes": _axes(stack, gates, shapes),
         "gate_start": start.tolist(),
         "gate_width": width.tolist(),
         "gate_depth": None if depth is None else depth.tolist(),
@@ -233,15 +278,53 @@ def _metadata(
             "bins": len(time),
             "time": float(time[0]),
             "step": float(time[1] - time[0]) if len(time) > 1 else 1.0,
+            **_quantity(record),
         }
     return metadata
 
 
-def _axes(stack: xr.Dataset, gates: _Blocks) -> dict[str, float]:
+def _quantity(record: xr.Dataset) -> dict[str, str]:
+    """Return name and unit of the waveforms of a record, the unit of counts empty."""
+    about = record["waveform"].attrs
+    unit = str(about.get("units", "W"))
+    return {"name": str(about.get("long_name", "received power")), "unit": "" if unit == "1" else unit}
+
+
+def _words(record: xr.Dataset | None) -> dict[str, Any]:
+    """Return names and units of what the page shows: energies in gates, or the values of a record in its time bins."""
+    if record is None:
+        return {"slice": "gate", "quantity": {"name": "energy in the gate", "unit": "J"}, "sum": 1.0}
+    quantity = _quantity(record)
+    # The energy after a time is the sum of powers times the width of a bin.
+    total = 1e-9 * time_axis(record).bin_width_ns if quantity["unit"] == "W" else None
+    return {"slice": "time bin", "quantity": quantity, "sum": total, "window": list(drawing.time_limits(record))}
+
+
+def _shapes(stack: xr.Dataset, gates: _Blocks) -> list[list[list[float]]] | None:
+    """Return the outlines of the pixels [mrad], lines angle_x, angle_y, angle_x, ... of each; None if unknown."""
+    if "pixel" not in stack.dims:
+        return None
+    lines = json.loads(stack.attrs.get("pixel_outlines", "[]"))
+    return lines if len(lines) == gates.columns and all(lines) else None
+
+
+def _axes(stack: xr.Dataset, gates: _Blocks, shapes: list[list[list[float]]] | None) -> dict[str, float]:
     """Return the left and upper edges of the image and the pitch of its blocks [mrad], or in pixels if no image.
 
-    The pitch is the change of angle_x from a row to the one above it, and of angle_y from a column to the next one.
+    The pitch is the change of angle_x from a row to the one above it, and of angle_y from a column to the next one. The
+    image of shapes is as wide as all columns, and has one row.
     """
+    if shapes is not None:
+        points = np.concatenate([np.reshape(line, (-1, 2)) for lines in shapes for line in lines])
+        (near, right), (far, left) = points.min(axis=0), points.max(axis=0)
+        margin = 0.03 * max(far - near, left - right)
+        width = left - right + 2 * margin
+        return {
+            "left": float(left + margin),
+            "top": float(far + margin),
+            "across": float(-width / gates.columns),
+            "along": float(far - near + 2 * margin),
+        }
     if "pixel" in stack["gate_energy"].dims:
         height = max(1.0, gates.columns / _STRIP_ASPECT)
         return {"left": -0.5, "top": height / 2, "across": 1.0, "along": height}
@@ -257,8 +340,9 @@ def _colour_maps() -> dict[str, str]:
 
 
 def _attributes(stack: xr.Dataset) -> list[list[str]]:
-    """Return names and values of the attributes, without the text of the scene, its files and its objects."""
-    long = ("scene_xml", "scene_dict", "scene_files", "plugin_parameters")
+    """Return names and values of the attributes, without texts of the scene, its files, objects and outlines."""
+    long = {"scene_xml", "scene_dict", "scene_files", "plugin_parameters"}
+    long |= {"pixel_outlines", "beam_outlines", "target_outlines"}
     return [[str(name), _readable(value)] for name, value in stack.attrs.items() if name not in long]
 
 
@@ -273,7 +357,8 @@ def _room_for_metadata(stack: xr.Dataset) -> int:
     letters = 3 * len(str(stack.attrs.get("scene", "")))  # also the title
     letters += sum(len(name) + len(value) + 8 for name, value in _attributes(stack))
     names = sum(len(str(name)) + 4 for name in stack["pixel"].values) if "pixel" in stack else 0
-    return 12 * (letters + names) + 75 * stack.sizes["gate"] + 10_000
+    outlines = len(stack.attrs.get("pixel_outlines", ""))
+    return 12 * (letters + names) + outlines + 75 * stack.sizes["gate"] + 10_000
 
 
 def _data_elements(metadata: dict[str, Any], gates: _Blocks, waveforms: _Blocks | None) -> Iterator[str]:

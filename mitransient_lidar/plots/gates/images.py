@@ -36,6 +36,7 @@ _DECADES = 3.0  # of a logarithmic colour scale
 _SHOWN_GATES = 36  # on a contact sheet
 _FRAMES_PER_SECOND = 8
 _FRAME_DPI = 100
+_LABEL_ROOM = 0.2  # inches, below the images of a contact sheet
 _PIXEL_DECADES = 5  # at most, on the logarithmic axis of a few pixels
 
 
@@ -83,21 +84,32 @@ def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: b
 
 
 def check_animation(stack: xr.Dataset, path: Path) -> None:
-    """Raise a `UserError` if the stack has no images, or the file is an MP4 and ffmpeg is not installed."""
+    """Raise a `UserError` if the stack has no images, or the file is an MP4 and there is no ffmpeg."""
     if "pixel" in stack.dims:
         raise UserError(
             f"cannot write {path}: an animation needs images, but this stack has {stack.sizes['pixel']} single pixels; "
             "draw its contact sheet."
         )
-    if path.suffix.lower() == ".mp4" and not FFMpegWriter.isAvailable():
+    if path.suffix.lower() == ".mp4" and _ffmpeg() is None:
         raise UserError(f"cannot write {path}: .mp4 needs the program ffmpeg, which is not installed; choose .gif.")
+
+
+def _ffmpeg() -> str | None:
+    """Return the ffmpeg that Matplotlib finds, or else that of the package imageio-ffmpeg; None without both."""
+    if FFMpegWriter.isAvailable():
+        return str(matplotlib.rcParams["animation.ffmpeg_path"])
+    try:
+        import imageio_ffmpeg
+
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        return None
 
 
 def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False) -> None:
     """Write an animation of a gate stack, one frame a gate, with the mean energy against depth.
 
-    The colours are those of `plot_gates`. The file name ends in ``.gif`` or, if the program ffmpeg is installed,
-    ``.mp4``.
+    The colours are those of `plot_gates`. The file name ends in ``.gif`` or ``.mp4``.
 
     Raises
     ------
@@ -117,9 +129,10 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
     figure.set_layout_engine("none")
     kind: type[AbstractMovieWriter] = PillowWriter if suffix == ".gif" else FFMpegWriter
     writer = kind(fps=_FRAMES_PER_SECOND)
+    program: dict[Any, Any] = {} if suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
     with replacing(path) as temporary:
         try:
-            with writer.saving(figure, os.fspath(temporary), _FRAME_DPI):
+            with matplotlib.rc_context(program), writer.saving(figure, os.fspath(temporary), _FRAME_DPI):
                 for index in range(stack.sizes["gate"]):
                     show(index)
                     writer.grab_frame()
@@ -211,6 +224,9 @@ def _draw_sheet(figure: Figure, stack: xr.Dataset, *, log: bool) -> None:
         ax.set_title("\n".join(_caption(stack, index)), fontsize=8.5, linespacing=1.15, pad=3)
         ax.tick_params(labelsize=8, labelleft=place % columns == 0, labelbottom=place + columns >= len(shown))
         ax.locator_params(nbins=4)
+    # Below a colour bar of all images, the layout leaves too little room for the label.
+    room = _LABEL_ROOM / figure.get_figheight()
+    figure.set_layout_engine("constrained", rect=(0, room, 1, 1 - room))
     figure.supxlabel(drawing.ANGLE_Y_LABEL, fontsize=10)
     figure.supylabel(drawing.ANGLE_X_LABEL, fontsize=10)
     figure.suptitle(_title(stack, len(shown)), fontsize=12)

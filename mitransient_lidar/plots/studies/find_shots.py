@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
 
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.rendering.sea_map import Shot
 from mitransient_lidar.studies.find_shots import RenderedShots
+
+#: Share of a pixel's peak that counts as an echo.
+_FAINT = 5e-3
 
 
 def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = None) -> Figure:
@@ -25,8 +30,11 @@ def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = No
     figure = drawing.new_figure(path, 6.0 + 3.6 * columns, max(5.4, 2.7 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[1.5, *[1.0] * columns])
     _draw_sea(figure.add_subplot(grid[:, 0]), rendered)
+    limits = _time_limits(rendered.results)
     for index, (shot, result) in enumerate(zip(rendered.shots, rendered.results, strict=False)):
-        _draw_waveforms(figure.add_subplot(grid[index // columns, 1 + index % columns]), shot, result)
+        ax = figure.add_subplot(grid[index // columns, 1 + index % columns])
+        _draw_waveforms(ax, f"{index + 1} {shot.kind}", shot, result)
+        ax.set_xlim(limits)
     figure.suptitle(rendered.scene)
     return drawing.save(figure, path)
 
@@ -58,7 +66,18 @@ def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
             ax.contour(lines + shot.x, lines + shot.y, mask, [0.5], colors=[palette[pixel]], linewidths=1.2)
         angle = math.degrees(rendered.azimuth)
         ax.add_patch(Ellipse((shot.x, shot.y), 2 * along, 2 * across, angle=angle, fill=False, color="gold"))
-        ax.annotate(f"{number}", (shot.x, shot.y), color="gold", ha="center", va="center", fontweight="bold")
+        # Beside the footprint, whose lines would cross the number.
+        ax.annotate(
+            f"{number}",
+            (shot.x, shot.y + rendered.pixel_lines.max()),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize="large",
+            fontweight="bold",
+            path_effects=[withStroke(linewidth=3, foreground="white")],
+        )
     ax.set_aspect("equal")
     turn = math.degrees(rendered.azimuth)
     beam = "+x" if abs(turn) < 1e-4 else f"{abs(turn):.3g}° from +x towards {'+' if turn > 0 else '-'}y"
@@ -66,13 +85,25 @@ def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
     ax.set(xlabel="x (m)", ylabel="y (m)")
 
 
-def _draw_waveforms(ax: Axes, shot: Shot, result: xr.Dataset) -> None:
+def _time_limits(results: Sequence[xr.Dataset]) -> tuple[float, float]:
+    """Return the echo windows of all shots, extended to where the power of a pixel exceeds 0.5 % of its peak [ns].
+
+    The echoes of a crest are earlier than the window, which is that of the mean sea level.
+    """
+    ends = []
+    for result in results:
+        power = np.nan_to_num(result["waveform"].values.reshape(-1, result.sizes["time"]))
+        lit = result["time"].values[(power > _FAINT * power.max(axis=-1, keepdims=True)).any(axis=0)]
+        ends.append((*drawing.time_limits(result), *lit[[0, -1]]) if lit.size else drawing.time_limits(result))
+    return min(map(min, ends), default=0.0), max(map(max, ends), default=1.0)
+
+
+def _draw_waveforms(ax: Axes, name: str, shot: Shot, result: xr.Dataset) -> None:
     """Draw the waveforms of a shot, with the slopes that the beam meets."""
     power = result["waveform"].values.reshape(-1, result.sizes["time"])
     for values, colour in zip(power, drawing.pixel_colours(len(power)), strict=True):
         ax.plot(result["time"].values, 1e3 * values, color=colour, linewidth=1.1)
-    ax.set_xlim(drawing.time_limits(result))
     ax.set_ylim(0, None)
     slopes = f"{math.degrees(math.atan(shot.along)):+.1f}°, {math.degrees(math.atan(shot.across)):+.1f}°"
-    ax.set_title(f"{shot.kind} ({slopes})", fontsize="small")
+    ax.set_title(f"{name} ({slopes})", fontsize="small")
     ax.set(xlabel="time (ns)", ylabel="power (mW)")

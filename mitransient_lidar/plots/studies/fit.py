@@ -41,7 +41,7 @@ def plot_fit(fitted: xr.Dataset, path: drawing.FilePath | None = None) -> Figure
     upper.set_ylabel(f"waveform ({fitted['measured'].attrs.get('units') or 'any unit'})")
     upper.legend(frameon=False, ncols=2 if strongest.size > 4 else 1)
     lower.set_xlim(time[shown][0], time[shown][-1])
-    lower.set(xlabel=drawing.TIME_LABEL, ylabel="difference (standard deviations)")
+    lower.set(xlabel=drawing.TIME_LABEL, ylabel="difference\n(standard deviations)")
     lower.axhline(0, color="0.5", linewidth=0.8)
     for ax in (upper, lower):
         drawing.add_grid(ax)

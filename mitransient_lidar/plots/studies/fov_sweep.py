@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.plots import drawing
@@ -51,7 +52,9 @@ def plot_fov_sweep(found: xr.Dataset, path: drawing.FilePath | None = None) -> F
     ax.set_ylabel("attenuation coefficient (1/m)")
     top = drawing.add_top_axis(ax, 0.0, found["field_of_view"].values[0] / scaled[0], "field of view (mrad)")
     for axis in (ax.xaxis, top):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     drawing.add_grid(ax)
     ax.legend(frameon=False, fontsize="small")
     depths = f"{attributes['min_depth']:g} to {attributes['max_depth']:g} m"

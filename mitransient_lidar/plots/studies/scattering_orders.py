@@ -32,7 +32,7 @@ def plot_scattering_orders(result: xr.Dataset, path: drawing.FilePath | None = N
     upper.legend(title="scattering events", frameon=False, ncols=2, fontsize="small")
     lit = total > 1e-5 * total.max()
     lower.plot(time[lit], 100 * several[lit] / total[lit], color="#b3421f", linewidth=1.2)
-    lower.set(xlabel=drawing.TIME_LABEL, ylabel="several reversals (%)")
+    lower.set(xlabel=drawing.TIME_LABEL, ylabel="several\nreversals (%)")
     lower.set_ylim(bottom=0)
     for ax in (upper, lower):
         drawing.add_grid(ax)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time as clock
 from types import ModuleType
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from command_line import assert_refused, run
 
 from mitransient_lidar import __version__, results
+from mitransient_lidar.cli import messages
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.loading import catalogue, variants
@@ -110,6 +112,20 @@ def test_render_quiet_without_plot(scene, calls, tmp_path):
     assert not (tmp_path / "fig09.png").exists()
     assert calls.seen[0][1]["target_error"] == 0.01
     assert calls.seen[0][1]["max_time"] == 5.0
+
+
+def test_progress_is_lines_where_there_is_no_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(messages, "_REPORT_S", 0.05)
+    with messages.reporting(quiet=False) as show:
+        clock.sleep(0.2)
+        show(Progress(3, 20, "shot", 0.1))
+        clock.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "preparing, 0 s so far"
+    assert lines[-1] == "shot 3/20, 0 s so far"
+    with messages.reporting(quiet=True):
+        clock.sleep(0.1)
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.slow

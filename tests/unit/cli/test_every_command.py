@@ -31,6 +31,7 @@ SCENE_COMMANDS = {
     "scattering-orders": ["--passes", 2, "--orders", 2],
 }
 RESULT_COMMANDS = {
+    "view": ["--no-browser"],
     "plot": [],
     "waveforms": ["--table"],
     "retrieve": [],

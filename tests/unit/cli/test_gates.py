@@ -1,5 +1,7 @@
 """The command that cuts gates: files, their names, and sentences."""
 
+import sys
+
 import command_line
 import numpy as np
 import pytest
@@ -145,6 +147,7 @@ def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
 def test_a_movie_that_cannot_be_leaves_no_files(stored, tmp_path, monkeypatch):
     path, _ = stored
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     result = run(path, *TRAIN, "-o", tmp_path / "out", "--mp4")
     assert result.exit_code == 2
     assert result.stdout == ""

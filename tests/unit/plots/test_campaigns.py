@@ -44,7 +44,7 @@ def test_sample_distributions_and_responses(campaign, tmp_path):
     )
     sample = figure.axes[0]
     assert len(sample.lines) == 12
-    assert all(line.get_ydata().max() == 1 for line in sample.lines)
+    assert all(np.nanmax(line.get_ydata()) == 1 for line in sample.lines)
     # The first surface is that over attenuation and depth.
     surface = next(ax for ax in figure.axes if (ax.get_xlabel(), ax.get_ylabel()) == ("attenuation", "bottom_depth"))
     (mesh,) = surface.collections
@@ -53,6 +53,17 @@ def test_sample_distributions_and_responses(campaign, tmp_path):
     assert np.nanmin(clear) == np.nanmax(clear) == 1
     assert np.nanmin(turbid) == np.nanmax(turbid) == 0
     assert surface.get_xscale() == "log"
+
+
+def test_what_is_below_the_range_is_not_drawn(campaign):
+    """Not as a level, at which it would look like a signal."""
+    waveform = campaign["waveform"].copy()
+    waveform[..., 10:20] = 0
+    ax = plot_campaign(campaign.assign(waveform=waveform)).axes[0]
+    for line in ax.lines:
+        assert np.isnan(line.get_ydata()[10:20]).all()
+        assert np.isfinite(line.get_ydata()[20:]).all()
+    assert ax.get_ylim() == (1e-6, 2)
 
 
 def test_other_contents(campaign):

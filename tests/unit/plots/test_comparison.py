@@ -26,6 +26,20 @@ def result(factor, **attributes):
     )
 
 
+@pytest.mark.parametrize(
+    ("attributes", "labels"),
+    [
+        ([{"integrator": "one", "seed": 1}, {"integrator": "one", "seed": 2}], ["seed 1", "seed 2"]),
+        ([{"instrument": "a"}, {"instrument": "b"}], ["a", "b"]),
+        ([{}, {}], ["first result", "second result"]),
+    ],
+)
+def test_legends_name_what_differs(attributes, labels):
+    first, second = (result(1.0, **one) for one in attributes)
+    figure = plot_comparison(first, second, compare(first, second))
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == labels
+
+
 def test_curves_bands_and_differences():
     first, second = result(1.0, integrator="one"), result(1.1, integrator="two")
     outcome = compare(first, second)
@@ -46,5 +60,5 @@ def test_curves_bands_and_differences():
     low, high = lower.get_ylim()
     assert low < -outcome.largest
     assert high > outcome.largest
-    assert lower.get_ylabel() == "difference (standard errors)"
+    assert lower.get_ylabel() == "difference\n(standard errors)"
     assert figure.get_suptitle().startswith(f"made: 120 bins, rms {outcome.rms:.2f} and largest {outcome.largest:.1f}")

@@ -56,6 +56,72 @@ def means(variable, block):
     return np.array([[values[r : r + block, c : c + block].mean((0, 1)) for c in columns] for r in rows])
 
 
+def numbered(dataset):
+    """Return an image with the coordinates that its files have."""
+    return dataset.assign_coords({dim: np.arange(dataset.sizes[dim]) for dim in ("row", "column")})
+
+
+def test_page_of_waveforms(scene, tmp_path):
+    """The time bins of waveforms are their gates; the arrays are there once."""
+    result = numbered(scene[1]).assign_attrs(altitude=200.0, off_nadir_deg=20.0, refractive_index=1.34)
+    result = result.assign_attrs(group_index=1.364, surface_time_ns=1422.0)
+    path = tmp_path / "page.html"
+    write_page(result, path)
+    metadata, arrays, _ = embedded(path)
+    assert set(arrays) == {"waveform", "waveform_stderr", "surface_time", "depth_per_ns"}
+    for name in ("waveform", "waveform_stderr"):
+        assert (arrays[name] == result[name].values.ravel().astype("f4")).all()
+    assert metadata["quantity"] == {"name": "received power", "unit": "W"}
+    assert metadata["gate_start"] == [1400.0 + k for k in range(BINS)]
+    assert set(metadata["gate_width"]) == {1.0}
+    # Energy [J] of a power [W] in bins of 1 ns.
+    assert metadata["sum"] == pytest.approx(1e-9)
+    # c0 cos(theta_water) / (2 n_g), with the surface at 1422 ns.
+    per_ns = 0.299792458 / (2 * 1.364) * np.sqrt(1 - (np.sin(np.radians(20)) / 1.34) ** 2)
+    assert metadata["depth_of_time"] == pytest.approx([-1422 * per_ns, per_ns], rel=1e-6)
+    assert metadata["shapes"] is None
+
+
+def test_large_pages_of_waveforms_show_means(scene, tmp_path):
+    result = numbered(scene[1])
+    path = tmp_path / "page.html"
+    write_page(result, path)
+    letters = sum(embedded(path)[2].values())
+    write_page(result, path, limit_mb=(path.stat().st_size - 0.6 * letters + 8000) / 1e6)
+    metadata, arrays, _ = embedded(path)
+    assert (metadata["block"], metadata["waveform"]["block"]) == (2, 1)
+    assert (metadata["rows"], metadata["columns"]) == (ROWS // 2, -(-COLUMNS // 2))
+    np.testing.assert_allclose(arrays["waveform"], means(result["waveform"], 2).ravel(), rtol=1e-6)
+
+
+def test_page_of_a_series_shows_the_mean_of_its_shots(scene, tmp_path):
+    one = numbered(scene[1])
+    series = xr.concat([one, 3 * one, 2 * one], "shot").assign_coords(shot=[0, 1, 2])
+    series = series.assign_coords({name: one[name] for name in ("angle_x", "angle_y")}).transpose("shot", ...)
+    write_page(series, tmp_path / "page.html")
+    metadata, arrays, _ = embedded(tmp_path / "page.html")
+    assert metadata["notes"] == ["The waveforms are means over 3 shots."]
+    np.testing.assert_allclose(arrays["waveform"], 2 * one["waveform"].values.ravel(), rtol=1e-6)
+    errors = np.sqrt(1 + 9 + 4) / 3 * one["waveform_stderr"].values.ravel()
+    np.testing.assert_allclose(arrays["waveform_stderr"], errors, rtol=1e-6)
+
+
+def test_pixels_with_outlines_have_shapes(scene, tmp_path):
+    lines = [[[-1.0, 2.0, 3.0, 2.0, 3.0, 0.0]], [[-2.0, -1.0, 0.0, -1.0, 0.0, 0.0]]]
+    result = scene[1].isel(row=0, column=[0, 1]).rename(column="pixel").assign_coords(pixel=["a", "b"])
+    result = result.assign_attrs(pixel_outlines=json.dumps(lines))
+    write_page(result, tmp_path / "page.html")
+    metadata, _, _ = embedded(tmp_path / "page.html")
+    assert metadata["shapes"] == lines
+    # From angle_x = -2 to 3 and angle_y = -1 to 2, with a margin of 3 % of the larger side.
+    axes = metadata["axes"]
+    assert (axes["top"], axes["left"]) == pytest.approx((3.15, 2.15))
+    assert (axes["along"], 2 * axes["across"]) == pytest.approx((5.3, -3.3))
+    # Without the outline of one pixel, all are drawn side by side.
+    write_page(result.assign_attrs(pixel_outlines=json.dumps(lines[:1])), tmp_path / "page.html")
+    assert embedded(tmp_path / "page.html")[0]["shapes"] is None
+
+
 def test_page_contains_all_data(scene, tmp_path):
     path = tmp_path / "page.html"
     write_page(scene[0].transpose("gate", "column", "row"), path, scene[1].transpose("time", ...))
@@ -161,7 +227,23 @@ def test_a_stack_may_hold_its_waveforms(scene, tmp_path):
     [
         (lambda stack, result: (stack, "page.htm"), "the file name must end in .html"),
         (lambda stack, result: (stack, "no/page.html"), "No such file"),
-        (lambda stack, result: (result, "page.html"), "the dataset is no gate stack: it has no variable gate_energy."),
+        (
+            lambda stack, result: (result[["waveform_stderr"]], "page.html"),
+            "the dataset is no gate stack: it has no variable gate_energy.",
+        ),
+        (lambda stack, result: (result, "page.html"), "the dataset has no coordinate row"),
+        (
+            lambda stack, result: (result.isel(row=0).rename(column="pixel").drop_vars("angle_x"), "page.html"),
+            "the dataset has no coordinate pixel",
+        ),
+        (
+            lambda stack, result: (numbered(result).drop_vars(["angle_x", "angle_y"]), "page.html"),
+            "the result has no coordinate angle_x over (row, column): it has no map to draw",
+        ),
+        (
+            lambda stack, result: (numbered(result), "page.html", None, 0.01),
+            "limit_mb = 0.01 is too small for this stack.",
+        ),
         (lambda stack, result: (stack, "page.html", result[["waveform_stderr"]]), "has no variable waveform."),
         (lambda stack, result: (stack, "page.html", result.isel(row=slice(3))), "must be those of the gate stack"),
         (lambda stack, result: (stack.isel(row=0), "page.html"), "(row, column, gate) or (pixel, gate)"),

@@ -68,6 +68,19 @@ def test_pixels_are_drawn_on_the_sea_in_their_colours(lidar_scene):
     assert texts == ["p0", "p1", "p2", "p3", "beam, e$^{-1/2}$", "beam, e$^{-2}$", "receiver's axis"]
 
 
+def test_targets_beside_the_view_are_drawn_whole(lidar_scene):
+    target = {"id": "plate", "z": [-1.0, -1.0], "line": [2, -6, 8, -6, 8, 6, 2, 6], "seen": [2, -6, 8, -6, 8, 6, 2, 6]}
+    figure = plot_layout(result(described(lidar_scene()) | {"target_outlines": json.dumps([target])}))
+    ax = figure.axes[0]
+    left, right = ax.get_xlim()
+    low, high = ax.get_ylim()
+    assert left > 6
+    assert right < -6
+    # The view reaches 3.4 m from the shot.
+    assert low < -3.4
+    assert high > 8
+
+
 def test_azimuth_points_up_for_every_direction_of_the_lidar(lidar_scene):
     """From a laser that looks towards -y the far edge is at negative y, and is still drawn on top."""
     pose = {"to_world": mi.ScalarTransform4f().look_at([0, 72.794, 200], [0, 0, 0], [0, 0, 1])}

@@ -1,5 +1,6 @@
 """Figures: what is drawn where."""
 
+import json
 import math
 
 import numpy as np
@@ -109,6 +110,23 @@ def test_layout_is_drawn_as_the_receiver_sees_it(layout, cells):
     assert np.argmax(to_rgb(drawn[0].get_facecolor()[:3])) == 0
     left, right = side_axes(figure).get_xlim()
     assert left > 0 > right
+
+
+def test_pixels_have_the_shapes_of_their_outlines():
+    """A triangle, and a square with a hole: angle_y to the left, angle_x up."""
+    lines = [[[1, 2, 3, 2, 3, 4]], [[-4, -4, -4, 4, 0, 4, 0, -4], [-3, -1, -1, -1, -1, 1, -3, 1]]]
+    made = make(2, attributes=ATTRIBUTES | {"layout": "", "pixel_outlines": json.dumps(lines)})
+    side = side_axes(waveforms.plot_waveforms(made))
+    triangle, square = (patch.get_path() for patch in side.patches)
+    assert triangle.contains_point((2.2, 2.5))
+    assert not triangle.contains_point((3.8, 1.5))
+    # Each loop of the second pixel goes round once; even-odd, the hole is open.
+    (outer, inner) = square.to_polygons(closed_only=True)
+    np.testing.assert_array_equal(outer[:-1], [(-4, -4), (4, -4), (4, 0), (-4, 0)])
+    np.testing.assert_array_equal(inner[:-1], [(-1, -3), (-1, -1), (1, -1), (1, -3)])
+    assert not side.collections  # no dots
+    left, right = side.get_xlim()
+    assert left > 4 > -4 > right
 
 
 def test_other_layouts_are_dots_at_the_centres():

@@ -2,6 +2,7 @@
 
 import math
 import stat
+import sys
 
 import matplotlib as mpl
 import numpy as np
@@ -218,11 +219,19 @@ def test_mp4_passes_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
     assert (tmp_path / "a.mp4").stat().st_size == 3 * 840 * 540 * 4  # raw frames
 
 
+@pytest.mark.slow
+def test_mp4_needs_no_program_besides_the_package(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    animate_gates(make(3), tmp_path / "a.mp4")
+    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"  # the first box of an MP4 file
+
+
 @pytest.mark.long
-def test_failing_or_missing_ffmpeg(tmp_path, fake_ffmpeg):
+def test_failing_or_missing_ffmpeg(tmp_path, fake_ffmpeg, monkeypatch):
     with fake_ffmpeg(status=3), pytest.raises(UserError, match=r"a\.mp4: ffmpeg ended with the error 3"):
         animate_gates(make(3), tmp_path / "a.mp4")
     missing = {"animation.ffmpeg_path": str(tmp_path / "none")}
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with mpl.rc_context(missing), pytest.raises(UserError, match=r"needs the program ffmpeg.*choose \.gif"):
         animate_gates(make(3), tmp_path / "a.mp4")
     assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
@@ -347,3 +356,14 @@ def test_wrong_files_and_datasets(tmp_path):
         animate_gates(make(pixels=True), tmp_path / "a.gif")
     with pytest.raises(UserError, match="No such file"):
         plot_gates(make(1), tmp_path / "missing" / "a.png")
+
+
+def test_the_label_of_a_sheet_is_below_its_ticks():
+    angle_x, angle_y = np.meshgrid(np.linspace(15, -15, 8), np.linspace(15, -15, 8), indexing="ij")
+    stack = make(12, energy=np.ones((ROWS, COLUMNS, 12))).isel(row=[0] * 8, column=[0] * 8)
+    stack = stack.assign_coords(angle_x=(("row", "column"), angle_x), angle_y=(("row", "column"), angle_y))
+    figure = plot_gates(stack)
+    FigureCanvasAgg(figure).draw()
+    ticks = [text.get_window_extent() for ax in figure.axes for text in ax.get_xticklabels() if text.get_text()]
+    label = next(text for text in figure.texts if text.get_text().startswith("to the left")).get_window_extent()
+    assert label.y1 < min(box.y0 for box in ticks if box.y0 > 0)

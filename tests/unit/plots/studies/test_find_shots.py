@@ -65,10 +65,20 @@ def test_sea_is_periodic_around_the_shots():
     np.testing.assert_allclose(image.get_array()[0], np.sin(2 * np.pi * x / 10), atol=1e-9)
 
 
+def test_early_echoes_are_not_cut():
+    """Waveforms begin where a pixel has 0.5 % of its peak, 6.5 ns before it, if the window is later."""
+    made = rendered()
+    for result in made.results:
+        result.attrs = {"window_start_ns": 1418.0, "window_end_ns": 1440.0, "bin_width_ns": 1.0}
+    panels = [ax for ax in plot_found_shots(made).axes if ax.get_ylabel() == "power (mW)"]
+    for ax in panels:
+        assert ax.get_xlim() == pytest.approx((1414.0, 1440.0 + 0.06 * 22))
+
+
 def test_waveforms_are_drawn_next_to_the_sea_with_their_slopes():
     figure = plot_found_shots(rendered())
     panels = [ax for ax in figure.axes if ax.get_ylabel() == "power (mW)"]
-    assert [ax.get_title() for ax in panels] == ["towards (+5.7°, +0.0°)", "level (+0.0°, -2.9°)"]
+    assert [ax.get_title() for ax in panels] == ["1 towards (+5.7°, +0.0°)", "2 level (+0.0°, -2.9°)"]
     peaks = [[line.get_ydata().max() for line in ax.lines] for ax in panels]
     np.testing.assert_allclose(peaks, [[1, 2], [3, 6]])  # mW
     assert len(plot_found_shots(rendered(waveforms=False)).axes) == 2  # the sea and its colour bar

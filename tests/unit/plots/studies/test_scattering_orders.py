@@ -23,7 +23,7 @@ def test_orders_add_up_and_the_last_one_holds_the_rest():
     expected = 100 * power[:, 1].sum(axis=(0, 1)) / power.sum(axis=(0, 1, 2))
     np.testing.assert_allclose(lower.lines[0].get_ydata(), expected)
     assert (upper.get_yscale(), upper.get_ylabel()) == ("log", "received power (W)")
-    assert (lower.get_ylabel(), lower.get_ylim()[0]) == ("several reversals (%)", 0)
+    assert (lower.get_ylabel(), lower.get_ylim()[0]) == ("several\nreversals (%)", 0)
     assert upper.get_title() == "made"
 
 

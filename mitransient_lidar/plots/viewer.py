@@ -1,0 +1,85 @@
+"""Interactive view of a result: a page for a browser, and below the cell of a notebook."""
+
+from __future__ import annotations
+
+import html
+import os
+import tempfile
+from pathlib import Path
+
+import xarray as xr
+
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import replacing
+from mitransient_lidar.plots.drawing import scene_name
+from mitransient_lidar.plots.gate_viewer.page import page_text
+
+_NOTEBOOK_MB = 20.0  # of a page in a notebook, which is stored with it
+
+
+class View:
+    """Page that shows a result, of `view`. A notebook shows it below the cell whose last value it is.
+
+    Attributes
+    ----------
+    page : str
+        Text of the HTML page, which needs no network.
+    height : int
+        Height below a cell [CSS pixels].
+    """
+
+    def __init__(self, page: str, name: str, height: int) -> None:
+        self.page, self.height = page, height
+        self._name = name
+
+    def _repr_html_(self) -> str:
+        # A sandbox without the origin of the notebook: scripts of the page reach nothing of it.
+        return (
+            f'<iframe sandbox="allow-scripts" srcdoc="{html.escape(self.page)}" title="{html.escape(self._name)}" '
+            f'style="width: 100%; height: {self.height}px; border: 0"></iframe>'
+        )
+
+    def __repr__(self) -> str:
+        return f"<view of {self._name}, {1e-6 * len(self.page):.1f} MB>"
+
+    def save(self, path: str | os.PathLike[str] | None = None) -> Path:
+        """Write the page to a file, by default a new one in the folder for temporary files, and return its path.
+
+        Raises
+        ------
+        UserError
+            If the file name does not end in ``.html``, or the file cannot be written.
+        """
+        if path is None:
+            path = Path(tempfile.mkdtemp(prefix="mitransient-lidar-")) / "view.html"
+        path = Path(path)
+        if path.suffix.lower() != ".html":
+            raise UserError(f"cannot write {path}: the file name must end in .html.")
+        with replacing(path) as temporary:
+            temporary.write_text(self.page, encoding="utf-8")
+        return path
+
+
+def view(
+    result: xr.Dataset, waveforms: xr.Dataset | None = None, *, height: int = 640, limit_mb: float = _NOTEBOOK_MB
+) -> View:
+    """Return a page that shows a result, which a notebook shows below the cell.
+
+    Parameters
+    ----------
+    result : xarray.Dataset
+        A result, a record of a receiver or a gate stack: see `plots.gate_viewer.page.page_text`.
+    waveforms : xarray.Dataset, optional
+        A render of the pixels of a gate stack.
+    height : int
+        Height in a notebook [CSS pixels].
+    limit_mb : float
+        Largest size of the page [MB of 1e6 bytes]; larger ones show means over blocks of pixels.
+
+    Raises
+    ------
+    UserError
+        If the result has neither gates nor a record in time, or `limit_mb` is too small for it.
+    """
+    name = scene_name(result.attrs) or "result"
+    return View(page_text(result, waveforms, limit_mb), name, height)

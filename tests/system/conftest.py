@@ -1,0 +1,37 @@
+"""Fixtures of tests in a browser."""
+
+import pytest
+from browser_page import BROWSER, DRIVER, Page
+
+from mitransient_lidar.plots.gate_viewer.page import write_page
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    # A given path of the driver avoids a search and a download.
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def show(browser, tmp_path):
+    """Function that writes the page of a stack and opens it; fails if the browser has logged an error."""
+
+    def open_page(stack, result=None, **options):
+        write_page(stack, tmp_path / "page.html", result, **options)
+        browser.get(f"file://{tmp_path}/page.html")
+        page = Page(browser)
+        page.wait("return document.querySelectorAll('#curve-plot .line').length > 0")
+        return page
+
+    yield open_page
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
