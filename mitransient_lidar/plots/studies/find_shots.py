@@ -24,14 +24,14 @@ def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = No
     rows = -(-len(rendered.results) // columns) if columns else 1
     figure = drawing.new_figure(path, 6.0 + 3.6 * columns, max(5.4, 2.7 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[1.5, *[1.0] * columns])
-    _draw_sea(figure.add_subplot(grid[:, 0]), rendered)
+    draw_sea(figure.add_subplot(grid[:, 0]), rendered)
     for index, (shot, result) in enumerate(zip(rendered.shots, rendered.results, strict=False)):
         _draw_waveforms(figure.add_subplot(grid[index // columns, 1 + index % columns]), shot, result)
     figure.suptitle(rendered.scene)
     return drawing.save(figure, path)
 
 
-def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
+def draw_sea(ax: Axes, rendered: RenderedShots) -> None:
     """Draw elevations about the shots, and the outlines of pixels and beam at each shot on the mean sea level."""
     sea, shots = rendered.sea, rendered.shots
     along, across = rendered.beam_spread
