@@ -81,7 +81,8 @@ def figures(
         Folder, made if needed. Each figure becomes a file as ``fig09.png``, and the table of the statements of these
         figures ``statements.csv``. Every file is moved into its place when it is complete.
     target_error
-        Relative standard error of the median bin, greater than 0.
+        Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
+        warning.
     seed
         Seed of all random numbers and of the other places, 0 to 10^6.
     progress

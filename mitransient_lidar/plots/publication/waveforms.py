@@ -53,7 +53,7 @@ def draw_waveforms(
     if log:
         ax.set_yscale("log")
     else:
-        ax.set_ylim(0, None)
+        ax.set_ylim(0, None, auto=True)  # for the curves that follow
     drawing.add_grid(ax, hide=("top", "right"))
     return factor
 
@@ -165,10 +165,10 @@ def _show_decades(axes: Sequence[Axes]) -> None:
         ax.set_ylim(3e-4 * ax.get_ylim()[1], None)
 
 
-def add_pixel_legend(ax: Axes) -> None:
+def add_pixel_legend(ax: Axes, loc: str = "best") -> None:
     """Name the four pixels by their colours."""
     handles = [
         ax.plot([], [], color=colour, label=name)[0]
         for name, colour in zip(PIXELS, drawing.pixel_colours(4), strict=True)
     ]
-    ax.legend(handles=handles, frameon=False, fontsize="small")
+    ax.legend(handles=handles, frameon=False, fontsize="small", loc=loc)

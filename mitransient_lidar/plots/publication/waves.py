@@ -23,19 +23,19 @@ _STYLES = ("-", "--", ":")
 
 def surface_echoes(renders: Renders) -> Figure:
     """Draw the places of the shots on the sea, and the surface echoes (figure 10)."""
-    figure = drawing.new_figure(None, 9.6, 6.2)
+    figure = drawing.new_figure(None, 10.4, 6.2)
     axes = figure.subplots(2, 3)
     _draw_places(renders, axes[0], "10")
     for ax, result, panel in zip(axes[1], shots(renders), "bcd", strict=True):
         draw_waveforms(ax, result, (-1.2, 1.2))
         ax.set_title(f"10 ({panel})  surface echo, shot {'bcd'.index(panel) + 1}", fontsize="medium")
-    add_pixel_legend(axes[1, 2])
+    add_pixel_legend(axes[1, 0], "upper left")
     return figure
 
 
 def bottom_echoes(renders: Renders) -> Figure:
     """Draw the places of the shots on the sea, and the bottom echoes of the red pixel (figure 11)."""
-    figure = drawing.new_figure(None, 9.6, 6.2)
+    figure = drawing.new_figure(None, 10.4, 6.2)
     grid = figure.add_gridspec(2, 3)
     _draw_places(renders, [figure.add_subplot(grid[0, number]) for number in range(3)], "11")
     ax = figure.add_subplot(grid[1, :])
@@ -85,7 +85,10 @@ def _draw_places(renders: Renders, axes: Sequence[Axes], number: str) -> None:
     """Draw the sea about each shot, with the footprints of beam and pixels."""
     places = shot_places(renders)
     drawn = render_found_shots(renders.session(SHOT_SCENES[0]), places, waveforms=False)
-    for ax, shot in zip(axes, places, strict=True):
-        draw_sea(ax, dataclasses.replace(drawn, shots=(shot,)))
-        along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
+    for index, (ax, shot) in enumerate(zip(axes, places, strict=True)):
+        draw_sea(ax, dataclasses.replace(drawn, shots=(shot,)), first=index + 1)
+        # Adding 0 turns -0 into 0.
+        along, across = (round(math.degrees(math.atan(slope)), 1) + 0.0 for slope in (shot.along, shot.across))
+        if index:
+            ax.set_ylabel("")
         ax.set_title(f"{number} (a)  {shot.kind}: {along:+.1f}° to the lidar, {across:+.1f}° left", fontsize="small")

@@ -42,13 +42,15 @@ def decay_statements(renders: Renders) -> list[Statement]:
     series, geometry = as_series(result), geometry_of(result)
     start, end = (float(geometry.time_of_depth(depth)) for depth in _COLUMN)
     per_metre = 2 * geometry.metres_per_ns
-    rate = estimate(lambda one: decay(one, (start, end))[0] / per_metre, series)
+    absorption = float(result.attrs["scene.attenuation"]) - float(result.attrs["scene.scattering"])
+
+    def absorbed(one: Waveform) -> float:
+        return absorption * per_metre / decay(one, (start, end))[0]
+
     rest = estimate(lambda one: decay(one, (start, end))[1], series)
     others = joined([as_series(one) for one in renders.random(FOUR)])
-    rates = others.each(lambda one: decay(one, (start, end))[0] / per_metre)
+    shares = others.each(absorbed)
     rests = others.each(lambda one: decay(one, (start, end))[1])
-    absorption = float(result.attrs["scene.attenuation"]) - float(result.attrs["scene.scattering"])
-    attenuation = float(result.attrs["scene.attenuation"])
     where = f"least squares of the logarithm from {_COLUMN[0]:g} to {_COLUMN[1]:g} m; {described(result)}"
     return [
         Statement(
@@ -66,12 +68,12 @@ def decay_statements(renders: Renders) -> list[Statement]:
         Statement(
             "fig01b",
             "absorption explains the decay",
-            "decay along the path (1/m), from absorption a to attenuation c",
+            "absorption over the decay along the path, most of it from 0.5 on",
             "",
-            *rate,
-            (absorption, attenuation),
-            f"{where}; a is {absorption:g} and c {attenuation:g} per metre",
-            float(np.mean((rates >= absorption) & (rates <= attenuation))),
+            *estimate(absorbed, series),
+            (0.5, 1.0),
+            f"{where}; absorption {absorption:g} per metre",
+            float(np.mean((shares >= 0.5) & (shares <= 1))),
             RANDOM,
             "scattering out of the field of view, and the spreading of the light, add to absorption",
         ),

@@ -43,9 +43,11 @@ class System(NamedTuple):
     def of(cls, scene: str) -> System:
         """Read the parameters of a scene."""
         values = scene_parameters(scene)
-        milli = [1e-3 * float(values[f"{name}_mrad"]) for name in ("divergence", "field_of_view")]
+        divergence, view = (1e-3 * float(values[f"{name}_mrad"]) for name in ("divergence", "field_of_view"))
         index, depth = float(values["refractive_index"]), float(values["bottom_depth"])
-        return cls(math.radians(float(values["off_nadir_deg"])), float(values["altitude"]), *milli, index, depth)
+        return cls(
+            math.radians(float(values["off_nadir_deg"])), float(values["altitude"]), divergence, view, index, depth
+        )
 
     @property
     def slant_range(self) -> float:
