@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.layout import draw_sea_level
@@ -167,8 +168,5 @@ def _show_decades(axes: Sequence[Axes]) -> None:
 
 def add_pixel_legend(ax: Axes, loc: str = "best") -> None:
     """Name the four pixels by their colours."""
-    handles = [
-        ax.plot([], [], color=colour, label=name)[0]
-        for name, colour in zip(PIXELS, drawing.pixel_colours(4), strict=True)
-    ]
-    ax.legend(handles=handles, frameon=False, fontsize="small", loc=loc)
+    handles = [Line2D([], [], color=colour) for colour in drawing.pixel_colours(4)]
+    ax.legend(handles, PIXELS, frameon=False, fontsize="small", loc=loc)

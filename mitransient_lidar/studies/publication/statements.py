@@ -94,8 +94,8 @@ def write_statements(statements: Sequence[Statement], path: Path) -> None:
 
 def describe_statements(statements: Sequence[Statement]) -> list[str]:
     """Return the lines of a table: figure, whether it holds, value, error, published value, statement."""
-    lines = [f"{'figure':<8}{'holds':<8}{'value':>10}{'error':>10}{'published':>12}  statement: quantity"]
+    lines = [f"{'figure':<8}{'holds':<8}{'value':>10}{'error':>10}{'published':>18}  statement: quantity"]
     for one in statements:
-        numbers = f"{one.value:>10.4g}{one.error:>10.2g}{one.published:>12}"
+        numbers = f"{one.value:>10.4g}{one.error:>10.2g}{one.published:>18}"
         lines.append(f"{one.figure:<8}{one.holds:<8}{numbers}  {one.statement}: {one.quantity}")
     return lines
