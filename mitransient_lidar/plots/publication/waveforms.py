@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -166,7 +167,7 @@ def _show_decades(axes: Sequence[Axes]) -> None:
         ax.set_ylim(3e-4 * ax.get_ylim()[1], None)
 
 
-def add_pixel_legend(ax: Axes, loc: str = "best") -> None:
+def add_pixel_legend(ax: Axes, loc: Literal["best", "upper left"] = "best") -> None:
     """Name the four pixels by their colours."""
     handles = [Line2D([], [], color=colour) for colour in drawing.pixel_colours(4)]
     ax.legend(handles, PIXELS, frameon=False, fontsize="small", loc=loc)

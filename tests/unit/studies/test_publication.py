@@ -13,6 +13,7 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.publication import figures as publication
 from mitransient_lidar.plots.publication.waves import refracted
+from mitransient_lidar.rendering.sea_map import SeaMap
 from mitransient_lidar.studies.publication import echoes, layers, measures, targets
 from mitransient_lidar.studies.publication.measures import Series, Waveform
 from mitransient_lidar.studies.publication.renders import joined
@@ -94,6 +95,17 @@ def test_series_of_other_bins_are_joined_on_common_ones():
     both = joined([early, late])
     np.testing.assert_array_equal(both.time, np.arange(2.5, 10))
     np.testing.assert_array_equal(both.power[0], both.power[1])
+
+
+def test_places_of_given_slopes_are_the_nearest_ones_apart():
+    """A slope of 0.01 per metre along x: two places 6 m or more apart lie on either side of the one wanted."""
+    lines = np.arange(-20.0, 21)
+    along, across = 0.01 * np.meshgrid(lines, lines)[0], np.abs(np.meshgrid(lines, lines)[1])
+    places = SeaMap(lines, lines, 0 * along, along, across).near((0.05, 0.0), 2, 6.0)
+    assert (places[0].x, places[0].y) == (5, 0)
+    assert places[1].x in (-1, 11)
+    assert places[1].y == 0
+    assert places[1].along == pytest.approx(0.01 * places[1].x)
 
 
 @pytest.mark.parametrize(
