@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.flights.fly import fly
     from mitransient_lidar.loading.catalogue import scene_names, scene_parameters
     from mitransient_lidar.loading.instruments import instrument_names, read_instrument
+    from mitransient_lidar.plots.publication.figures import figures
     from mitransient_lidar.plots.viewer import view
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.shot_series import render_shots
@@ -79,6 +80,7 @@ _FUNCTIONS = {
     "depth_uncertainty": ("studies.depth_uncertainty", "depth_uncertainty"),
     "detect": ("studies.detection", "detect"),
     "estimate": ("studies.estimate", "estimate"),
+    "figures": ("plots.publication.figures", "figures"),
     "fit": ("studies.fit", "fit"),
     "fly": ("flights.fly", "fly"),
     "instrument_names": ("loading.instruments", "instrument_names"),
@@ -103,6 +105,7 @@ __all__ = [
     "depth_uncertainty",
     "detect",
     "estimate",
+    "figures",
     "fit",
     "fly",
     "instrument_names",

@@ -20,6 +20,7 @@ from mitransient_lidar.cli import (
     bounds,
     campaigns,
     depth_bias,
+    figures,
     fit,
     flights,
     gates,
@@ -49,6 +50,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
         studies.fov_sweep,
         studies.scattering_orders,
         studies.water,
+        figures.figures,
     ),
     "Analyse results": (
         results.view,

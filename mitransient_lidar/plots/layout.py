@@ -109,6 +109,21 @@ def plot_layout(dataset: xr.Dataset, path: drawing.FilePath | None = None) -> Fi
     return drawing.save(figure, path)
 
 
+def draw_sea_level(ax: Axes, dataset: xr.Dataset) -> None:
+    """Draw pixels, beam and targets on the mean sea level, as `plot_layout`; targets are where the receiver sees them.
+
+    Raises
+    ------
+    UserError
+        As `plot_layout`.
+    """
+    ground = _Ground.of_result(dataset.attrs)
+    plane = _planes(dataset.attrs, json.loads(dataset.attrs.get("target_outlines", "[]")))[0]
+    _draw_plane(ax, dataset, ground.at(plane.z), plane, [])
+    across, along = ground.axis_names()
+    ax.set(xlabel=across, ylabel=along)
+
+
 def axis_points(dataset: xr.Dataset) -> list[str]:
     """Return, for each plane of `plot_layout`, its name and the points where receiver's axis and laser's axis meet it.
 

@@ -97,6 +97,18 @@ class SeaMap:
                 f"slope_sigmas = {slope_sigmas:g}: the sea has no place of the kind {kind} with such a slope; the "
                 f"nearest one differs by {nearest:.1f} standard deviations, and at most {_NEAREST:g} are allowed"
             )
+        return self._nearest(kind, distance, count, apart)
+
+    def near(self, slopes: tuple[float, float], count: int, apart: float) -> list[Shot]:
+        """Return the places whose slopes (along, across) [1] are nearest to given ones, `apart` metres or more apart.
+
+        A small sea may have fewer than `count` places.
+        """
+        distance = np.hypot(self.along - slopes[0], self.across - slopes[1])
+        return self._nearest("near", distance, count, apart)
+
+    def _nearest(self, kind: str, distance: FloatArray, count: int, apart: float) -> list[Shot]:
+        """Return places in the order of a distance of their slopes, shape of the map."""
         shots: list[Shot] = []
         for index in np.argsort(distance, axis=None):
             j, i = np.unravel_index(index, distance.shape)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
@@ -106,7 +107,11 @@ def highest_points(shot: xr.Dataset, start: float, end: float) -> tuple[FloatArr
     inside = np.flatnonzero((time >= start) & (time <= end))
     if len(inside) < 3 or inside[0] == 0 or inside[-1] == len(time) - 1:
         raise UserError(f"the record must hold {start:.1f} to {end:.1f} ns: change time_start_ns or bin_count")
-    power = shot["waveform"].values.reshape(-1, len(time))
+    return highest_of(time, shot["waveform"].values.reshape(-1, len(time)), inside)
+
+
+def highest_of(time: FloatArray, power: FloatArray, inside: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """Return height and time of `highest_points` for power [W], shape (pixels, time), in bins of given indices."""
     heights, times = np.full(len(power), np.nan), np.full(len(power), np.nan)
     for pixel, values in enumerate(power):
         top = inside[np.argmax(values[inside])]

@@ -29,7 +29,7 @@ def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = No
     rows = -(-len(rendered.results) // columns) if columns else 1
     figure = drawing.new_figure(path, 6.0 + 3.6 * columns, max(5.4, 2.7 * rows))
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[1.5, *[1.0] * columns])
-    _draw_sea(figure.add_subplot(grid[:, 0]), rendered)
+    draw_sea(figure.add_subplot(grid[:, 0]), rendered)
     limits = _time_limits(rendered.results)
     for index, (shot, result) in enumerate(zip(rendered.shots, rendered.results, strict=False)):
         ax = figure.add_subplot(grid[index // columns, 1 + index % columns])
@@ -39,8 +39,11 @@ def plot_found_shots(rendered: RenderedShots, path: drawing.FilePath | None = No
     return drawing.save(figure, path)
 
 
-def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
-    """Draw elevations about the shots, and the outlines of pixels and beam at each shot on the mean sea level."""
+def draw_sea(ax: Axes, rendered: RenderedShots, first: int = 1) -> None:
+    """Draw elevations about the shots, and the outlines of pixels and beam at each shot on the mean sea level.
+
+    Shots are numbered from `first` on.
+    """
     sea, shots = rendered.sea, rendered.shots
     along, across = rendered.beam_spread
     x, y = np.array([shot.x for shot in shots]), np.array([shot.y for shot in shots])
@@ -48,9 +51,9 @@ def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
     spacing = sea.x[1] - sea.x[0]
     windows = []
     for places, lines in ((x, sea.x), (y, sea.y)):
-        first = math.floor((places.min() - margin - lines[0]) / spacing)
-        last = math.ceil((places.max() + margin - lines[0]) / spacing)
-        windows.append(np.arange(first, last + 1))
+        start = math.floor((places.min() - margin - lines[0]) / spacing)
+        end = math.ceil((places.max() + margin - lines[0]) / spacing)
+        windows.append(np.arange(start, end + 1))
     # The sea repeats itself.
     heights = sea.heights[np.ix_(windows[1] % len(sea.y), windows[0] % len(sea.x))]
     left, right = sea.x[0] + windows[0][[0, -1]] * spacing
@@ -60,7 +63,7 @@ def _draw_sea(ax: Axes, rendered: RenderedShots) -> None:
     )
     ax.figure.colorbar(image, ax=ax, label="elevation (m)", shrink=0.6)
     palette = drawing.pixel_colours(rendered.pixel_count)
-    for number, shot in enumerate(shots, start=1):
+    for number, shot in enumerate(shots, start=first):
         for pixel in np.unique(rendered.pixel_map[rendered.pixel_map >= 0]):
             lines, mask = rendered.pixel_lines, (rendered.pixel_map == pixel).astype(np.float64)
             ax.contour(lines + shot.x, lines + shot.y, mask, [0.5], colors=[palette[pixel]], linewidths=1.2)

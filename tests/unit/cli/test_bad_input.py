@@ -224,6 +224,7 @@ OPTIONS = [
     (("scattering-orders", "fig09_2x2"), "--orders", "63", "must lie between 1 and 62"),
     (("water", "pure"), "--wavelength", "x", "must be a valid number"),
     (("water", "mud"), "--tolerance", "0.1", "kind = 'mud'"),
+    (("figures", "fig05"), "--seed", "-1", "seed = -1 must lie between 0"),
     (("bench", "--quick"), "--target-error", "0", "must be greater than 0"),
 ]
 

@@ -16,7 +16,7 @@ WAVES = ["-D", "surface_size=60", "-D", "surface_cell_size=0.25", *FLAT[4:]]
 SEA_COMMANDS = ("find-shots", "shot-statistics")
 #: Those that take most time.
 SLOW = {"detect", "target-signal", "shot-statistics", "beam-spread", "fov-sweep", "plot", "passive"}
-SLOW |= {"waveforms", "scattering-orders", "bounds"}
+SLOW |= {"waveforms", "scattering-orders", "bounds", "figures"}
 
 #: Arguments of each command, after the scene or the result if it takes one.
 SCENE_COMMANDS = {
@@ -43,6 +43,7 @@ OTHER_COMMANDS = {
     "info": [],
     "scenes": ["list"],
     "instruments": ["teledyne_czmil"],
+    "figures": ["fig06", "fig08"],
     "passive": ["passive_sea", "-D", "layout=4x4", "-D", "surface_cell_size=2", "--passes", 2],
 }
 

@@ -1,0 +1,1 @@
+"""Drawings of the figures of `studies.publication`."""

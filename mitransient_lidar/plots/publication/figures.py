@@ -1,0 +1,136 @@
+"""All figures of the publication, and the table of its statements."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from mitransient_lidar.core.errors import UserError, is_interruption
+from mitransient_lidar.plots import drawing
+from mitransient_lidar.plots.publication import drawings, waveforms
+from mitransient_lidar.plots.publication import waves as wave_drawings
+from mitransient_lidar.rendering.passes import ProgressCallback
+from mitransient_lidar.studies.publication import echoes, geometry, layers, targets, waves
+from mitransient_lidar.studies.publication.renders import Renders
+from mitransient_lidar.studies.publication.statements import Statement, write_statements
+
+_LOG = logging.getLogger(__name__)
+
+#: File of the statements.
+TABLE = "statements.csv"
+
+
+class _Figure(NamedTuple):
+    """How a figure is drawn, and the statements that it shows."""
+
+    draw: Callable[[Renders], Figure]
+    statements: Callable[[Renders], list[Statement]] | None = None
+
+
+_FIGURES = {
+    "fig01b": _Figure(waveforms.example, echoes.decay_statements),
+    "fig02": _Figure(waveforms.mine, echoes.target_statements),
+    "fig04": _Figure(waveforms.mast, echoes.mast_statements),
+    "fig05": _Figure(drawings.system, geometry.system_statements),
+    "fig06": _Figure(drawings.mesh),
+    "fig08": _Figure(drawings.pixels, geometry.pixel_statements),
+    "fig09": _Figure(waveforms.pixels_over_bottom, echoes.pixel_statements),
+    "fig10": _Figure(wave_drawings.surface_echoes, waves.surface_statements),
+    "fig11": _Figure(wave_drawings.bottom_echoes, waves.bottom_statements),
+    "fig12": _Figure(wave_drawings.paths, geometry.path_statements),
+    "fig13": _Figure(waveforms.square_target, targets.square_statements),
+    "fig14": _Figure(waveforms.strip_target, targets.strip_statements),
+    "fig15": _Figure(waveforms.layered, layers.delay_statements),
+    "fig16": _Figure(waveforms.layer_zoom, layers.duration_statements),
+}
+
+#: Names of the figures.
+NAMES = tuple(_FIGURES)
+
+
+@dataclass(frozen=True)
+class Publication:
+    """Files that were written, the statements of the figures, and whether an interruption ended the work."""
+
+    files: tuple[Path, ...]
+    statements: tuple[Statement, ...]
+    interrupted: bool = False
+
+
+def figures(
+    names: Sequence[str] | None = None,
+    output: str | os.PathLike[str] = "figures",
+    *,
+    target_error: float = 0.01,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+) -> Publication:
+    """Make the figures of the multipixel lidar model of FOI (Tulldahl 2006), and the table of its statements.
+
+    Parameters
+    ----------
+    names
+        Figures, of ``fig01b``, ``fig02``, ``fig04`` to ``fig06``, and ``fig08`` to ``fig16``; by default all.
+    output
+        Folder, made if needed. Each figure becomes a file as ``fig09.png``, and the table of the statements of these
+        figures ``statements.csv``. Every file is moved into its place when it is complete.
+    target_error
+        Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
+        warning.
+    seed
+        Seed of all random numbers and of the other places, 0 to 10^6.
+    progress
+        Called with a `passes.Progress` after every batch of shots.
+
+    Returns
+    -------
+    Publication
+        Paths of the files in the order of the figures, the table last; the statements; and whether Ctrl-C ended the
+        work, in which case the files and statements are those of the figures completed by then.
+
+    Raises
+    ------
+    UserError
+        If a name is unknown or a number is out of range.
+    WriteError
+        If a file cannot be written.
+    """
+    chosen = check_names(names)
+    renders = Renders(target_error, seed, progress)
+    folder = Path(output)
+    folder.mkdir(parents=True, exist_ok=True)
+    files: list[Path] = []
+    found: list[Statement] = []
+    interrupted = False
+    try:
+        for number, name in enumerate(chosen, start=1):
+            _LOG.info("%s, %d of %d", name, number, len(chosen))
+            figure = _FIGURES[name]
+            stated = figure.statements(renders) if figure.statements else []
+            path = folder / f"{name}.png"
+            drawing.save(figure.draw(renders), path)
+            files.append(path)
+            found += stated
+            # The table holds the statements of the figures that are there, even if the process is killed.
+            write_statements(found, folder / TABLE)
+    except (KeyboardInterrupt, RuntimeError) as error:
+        if not is_interruption(error):
+            raise
+        interrupted = True
+    if files:
+        files.append(folder / TABLE)
+    return Publication(tuple(files), tuple(found), interrupted)
+
+
+def check_names(names: Sequence[str] | None) -> list[str]:
+    """Return names of figures in the order of the publication, by default all; raise `UserError` for unknown ones."""
+    for name in names or ():
+        if name not in NAMES:
+            raise UserError(f"figure {name!r} must be one of {', '.join(NAMES)}")
+    return [name for name in NAMES if not names or name in names]

@@ -1,0 +1,101 @@
+"""Statements of the publication, each with a measured quantity, its error, and whether it holds."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mitransient_lidar.core.files import replacing
+
+#: Names of the columns of the table.
+COLUMNS = (
+    *("figure", "statement", "quantity", "published", "value", "standard_error", "holds", "share", "where"),
+    "difference",
+)
+
+#: Standard errors within which a quantity at a limit may lie on either side.
+_MARGIN = 2.0
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A statement of the publication in our words, and what was measured.
+
+    Attributes
+    ----------
+    figure, statement, quantity
+        Name of the figure, what is stated, and the measured quantity with its unit.
+    published
+        Published value, empty without a number.
+    value, error
+        Measured value and its standard error.
+    limits
+        Interval of the values for which the statement holds.
+    where
+        Measure, place and mesh.
+    share
+        Share of other places for which it holds, None if no place was chosen.
+    places
+        What these places are.
+    difference
+        Reason for a difference from the publication.
+    """
+
+    figure: str
+    statement: str
+    quantity: str
+    published: str
+    value: float
+    error: float
+    limits: tuple[float, float]
+    where: str
+    share: float | None = None
+    places: str = ""
+    difference: str = ""
+
+    @property
+    def holds(self) -> str:
+        """``yes`` within the limits, and at half of the other places or more; ``no``; ``partly`` between these.
+
+        Partly is a value within the limits that holds at fewer places, one outside that holds at half of them, and one
+        that is less than two standard errors outside.
+        """
+        low, high = self.limits
+        common = self.share is None or self.share >= 0.5
+        if low <= self.value <= high:
+            return "yes" if common else "partly"
+        outside = max(low - self.value, self.value - high)
+        near = outside <= _MARGIN * self.error or (self.share is not None and common)
+        return "partly" if near and math.isfinite(self.value) else "no"
+
+    def row(self) -> list[str]:
+        """Return the texts of the columns."""
+        share = "" if self.share is None else f"{self.share:.2f}"
+        where = (
+            self.where if self.share is None else f"{self.where}; holds at {100 * self.share:.0f} % of {self.places}"
+        )
+        numbers = f"{self.value:.4g}", f"{self.error:.2g}"
+        return [
+            *(self.figure, self.statement, self.quantity, self.published, *numbers, self.holds, share, where),
+            self.difference,
+        ]
+
+
+def write_statements(statements: Sequence[Statement], path: Path) -> None:
+    """Write a CSV table of statements, in place of an existing file on success only."""
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        table.writerows(one.row() for one in statements)
+
+
+def describe_statements(statements: Sequence[Statement]) -> list[str]:
+    """Return the lines of a table: figure, whether it holds, value, error, published value, statement."""
+    lines = [f"{'figure':<8}{'holds':<8}{'value':>10}{'error':>10}{'published':>18}  statement: quantity"]
+    for one in statements:
+        numbers = f"{one.value:>10.4g}{one.error:>10.2g}{one.published:>18}"
+        lines.append(f"{one.figure:<8}{one.holds:<8}{numbers}  {one.statement}: {one.quantity}")
+    return lines
