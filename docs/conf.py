@@ -73,9 +73,6 @@ if any((DOCS / "gallery").glob("*.py")):
         "within_subsection_order": "FileNameSortKey",
     }
 
-# Pages that are not written yet; tests/unit/docs checks the contents of the others.
-suppress_warnings = ["toc.not_readable"]
-
 html_theme = "pydata_sphinx_theme"
 html_title = "mitransient-lidar"
 # MathJax is part of the site, so that formulas appear without a network. Its package is no extension that is safe for
