@@ -201,9 +201,9 @@ def daylight() -> list[Row]:
         scene = daylight_scenes.build(
             sky={"irradiance": 1.0},
             water={"attenuation": 1.0, "scattering": albedo, "backscattering": 0.0183 * albedo},
-            integrator={"paths_per_pass": 2**15},
+            integrator={"paths_per_pass": 2**18},
         )
-        # Of the sky's mirror image, a constant, nothing is random.
+        # The sky's mirror image is not random.
         leaving = daylight_scenes.passes(scene, 12)[:, 0] - float(fresnel(0.0, daylight_scenes.N)[0]) / np.pi
         quantity = f"reflectance of deep water, albedo {albedo:g}"
         found.append(row(quantity, "1/sr", leaving, expected, "HydroLight 4.2"))
