@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 #: Speed of light [m/ns].
 LIGHT = 0.299792458
 #: Rays of the beam along its radius and azimuth, radius of a Gaussian beam in standard deviations, and nodes of depth.
-RADII, AZIMUTHS, REACH, DEPTHS = 64, 96, 6.0, 6
+RADII, AZIMUTHS, REACH, DEPTHS = 96, 192, 6.0, 6
 
 
 def read_cases() -> dict[str, Case]:
