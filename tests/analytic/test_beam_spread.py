@@ -1,6 +1,7 @@
 """Light at depth against radiative-transfer benchmarks, exact moments, small-angle theory, and energy conservation."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import drjit as dr
@@ -32,16 +33,17 @@ VIEW = {"off_nadir_deg": 0.0, "field_of_view_mrad": 200.0, "layout": "1x1"}
 LARGE_SEA = {"size": 4000.0, "slope_variance": "2e-5"}
 
 
+def parts_of(lidar_scene, water, tx=PENCIL, **options):
+    """Return the parts of a scene with a large flat sea."""
+    water = {"backscattering": 0.0, **water}
+    scene = lidar_scene(tx=tx, rx=VIEW, sea=LARGE_SEA, water=water, **options)
+    return find_lidar_scene(scene, scene.sensors()[0])
+
+
 @pytest.fixture
 def system(lidar_scene):
-    """Builder of the parts of a scene with a large flat sea."""
-
-    def build(water, tx=PENCIL, **options):
-        water = {"backscattering": 0.0, **water}
-        scene = lidar_scene(tx=tx, rx=VIEW, sea=LARGE_SEA, water=water, **options)
-        return find_lidar_scene(scene, scene.sensors()[0])
-
-    return build
+    """Builder of these parts."""
+    return partial(parts_of, lidar_scene)
 
 
 def fluxes(system, depths, photons, passes):
@@ -55,20 +57,21 @@ def fluxes(system, depths, photons, passes):
     return down / system.transmitter.energy, up / system.transmitter.energy
 
 
+#: Water above clear water, and the shares of light that it transmits and reflects.
+SLAB = {
+    **{"layer_tops": "0, 20", "attenuation": "0.1, 0", "scattering": "0.09, 0"},
+    **{"phase_function": "hg", "phase_g": 0.75},
+}
+SLAB_SHARES = 0.66096, 0.09739
+
+
 @pytest.mark.slow
 def test_slab_transmits_and_reflects_as_tabulated(system, z_score):
     # Van de Hulst (1980): Henyey-Greenstein g = 0.75, albedo 0.9, optical thickness 2, matched index, normal incidence.
     # Below the slab is clear water and a black bottom. Here the thickness is 20 m, and reflected light crosses a plane
     # at a ten-thousandth of a mean free path.
-    water = {
-        "layer_tops": "0, 20",
-        "attenuation": "0.1, 0",
-        "scattering": "0.09, 0",
-        "phase_function": "hg",
-        "phase_g": 0.75,
-    }
-    down, up = fluxes(system({**MATCHED, **water}, bottom=21.0, rho=0.0), [1e-3, 20.0], 2**16, 16)
-    for share, expected in ((down[:, 1], 0.66096), (up[:, 0], 0.09739)):
+    down, up = fluxes(system({**MATCHED, **SLAB}, bottom=21.0, rho=0.0), [1e-3, 20.0], 2**16, 16)
+    for share, expected in zip((down[:, 1], up[:, 0]), SLAB_SHARES, strict=True):
         z, error = z_score(share, expected)
         assert abs(z) < largest_z(16, 2), (share.mean(), expected)
         assert error < largest_error(16, 0.0029)
@@ -83,21 +86,23 @@ def test_light_that_leaves_for_ever_is_counted(system):
     assert np.all(up == 0)
 
 
-@pytest.mark.slow
-def test_moments_of_an_infinite_medium(system, z_score):
-    # Exact at every path length s (derivation: the directions' correlations decay as exp(-b (1 - g_l) s)).
-    b, g, start, step = 1.0, 0.924, 150.0, 10.0
-    water = {**MATCHED, "attenuation": b, "scattering": b, "phase_function": "hg", "phase_g": g}
+#: Mean cosine of the scattering angle, depth of the source [m], and distance of the points [m] in `moments`, b = 1 /m.
+MEAN_COSINE, SOURCE_DEPTH, STEP = 0.924, 150.0, 10.0
+
+
+def moments(system, passes):
+    """Return depth, its square, and the squared radius of light after 10, 20 and 30 m, shape (passes, lengths, 3)."""
+    water = {**MATCHED, "attenuation": 1.0, "scattering": 1.0, "phase_function": "hg", "phase_g": MEAN_COSINE}
     parts = system(water, bottom=None)
-    count, passes = 2**13, 12
+    count = 2**13
     samples = np.zeros((passes, 3, 3))
     for number in range(passes):
         rng = pass_streams(3, number, count)
         down = mi.Point2f(dr.zeros(mi.Float, count), 0)
-        path = RandomWalkPath.start(parts, parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(step))
-        path.point, path.in_water = mi.Point3f(0, 0, -start), mi.Bool(True)
+        path = RandomWalkPath.start(parts, parts.transmitter.pose, down, dr.ones(mi.Float, count), mi.Float(STEP))
+        path.point, path.in_water = mi.Point3f(0, 0, -SOURCE_DEPTH), mi.Bool(True)
         path.at_start, path.length = mi.Bool(False), mi.Float(1)
-        segments = SegmentBuffer(parts, PathClasses(), step, count, 150 * count)
+        segments = SegmentBuffer(parts, PathClasses(), STEP, count, 150 * count)
         end = parts.reference_length + 500.0
         RandomWalk(parts, mi.TransportMode.Importance, parts.receiver.pose, end).run(
             path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False
@@ -106,21 +111,31 @@ def test_moments_of_an_infinite_medium(system, z_score):
         assert wanted <= segments.capacity
         found = segments.points(dr.arange(mi.UInt32, points))
         x, y, z = np.array(found.point, dtype=np.float64)
-        depth = -z - start
-        stop = np.rint((np.array(found.length) - 1) / step).astype(int)
+        depth = -z - SOURCE_DEPTH
+        stop = np.rint((np.array(found.length) - 1) / STEP).astype(int)
         for k in range(3):
             at = stop == k + 1
             assert np.count_nonzero(at) == count
             samples[number, k] = depth[at].mean(), (depth[at] ** 2).mean(), (x[at] ** 2 + y[at] ** 2).mean()
-    s = step * np.arange(1, 4)
-    k1, kappa = b * (1 - g), b * (1 - g * g)
+    return samples
+
+
+def exact_moments():
+    """Return the same moments, exact at every path length: directions' correlations decay as exp(-b (1 - g_l) s)."""
+    s = STEP * np.arange(1, 4)
+    k1, kappa = 1 - MEAN_COSINE, 1 - MEAN_COSINE**2
     z1 = (1 - np.exp(-k1 * s)) / k1
     square = 2 / k1**2 * (k1 * s - 1 + np.exp(-k1 * s))
     z2 = 2 / (3 * k1) * (s - z1) + 4 / 3 / (k1 - kappa) * ((1 - np.exp(-kappa * s)) / kappa - z1)
-    expected = np.stack([z1, z2, square - z2], axis=1)
+    return np.stack([z1, z2, square - z2], axis=1)
+
+
+@pytest.mark.slow
+def test_moments_of_an_infinite_medium(system, z_score):
+    passes, expected = 12, exact_moments()
     # The same formulas evaluated elsewhere, for s = 10.
     np.testing.assert_allclose(expected[0], [7.00439, 59.509, 19.323], rtol=1e-4)
-    score, error = z_score(samples, expected)
+    score, error = z_score(moments(system, passes), expected)
     assert np.all(np.abs(score) < largest_z(passes, score.size)), score
     assert np.all(error < largest_error(passes, 0.006))
 

@@ -156,6 +156,13 @@ def test_sun_glint_of_gaussian_slopes(zenith, azimuth, view, wind, wind_azimuth)
         depth=0.5,
         rho=0.0,
     )
+    expected = glint_radiance(zenith, azimuth, view, wind, wind_azimuth)
+    # Facets in the shadow of others, which the formula leaves out, and the sun's disc: below a thousandth here.
+    assert agrees(passes(scene, 4), expected, 3, bias=1.5e-3) < 1e-3
+
+
+def glint_radiance(zenith, azimuth, view, wind, wind_azimuth):
+    """Return the radiance [1/sr] of the glint of a sun of unit irradiance, by Cox and Munk; angles in degrees."""
     to_sun, to_receiver = direction(zenith, azimuth), direction(view, 180.0)
     half = (to_sun + to_receiver) / np.linalg.norm(to_sun + to_receiver)
     slope = -half[:2] / half[2]
@@ -165,9 +172,7 @@ def test_sun_glint_of_gaussian_slopes(zenith, azimuth, view, wind, wind_azimuth)
     exponent = up**2 / variance_up + across**2 / variance_across
     density = np.exp(-0.5 * exponent) / (2 * np.pi * np.sqrt(variance_up * variance_across))
     reflectance = fresnel(np.arccos(half @ to_sun), N)[0]
-    expected = float(reflectance * density / (4 * to_receiver[2] * half[2] ** 4))
-    # Facets in the shadow of others, which the formula leaves out, and the sun's disc: below a thousandth here.
-    assert agrees(passes(scene, 4), expected, 3, bias=1.5e-3) < 1e-3
+    return float(reflectance * density / (4 * to_receiver[2] * half[2] ** 4))
 
 
 def direction(zenith, azimuth):
