@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mitransient_lidar.cli.files import check_writable
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import Quiet, Seed
+from mitransient_lidar.cli.options import OUTPUT, Quiet, Seed
 
 
 def figures(
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Figures, as fig09; all by default.")
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = Path("figures"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = OUTPUT / "figures",
     target_error: Annotated[float, typer.Option(help="Relative standard error of the median bin.")] = 0.01,
+    max_time: Annotated[
+        float | None, typer.Option(help="Begin no further figure after this many seconds (greater than 0).")
+    ] = None,
     seed: Seed = 0,
     quiet: Quiet = False,
 ) -> None:
@@ -31,8 +34,9 @@ def figures(
 
     chosen = publication.check_names(names)
     check_writable(output, [output / f"{name}.png" for name in chosen] + [output / publication.TABLE])
+    options: dict[str, Any] = {"target_error": target_error, "max_time": max_time, "seed": seed}
     with reporting(quiet) as progress:
-        made = publication.figures(chosen, output, target_error=target_error, seed=seed, progress=progress)
+        made = publication.figures(chosen, output, progress=progress, **options)
     for path in made.files:
         typer.echo(path)
     for line in describe_statements(made.statements):

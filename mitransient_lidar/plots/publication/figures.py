@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError, is_interruption
+from mitransient_lidar.core.validation import positive
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
 from mitransient_lidar.plots.publication import waves as wave_drawings
@@ -65,9 +68,10 @@ class Publication:
 
 def figures(
     names: Sequence[str] | None = None,
-    output: str | os.PathLike[str] = "figures",
+    output: str | os.PathLike[str] = "output/figures",
     *,
     target_error: float = 0.01,
+    max_time: float | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> Publication:
@@ -83,6 +87,8 @@ def figures(
     target_error
         Relative standard error of the median bin, greater than 0. Figure 4, which converges slowly, may miss it, with a
         warning.
+    max_time
+        Time after which no further figure is begun [s], greater than 0; by default all are made.
     seed
         Seed of all random numbers and of the other places, 0 to 10^6.
     progress
@@ -102,6 +108,8 @@ def figures(
         If a file cannot be written.
     """
     chosen = check_names(names)
+    limit = math.inf if max_time is None else positive("max_time", max_time)
+    began = time.perf_counter()
     renders = Renders(target_error, seed, progress)
     folder = Path(output)
     folder.mkdir(parents=True, exist_ok=True)
@@ -110,6 +118,9 @@ def figures(
     interrupted = False
     try:
         for number, name in enumerate(chosen, start=1):
+            if files and time.perf_counter() - began > limit:
+                _LOG.warning("max_time = %g s ended after %d of %d figures", limit, len(files), len(chosen))
+                break
             _LOG.info("%s, %d of %d", name, number, len(chosen))
             figure = _FIGURES[name]
             stated = figure.statements(renders) if figure.statements else []

@@ -314,10 +314,10 @@ def test_lines_of_the_documentation_make_a_batch(tmp_path, monkeypatch):
     }
     columns = {"altitude": np.arange(10)}
     store = Store.create(tmp_path / "bottoms.zarr", RunRenderer(CAMPAIGN, RECORD, AXIS), columns, arrays, COORDINATES)
-    status, errors, values = store.read(0)
-    status[:], values["signal"][:], values["true_bottom_depth"][:] = DONE, 1e-4, np.arange(10)
-    status[3] = FAILED
-    store.write(0, status, errors, values)
+    for shard, runs in ((0, np.arange(8)), (1, np.arange(8, 10))):
+        status, errors, values = store.read(shard)
+        values["signal"][:], values["true_bottom_depth"][:] = 1e-4, runs
+        store.write(shard, np.where(runs == 3, FAILED, DONE).astype(status.dtype), errors, values)
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(code, names)

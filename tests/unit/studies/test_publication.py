@@ -183,6 +183,12 @@ def test_an_interruption_keeps_the_figures_that_are_done(tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fig05.png", "statements.csv"]
 
 
+def test_the_longest_time_ends_the_work_between_figures(tmp_path, caplog):
+    made = mitransient_lidar.figures(["fig05", "fig08"], tmp_path, max_time=1e-9)
+    assert [path.name for path in made.files] == ["fig05.png", "statements.csv"]
+    assert "max_time = 1e-09 s ended after 1 of 2 figures" in caplog.text
+
+
 @pytest.mark.slow
 def test_a_rendered_figure(tmp_path):
     """Sphere at 9 m: its echo lies within half its size about its centre."""
