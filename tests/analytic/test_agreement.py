@@ -246,10 +246,12 @@ def assert_same_light(merged, reference, error):
 #: In the quick tier.
 MIXED = "mirror and sphere in strata"
 #: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water, strata
-#: (the quick case) and orders (turbid water). Closed forms cover beam and view of millimetres over ripples.
+#: (the quick case) and orders (turbid water). Closed forms cover solids, masts, poses under water, and beam and view of
+#: millimetres over ripples.
 LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam", "a diver looks up"}
 LONG |= {"narrow view at 75 degrees", "mast, 1 m aside over waves", "from orbit over waves"}
-LONG |= {"strata of other indices, by order", "view as narrow as the beam"}
+LONG |= {"strata of other indices, by order", "view as narrow as the beam", "narrow beam in turbid, smooth water"}
+LONG |= {"solids on sand", "mast at 60 degrees", "below a boat, at a target"}
 
 
 def tier_of(name):

@@ -104,7 +104,7 @@ def test_layer_seen_by_its_scattering_begins_at_its_slanted_depth(lidar_scene, p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_volpath", "lidar_merging"])
-@pytest.mark.parametrize("angle", [0.0, 20.0])
+@pytest.mark.parametrize("angle", [pytest.param(0.0, marks=pytest.mark.long), 20.0])
 def test_echoes_reach_orbit_when_geometry_says(lidar_scene, passes, angle, integrator):
     """From 500 km, to 1 mm of range; single precision resolves 3 cm in such distances, and 6 cm of the path."""
     altitude, pixel = 5e5, {"altitude": 5e5, "off_nadir_deg": angle}

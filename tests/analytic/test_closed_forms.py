@@ -83,7 +83,9 @@ def tier_of(name, integrator):
     """Return the marks of a case."""
     if name == QUICK:
         return []
-    return pytest.mark.long if (name, integrator) == ("petzold", "lidar_merging") else pytest.mark.slow
+    # One integrator in each: the quick case has both.
+    one = integrator == ("lidar_volpath" if name in ("chi", "petzold") else "lidar_merging")
+    return pytest.mark.slow if one else pytest.mark.long
 
 
 BOTH_IN_ALL_CASES = pytest.mark.parametrize(
@@ -252,8 +254,9 @@ def test_ripples_spread_a_beam_and_its_view_within_decimetres(lidar_scene, passe
     significance.assert_equal(found, expected[1:], error=0.02, bias=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"point_spacing": 0.4}])
+@pytest.mark.parametrize(
+    "options", [pytest.param({}, marks=pytest.mark.long), pytest.param({"point_spacing": 0.4}, marks=pytest.mark.slow)]
+)
 def test_column_ends_at_the_bottom(lidar_scene, passes, options):
     """The last tenth of a column above a black bottom; cells that it cuts lost 6 and 21 % of it."""
     height, depth, beam = 730.0, 1.4, 10.0

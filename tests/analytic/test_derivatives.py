@@ -163,7 +163,9 @@ def test_derivatives_are_limits_of_reweighted_light(lidar, integrator, name):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"attenuation[0]": 0.54, "attenuation[1]": 0.27, "bottom_reflectance": 0.13},
+        pytest.param(
+            {"attenuation[0]": 0.54, "attenuation[1]": 0.27, "bottom_reflectance": 0.13}, marks=pytest.mark.long
+        ),
         {"scattering[0]": 0.39, "scattering[1]": 0.22, "backscattering[0]": 0.012, "backscattering[1]": 0.0028},
     ],
 )

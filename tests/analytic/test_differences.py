@@ -56,6 +56,7 @@ def test_bottom_reflectance_against_the_scene_without_its_light():
     significance.assert_same(in_bins(found[:, echo]), in_bins(wanted[:, echo]), error=0.02, bias=0.002)
 
 
+@pytest.mark.long
 def test_attenuation_of_water_that_only_absorbs():
     """Light that reaches the bottom at nadir and returns loses exp(-2 c d); all ways are longer by at most 0.1 %."""
     depth, view = 8.0, {"off_nadir_deg": 0, "field_of_view_mrad": 30, "slope_variance": 2e-5}

@@ -87,7 +87,7 @@ def closed_form_ns(side):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
+@pytest.mark.parametrize("integrator", [pytest.param("lidar_merging", marks=pytest.mark.long), "lidar_volpath"])
 def test_layers_of_one_water_are_that_water(lidar_scene, passes, integrator):
     """Same seeds, same light: to the bit where layers are equal, as they are joined.
 
@@ -141,6 +141,7 @@ def test_scenes_of_figure_15_differ_in_layout_only():
         pytest.param("nepheloid_layer", 6.5, 1.364, {}, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.long
 def test_step_is_seen_at_its_slanted_depth(name, depth, group_index, sea):
     """A beam of 2 mrad, so narrow that its own spread in time is 0.5 ns; light scattered forward comes later."""
     expected = float(bottom_time_ns(200.0, depth, ANGLE, INDEX, group_index))
@@ -231,7 +232,7 @@ def absorbing(upper, lower):
     return {"layer_tops": "0, 3", **dict(zip(("attenuation", "scattering", "backscattering"), texts, strict=True))}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_absorption_changes_the_bins_behind_it_and_no_others(lidar_scene, passes):
     """A path's absorption is a weight: other absorption, same paths, and exp(-da L) for the way L through it."""
     start, bins = 1410.0, 150

@@ -278,11 +278,13 @@ def kernels_of_pass(scene, sensor, integrator):
     ("name", "parameters", "changes"),
     [
         ("table1", {}, {"attenuation": 0.3, "scattering": 0.21, "bottom_depth": 7.5, "bottom_reflectance": 0.2}),
-        ("table1", {}, {"wind_speed": 4, "surface_seed": 3}),
-        ("table1", {}, {"time_start_ns": 1310, "bin_count": 270}),
+        pytest.param("table1", {}, {"wind_speed": 4, "surface_seed": 3}, marks=pytest.mark.long),
+        pytest.param("table1", {}, {"time_start_ns": 1310, "bin_count": 270}, marks=pytest.mark.long),
         ("table1", {}, {"altitude": 230, "off_nadir_deg": 17, "pulse_energy_mj": 3, "pulse_fwhm_ns": 4}),
-        ("table1", {}, {"divergence_mrad": 8, "field_of_view_mrad": 28, "aperture_area": 0.02}),
-        ("table1", {"layout": "hex7"}, {"field_of_view_mrad": 20, "refractive_index": 1.336, "group_index": 1.36}),
+        pytest.param("table1", {}, {"divergence_mrad": 8, "field_of_view_mrad": 28}, marks=pytest.mark.long),
+        pytest.param(
+            "table1", {"layout": "hex7"}, {"field_of_view_mrad": 20, "group_index": 1.36}, marks=pytest.mark.long
+        ),
         ("ship_wake", STRATA, OTHER_STRATA),
     ],
     ids=lambda value: next(iter(value), "none") if isinstance(value, dict) else value,
@@ -296,8 +298,13 @@ def test_scenes_share_their_kernels(name, parameters, changes, integrator):
     assert found[2] <= found[0] | found[1]
 
 
+#: Kinds of pixels, the first two in the slow tier.
+RECEIVERS = ["hexagons with gaps", "measured blur"]
+RECEIVERS += [pytest.param(kind, marks=pytest.mark.long) for kind in ("gaps", "blur", "map")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["gaps", "hexagons with gaps", "blur", "measured blur", "map"])
+@pytest.mark.parametrize("kind", RECEIVERS)
 def test_receivers_share_their_kernels(lidar_scene, tmp_path, kind):
     found = []
     for number, share in enumerate((0.5, 0.5, 0.7)):

@@ -122,6 +122,7 @@ def test_where_nothing_absorbs_everything_is_as_bright_as_the_sky(sea, layers, l
         pytest.param({"layer_tops": "0, 2", "refractive_index": "1.33, 1.36"}, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.long
 def test_sampling_does_not_change_the_image(layers):
     """Guided directions, roulette and kinds of connections change only the noise."""
     water = {"attenuation": 0.2, "scattering": 0.12, "backscattering": 0.006}

@@ -108,7 +108,7 @@ def test_labels_keep_pixel_and_events():
     np.testing.assert_array_equal(np.array(reversals), 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_echoes_do_not_depend_on_the_shortest_wave():
     """Waves of 1 m and ripples, or waves from 0.15 m: gates of the column, and the bottom, mean over seas."""
     gates = (0.6, 1.4, 2.5, 4.0, 7.0)

@@ -26,7 +26,7 @@ def published(request):
     return request.getfixturevalue(request.param)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_common_random_numbers_know_the_target_better_than_the_records(published):
     """Where the target's echo is not, both records are of the same paths, so that their difference is known to be 0."""
     before = published.sel(time=slice(1420, 1470))

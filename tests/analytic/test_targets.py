@@ -133,9 +133,11 @@ SPHERES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("sphere", SPHERES)
+@pytest.mark.parametrize(
+    "sphere",
+    [pytest.param(name, marks=pytest.mark.slow if "narrow" in name else pytest.mark.long) for name in SPHERES],
+)
 def test_sphere_in_clear_water(lidar_scene, passes, integrator, sphere):
     """Energy and mean time against quadrature over the sphere's lit cap, which is also the one that is seen."""
     lidar, sigma, centre, radius = SPHERES[sphere]

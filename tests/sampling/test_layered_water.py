@@ -149,7 +149,7 @@ def test_column_follows_the_phase_function_at_180_degrees(lidar_scene, passes, h
     assert_same(samples, reference * backward * 4 * np.pi * 1.5**2 / 0.5, error=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_profile_file_is_its_layers(lidar_scene, passes, tmp_path):
     """Two nodes of one water: the same bits as that water; a gradient: the energies of many thin layers by hand."""
     path = tmp_path / "even.csv"

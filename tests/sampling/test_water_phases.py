@@ -190,7 +190,7 @@ def test_layers_with_many_ratios_share_functions_within_two_percent():
     layer_tops = ", ".join(f"{0.01 * layer:.2f}" for layer in range(500))
     water = mi.load_dict(
         {"type": "layered_water", "layer_tops": layer_tops, "backscattering": text, "water_scattering": 0.001}
-    )
+    ).water
     assert len({id(phase) for phase in water.phases.phases}) < 500
     share = 0.001 / 0.15
     for layer in (0, 250, 499):

@@ -95,7 +95,7 @@ def quick(campaign, tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_everything_that_can_be_kept(tmp_path):
     (tmp_path / "runs.csv").write_text(TABLE)
     told = []

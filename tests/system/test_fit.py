@@ -7,7 +7,7 @@ from significance import largest_chi2
 import mitransient_lidar
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_attenuation_and_reflectance_of_a_render_are_found_within_their_errors():
     """Data and model share the scene but no random numbers, so that estimates differ by the errors of both.
 

@@ -105,7 +105,7 @@ def assert_files(folder, points, flown):
     assert (folder / "waveforms.wdp").stat().st_size == 60 + 2 * signal.size
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
     path = tmp_path / "short.toml"
     path.write_text(TOML)

@@ -45,10 +45,10 @@ def shot(lidar_scene):
 @pytest.mark.parametrize(
     ("tx", "rx"),
     [
-        pytest.param({}, {}, id="quarters"),
+        pytest.param({}, {}, id="quarters", marks=pytest.mark.long),
         # Hexagons with gaps are obscured, too.
         pytest.param({}, {"obscuration": 0.3}, id="obscured", marks=pytest.mark.long),
-        pytest.param({}, {"fill_factor": 0.5}, id="gaps"),
+        pytest.param({}, {"fill_factor": 0.5}, id="gaps", marks=pytest.mark.long),
         pytest.param({}, {"layout": "hex7"}, id="hexagons", marks=pytest.mark.long),
         pytest.param({}, {"layout": "hex19", "fill_factor": 0.5, "obscuration": 0.3}, id="hexagons with gaps"),
         pytest.param({}, OFF_AXIS, id="off axis"),
@@ -57,7 +57,7 @@ def shot(lidar_scene):
             {"field_of_view_mrad": 20.0},
             id="ellipse",
         ),
-        pytest.param({"beam_profile": "top_hat"}, {}, id="top hat"),
+        pytest.param({"beam_profile": "top_hat"}, {}, id="top hat", marks=pytest.mark.long),
         pytest.param({"beam_profile": "top_hat"}, {"field_of_view_mrad": 8.0}, id="top hat in a narrow view"),
     ],
 )
@@ -92,7 +92,7 @@ def test_two_layers_leave_no_class_that_looks_sure(field_of_view, water, shot):
     assert not (found["class_probability"] > 0.95).any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sphere_is_not_the_bottom():
     """A sphere in the beam, whose echo is the only one of a record that ends before the bottom's, and one above it."""
     near, only = (

@@ -53,7 +53,7 @@ def planes(tmp_path_factory):
     return xr.concat(shots, "shot", combine_attrs="override").assign_coords(shot=np.arange(len(shots)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_slopes_of_planes(planes):
     """Within 0.05: the steep face away leaves little echo, and pixels cut the beam where it is uneven."""
     found = retrieve.surface_slopes(planes)

@@ -30,7 +30,7 @@ def test_orders(scene, tmp_path):
     assert lines[:2] == [str(plot), str(plot.with_suffix(".nc"))]
     assert [line.split()[0] for line in lines[3:]] == ["0", "1", "2", ">=3", "all"]
     assert sum(float(line.split()[4]) for line in lines[3:-1]) == pytest.approx(100, abs=0.01)
-    assert texts(plot) >= {"all", "0", "1", "2", "≥ 3", "scattering events", "several\nreversals (%)"}
+    assert texts(plot) >= {"all", "0", "1", "2", "≥ 3", "scattering events", "several", "reversals (%)"}
     with xr.open_dataset(plot.with_suffix(".nc"), engine="h5netcdf") as found:
         assert found["waveform"].dims == ("pixel", "reversals", "order", "time")
 

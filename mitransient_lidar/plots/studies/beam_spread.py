@@ -56,7 +56,8 @@ def plot_beam_spread(spread: xr.Dataset, path: drawing.FilePath | None = None) -
             elif closed is not None:
                 share = _within_shift if name == "within_shift" else _within_delay
                 ax.plot(values, share(closed, values), color=colour, **_CLOSED_FORM)
-                differences.append(np.nanmax(np.abs(share(closed, values) - row[name].values)))
+                apart = np.abs(share(closed, values) - row[name].values)
+                differences.append(float(np.max(apart, initial=0.0, where=np.isfinite(apart))))
         first = int(np.argmax(spread[name].values.max(axis=0, initial=0) > _SMALLEST_SHARE))
         ax.set_xscale("log")
         ax.set(xlim=(values[max(first - 1, 0)], values[-1]), ylim=(0, 1.02), xlabel=label)

@@ -145,7 +145,7 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     assert_refused(run("waveforms", recorded, "--wind-speed", 3), "--wind-speed 3 needs --correct")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_uncertainties_of_an_instrument_from_end_to_end(tmp_path):
     """The table of a level sea: its errors are those of depth-bias, and the footprint is that of the beam."""
     few = ["--winds", "0", "--waters", "IB,5C", "--depths", "3,6", "--shots", 4, "--records", 4, "-q"]

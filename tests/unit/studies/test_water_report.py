@@ -133,7 +133,7 @@ def test_profile_line_is_xml_for_a_medium(station):
     assert "profile_tolerance" not in usual
     for element, tolerance in ((done.stdout.splitlines()[-1], 0.05), (usual, 0.01)):
         loaded = mi.load_string(f'<medium version="3.0.0" type="layered_water">{element}</medium>')
-        assert loaded.column.count == read_profile(station).layers(tolerance).count
+        assert loaded.water.column.count == read_profile(station).layers(tolerance).count
 
 
 def test_tolerance_out_of_range(station):

@@ -37,7 +37,7 @@ def assert_chi_squared(distances, freedom):
     assert kstest(distances, chi2(freedom).cdf).pvalue > FALSE_ALARM
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_of_200_fits_have_the_stated_covariance():
     random = np.random.default_rng(1)
     fits = [fit(noisy(0.002, random)) for _ in range(200)]

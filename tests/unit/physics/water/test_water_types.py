@@ -112,8 +112,13 @@ def test_oracle_of_irradiance():
 WATERS = [*(f"jerlov {name}" for name in ("I", "II", "III", "1C", "5C", "9C")), "chlorophyll 1", "kd 0.15", "secchi 6"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", WATERS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if "1C" in name or "kd" in name else pytest.mark.long)
+        for name in WATERS
+    ],
+)
 def test_diffuse_attenuation_by_monte_carlo(name):
     """Kd of each kind of water within the 0.6 % of the fit, in water with the functions that are rendered."""
     water = water_of(*name.split())
