@@ -109,7 +109,7 @@ CASES = {
     "mast, 1 m aside over waves": (
         {
             "tx": pose(20.0, 15.0),
-            "rx": {**pose(20.0, 15.0), "aim_y": 1.0, "field_of_view_mrad": 120.0},
+            "rx": {**pose(20.0, 15.0), "aim_y": 1.0, "field_of_view_mrad": 120.0, "layout": "1x1"},
             "sea": WAVES,
         },
         (120.0, 4.0, 40),

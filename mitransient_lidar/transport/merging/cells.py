@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -37,14 +38,9 @@ _SURFACE_STEPS, _LEAST_STRETCH = 2, 0.1
 #: Least slope of the sea, against division by zero.
 _LEAST_SLOPE = 1e-9
 
-#: Halo of the beam's profile over its core: at the surface, and for each scattered photon over one that is not.
-_HALO, _HALO_PER_SCATTERED = 0.02, 0.2
-
-#: Spread of scattered light over the depth.
-_SPREAD_OF_SCATTERING = 0.1
-
-#: Largest optical depth of scattering of which the halo is taken.
-_MOST_SCATTERING = 4.0
+#: Halo of the profile of unscattered light over its core, and square of the distance from the axis, in standard
+#: deviations, that parts both.
+_HALO, _SQUARES_INSIDE = 0.02, 25.0
 
 #: Step of the planes' places from one layer to the next, which distributes them evenly: the golden ratio.
 _PLANE_STEP = 0.618034
@@ -53,11 +49,26 @@ _PLANE_STEP = 0.618034
 ORIGIN = 1 << 20
 
 
-class RefractedProfile:
-    """Approximate profile of the beam's light at a depth: a Gaussian function that ripples widen, and a halo.
+@dataclass(frozen=True)
+class Cell:
+    """Cells of points.
 
-    The halo is light that has been scattered. It grows with depth: where it prevails, light changes little between a
-    point and the plane on which it is counted.
+    Attributes
+    ----------
+    bucket, tag
+        Number of the bucket, and what tells its cells apart.
+    volume, volume_of_unscattered
+        Volume [m^3], and the one by which unscattered light is divided.
+    """
+
+    bucket: mi.UInt32
+    tag: mi.UInt32
+    volume: mi.Float
+    volume_of_unscattered: mi.Float
+
+
+class RefractedProfile:
+    """Approximate profile of the beam's unscattered light: a Gaussian function that ripples widen, and a halo.
 
     Parameters
     ----------
@@ -73,28 +84,43 @@ class RefractedProfile:
         # Displacement for each metre of depth and unit of slope, along and across the azimuth of the beam, with the
         # scale of `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
-        self._scattering = opaque(float(scene.required_water.column.scattering.max()) / cosine)
         ripples = 0.5 * max((sum(sea.ripple_variance) for sea in scene.seas), default=0.0)
         self._spreads, self._shifts = ([opaque(value) for value in values] for values in (spreads, shifts))
         self._growths = [opaque(shift * math.sqrt(ripples)) for shift in shifts]
         #: Depth at which the sea's slopes double the variance [m].
         slopes = max(math.sqrt(0.5 * scene.slope_variance), _LEAST_SLOPE)
         self.depth = min(spread / (shift * slopes) for spread, shift in zip(spreads, shifts, strict=True))
+        #: Displacement for each metre of depth by the slopes of facets.
+        of_facets = max(0.5 * scene.slope_variance - ripples, 0.0)
+        self.shift_by_facets = max(max(shifts) * math.sqrt(of_facets), _LEAST_SLOPE)
+
+    def _axes(
+        self, offset: tuple[mi.Float, mi.Float], depth: mi.Float, slopes: tuple[mi.Float, mi.Float]
+    ) -> list[tuple[mi.Float, mi.Float]]:
+        """Return offset from the refracted axis, and standard deviation [m], along and across it."""
+        axes = zip(self._spreads, self._shifts, self._growths, offset, slopes, strict=True)
+        return [
+            (place - shift * slope * depth, dr.sqrt(dr.square(spread) + dr.square(growth * depth)))
+            for spread, shift, growth, place, slope in axes
+        ]
 
     def at(self, offset: tuple[mi.Float, mi.Float], depth: mi.Float, slopes: tuple[mi.Float, mi.Float]) -> mi.Float:
         """Return the light at offsets from the axis and a depth [m], under slopes along and across it, unscaled."""
-        squares, area = mi.Float(0), mi.Float(1)
-        axes = zip(self._spreads, self._shifts, self._growths, offset, slopes, strict=True)
-        for spread, shift, growth, place, slope in axes:
-            variance = dr.square(spread) + dr.square(growth * depth)
-            squares += dr.square(place - shift * slope * depth) / variance
-            area *= variance
-        # Light that has been scattered, over the rest; about a beam wider than its spread it has the beam's profile.
-        scattered = dr.exp(dr.minimum(depth * self._scattering, _MOST_SCATTERING)) - 1
-        spread = dr.square(_SPREAD_OF_SCATTERING * depth)
-        scattered *= spread / (spread + dr.sqrt(area))
-        halo = dr.fma(_HALO_PER_SCATTERED, scattered, _HALO)
-        return (dr.exp(-0.5 * squares) + halo * dr.rcp(1 + squares)) * dr.rsqrt(area)
+        (along, long), (across, wide) = self._axes(offset, depth, slopes)
+        squares = dr.square(along / long) + dr.square(across / wide)
+        return dr.fma(_HALO, dr.rcp(1 + squares), dr.exp(-0.5 * squares)) / (long * wide)
+
+    def spread(
+        self, offset: tuple[mi.Float, mi.Float], depth: mi.Float, other: mi.Float, slopes: tuple[mi.Float, mi.Float]
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return by how much offsets grow from a depth to another one as the beam does, close to its axis [m]."""
+        here, there = (self._axes(offset, each, slopes) for each in (depth, other))
+        squares = sum(dr.square(place / spread) for place, spread in here)
+        inside = dr.rcp(1 + dr.square(squares / _SQUARES_INSIDE))
+        along, across = (
+            inside * place * (after / before - 1) for (place, before), (_, after) in zip(here, there, strict=True)
+        )
+        return along, across
 
 
 class WaterGrid:
@@ -102,8 +128,8 @@ class WaterGrid:
 
     Cells are sectors of rings in layers of the depth below the surface, so that the surface cuts none. The lowest one
     above a solid ends there. They are sheared along the beam in still water, so that its light stays in one column of
-    cells. Within a layer, points are compared where their lines meet a common plane, so that neither light nor lines of
-    sight blur however they are refracted.
+    cells. Within a layer, light is counted on a common plane, and looked up where the light at a point comes from if it
+    is that of the beam, refracted and spread: narrow beams do not blur, however they are refracted.
 
     Parameters
     ----------
@@ -230,14 +256,20 @@ class WaterCells:
             depth += (height - point.z - depth) / stretch
         return depth, slope, stretch
 
-    def locate(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """Return bucket, tag and volume [m^3] of the cells of points on lines; cells of one bucket differ in tag.
+    def locate(
+        self, point: mi.Point3f, direction: mi.Vector3f | None = None, unscattered: mi.Bool | None = None
+    ) -> Cell:
+        """Return the cells of points.
 
-        Light is counted where it meets the plane of the layer: the volume is corrected by the profile of the beam there
-        over that at the point, so that it is light at the point.
+        Points of unscattered light are moved to the plane of their layer along their lines, of a `direction`, all
+        others along the beam as it is refracted there. The volume for unscattered light is corrected by the profile of
+        the beam on the plane over that at the point, so that it is light at the point.
         """
         grid, rings = self.grid, self.rings
         depth, slope, stretch = self._depth_along_beam(point)
+        line, looks_up = rings.refracted(slope), direction is None
+        if not looks_up:
+            line = dr.select(unscattered, direction, line)
         end = dr.maximum(depth + point.z - self.heights.bed_at(point.x, point.y), 0)
         # Points above the approximate surface are just below it.
         depth = dr.maximum(depth, 0)
@@ -253,15 +285,17 @@ class WaterCells:
         place = dr.fma(_PLANE_STEP, layer, self._shift.w)
         plane = dr.lerp(above, below, place - dr.floor(place))
         # Change of this depth for each metre along the line, at least so large that level lines stay near.
-        descent = (slope.x * direction.x + slope.y * direction.y - direction.z) / stretch
+        descent = (slope.x * line.x + slope.y * line.y - line.z) / stretch
         distance = (plane - depth) / dr.copysign(dr.maximum(dr.abs(descent), _LEAST_DESCENT), descent)
-        x, y = dr.fma(distance, direction.x, point.x), dr.fma(distance, direction.y, point.y)
+        x, y = dr.fma(distance, line.x, point.x), dr.fma(distance, line.y, point.y)
         moved = dr.fma(distance, descent, depth)
         along, across = rings.offset(x, y, moved)
+        slopes, start = rings.along_and_across(slope), rings.offset(point.x, point.y, depth)
+        if looks_up:
+            more = grid.profile.spread(start, depth, moved, slopes)
+            along, across = along + more[0], across + more[1]
         sector = rings.sector(along, across, rings.core(above), grid.widths(above), mi.Point2f(self._shift.xy))
-        slopes = rings.along_and_across(slope)
-        profile_there = grid.profile.at((along, across), moved, slopes)
-        profile_here = grid.profile.at(rings.offset(point.x, point.y, depth), depth, slopes)
+        there, here = grid.profile.at((along, across), moved, slopes), grid.profile.at(start, depth, slopes)
         i, j, k = sector.ring, sector.number, mi.UInt32(layer)
         of_ring, of_sector, z = grid.bits_ring, grid.bits_sector, grid.bits_z
         bucket = (
@@ -269,8 +303,8 @@ class WaterCells:
         )
         tag = low_bits(i >> of_ring, 12) | (low_bits(j >> of_sector, 12) << 12) | (low_bits(k >> z, 8) << 24)
         thickness = dr.maximum(below - above, 0.25 * grid.thickness_at(above))
-        volume = thickness * stretch * rings.area(sector) * profile_there / profile_here
-        return self._start + bucket, tag, volume
+        volume = thickness * stretch * rings.area(sector)
+        return Cell(self._start + bucket, tag, volume, volume * there / here)
 
 
 def low_bits(number: mi.UInt32, bits: int) -> mi.UInt32:

@@ -32,12 +32,12 @@ def store_points(
     index = dr.arange(mi.UInt32, count)
     cells = cells.of(segments.lanes(index))
     points = segments.points(index)
-    bucket, _, _ = cells.locate(points.point, points.direction)
+    bucket = cells.locate(points.point, points.direction, points.unscattered).bucket
     u = segments.random(index, shots)
     photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, classes.labels_orders)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
-    _, tag, _ = cells.locate(points.point, points.direction)
+    tag = cells.locate(points.point, points.direction, points.unscattered).tag
     position = dr.dot(points.point, points.direction)
     photon = Photon(
         points.direction,
@@ -68,7 +68,7 @@ def merge_in_water(
     and `connections`, a share of all pairs, that make the same path; water and bubbles make different paths.
     """
     water, perturbations = scene.required_water, scene.perturbations
-    bucket, cell, volume = cells.locate(points.point, points.direction)
+    cell = cells.locate(points.point)
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi = points.point, -points.direction
     mei.sh_frame = mi.Frame3f(mei.wi)
@@ -79,14 +79,15 @@ def merge_in_water(
     absorption = water.absorption_flight.attenuation(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
     subpath = SensorSubpath.at(record, points, mi.UInt32(0))
-    first, end = photons.find(bucket, mi.Bool(True))
+    first, end = photons.find(cell.bucket, mi.Bool(True))
     typical = cells.typical_volume(points.point)
-    weight = points.weight / volume * typical
+    weight = points.weight * typical / cell.volume
+    weight_of_unscattered = points.weight * typical / cell.volume_of_unscattered
 
     def merge(index: mi.UInt32) -> tuple[mi.UInt32]:
         active = index < end
         photon, tag = photons.photon(index, active)
-        active &= tag == cell
+        active &= tag == cell.tag
         shared, shares = mi.Float(0), []
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
@@ -95,7 +96,8 @@ def merge_in_water(
             shared += shares[-1]
         # The photon continues to the plane through the point normal to its direction, so that times do not blur.
         beyond = dr.dot(points.point, photon.direction) - photon.position
-        energy = weight * photon.weight * shared * dr.exp(-absorption * beyond)
+        factor = dr.select(photon.unscattered, weight_of_unscattered, weight)
+        energy = factor * photon.weight * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + beyond * group
         by_water = None if len(scatterers) == 1 else shares[0] / shared
         depth, light = -points.point.z, -photon.direction

@@ -52,6 +52,11 @@ class Photon:
     label: mi.UInt32
     sums: Sums
 
+    @property
+    def unscattered(self) -> mi.Bool:
+        """Whether no event in the water has scattered the path: its sum has no terms."""
+        return self.mis_partial_sum == 0
+
 
 class PhotonMap:
     """Photons sorted by bucket, by counting.

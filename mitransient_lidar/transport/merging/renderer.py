@@ -63,8 +63,12 @@ _PATCH_PER_SOLID = 2**-20
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 
-#: Thickness of the uppermost cells, over the depth at which the sea doubles the variance of the beam.
-_UPPERMOST_PER_SPREAD = 0.25
+#: Thickness of the uppermost cells, over the depth at which the sea doubles the variance of the beam, over the depth at
+#: which neighbouring facets move light by their own side, and over the attenuation length.
+_UPPERMOST_PER_SPREAD, _UPPERMOST_PER_FACET, _UPPERMOST_PER_ATTENUATION = 0.25, 0.1, 0.05
+
+#: Least attenuation, against division by zero [1/m].
+_LEAST_ATTENUATION = 1e-6
 
 #: Sensor paths for each path of the path tracer, which adds the light that merging leaves out, where that is very weak.
 _PATHS_PER_COMPLEMENT_PATH = 16
@@ -216,7 +220,11 @@ class MergingLayout:
         spreads = np.sqrt([squares @ np.square(beam.spreads), squares[::-1] @ np.square(beam.spreads)])
         along, across = (spreads * footprint / scene.transmitter.angular_spread).tolist()
         profile = RefractedProfile(scene, (along, across))
-        uppermost = _UPPERMOST_PER_SPREAD * profile.depth
+        uppermost = min(
+            _UPPERMOST_PER_SPREAD * profile.depth,
+            _UPPERMOST_PER_FACET * scene.facet_size / profile.shift_by_facets,
+            _UPPERMOST_PER_ATTENUATION / max(float(column.attenuation[0]), _LEAST_ATTENUATION),
+        )
         grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
         patches = _patch_width(scene, width)
         return cls(

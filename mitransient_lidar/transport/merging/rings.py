@@ -14,6 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.snell import refract
 
 #: Growth of the core radius with depth [m/m], as light spreads by ripples and scattering.
 _CORE_PER_METRE = 0.05
@@ -125,6 +126,15 @@ class BeamRings:
         dy = y - self._spot[1] - self._entry.y - self.shear[1] * depth
         along, across = self.along_and_across(mi.Vector2f(dx, dy))
         return along * self.cosine, across
+
+    def refracted(self, slope: mi.Vector2f) -> mi.Vector3f:
+        """Return the unit direction of the axis below facets of a slope."""
+        level = dr.normalize(mi.Vector3f(self.shear[0], self.shear[1], -1))
+        index = opaque(self._index)
+        x, y = index * level.x, index * level.y
+        to_laser = mi.Vector3f(-x, -y, dr.safe_sqrt(1 - x * x - y * y))
+        normal = mi.Normal3f(dr.normalize(mi.Vector3f(-slope.x, -slope.y, 1)))
+        return -refract(to_laser, normal, dr.rcp(index))
 
     def along_and_across(self, horizontal: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
         """Return the components of horizontal vectors along and across the azimuth of the axis."""

@@ -57,6 +57,11 @@ class SegmentPoints:
     surface_length: mi.Float
     sums: Sums
 
+    @property
+    def unscattered(self) -> mi.Bool:
+        """Whether no event in the water has scattered the path: its sum has no terms."""
+        return self.mis_partial_sum == 0
+
 
 class SegmentBuffer:
     """Segments in the water of `paths` paths of each shot, with points at equal distances `spacing` [m] along them.

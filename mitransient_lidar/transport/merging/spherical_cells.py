@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.merging.cells import Cell
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.opaque import opaque, opaque_point
 from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
@@ -79,13 +80,12 @@ class SphericalCells:
 
     def typical_volume(self, point: mi.Point3f) -> mi.Float:
         """Return the volume of cells [m^3] for the weights of merges, which are rare in small cells."""
-        return self.locate(point)[2]
+        return self.locate(point).volume
 
-    def locate(self, point: mi.Point3f, direction: mi.Vector3f | None = None) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """Return bucket, tag and volume [m^3] of the cells of points; cells of one bucket differ in tag.
-
-        They do not depend on the direction of the points' lines.
-        """
+    def locate(
+        self, point: mi.Point3f, direction: mi.Vector3f | None = None, unscattered: mi.Bool | None = None
+    ) -> Cell:
+        """Return the cells of points, which do not depend on the directions of their lines."""
         grid = self.grid
         offset = point - grid.origin
         radius = dr.maximum(dr.norm(offset), _SMALLEST_RADIUS)
@@ -107,7 +107,7 @@ class SphericalCells:
         tag = mi.UInt32(mi.Int32(shell) + (1 << 10)) << (_RING_BITS + _SECTOR_BITS)
         tag |= (mi.UInt32(ring) << _SECTOR_BITS) | mi.UInt32(sector)
         # Fibonacci hashing (Knuth 1998, The Art of Computer Programming 3, section 6.4).
-        return self._start + ((tag * 2654435769) >> (32 - _BUCKET_BITS)), tag, volume
+        return Cell(self._start + ((tag * 2654435769) >> (32 - _BUCKET_BITS)), tag, volume, volume)
 
     def _shell_at(self, radius: mi.Float) -> mi.Float:
         """Return the coordinate of shells at a radius [m]."""
