@@ -71,6 +71,8 @@ _UNITS = {
     **dict.fromkeys(("wind_speed", "wake_speed"), "m s-1"),
     **dict.fromkeys(("refractive_index", "group_index", "phase_g", "chi_p", "slope_variance"), "1"),
     **dict.fromkeys(("optical_efficiency", "two_way_atmospheric_transmittance", "pulses"), "1"),
+    **dict.fromkeys(("lobe_asymmetry", "backward_share", "opposition_amplitude"), "1"),
+    "opposition_width": "rad",
     "aperture_area": "m2",
     "chlorophyll": "mg m-3",
     **dict.fromkeys(("time", "surface_time"), "s"),

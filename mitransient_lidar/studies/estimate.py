@@ -177,6 +177,8 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     if not lidar.bottoms:
         darkest = _DARK / max(float((column.absorption + column.backscattering).min()), 1e-3)
         return min(darkest, 1e-9 * C0 / 2 * (lidar.axis.end_ns - lidar.axis.start_ns)), 0.0
+    if getattr(lidar.bottoms[0].bsdf(), "parameters", {}).get("type") == "sediment":
+        raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
     si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.clear_water[1])))
     box = lidar.bottoms[0].bbox()

@@ -34,6 +34,7 @@ WITHOUT_VALUE = {
         *("gate_start_ns", "gate_start_depth", "gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns"),
         *("gate_profile", "pulses"),
     },
+    "sediment": {"single_scattering_albedo"},
     "lidar_merging": {"paths_per_pass", "photons_per_pass"},
     "fournier_forand": {"refractive_index", "junge_slope"},
 }
@@ -54,6 +55,8 @@ def _values(plugin, folder):
         path = folder / "phase.csv"
         path.write_text("\n".join(f"{angle} {1 / angle}" for angle in range(5, 180, 5)))
         part["filename"] = str(path)
+    if plugin == "sediment":
+        part["model"] = "hapke"  # the other model is an object of Mitsuba
     return object_values(mi.load_dict(part))
 
 
