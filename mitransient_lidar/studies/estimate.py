@@ -148,7 +148,9 @@ def _model(lidar: LidarScene) -> EchoEstimate:
     lidar.transmitter.pose.require_above_sea()
     water, pose, pixels = lidar.required_water, lidar.receiver.pose, lidar.receiver.pixels
     if water.plume is not None:
-        raise UserError("the scene has bubbles, which an estimate lacks: plume_scattering must be 0")
+        raise UserError(
+            "the scene has bubbles, which an estimate lacks: plume_scattering and bubble_wind_speed must be 0"
+        )
     if len(water.index_layers.boundaries):
         raise UserError("the layers of the water have different indices: an estimate needs one refractive index")
     if pixels.count > _MOST_PIXELS:

@@ -26,6 +26,7 @@ TABLE = {
     **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "", "chi_p": ""},
     **dict.fromkeys(("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure", "profile"), ""),
     **{"phase": "fournier_forand", "phase_g": "0.924"},
+    **{"bubble_wind_speed": "0", "bubble_void_fraction": "", "bubble_depth": ""},
     **{"bottom_depth": "8", "bottom_reflectance": "0.1"},
     **{"bottom_model": "lambertian", "lobe_asymmetry": "0", "backward_share": "0.5"},
     **{"opposition_amplitude": "1", "opposition_width": "0.06"},
@@ -125,6 +126,7 @@ PARTICLES = {"bottom_model", "lobe_asymmetry", "backward_share", "opposition_amp
 
 #: The steps of gated_waves replace the bottom, as a seabed does elsewhere.
 MISSING = {
+    "ship_wake": {"bubble_wind_speed", "bubble_void_fraction", "bubble_depth"},
     "gated_waves": {"bottom_depth", "bottom_reflectance", *PARTICLES},
     **dict.fromkeys(("flight", "gated_mine"), PARTICLES),
 }

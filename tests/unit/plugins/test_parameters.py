@@ -13,7 +13,10 @@ from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 #: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
 WITHOUT_VALUE = {
-    "layered_water": {"jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"},
+    "layered_water": {
+        *("jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"),
+        *("bubble_void_fraction", "bubble_depth"),
+    },
     "ocean_surface": {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
         *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
@@ -41,7 +44,7 @@ WITHOUT_VALUE = {
 
 #: Numbers of defaults that the manual pages of the larger plugins give as a number or a word.
 MOST_DEFAULTS = {
-    **{"layered_water": 18, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
+    **{"layered_water": 20, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
     **{"lidar_volpath": 6, "time_gated_film": 4},
 }
 
