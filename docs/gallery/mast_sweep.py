@@ -1,5 +1,5 @@
 """A lidar on masts of other heights and angles
-===============================================
+============================================
 
 Figure 3 of the publication sketches a mast lidar at several heights and angles of incidence on the sea. Here each of
 these geometries is rendered over the target of its figure 4, a square metre 1 m below the surface.
