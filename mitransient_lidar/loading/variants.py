@@ -34,6 +34,7 @@ PLUGIN_MODULES = (
     "ocean_surface",
     "seabed",
     "retroreflector",
+    "sediment",
     "lidar_transmitter",
     "sun",
     "sky",

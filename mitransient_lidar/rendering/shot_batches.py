@@ -20,6 +20,7 @@ from mitransient_lidar.rendering.accuracy import ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.passes import pass_seed
 from mitransient_lidar.rendering.shot_poses import ShotPoses
+from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer
@@ -82,7 +83,7 @@ class ShotBatches:
 
     The frame of the lidar is that of the scene, and a place is that of the aim. The sea is refined about each place,
     and the patches lie beside each other in one mesh. Solids are met at the place itself, except those that go with the
-    lidar. Bubbles cannot be displaced: scenes with a plume are loaded again for each shot.
+    lidar. A plume of bubbles cannot be displaced: such scenes are loaded again for each shot.
 
     Parameters
     ----------
@@ -113,7 +114,7 @@ class ShotBatches:
         loaded_at: Callable[[float, float], PassRenderer],
     ) -> None:
         lidar = renderer.scene
-        has_plume = lidar.water is not None and lidar.water.plume is not None
+        has_plume = lidar.water is not None and isinstance(lidar.water.plume, BubblePlume)
         self._loaded_at = loaded_at if has_plume else None
         self._renderer, self._aim, self.passes, self.share = renderer.scaled(share), np.array(aim), passes, share
         self._goal, in_turn = goal, passes if goal is None else _PASSES_FOR_ERROR

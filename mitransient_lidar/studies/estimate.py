@@ -148,7 +148,9 @@ def _model(lidar: LidarScene) -> EchoEstimate:
     lidar.transmitter.pose.require_above_sea()
     water, pose, pixels = lidar.required_water, lidar.receiver.pose, lidar.receiver.pixels
     if water.plume is not None:
-        raise UserError("the scene has bubbles, which an estimate lacks: plume_scattering must be 0")
+        raise UserError(
+            "the scene has bubbles, which an estimate lacks: plume_scattering and bubble_wind_speed must be 0"
+        )
     if len(water.index_layers.boundaries):
         raise UserError("the layers of the water have different indices: an estimate needs one refractive index")
     if pixels.count > _MOST_PIXELS:
@@ -177,6 +179,8 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     if not lidar.bottoms:
         darkest = _DARK / max(float((column.absorption + column.backscattering).min()), 1e-3)
         return min(darkest, 1e-9 * C0 / 2 * (lidar.axis.end_ns - lidar.axis.start_ns)), 0.0
+    if getattr(lidar.bottoms[0].bsdf(), "parameters", {}).get("type") == "sediment":
+        raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
     si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.clear_water[1])))
     box = lidar.bottoms[0].bbox()

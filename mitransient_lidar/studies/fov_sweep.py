@@ -189,7 +189,10 @@ def _water(lidar: LidarScene, min_depth: float, max_depth: float) -> InherentPro
     if water is None:
         raise UserError("the scene has no water: give its surface a layered_water as interior medium")
     if water.plume is not None:
-        raise UserError("the scene has bubbles: the slope needs the same water everywhere, plume_scattering = 0")
+        raise UserError(
+            "the scene has bubbles: the slope needs the same water everywhere, plume_scattering = 0 and "
+            "bubble_wind_speed = 0"
+        )
     layer, last = (int(number) for number in water.column.layer_at([min_depth, max_depth]))
     if layer != last:
         raise UserError(

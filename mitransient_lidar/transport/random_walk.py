@@ -205,7 +205,7 @@ class RandomWalk:
         event = step.scattering_event(path, vertex.scattered, rng)
         context = mi.PhaseFunctionContext()
         natural, weight, pdf = event.phase.sample(context, event.interaction, pick, u, vertex.scattered)
-        b_p = self._water.coefficient(self._water.scattering_flight, event.scatterer) * weight[0] * pdf
+        b_p = self._water.coefficient(self._water.scattering_flight, event.scatterer, path.point) * weight[0] * pdf
         inverse = dr.select(vertex.scattered, dr.rcp(b_p), 0)
         if self._rates is not None:
             path.mis_partial_sum += inverse * (self._rates.volume(path.point) + self._rates.in_water * edge)

@@ -66,6 +66,7 @@ DRY = {
     "in_the_air": plate(0.5, 0.8, 1.0, 0.5, diffuse(0.3)),
     "through_the_surface": plate(0.5, -0.6, 0.0, 0.7, diffuse(0.3), tilt=80.0),
 }
+PARTICLES = {"type": "sediment", "model": "hapke", "reflectance": 0.2, "lobe_asymmetry": 0.4, "backward_share": 0.8}
 PATCHES = {"type": "seabed", "slope_x_deg": 6.0, "slope_y_deg": -3.0, "size": 100.0, "patches": "2 0 1 0.4; 3 1 1 0"}
 BALL = {"type": "sphere", "center": [0.1, 0.05, -4.0], "radius": 0.2, "bsdf": {"type": "diffuse"}}
 #: Bins of a record [ns]: start, width, number.
@@ -75,6 +76,16 @@ FROM_200_M = 1400.0, 2.0, 70
 #: the comparison of all light. None: the origins are separated; else the number of orders of scattering.
 CASES = {
     "layers and bubbles under waves": ({"sea": WAVES, "water": LAYERS | BUBBLES}, FROM_200_M, 3, 0.03, None),
+    "sand below bubbles of a windy sea": (
+        {
+            **{"sea": ROUGH, "water": {"bubble_wind_speed": 20.0}, "bottom": None},
+            "extra": {
+                "bottom": plate(0.0, 0.0, -8.0, 500.0, PARTICLES),
+                "plate": plate(1.6, -0.9, -5.0, 0.7, {**PARTICLES, "reflectance": 0.3}, tilt=30.0),
+            },
+        },
+        *(FROM_200_M, 5, 0.03, None),
+    ),
     "turbid, by order": ({"sea": ROUGH, "water": TURBID, "bottom": 4.0}, FROM_200_M, 5, 0.03, 4),
     "solids on sand": ({"sea": ROUGH, "bottom": None, "extra": SOLIDS}, FROM_200_M, 5, 0.02, None),
     "materials": ({"sea": ROUGH, "extra": MATERIALS}, FROM_200_M, 5, 0.03, None),
@@ -247,11 +258,11 @@ def assert_same_light(merged, reference, error):
 MIXED = "mirror and sphere in strata"
 #: In the long tier, as others have what they test: seabeds, receivers aside, beams in views, poses under water, strata
 #: (the quick case) and orders (turbid water). Closed forms cover solids, masts, poses under water, and beam and view of
-#: millimetres over ripples.
+#: millimetres over ripples, and the opposition effect.
 LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam", "a diver looks up"}
 LONG |= {"narrow view at 75 degrees", "mast, 1 m aside over waves", "from orbit over waves"}
 LONG |= {"strata of other indices, by order", "view as narrow as the beam", "narrow beam in turbid, smooth water"}
-LONG |= {"solids on sand", "mast at 60 degrees", "below a boat, at a target"}
+LONG |= {"sand below bubbles of a windy sea", "solids on sand", "mast at 60 degrees", "below a boat, at a target"}
 
 
 def tier_of(name):

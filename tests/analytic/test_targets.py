@@ -11,6 +11,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
+from mitransient_lidar.physics.water.hapke import HapkeSurface
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 SIGMA = 5e-3
@@ -207,6 +208,38 @@ def test_retroreflector_in_clear_water(lidar_scene, passes, integrator):
     assert error < 0.03 * mean
     # Slopes of 0.003 turn light and view 0.001 rad apart, 0.1 % off the peak.
     assert abs(mean - expected) < largest_z(24) * error + 3e-3 * expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_opposition_effect_brightens_a_level_bottom(lidar_scene, passes, integrator):
+    """Over a Lambertian bottom of the same reflectance: pi f / R for light that goes back as it came."""
+    particles, reflectance = {"lobe_asymmetry": 0.3, "backward_share": 0.7, "opposition_width": 0.3}, 0.2
+    surface = HapkeSurface(0.0, 0.3, 0.7, 1.0, 0.3).of_reflectance("reflectance", reflectance)
+    cosine = np.sqrt(1 - (np.sin(OFF_NADIR) / INDEX) ** 2)
+    expected = np.pi * surface.brdf(cosine, cosine, 0.0) / reflectance
+    energies = []
+    for number, model in enumerate(("hapke", "lambertian")):
+        scene = lidar_scene(
+            **ONE,
+            integrator={"type": integrator, "paths_per_pass": 2**14},
+            film={"time_start_ns": 1430.0, "bin_width_ns": 120.0, "bin_count": 1},
+            bottom=None,
+            extra={
+                "bottom": {
+                    "type": "rectangle",
+                    "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).scale(500),
+                    "bsdf": {"type": "sediment", "model": model, "reflectance": reflectance, **particles},
+                }
+            },
+        )
+        energies.append(mean_and_error(passes(scene, 16, first_seed=100 * number).sum(axis=(1, 2))))
+    (bright, bright_error), (even, even_error) = energies
+    ratio, error = bright / even, bright / even * np.hypot(bright_error / bright, even_error / even)
+    assert error < 0.02 * ratio
+    # Slopes of 0.003 turn light and view 0.001 rad apart, 0.1 % of the peak's height, and the beam is 0.008 rad wide.
+    assert abs(ratio - expected) < largest_z(16) * error + 2e-3 * expected
+    assert expected > 1.5
 
 
 # Published figures 13 and 14.

@@ -73,6 +73,10 @@ class BubblePlume:
         """Return the scattering coefficient of the bubbles at a point [1/m]."""
         return dr.select(self.holds(point), opaque(self.scattering), 0)
 
+    def scattering_of_event(self, point: mi.Point3f) -> mi.Float:
+        """Return the scattering coefficient at the place of an event of bubbles [1/m], which may be on the edge."""
+        return opaque(self.scattering)
+
     def crossing(self, point: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Return the distances at which a ray enters and leaves the plume [m], in reverse order where it misses."""
         near, far = mi.Float(0), mi.Float(dr.inf)

@@ -9,16 +9,16 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.physics.water.layers import WaterColumn
+from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water_phases import LayerPhases, ScattererPhases
-from mitransient_lidar.transport.opaque import opaque
 
 
 @dataclass(frozen=True, eq=False)
 class Water:
-    """Water in horizontal layers, with or without bubbles behind a ship.
+    """Water in horizontal layers, with or without bubbles behind a ship or below a windy sea.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Water:
     phases: ScattererPhases
     index_layers: IndexLayers
     water_scattering: np.ndarray
-    plume: BubblePlume | None = None
+    plume: BubblePlume | BubbleLayer | None = None
     from_profile: bool = False
     flight: LayeredFlight = field(init=False)
     scattering_flight: LayeredFlight = field(init=False)
@@ -106,12 +106,13 @@ class Water:
         """Return whether scatterers are layers of water, not bubbles."""
         return scatterer < self.column.count
 
-    def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32) -> mi.Float:
-        """Return the coefficient of a scatterer in `flight` [1/m]."""
+    def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32, point: mi.Point3f) -> mi.Float:
+        """Return the coefficient in `flight` of the scatterer of an event at a point [1/m]."""
         if self.plume is None:
             return flight.attenuation(scatterer)
         layer = dr.minimum(scatterer, self.column.count - 1)
-        return dr.select(scatterer == self.column.count, opaque(self.plume.scattering), flight.attenuation(layer))
+        bubbles = self.plume.scattering_of_event(point)
+        return dr.select(scatterer == self.column.count, bubbles, flight.attenuation(layer))
 
     def albedo(self, scatterer: mi.UInt32) -> mi.Float:
         """Return the single-scattering albedo of a scatterer; bubbles absorb nothing."""

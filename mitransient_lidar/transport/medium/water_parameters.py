@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, number_list, positive
+from mitransient_lidar.physics.water.bubbles import CLEAN_BACKSCATTER, STRONGEST_WIND, WindBubbles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import read_profile
 from mitransient_lidar.physics.water.water_types import KINDS as WATERS
 from mitransient_lidar.physics.water.water_types import water_of
+from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
@@ -24,7 +27,10 @@ from mitransient_lidar.transport.nested_objects import create_object
 _DEFAULTS = {"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006}
 
 #: Parameters for which an empty text counts as not given.
-MAY_BE_EMPTY = ("layer_tops", *_DEFAULTS, "water_scattering", "chi_p", *WATERS, "profile")
+MAY_BE_EMPTY = (
+    *("layer_tops", *_DEFAULTS, "water_scattering", "chi_p", *WATERS, "profile"),
+    *("bubble_void_fraction", "bubble_depth"),
+)
 
 
 def read_water(
@@ -42,7 +48,7 @@ def read_water(
     nested
         Phase functions by name, one for all layers or one for each; may be empty.
     bubbles
-        Phase function of the bubbles; None for that of ``plume_backscatter_ratio``.
+        Phase function of the bubbles; None for that of ``plume_backscatter_ratio`` or ``bubble_backscatter``.
     tabulated
         Makes a phase function of a table.
 
@@ -61,8 +67,7 @@ def read_water(
     phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
     if kind not in KINDS:
         raise UserError(f"phase_function = {kind!r} must be one of {', '.join(KINDS)}")
-    plume = BubblePlume.from_properties(props)
-    ratio = in_range("plume_backscatter_ratio", props.get("plume_backscatter_ratio", 0.02), 1e-4, 0.4)
+    plume, ratio = _bubbles(props)
     if not _is_given(props, "pure") and (nested or kind != "fournier_forand"):
         molecules = np.zeros(1)
     own = ", ".join(map(repr, molecules.tolist()))
@@ -118,6 +123,28 @@ def _column(props: mi.Properties) -> tuple[WaterColumn, np.ndarray]:
     rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
     *coefficients, molecules = np.transpose(rows)
     return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules
+
+
+def _bubbles(props: mi.Properties) -> tuple[BubblePlume | BubbleLayer | None, float]:
+    """Return the bubbles, behind a ship or below a windy sea, and their bb/b."""
+    plume = BubblePlume.from_properties(props)
+    ratio = in_range("plume_backscatter_ratio", props.get("plume_backscatter_ratio", 0.02), 1e-4, 0.4)
+    wind = in_range("bubble_wind_speed", props.get("bubble_wind_speed", 0.0), 0.0, STRONGEST_WIND)
+    backscatter = in_range("bubble_backscatter", props.get("bubble_backscatter", CLEAN_BACKSCATTER), 100.0, 1445.0)
+    bubbles = WindBubbles.of_wind(wind)
+    if "bubble_void_fraction" in props:
+        fraction = in_range("bubble_void_fraction", props["bubble_void_fraction"], 0.0, 1e-3)
+        bubbles = replace(bubbles, void_fraction=fraction)
+    if "bubble_depth" in props:
+        bubbles = replace(bubbles, depth=in_range("bubble_depth", props["bubble_depth"], 0.05, 20.0))
+    if bubbles.void_fraction == 0:
+        return plume, ratio
+    if plume is not None:
+        raise UserError(
+            f"plume_scattering = {plume.scattering:g} must be 0 with bubbles of bubble_wind_speed or "
+            "bubble_void_fraction: water has one kind of bubbles"
+        )
+    return BubbleLayer(bubbles.scattering, bubbles.depth), bubbles.backscatter_ratio(backscatter)
 
 
 def _is_given(props: mi.Properties, name: str) -> bool:

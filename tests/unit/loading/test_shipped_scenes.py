@@ -26,7 +26,10 @@ TABLE = {
     **{"attenuation": "0.3", "scattering": "0.15", "backscattering": "0.006", "water_scattering": "", "chi_p": ""},
     **dict.fromkeys(("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure", "profile"), ""),
     **{"phase": "fournier_forand", "phase_g": "0.924"},
+    **{"bubble_wind_speed": "0", "bubble_void_fraction": "", "bubble_depth": ""},
     **{"bottom_depth": "8", "bottom_reflectance": "0.1"},
+    **{"bottom_model": "lambertian", "lobe_asymmetry": "0", "backward_share": "0.5"},
+    **{"opposition_amplitude": "1", "opposition_width": "0.06"},
 }
 
 INDEX = {"group_index": "1.34"}
@@ -118,8 +121,15 @@ OWN = {
     },
 }
 
-#: The steps of gated_waves replace the bottom.
-MISSING = {"gated_waves": {"bottom_depth", "bottom_reflectance"}}
+#: Parameters of particles of the flat bottom.
+PARTICLES = {"bottom_model", "lobe_asymmetry", "backward_share", "opposition_amplitude", "opposition_width"}
+
+#: The steps of gated_waves replace the bottom, as a seabed does elsewhere.
+MISSING = {
+    "ship_wake": {"bubble_wind_speed", "bubble_void_fraction", "bubble_depth"},
+    "gated_waves": {"bottom_depth", "bottom_reflectance", *PARTICLES},
+    **dict.fromkeys(("flight", "gated_mine"), PARTICLES),
+}
 
 
 def test_every_scene_is_listed():
@@ -134,7 +144,9 @@ def test_parameters(name):
 
 def test_order_of_parameters():
     assert list(catalogue.scene_parameters("table1")) == list(TABLE)
-    assert [key for key in catalogue.scene_parameters("gated_mine") if key in TABLE] == list(TABLE)
+    assert [key for key in catalogue.scene_parameters("gated_mine") if key in TABLE] == [
+        key for key in TABLE if key not in PARTICLES
+    ]
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -192,6 +204,7 @@ def test_all_parameters_but_texts_have_a_unit():
         "pure",
         "profile",
         "phase",
+        "bottom_model",
     }
     assert {name for name in names if unit_of(name) is None} == texts
     given = {"bottom_depth": "m", "gate_width_ns": "ns", "plume_width": "m", "sphere_reflectance": "1", "kd": "1/m"}

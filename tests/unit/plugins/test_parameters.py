@@ -13,7 +13,10 @@ from mitransient_lidar.loading.variants import PLUGIN_MODULES
 
 #: Parameters without a value where no other parameter is given: alternatives, automatic ones and files.
 WITHOUT_VALUE = {
-    "layered_water": {"jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"},
+    "layered_water": {
+        *("jerlov", "chlorophyll", "kd", "secchi", "petzold", "wavelength_nm", "profile", "chi_p"),
+        *("bubble_void_fraction", "bubble_depth"),
+    },
     "ocean_surface": {
         *("fetch", "inverse_wave_age", "filename", "altitude", "off_nadir_deg", "field_of_view_mrad", "interior"),
         *("divergence_mrad", "divergence_fwhm_mrad", "divergence_1e2_mrad"),
@@ -34,13 +37,14 @@ WITHOUT_VALUE = {
         *("gate_start_ns", "gate_start_depth", "gate_width_ns", "gate_step_ns", "gate_rise_ns", "gate_fall_ns"),
         *("gate_profile", "pulses"),
     },
+    "sediment": {"single_scattering_albedo"},
     "lidar_merging": {"paths_per_pass", "photons_per_pass"},
     "fournier_forand": {"refractive_index", "junge_slope"},
 }
 
 #: Numbers of defaults that the manual pages of the larger plugins give as a number or a word.
 MOST_DEFAULTS = {
-    **{"layered_water": 18, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
+    **{"layered_water": 20, "ocean_surface": 22, "seabed": 11, "lidar_transmitter": 10, "multipixel_receiver": 10},
     **{"lidar_volpath": 6, "time_gated_film": 4},
 }
 
@@ -54,6 +58,8 @@ def _values(plugin, folder):
         path = folder / "phase.csv"
         path.write_text("\n".join(f"{angle} {1 / angle}" for angle in range(5, 180, 5)))
         part["filename"] = str(path)
+    if plugin == "sediment":
+        part["model"] = "hapke"  # the other model is an object of Mitsuba
     return object_values(mi.load_dict(part))
 
 
