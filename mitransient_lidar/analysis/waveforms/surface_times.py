@@ -77,7 +77,8 @@ def surface_times(
     agrees with these within its error, that of its shape, a tenth of its width, and the spread of the light.
 
     The error by noise includes what trigger and clock change between this time and later echoes of the same pixel:
-    nothing of its own echo, the clocks of all pixels that a time is taken from, and both against the mean sea level.
+    nothing if the time is that of its own echo, the clocks of all pixels that it is taken from, and both as far as it
+    is drawn to the mean sea level.
     """
     known = np.isfinite(time_ns)
     share = lines.beam_share
@@ -117,7 +118,9 @@ def surface_times(
     # Weights of the clocks in the time, less the pixel's own clock in its later echoes.
     others = np.sum(gain**2, axis=1, keepdims=True) - gain**2
     by_clocks = np.where(lit, (1 - share_of_own) ** 2 * ((1 - gain) ** 2 + others), 1 + gain**2 + others)
-    by_timing = clock_ns**2 * by_clocks + np.where(some, 0, trigger_ns**2)
+    # What the mean sea level has of the time does not move with the trigger.
+    by_trigger = np.where(lit, 1 - share_of_own, 1.0) * (1 - gain.sum(axis=1, keepdims=True))
+    by_timing = clock_ns**2 * by_clocks + (trigger_ns * by_trigger) ** 2
     return SurfaceTimes(
         np.where(lit, own, inferred),
         np.hypot(np.where(lit, np.sqrt(by_noise), error), np.sqrt(by_timing)),

@@ -99,4 +99,5 @@ def _step(state: FloatArray, hit: FloatArray, chances: FloatArray) -> tuple[Floa
     after = np.zeros_like(state)
     after[1:] = survived[:-1]
     after[-1] += survived[-1]
-    return np.asarray(np.sum(state, axis=0) - np.sum(survived, axis=0)), after
+    fired: FloatArray = np.sum(state, axis=0) - np.sum(survived, axis=0)
+    return fired, after
