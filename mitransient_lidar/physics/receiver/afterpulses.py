@@ -89,7 +89,7 @@ def _recovered(fired: FloatArray, k: int, dead: DeadBins) -> FloatArray:
     for bins, share in ((dead.bins, 1 - dead.fraction), (dead.bins + 1, dead.fraction)):
         if k >= bins:
             found = found + share * fired[k - bins]
-    return found
+    return np.asarray(found)
 
 
 def _step(state: FloatArray, hit: FloatArray, chances: FloatArray) -> tuple[FloatArray, FloatArray]:
