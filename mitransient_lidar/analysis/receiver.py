@@ -91,12 +91,12 @@ def detect_waveforms(
     """
     receiver, groups, sky = _channels(dataset, chain, gain, optical_density, background_power)
     if len(groups) == 1:
-        recorded = _record_channel(dataset, groups[0][0], shots, seed, sky)
+        recorded = _record_channel(dataset, groups[0][0], shots, (seed, seed), sky)
     else:
         parts = []
         for number, (channel, pixels) in enumerate(groups):
             part, light = dataset.isel(pixel=pixels), sky if np.ndim(sky) == 0 else sky[pixels]
-            parts.append(_record_channel(part, channel, shots, seed + number, light))
+            parts.append(_record_channel(part, channel, shots, (seed, seed + number), light))
         recorded = _joined(parts, [pixels for _, pixels in groups])
     recorded.attrs |= {"noise_seed": int(seed)} | ({} if receiver.name == "custom" else {"receiver": receiver.name})
     if receiver.pulse_repetition_khz is not None:
@@ -193,8 +193,13 @@ def _same(first: Any, second: Any) -> bool:
     return type(first) is type(second) and bool(np.array_equal(first, second))
 
 
-def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int, sky: FloatArray) -> xr.Dataset:
-    """Return the record of pixels that share a channel; the arguments are those of `detect_waveforms`."""
+def _record_channel(
+    dataset: xr.Dataset, channel: Channel, shots: int, seeds: tuple[int, int], sky: FloatArray
+) -> xr.Dataset:
+    """Return the record of pixels that share a channel.
+
+    The arguments are those of `detect_waveforms`; seeds are those of energy and trigger, and of all else.
+    """
     given = channel.chain
     dims, light = _waveform(dataset)
     pixels, series = tuple(dim for dim in dims[:-1] if dim != "shot"), dims[0] == "shot"
@@ -204,7 +209,7 @@ def _record_channel(dataset: xr.Dataset, channel: Channel, shots: int, seed: int
         _LOG.warning("the waveform includes a response time already, and the amplifier's bandwidth smooths it again")
     receiver, density, fitting = _in_range(given, channel.gain, channel.optical_density, light, width, sky)
     power, background = 10**-density * light, np.broadcast_to(10**-density * sky, light.shape[:-1])
-    signal, saturated = receiver.apply(power, width, shots, seed, background)
+    signal, saturated = receiver.apply(power, width, shots, seeds[1], background, series=series, common_seed=seeds[0])
     number = len(signal)
     expected = receiver.expected(power, width, background)
     snr = receiver.snr(power, width, background)

@@ -15,7 +15,6 @@ from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
-from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
@@ -221,9 +220,9 @@ def _experiment(
             f"the record must hold {trials.HALF_GATE:g} pulse widths about the target's echo at "
             f"{time[np.argmax(echo)]:.1f} ns in 3 or more samples: change time_start_ns, bin_count or bin_width_ns"
         )
-    # The signal of a linear detector does not depend on earlier light than the memory of its filter.
+    # Earlier light than the memory of the filter may not matter.
     start = 0
-    if isinstance(chain.detector, LinearDetector):
+    if chain.forgets_light:
         start = max(0, int(chosen[0]) * stride - chain.low_pass(width).before - math.ceil(pulse / width)) // stride
     kept = slice(start * stride, None)
     return Experiment(

@@ -138,7 +138,7 @@ class Experiment:
     def draw(self, single: bool, light: FloatArray, chain: ReceiverChain, shots: int, seed: int) -> FloatArray:
         """Return random samples of shots, shape (shots, cases, detectors * samples)."""
         power, sky = self.on_detectors(single, light)
-        record = chain.apply(power, self.bin_width_ns, shots, seed, sky)
+        record = chain.apply(power, self.bin_width_ns, shots, seed, sky, series=True)
         signal = record.signal[..., self.samples]
         return signal.reshape(*signal.shape[:2], -1).astype(np.float64)
 

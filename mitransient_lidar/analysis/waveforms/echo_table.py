@@ -26,6 +26,7 @@ from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, surf
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.physics.receiver.shot_jitter import timing_jitter
 from mitransient_lidar.results.geometry import optional_number
 
 ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deconvolution")
@@ -141,7 +142,8 @@ def extract(
     ``gaussian`` flags a surface echo of less than 3 standard errors as ``no_echo``; its time is that of the column's
     onset.
 
-    ``depth_m_stderr`` is the error by noise. The method errs by more: ``depth_m_method_error`` states for ``gaussian``
+    ``depth_m_stderr`` is the error by noise and by the jitter of the record's trigger and clocks, which cancels where
+    the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for ``gaussian``
     the typical error by scattered light that arrives later, by the light's distribution in the pixel, which the surface
     echo samples at few places, and by waves; see `depth_errors.DepthErrors`. Its constants are from 40 random level
     seas and 36 shots on waves, its dependence on sqrt(K bb) also from one lidar in Jerlov waters. In other renders the
@@ -313,6 +315,7 @@ def _with_depths(
     lowest, highest = dataset.attrs.get("surface_heights_m", (-np.inf, np.inf))
     time, error, peak = table["time_ns"], table["time_ns_stderr"], table.pop("peak_ns")
     errors = DepthErrors.of(dataset.attrs, lines, shots, waveforms.geometry, waveforms.template.fwhm_ns)
+    trigger, clock = timing_jitter(dataset.attrs)
     zero, zero_error, by_light = (np.empty(time.shape[:2]) for _ in range(3))
     dark = lines.beam_share < LEAST_SHARE * waveforms.brightest
     table["flags"][..., 2:] |= np.where(dark, int(EchoFlag.SCATTERED_LIGHT), 0)[:, np.newaxis, np.newaxis]
@@ -329,6 +332,8 @@ def _with_depths(
             slope_variance=_TYPICAL_SLOPE_VARIANCE if variance is None else variance,
             heights_m=(lowest, highest),
             echo_fwhm_ns=waveforms.echo_fwhm_ns,
+            trigger_ns=trigger,
+            clock_ns=clock,
         )
         own = found.own.ravel()
         flags = table["flags"][:, number, 0]
@@ -350,7 +355,7 @@ def _with_depths(
         first = zero[:, 0]
         layer_zero = np.where(np.isfinite(first), first, peak)
     else:
-        delay, spread = time - lines.surface_time[:, np.newaxis, np.newaxis], error
+        delay, spread = time - lines.surface_time[:, np.newaxis, np.newaxis], np.hypot(error, np.hypot(trigger, clock))
         layer_zero = lines.surface_time
     table |= {"depth_m": lines.depth_of_delay(delay), "depth_m_stderr": lines.depth_of_delay(spread)}
     from_mean = settings.depth_from == "mean"

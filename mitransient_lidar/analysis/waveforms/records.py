@@ -341,7 +341,8 @@ def _receiver_noise(
     deviation = dataset["signal_deviation"].values.reshape(-1, pixels, count)
     deviation = np.maximum(deviation, spread)
     shots = samples[: _MOST_SHOTS * pixels].reshape(-1, pixels, count)
-    if len(shots) < _FEWEST_SHOTS:
+    # Jitter moves and scales whole echoes from shot to shot, which is no noise of their samples.
+    if len(shots) < _FEWEST_SHOTS or "receiver.jitter" in dataset.attrs:
         return np.asarray(deviation.reshape(-1, count) * _inflation(rest, run))
     # The noise has a larger correlation in an echo than in the dark. Shots of one place differ by noise alone.
     of_each = "shot" in dataset["signal_deviation"].dims and "signal_mean" in dataset

@@ -37,6 +37,8 @@ def surface_times(
     slope_variance: float,
     heights_m: tuple[float, float],
     echo_fwhm_ns: float,
+    trigger_ns: float = 0.0,
+    clock_ns: float = 0.0,
 ) -> SurfaceTimes:
     """Hold the surface echoes of shots against beam and geometry, and replace those without direct light.
 
@@ -54,6 +56,8 @@ def surface_times(
         Lowest and highest point of the sea [m], infinite if unknown.
     echo_fwhm_ns : float
         Expected full width of an echo at half maximum [ns].
+    trigger_ns, clock_ns : float
+        Standard deviations of the time of a shot, which its pixels share, and of a pixel [ns]; see `ShotJitter`.
 
     Returns
     -------
@@ -71,6 +75,10 @@ def surface_times(
     of the light; its echo has the errors by noise and method. The times are the means of the deviations given all
     echoes of the shot, which draws uncertain times to the mean sea level and to those of the other pixels. An echo
     agrees with these within its error, that of its shape, a tenth of its width, and the spread of the light.
+
+    The error by noise includes what trigger and clock change between this time and later echoes of the same pixel:
+    nothing if the time is that of its own echo, the clocks of all pixels that it is taken from, and both as far as it
+    is drawn to the mean sea level.
     """
     known = np.isfinite(time_ns)
     share = lines.beam_share
@@ -107,9 +115,15 @@ def surface_times(
     shared = np.sum((gain * noise) ** 2, axis=1, keepdims=True) - (gain * noise) ** 2
     by_noise = (share_of_own + (1 - share_of_own) * gain) ** 2 * noise**2 + (1 - share_of_own) ** 2 * shared
     by_method = np.sqrt(np.maximum(own_variance - by_noise, 0))
+    # Weights of the clocks in the time, less the pixel's own clock in its later echoes.
+    others = np.sum(gain**2, axis=1, keepdims=True) - gain**2
+    by_clocks = np.where(lit, (1 - share_of_own) ** 2 * ((1 - gain) ** 2 + others), 1 + gain**2 + others)
+    # What the mean sea level has of the time does not move with the trigger.
+    by_trigger = np.where(lit, 1 - share_of_own, 1.0) * (1 - gain.sum(axis=1, keepdims=True))
+    by_timing = clock_ns**2 * by_clocks + (trigger_ns * by_trigger) ** 2
     return SurfaceTimes(
         np.where(lit, own, inferred),
-        np.where(lit, np.sqrt(by_noise), error),
+        np.hypot(np.where(lit, np.sqrt(by_noise), error), np.sqrt(by_timing)),
         np.where(lit, by_method, 0),
         lit,
     )

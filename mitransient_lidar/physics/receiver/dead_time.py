@@ -142,14 +142,30 @@ def sample_cells(events: FloatArray, cells: int, dead: DeadBins, shots: int, ran
 
 
 def sample_counter(
-    events: FloatArray, dead: DeadBins, paralyzable: bool, shots: int, random: np.random.Generator
+    events: FloatArray,
+    dead: DeadBins,
+    paralyzable: bool,
+    shots: int,
+    random: np.random.Generator,
+    hazard: FloatArray | None = None,
 ) -> IntArray:
-    """Draw the counts of a single cell, 0 or 1 in each bin, in `shots` records, shape (shots, ..., time)."""
+    """Draw the counts of a single cell, 0 or 1 in each bin, in `shots` records, shape (shots, ..., time).
+
+    `hazard` is the probability of an afterpulse by the number of bins since the cell is live again, see
+    `afterpulses.hazard`; None for no afterpulses.
+    """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     fired = np.zeros((len(hit), shots, *hit.shape[1:]), dtype=np.int64)
     free_from = np.zeros(fired.shape[1:], dtype=np.int64)
+    if hazard is not None:
+        # Before its first count, a cell has been live for longer than afterpulses last.
+        free_from -= hazard.size
     for k in range(len(hit)):
-        detected = random.random(free_from.shape) < hit[k]
+        probability = hit[k]
+        if hazard is not None:
+            age = np.clip(k - free_from, 0, hazard.size - 1)
+            probability = 1 - (1 - probability) * (1 - hazard[age])
+        detected = random.random(free_from.shape) < probability
         counted = detected & (free_from <= k)
         fired[k] = counted
         restarts = np.flatnonzero(detected if paralyzable else counted)

@@ -14,7 +14,7 @@ process: speckle of the laser averages out over the many coherence cells of an a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,8 @@ from mitransient_lidar.core.validation import (
     non_negative,
     positive,
 )
-from mitransient_lidar.physics.receiver import dead_time
+from mitransient_lidar.physics.receiver import afterpulses, dead_time
+from mitransient_lidar.physics.receiver.signal_tail import SignalTail
 
 Moments = tuple[FloatArray, list[FloatArray]]
 """Mean, shape (..., time), and covariances of the bins k and k + l at index l, shape (..., time - l)."""
@@ -79,7 +80,7 @@ def dynode_excess_noise(dynode_gains: Sequence[float]) -> float:
 
 
 @dataclass(frozen=True)
-class LinearDetector:
+class LinearDetector(SignalTail):
     """Detector whose charge is proportional to the light: photodiode, avalanche photodiode or photomultiplier.
 
     Parameters
@@ -98,12 +99,11 @@ class LinearDetector:
         Gains of the dynodes of a photomultiplier, whose voltage can be lowered; empty for other detectors.
     largest_current_ma : float
         Largest output current in pulses [mA]: behind an amplifier, more saturates.
+    tail_fractions, tail_decays_ns, tail_delays_ns : tuple of float
+        Signal-induced noise, and the afterpulses of a photomultiplier; see `SignalTail`.
 
     Notes
     -----
-    Afterpulses, jitter, recovery from overload and signal-induced noise (a tail of 1e-4 to 1e-3 of a strong surface
-    echo for up to a microsecond, in photomultipliers) are neglected: real receivers see false echoes there.
-
     The charge of n events is drawn from a gamma distribution of mean n gain and variance n gain^2 (excess_noise - 1),
     the shot noise of the leakage from a normal one: mean and variance are exact, the shape of the tails is not.
     """
@@ -117,6 +117,7 @@ class LinearDetector:
     largest_current_ma: float = np.inf
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_efficiency(self.quantum_efficiency)
         for name in ("gain", "excess_noise"):
             in_range(name, getattr(self, name), 1, np.inf)
@@ -133,10 +134,21 @@ class LinearDetector:
         ionisation_ratio: float,
         dark_current_na: float = 0.0,
         leakage_current_na: float = 0.0,
+        tail_fractions: tuple[float, ...] = (),
+        tail_decays_ns: tuple[float, ...] = (),
+        tail_delays_ns: tuple[float, ...] = (),
     ) -> LinearDetector:
         """Avalanche photodiode below breakdown, its excess noise from `avalanche_excess_noise`."""
-        noise = avalanche_excess_noise(gain, ionisation_ratio)
-        return cls(quantum_efficiency, gain, noise, dark_current_na, leakage_current_na)
+        return cls(
+            quantum_efficiency,
+            gain,
+            avalanche_excess_noise(gain, ionisation_ratio),
+            dark_current_na,
+            leakage_current_na,
+            tail_fractions=tail_fractions,
+            tail_decays_ns=tail_decays_ns,
+            tail_delays_ns=tail_delays_ns,
+        )
 
     @classmethod
     def photomultiplier(
@@ -145,11 +157,24 @@ class LinearDetector:
         dynode_gains: Sequence[float],
         dark_current_na: float = 0.0,
         largest_current_ma: float = np.inf,
+        tail_fractions: tuple[float, ...] = (),
+        tail_decays_ns: tuple[float, ...] = (),
+        tail_delays_ns: tuple[float, ...] = (),
     ) -> LinearDetector:
         """Photomultiplier tube, its gain and excess noise from the gains of its dynodes (`dynode_excess_noise`)."""
         gains, noise = tuple(float(gain) for gain in dynode_gains), dynode_excess_noise(dynode_gains)
-        gain = float(np.prod(gains))
-        return cls(quantum_efficiency, gain, noise, dark_current_na, 0.0, gains, largest_current_ma)
+        return cls(
+            quantum_efficiency,
+            float(np.prod(gains)),
+            noise,
+            dark_current_na,
+            0.0,
+            gains,
+            largest_current_ma,
+            tail_fractions=tail_fractions,
+            tail_decays_ns=tail_decays_ns,
+            tail_delays_ns=tail_delays_ns,
+        )
 
     @property
     def charge_spread(self) -> float:
@@ -169,7 +194,8 @@ class LinearDetector:
         if min(gains) <= 1:
             least = min(self.dynode_gains) ** -len(self.dynode_gains)
             raise UserError(f"gain = {factor:g} must be above {least:.3g}, for gains of all dynodes above 1")
-        return self.photomultiplier(self.quantum_efficiency, gains, self.dark_current_na, self.largest_current_ma)
+        changed = self.photomultiplier(self.quantum_efficiency, gains)
+        return replace(self, gain=changed.gain, excess_noise=changed.excess_noise, dynode_gains=changed.dynode_gains)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin for a mean number of photons per bin, of the same shape."""
@@ -190,7 +216,7 @@ class LinearDetector:
 
 
 @dataclass(frozen=True)
-class SiliconPhotomultiplier:
+class SiliconPhotomultiplier(SignalTail):
     """Array of Geiger-mode cells in parallel (SiPM, MPPC).
 
     Parameters
@@ -209,6 +235,8 @@ class SiliconPhotomultiplier:
         Mean charge of an avalanche in electrons, at least 1.
     gain_spread : float
         Standard deviation of the charge over its mean, at least 0.
+    tail_fractions, tail_decays_ns, tail_delays_ns : tuple of float
+        Afterpulses, per primary avalanche; see `SignalTail`.
 
     Notes
     -----
@@ -216,8 +244,7 @@ class SiliconPhotomultiplier:
     Borel-distributed total number of avalanches, of mean 1/(1 - L) and variance L/(1 - L)^3, L = -ln(1 - crosstalk)
     (S. Vinogradov, Nucl. Instrum. Methods A 695, 247 (2012), arXiv:1109.2014). Here L is multiplied by the mean
     fraction of live cells; the dead time of cells fired by crosstalk is neglected, which matters where many cells fire.
-    A cell recovers instantaneously. Afterpulses are neglected: within some 100 ns after a strong surface echo the
-    signal is cleaner than that of a real device.
+    A cell recovers instantaneously. Afterpulses are in any cell, with equal probability.
     """
 
     quantum_efficiency: float
@@ -229,6 +256,7 @@ class SiliconPhotomultiplier:
     gain_spread: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_efficiency(self.quantum_efficiency)
         integer("cells", self.cells, 1, 10**9)
         positive("recovery_time_ns", self.recovery_time_ns)
@@ -278,13 +306,18 @@ class SiliconPhotomultiplier:
                 flat[parents] += born
         return _multiplied(count, self.gain, self.gain_spread**2, random)
 
+    def _tail_sources(self, events: FloatArray, part_ns: float) -> FloatArray:
+        """Return the mean primary avalanches, fewer than the events where cells are dead."""
+        dead = dead_time.dead_bins(self.recovery_time_ns, part_ns)
+        return self.cells * dead_time.firing_probability(events / self.cells, dead)[0]
+
     def _offspring(self, fired: FloatArray, live: FloatArray) -> FloatArray:
         """Mean avalanches that one triggers directly."""
         return np.asarray(-np.log1p(-self.crosstalk) * np.maximum(live - fired, 0))
 
 
 @dataclass(frozen=True)
-class SinglePhotonDetector:
+class SinglePhotonDetector(SignalTail):
     """Single-photon avalanche diode, or several channels that share the light evenly, with a counter in time bins.
 
     Parameters
@@ -300,10 +333,19 @@ class SinglePhotonDetector:
         Whether an event in the dead time prolongs it.
     channels : int
         Number of channels, each with its own dead time, whose counts are summed; 1 to 10^4. Dark counts are of all.
+    afterpulse_probability : float
+        Probability that a count causes another one in its channel after the dead time, 0 to 0.5, where no other event
+        is earlier. It needs a detector that is not paralyzable.
+    afterpulse_decay_ns : float or None
+        Mean time from the end of the dead time to an afterpulse [ns], positive; required for a probability above 0.
+    tail_fractions, tail_decays_ns, tail_delays_ns : tuple of float
+        Events in proportion to the light that come later, such as by slow carriers; see `SignalTail`.
 
     Notes
     -----
-    The detector is live at the first bin of the record, as if gated on there. Afterpulses are neglected.
+    The detector is live at the first bin of the record, as if gated on there. The time to an afterpulse is
+    exponentially distributed, and an afterpulse may cause another one. Each count begins anew: carriers that earlier
+    ones have trapped no longer count, so that the counts are a renewal process with exact moments.
     """
 
     quantum_efficiency: float
@@ -311,12 +353,24 @@ class SinglePhotonDetector:
     dark_count_rate_hz: float = 0.0
     paralyzable: bool = False
     channels: int = 1
+    afterpulse_probability: float = 0.0
+    afterpulse_decay_ns: float | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_efficiency(self.quantum_efficiency)
         positive("dead_time_ns", self.dead_time_ns)
         non_negative("dark_count_rate_hz", self.dark_count_rate_hz)
         integer("channels", self.channels, 1, 10_000)
+        if in_range("afterpulse_probability", self.afterpulse_probability, 0, 0.5) > 0:
+            if self.paralyzable:
+                raise UserError(
+                    f"afterpulse_probability = {self.afterpulse_probability:g} must be 0 for a paralyzable detector"
+                )
+            if self.afterpulse_decay_ns is None:
+                raise UserError("afterpulse_decay_ns is required for an afterpulse_probability above 0")
+        if self.afterpulse_decay_ns is not None:
+            positive("afterpulse_decay_ns", self.afterpulse_decay_ns)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin without dead time for a mean number of photons per bin, of the same shape."""
@@ -325,20 +379,31 @@ class SinglePhotonDetector:
     def moments(self, events: FloatArray, bin_width_ns: float, lags: int) -> Moments:
         """Mean and covariances of the counts for mean events per bin, shape (..., time)."""
         dead, own = dead_time.dead_bins(self.dead_time_ns, bin_width_ns), events / self.channels
-        if self.paralyzable:
+        hazard = self._hazard(bin_width_ns, events.shape[-1])
+        if hazard is not None:
+            fired, covariances = afterpulses.moments(own, dead, hazard, lags)
+        elif self.paralyzable:
             fired = dead_time.firing_probability_paralyzable(own, dead)
+            covariances = dead_time.pair_covariances(own, fired, dead, lags, paralyzable=True)
         else:
             fired, _ = dead_time.firing_probability(own, dead)
-        covariances = dead_time.pair_covariances(own, fired, dead, lags, self.paralyzable)
+            covariances = dead_time.pair_covariances(own, fired, dead, lags)
         return self.channels * fired, [self.channels * one for one in covariances]
 
     def sample(self, events: FloatArray, bin_width_ns: float, shots: int, random: np.random.Generator) -> FloatArray:
         """Draw counts per bin, 0 to the number of channels, shape ``(shots, *events.shape)``."""
         dead, own = dead_time.dead_bins(self.dead_time_ns, bin_width_ns), events / self.channels
+        hazard = self._hazard(bin_width_ns, events.shape[-1])
         count = np.zeros((shots, *events.shape))
         for _ in range(self.channels):
-            count += dead_time.sample_counter(own, dead, self.paralyzable, shots, random)
+            count += dead_time.sample_counter(own, dead, self.paralyzable, shots, random, hazard)
         return count
+
+    def _hazard(self, bin_width_ns: float, bins: int) -> FloatArray | None:
+        """Return the probability of an afterpulse in each bin since a channel is live, or None without afterpulses."""
+        if self.afterpulse_probability == 0 or self.afterpulse_decay_ns is None:
+            return None
+        return afterpulses.hazard(self.afterpulse_probability, self.afterpulse_decay_ns / bin_width_ns, bins)
 
 
 Detector = LinearDetector | SiliconPhotomultiplier | SinglePhotonDetector

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -98,9 +98,18 @@ class Amplifier:
     impulse_response : (tuple of float, tuple of float) or None
         Measured response instead of a bandwidth: times after the light [ns], ascending, with 0 among them, and values
         in any unit, linear between the times, of positive area, and at either end within 2 % of their peak about 0.
+    coupling_ns : float or None
+        Time constant of the coupling capacitor between detector and amplifier [ns], positive; None for DC coupling.
+    recovery_ns : float or None
+        Time for which the output stays at its limit after an overload has ended [ns], positive; None for none.
 
     Notes
     -----
+    A coupling capacitor removes steady light from the signal. An echo of charge Q leaves a baseline that is lower by
+    R Q/coupling_ns and recovers as exp(-t/coupling_ns), in full where the echo itself is clipped. The amplifier's noise
+    and the variance of the signal are taken as without the capacitor; the latter is less by a share of about the
+    low-pass response time over coupling_ns.
+
     Thermal noise: J. B. Johnson and H. Nyquist, Phys. Rev. 32, 97 and 110 (1928), doi:10.1103/PhysRev.32.110.
     """
 
@@ -112,12 +121,14 @@ class Amplifier:
     response: Literal["single_pole", "gaussian"] = "single_pole"
     limit_v: float | None = None
     impulse_response: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    coupling_ns: float | None = None
+    recovery_ns: float | None = None
 
     def __post_init__(self) -> None:
         positive("transimpedance_ohm", self.transimpedance_ohm)
         for name in ("noise_pa_per_rthz", "temperature_k"):
             non_negative(name, getattr(self, name))
-        for name in ("load_ohm", "bandwidth_mhz", "limit_v"):
+        for name in ("load_ohm", "bandwidth_mhz", "limit_v", "coupling_ns", "recovery_ns"):
             if getattr(self, name) is not None:
                 positive(name, getattr(self, name))
         if self.response not in ("single_pole", "gaussian"):
@@ -144,6 +155,23 @@ class Amplifier:
             return LowPass(parts, 0, _unit(-np.diff(np.exp(-edges * decay))))
         reach = int(np.ceil(6.5 / decay))
         return LowPass(parts, -reach, _unit(np.diff(ndtr(np.arange(-reach, reach + 1) * decay))))
+
+    def coupled(self, volts: FloatArray, sample_ns: float) -> FloatArray:
+        """Return voltages behind the coupling capacitor, if any.
+
+        Parameters
+        ----------
+        volts : ndarray, shape (..., sample)
+            Voltages less that of steady light [V], 0 before the first sample.
+        sample_ns : float
+            Time between samples [ns].
+        """
+        from scipy.signal import lfilter
+
+        if self.coupling_ns is None:
+            return volts
+        kept = math.exp(-sample_ns / self.coupling_ns)
+        return np.asarray(volts - lfilter([(1 - kept) / 2, (1 - kept) / 2], [1, -kept], volts, axis=-1))
 
     def noise(self, bin_width_ns: float, stride: int = 1) -> tuple[float, FloatArray]:
         """Return the amplifier's own noise in samples that are `stride` bins apart.
@@ -274,6 +302,7 @@ class Readout:
     limit_v: float | None = None  #: Largest voltage of either sign [V].
     logarithm: LogAmplifier | None = None
     digitiser: Digitiser | None = None
+    hold: int = 0  #: Samples for which the output stays at `limit_v` after an overload.
 
     @property
     def top_v(self) -> float:
@@ -283,6 +312,10 @@ class Readout:
     def read(self, volts: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the samples [V] for voltages [V], and where they are saturated."""
         clip, over = self._limits()
+        if self.hold and self.limit_v is not None:
+            held = _before(volts > self.limit_v, self.hold)
+            # Beyond every limit, so that held samples are saturated.
+            volts = np.where(held, np.inf, volts)
         saturated = (volts < over[0]) | (volts > over[1])
         samples = self._compressed(np.clip(volts, *clip))
         if self.digitiser is not None:
@@ -293,7 +326,8 @@ class Readout:
     def expected(self, mean: FloatArray, variance: FloatArray) -> Expected:
         """Return the moments of the samples for normally distributed voltages of a mean [V] and variance [V^2].
 
-        Gauss-Legendre quadrature within the limits; clipped values are included.
+        Gauss-Legendre quadrature within the limits; clipped values are included. Samples that an overload may hold at
+        the limit are taken as held with the largest probability of an overload in the time before.
         """
         from scipy.special import ndtr
 
@@ -322,7 +356,16 @@ class Readout:
             first, second = first + fraction * distance, second + fraction * distance**2
         saturation = np.clip(below(over[0]) + 1 - below(over[1]), 0, 1)
         rounding = 0.0 if self.digitiser is None else self.digitiser.step_v**2 / 12
-        return Expected(centre + first, np.maximum(second - first**2, 0) + rounding * (1 - saturation), saturation)
+        plain = Expected(centre + first, np.maximum(second - first**2, 0) + rounding * (1 - saturation), saturation)
+        if self.hold == 0 or self.limit_v is None:
+            return plain
+        held = _before(1 - below(self.limit_v), self.hold)
+        height = self._compressed(np.asarray(clip[1])) - plain.mean
+        return Expected(
+            plain.mean + held * height,
+            (1 - held) * plain.variance + held * (1 - held) * height**2,
+            held + (1 - held) * saturation,
+        )
 
     def _compressed(self, volts: FloatArray) -> FloatArray:
         """Apply the logarithm, if any."""
@@ -339,6 +382,13 @@ class Readout:
                 codes, beyond = self.logarithm.expand(codes), self.logarithm.expand(beyond)
             clip, over = np.clip(codes, -rail, rail), np.clip(beyond, -rail, rail)
         return (float(clip[0]), float(clip[1])), (float(over[0]), float(over[1]))
+
+
+def _before(values: npt.NDArray[Any], samples: int) -> npt.NDArray[Any]:
+    """Return the largest of some values before each one, 0 where there are none; shape (..., sample)."""
+    ends = [(0, 0)] * (values.ndim - 1) + [(samples, 0)]
+    earlier = np.pad(values, ends)[..., :-1]
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(earlier, samples, axis=-1).max(axis=-1))
 
 
 def _check_response(times: tuple[float, ...], values: tuple[float, ...]) -> None:

@@ -36,6 +36,7 @@ from mitransient_lidar.physics.receiver.electronics import (
     Readout,
     filtered,
 )
+from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter, delayed
 
 _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
 _RARE = 1e-3  # share of records in which a single event is higher than stated
@@ -68,6 +69,8 @@ class ReceiverChain:
     normally distributed, which holds where the amplifier's noise or tens of photoelectrons within its response
     dominate. With a logarithm and less than one photoelectron, errors of 0.05 standard deviations in the mean and of a
     third in the variance were found; the shots themselves (`apply`) make no such assumption.
+
+    Jitter is in the shots alone. Closed forms are those of a shot of mean energy at its nominal time.
     """
 
     detector: Detector  #: A `SinglePhotonDetector` outputs counts and takes no further stages.
@@ -76,6 +79,7 @@ class ReceiverChain:
     digitiser: Digitiser | None = None  #: It requires an amplifier.
     wavelength_nm: float = 532.0  #: Vacuum wavelength of the light [nm], positive.
     source: str = ""  #: Source of the numbers.
+    jitter: ShotJitter | None = None  #: Energy and time of the shots; None for none.
 
     def __post_init__(self) -> None:
         positive("wavelength_nm", self.wavelength_nm)
@@ -84,6 +88,11 @@ class ReceiverChain:
                 raise UserError(f"{name} needs an amplifier, which converts the charge to a voltage")
         if self.amplifier is not None and isinstance(self.detector, SinglePhotonDetector):
             raise UserError("amplifier must be None behind a SinglePhotonDetector, which outputs counts")
+        if self.amplifier is not None and self.amplifier.recovery_ns is not None and self._limit_v() is None:
+            raise UserError(
+                f"recovery_ns = {self.amplifier.recovery_ns:g} needs a limit_v of the amplifier, or a "
+                "largest_current_ma of the detector, from which it recovers"
+            )
 
     @property
     def units(self) -> str:
@@ -94,8 +103,25 @@ class ReceiverChain:
         """Return the number of bins between samples, for a bin width in ns; sample i is taken in bin i stride."""
         return 1 if self.digitiser is None else self.digitiser.stride(positive("bin_width_ns", bin_width_ns))
 
+    @property
+    def forgets_light(self) -> bool:
+        """Whether samples depend only on light within the low-pass and the time of the shot is certain."""
+        recovers = self.amplifier is not None and not (
+            self.amplifier.coupling_ns is None and self.amplifier.recovery_ns is None
+        )
+        linear = isinstance(self.detector, LinearDetector) and not self.detector.tail_fractions
+        return linear and not recovers and self.jitter is None
+
     def apply(
-        self, power: npt.ArrayLike, bin_width_ns: float, shots: int, seed: int, background: npt.ArrayLike = 0.0
+        self,
+        power: npt.ArrayLike,
+        bin_width_ns: float,
+        shots: int,
+        seed: int,
+        background: npt.ArrayLike = 0.0,
+        *,
+        series: bool = False,
+        common_seed: int | None = None,
     ) -> Record:
         """Draw the samples of independent shots.
 
@@ -111,6 +137,11 @@ class ReceiverChain:
             Seed of the random numbers, 0 to 2^63 - 1. The same arguments give the same samples on any number of cores.
         background : array_like
             Constant power added to the signal [W], not negative: a number, or one for each record.
+        series : bool
+            Whether the first axis of the power is one of different pulses, each with its own energy and trigger. All
+            other records are channels that share those of a shot.
+        common_seed : int, optional
+            Seed of energy and trigger, by default `seed`: the same one for channels that are drawn one by one.
 
         Returns
         -------
@@ -128,14 +159,25 @@ class ReceiverChain:
         size = max(1, _BLOCK // (some * length))
         blocks = [(i, j) for i in range(0, number, size) for j in range(0, len(light), some)]
         seeds = np.random.SeedSequence(start).spawn(len(blocks))
+        jitter = None
+        if self.jitter is not None:
+            records = np.shape(power)[:-1]
+            drawn = self.jitter.draw(number, records, series, start, start if common_seed is None else common_seed)
+            jitter = tuple(one.reshape(number, -1) for one in drawn)
 
         def draw(block: int) -> None:
             i, j = blocks[block]
             own = slice(i, min(i + size, number)), slice(j, j + some)
             random = np.random.default_rng(seeds[block])
-            events = self.events(light[own[1]], bin_width_ns, sky[own[1]])
-            charge = self.detector.sample(events, bin_width_ns / low_pass.parts, own[0].stop - i, random)
-            record.signal[own], record.saturated[own] = self._process(charge, bin_width_ns, random)
+            part = bin_width_ns / low_pass.parts
+            if jitter is None:
+                events = self.events(light[own[1]], bin_width_ns, sky[own[1]])
+                charge = self.detector.sample(events, part, own[0].stop - i, random)
+            else:
+                energy, delay = (one[own] for one in jitter)
+                shifted = energy[..., np.newaxis] * delayed(light[own[1]], delay / bin_width_ns)
+                charge = self.detector.sample(self.events(shifted, bin_width_ns, sky[own[1]]), part, 1, random)[0]
+            record.signal[own], record.saturated[own] = self._process(charge, bin_width_ns, sky[own[1]], random)
 
         with ThreadPoolExecutor(min(len(blocks), os.cpu_count() or 1, 8)) as pool:
             for _ in pool.map(draw, range(len(blocks))):
@@ -151,7 +193,7 @@ class ReceiverChain:
         mean, variance = self._unlimited(power, bin_width_ns, background)
         if self.amplifier is None:
             return Expected(mean, variance, np.zeros_like(mean))
-        return self.readout().expected(mean, variance)
+        return self.readout(bin_width_ns).expected(mean, variance)
 
     def with_gain(self, factor: float) -> ReceiverChain:
         """Return the chain with another gain: of a photomultiplier's dynodes, or of the amplifier behind others.
@@ -184,7 +226,7 @@ class ReceiverChain:
         factor, chain = 1.0, self
         # Behind a photomultiplier, the noise of the amplifier stays and the excess noise grows.
         for _ in range(_MOST_STEPS):
-            if chain.amplifier is None or not math.isfinite(top := chain.readout().top_v):
+            if chain.amplifier is None or not math.isfinite(top := chain.readout(bin_width_ns).top_v):
                 break
             highest = float(chain._highest(power, bin_width_ns, background, samples).max())
             if highest <= top * (1 + _IN_RANGE):
@@ -204,7 +246,7 @@ class ReceiverChain:
         """
         from scipy.optimize import brentq
 
-        if self.amplifier is None or not math.isfinite(top := self.readout().top_v):
+        if self.amplifier is None or not math.isfinite(top := self.readout(bin_width_ns).top_v):
             return 1.0
         light = np.asarray(power, dtype=np.float64)
         sky = np.broadcast_to(np.asarray(background, dtype=np.float64), light.shape[:-1]).ravel()
@@ -284,6 +326,7 @@ class ReceiverChain:
     def events(self, power: FloatArray, bin_width_ns: float, background: FloatArray) -> FloatArray:
         """Return mean primary events in parts of bins, with those before and after that the low-pass needs.
 
+        Events of the detector's tail are included.
         Powers [W] are of shape (..., time), backgrounds [W] of shape (...).
         """
         low_pass = self.low_pass(bin_width_ns)
@@ -291,7 +334,17 @@ class ReceiverChain:
         photons = (
             (np.pad(power, ends) + background[..., None]) * 1e-9 * bin_width_ns * photons_per_joule(self.wavelength_nm)
         )
-        return self.detector.event_means(low_pass.divided(photons), bin_width_ns / low_pass.parts)
+        part = bin_width_ns / low_pass.parts
+        events = self.detector.event_means(low_pass.divided(photons), part)
+        if not self.detector.tail_fractions:
+            return events
+        return self.detector.with_tail(events, self._steady_events(bin_width_ns, background), part)
+
+    def _steady_events(self, bin_width_ns: float, background: FloatArray) -> FloatArray:
+        """Return mean primary events of background [W] and dark current in a part of a bin, shape (..., 1)."""
+        parts = self.low_pass(bin_width_ns).parts
+        photons = background[..., None] * 1e-9 * bin_width_ns * photons_per_joule(self.wavelength_nm) / parts
+        return self.detector.event_means(photons, bin_width_ns / parts)
 
     def _light(
         self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike
@@ -317,7 +370,21 @@ class ReceiverChain:
         for lag, covariance in enumerate(covariances[1:], 1):
             variance += 2 * low_pass.sampled(covariance, stride, weights[:-lag] * weights[lag:])
         volts = 1.0 if self.amplifier is None else self.volts_per_electron(bin_width_ns)
-        return low_pass.sampled(charge, stride) * volts, np.maximum(variance, 0) * volts**2
+        mean = self.coupled(low_pass.sampled(charge, stride) * volts, bin_width_ns, background)
+        return mean, np.maximum(variance, 0) * volts**2
+
+    def coupled(self, volts: FloatArray, bin_width_ns: float, background: FloatArray) -> FloatArray:
+        """Return samples of the detector's signal [V], shape (..., sample), behind the coupling capacitor, if any.
+
+        Backgrounds [W] are of shape (...), or of its last axes.
+        """
+        if self.amplifier is None or self.amplifier.coupling_ns is None:
+            return volts
+        low_pass = self.low_pass(bin_width_ns)
+        events = self.events(np.zeros((*background.shape, 1)), bin_width_ns, background)
+        charge, _ = self.detector.moments(events, bin_width_ns / low_pass.parts, 1)
+        steady = low_pass.sampled(charge, 1) * self.volts_per_electron(bin_width_ns)
+        return self.amplifier.coupled(volts - steady, bin_width_ns * self.stride(bin_width_ns))
 
     def volts_per_electron(self, bin_width_ns: float) -> float:
         """Mean voltage over a part of a bin per electron in it."""
@@ -325,16 +392,23 @@ class ReceiverChain:
         width = bin_width_ns / self.low_pass(bin_width_ns).parts
         return self.amplifier.transimpedance_ohm * ELEMENTARY_CHARGE / (1e-9 * width)
 
-    def readout(self) -> Readout:
-        """Return the stages behind the low-pass."""
+    def readout(self, bin_width_ns: float) -> Readout:
+        """Return the stages behind the low-pass and the coupling."""
+        assert self.amplifier is not None
+        recovery = self.amplifier.recovery_ns or 0.0
+        hold = math.ceil(recovery / (bin_width_ns * self.stride(bin_width_ns)) - 1e-9)
+        return Readout(self._limit_v(), self.logarithm, self.digitiser, hold)
+
+    def _limit_v(self) -> float | None:
+        """Return the largest voltage of amplifier and detector, or None."""
         assert self.amplifier is not None
         limits = [] if self.amplifier.limit_v is None else [self.amplifier.limit_v]
         if isinstance(self.detector, LinearDetector) and math.isfinite(self.detector.largest_current_ma):
             limits.append(1e-3 * self.detector.largest_current_ma * self.amplifier.transimpedance_ohm)
-        return Readout(min(limits, default=None), self.logarithm, self.digitiser)
+        return min(limits, default=None)
 
     def _process(
-        self, charge: FloatArray, bin_width_ns: float, random: np.random.Generator
+        self, charge: FloatArray, bin_width_ns: float, background: FloatArray, random: np.random.Generator
     ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Convert charges in electrons in each part of a bin to samples."""
         low_pass, stride = self.low_pass(bin_width_ns), self.stride(bin_width_ns)
@@ -342,11 +416,12 @@ class ReceiverChain:
             signal = low_pass.sampled(charge, stride)
             return signal, np.zeros(signal.shape, np.bool_)
         volts = low_pass.sampled(charge, stride) * self.volts_per_electron(bin_width_ns)
+        volts = self.coupled(volts, bin_width_ns, background)
         deviation, weights = self.amplifier.noise(bin_width_ns, stride)
         if deviation > 0:
             normal = random.standard_normal((*volts.shape[:-1], volts.shape[-1] + weights.size - 1))
             volts += deviation * filtered(normal, weights)
-        return self.readout().read(volts)
+        return self.readout(bin_width_ns).read(volts)
 
 
 # A gain of 5 and six of 4 give an excess noise of 1.27; photomultipliers have 1.2 to 1.3 (Hamamatsu, questions and

@@ -19,6 +19,7 @@ from mitransient_lidar.core.validation import positive, shown
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SiliconPhotomultiplier, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
+from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 Setting = float | Literal["auto"]
 
@@ -30,9 +31,14 @@ _DETECTORS: dict[str, Callable[..., Any]] = {
     "silicon_photomultiplier": SiliconPhotomultiplier,
     "photon_counter": SinglePhotonDetector,
 }
-_STAGES: dict[str, Callable[..., Any]] = {"amplifier": Amplifier, "logarithm": LogAmplifier, "digitiser": Digitiser}
-_OF_CHANNEL = ("detector", *_STAGES, "gain", "optical_density")
-_OF_FILE = ("preset", *_OF_CHANNEL, "wavelength_nm", "pulse_repetition_khz", "source", "channels")
+_STAGES: dict[str, Callable[..., Any]] = {
+    "amplifier": Amplifier,
+    "logarithm": LogAmplifier,
+    "digitiser": Digitiser,
+    "jitter": ShotJitter,
+}
+_OF_CHANNEL = ("detector", "amplifier", "logarithm", "digitiser", "gain", "optical_density")
+_OF_FILE = ("preset", *_OF_CHANNEL, "jitter", "wavelength_nm", "pulse_repetition_khz", "source", "channels")
 #: Names of the samples of an impulse response.
 _RESPONSE = Column(
     "impulse_response", ("response", "signal", "amplitude", "power", "v", "mv", "volt", "voltage", "counts")
@@ -66,8 +72,8 @@ class Receiver:
     Raises
     ------
     UserError
-        If the channels differ in the response of the amplifier, in the logarithm or in the converter, which are those
-        of the record.
+        If the channels differ in the response of the amplifier, in the logarithm, in the converter or in the jitter,
+        which are those of the record.
     """
 
     default: Channel
@@ -77,7 +83,7 @@ class Receiver:
 
     def __post_init__(self) -> None:
         for name, channel in self.channels.items():
-            for stage in ("logarithm", "digitiser", "wavelength_nm"):
+            for stage in ("logarithm", "digitiser", "jitter", "wavelength_nm"):
                 if getattr(channel.chain, stage) != getattr(self.default.chain, stage):
                     raise UserError(f"{stage} of channel {name!r} must be that of all channels")
             if _shape(channel.chain.amplifier) != _shape(self.default.chain.amplifier):
@@ -146,9 +152,9 @@ def parse_receiver(text: str, name: str, folder: Path) -> Receiver:
     Keys of the file: ``preset`` (a receiver of `presets.RECEIVERS` whose stages count where the file has no others),
     ``wavelength_nm``, ``pulse_repetition_khz``, ``source``, ``gain`` and ``optical_density`` (numbers or "auto"), the
     tables ``detector`` (with ``type``: photodiode, avalanche_photodiode, photomultiplier, silicon_photomultiplier or
-    photon_counter), ``amplifier`` (its ``impulse_response`` may name a file in `folder`), ``logarithm`` and
-    ``digitiser``, and ``channels.NAME`` with those among them that differ. Keys of tables are the parameters of
-    `detectors` and `electronics`.
+    photon_counter), ``amplifier`` (its ``impulse_response`` may name a file in `folder`), ``logarithm``,
+    ``digitiser`` and ``jitter`` (of all channels), and ``channels.NAME`` with those among the others that differ. Keys
+    of tables are the parameters of `detectors`, `electronics` and `shot_jitter`.
 
     Raises
     ------

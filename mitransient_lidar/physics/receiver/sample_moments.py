@@ -92,7 +92,7 @@ def sample_moments(
     saturation = np.zeros_like(mean)
     if chain.amplifier is not None:
         covariance = covariance + _amplifier_noise(chain, mean.size, width)
-        readout = chain.readout()
+        readout = chain.readout(width)
         saturation = readout.expected(mean, np.diagonal(covariance)).saturation
         if readout.digitiser is not None:
             rounding = readout.digitiser.step_v**2 / 12
@@ -123,7 +123,12 @@ def _detected(
     lags = range(len(covariances))
     between = sparse.diags([*covariances, *covariances[1:]], [*lags, *(-lag for lag in lags[1:])], format="csr")
     volts = 1.0 if chain.amplifier is None else chain.volts_per_electron(width)
-    return weights @ charge * volts, (weights @ between @ weights.T).toarray() * volts**2
+    mean = chain.coupled(weights @ charge * volts, width, np.asarray(background))
+    covariance = (weights @ between @ weights.T).toarray() * volts**2
+    if chain.amplifier is not None:
+        step = width * chain.stride(width)
+        covariance = chain.amplifier.coupled(chain.amplifier.coupled(covariance, step).T, step)
+    return mean, covariance
 
 
 def _step(chain: ReceiverChain, power: FloatArray, change: FloatArray, seconds: float) -> float:

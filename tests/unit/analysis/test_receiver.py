@@ -1,6 +1,7 @@
 """Recorded shots of a result: labels, values, provenance and invalid input."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mitransient_lidar.physics.receiver.detectors import LinearDetector, SingleP
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver
+from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 from mitransient_lidar.results.netcdf import dump
 
 PHOTON = 6.62607015e-34 * 299792458 / 532e-9  # J
@@ -193,6 +195,45 @@ def test_every_shot_of_a_series_is_recorded():
     np.testing.assert_allclose(shots["signal_mean"][1], alone[0])
     z = (shots["signal"] - shots["signal_mean"]) / shots["signal_deviation"]
     assert np.abs(z.values).max() < largest_z(10**6, z.size)
+
+
+def test_trigger_and_energy_of_channels_with_own_receivers():
+    """Channels that are drawn one by one share energy and trigger of a shot; the clocks are their own."""
+    bright = (1e7 * make(bins=60)).assign_attrs(make(bins=60).attrs)
+    chain = ReceiverChain(LinearDetector(1.0), jitter=ShotJitter(energy_rms=0.1, trigger_ns=0.3))
+    other = replace(chain, detector=LinearDetector(0.5))
+    both = Receiver(Channel(chain), {"green": Channel(other)})
+    shots = detect_waveforms(bright, both, shots=300, seed=5)
+    assert shots.attrs["receiver.jitter.trigger_ns"] == 0.3
+    energy = shots["signal"].sum("time")
+    time = (shots["signal"] * shots["time"]).sum("time") / energy
+    energy, time = energy / energy.mean("shot"), time - time.mean("shot")
+    # 1e10 photons and more: shot noise of 1e-5 and of 0.02 ps.
+    for values, spread in ((energy, 0.1), (time, 0.3)):
+        assert float(np.abs(values - values.isel(pixel=0)).max()) < 2e-3
+        assert abs(float(values.isel(pixel=0).std()) / spread - 1) < largest_z(300) / np.sqrt(600)
+    clocks = replace(chain, jitter=ShotJitter(clock_ns=0.3))
+    both = Receiver(Channel(clocks), {"green": Channel(replace(other, jitter=clocks.jitter))})
+    shots = detect_waveforms(bright, both, shots=300, seed=5)
+    time = (shots["signal"] * shots["time"]).sum("time") / shots["signal"].sum("time")
+    assert np.max(np.abs(np.corrcoef(time.T) - np.eye(4))) < largest_z(300, 6) / np.sqrt(300)
+    with pytest.raises(UserError, match="jitter of channel 'green' must be that of all channels"):
+        Receiver(Channel(clocks), {"green": Channel(other)})
+
+
+def test_tails_are_in_the_records_of_every_channel():
+    dataset = make(bins=200)
+    plain = ReceiverChain(LinearDetector(1.0))
+    tailed = replace(plain, detector=LinearDetector(1.0, tail_fractions=(0.1,), tail_decays_ns=(50.0,)))
+    shots = detect_waveforms(dataset, Receiver(Channel(plain), {"black": Channel(tailed)}), shots=2)
+    behind = shots["signal_mean"].isel(time=slice(60, None))
+    # 14 times the width of the echo behind it; 0.1 exp(-t / 50 ns) of its charge is still to come.
+    np.testing.assert_allclose(behind.isel(pixel=slice(0, 3)), 0, atol=1e-9)
+    charge = float(shots["signal_mean"].sel(pixel="green").sum())
+    later = 0.1 * 2 * charge * np.exp(-(60 - 0.5 - 15) * 0.5 / 50)
+    reach = 1 - np.exp(-140 * 0.5 / 50)
+    assert float(behind.sel(pixel="black").sum()) == pytest.approx(later * reach, rel=1e-3)
+    assert shots.attrs["receiver.channels.black.detector.tail_fractions"] == [0.1]
 
 
 def test_records_of_a_shot_of_a_series_follow_each_other():

@@ -103,6 +103,43 @@ def test_times_are_the_means_given_all_echoes_and_the_heights_of_the_sea(noise, 
         assert error[0, 0] < 0.6 * np.hypot(noise, method)
 
 
+@pytest.mark.parametrize("height", [0.05, 1e3])
+def test_clocks_and_trigger_between_a_surface_and_later_echoes(height):
+    """A level sea, noise, a trigger of 0.5 ns and clocks of 0.3 ns: the stated errors of the time to a later echo.
+
+    A sea that is known to be calm draws the time to the mean sea level, so that the trigger does not cancel.
+    """
+    rng = np.random.default_rng(3)
+    shots, noise, trigger, clock = 4000, 0.4, 0.5, 0.3
+    at = lines(shots)
+    errors = {"slope_variance": 0.02, "heights_m": (-height, height), "echo_fwhm_ns": 5.0}
+    shift = trigger * rng.standard_normal((shots, 1)) + clock * rng.standard_normal((shots, 5))
+    seen = at.surface_time + shift + noise * rng.standard_normal((shots, 5))
+    stated = np.full(seen.shape, noise)
+    found = surface_times(seen, stated, 0 * stated, at, **errors, trigger_ns=trigger, clock_ns=clock)
+    plain = surface_times(seen, stated, 0 * stated, at, **errors)
+    z = ((found.time_ns - at.surface_time - shift) / found.stderr_ns)[:, :4]
+    assert found.own[:, :4].all()
+    assert np.max(np.abs(z.var(axis=0) - 1)) < largest_z(shots, 4) * np.sqrt(2 / shots)
+    # Its own clock cancels but for what the other pixels take of the time; the dark pixel has only theirs.
+    extra = found.stderr_ns**2 - plain.stderr_ns**2
+    assert np.all((extra[:, :4] > 0) & (extra[:, :4] < clock**2))
+    if height > 1:
+        np.testing.assert_allclose(extra[:, 4], clock**2 * (1 + 1 / 4), rtol=1e-2)
+    # Without any surface echo the time is that of the mean sea level.
+    none = surface_times(0 * seen + np.nan, stated, 0 * stated, at, **{**errors, "heights_m": (-1, 1)})
+    late = surface_times(
+        0 * seen + np.nan,
+        stated,
+        0 * stated,
+        at,
+        **{**errors, "heights_m": (-1, 1)},
+        trigger_ns=trigger,
+        clock_ns=clock,
+    )
+    np.testing.assert_allclose(late.stderr_ns**2 - none.stderr_ns**2, trigger**2 + clock**2)
+
+
 def test_unknown_shares_leave_the_times_as_they_are():
     time = lines(1).surface_time + np.array([0, 30, 0, 0, np.nan])
     found = infer(time, share=np.full(5, np.nan))

@@ -176,6 +176,8 @@ def test_samples_fall_on_bins():
         (lambda: Amplifier(1.0, bandwidth_mhz=0.0), "bandwidth_mhz = 0"),
         (lambda: Amplifier(1.0, limit_v=float("nan")), "limit_v = nan"),
         (lambda: Amplifier(1.0, response="boxcar"), "response = 'boxcar'"),
+        (lambda: Amplifier(1.0, coupling_ns=0.0), "coupling_ns = 0"),
+        (lambda: Amplifier(1.0, limit_v=1.0, recovery_ns=-2.0), "recovery_ns = -2"),
         (lambda: LogAmplifier(0.3, 0.0), "knee_v = 0"),
         (lambda: Digitiser(0, 1.0), "bits = 0"),
         (lambda: Digitiser(8, -1.0), "full_scale_v = -1"),

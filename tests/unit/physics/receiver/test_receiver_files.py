@@ -13,6 +13,7 @@ from mitransient_lidar.physics.receiver.detectors import LinearDetector, SingleP
 from mitransient_lidar.physics.receiver.electronics import Amplifier
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import instrument_receiver, parse_receiver, receiver
+from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 
 WHOLE = """
 wavelength_nm = 515
@@ -65,6 +66,27 @@ def test_a_preset_keeps_what_a_file_leaves_out():
     assert own.amplifier == Amplifier(10e3, noise_pa_per_rthz=3.0, bandwidth_mhz=100)
 
 
+def test_tails_jitter_and_overload_from_a_file():
+    text = WHOLE.replace(
+        "dynode_gains = [5, 4, 4]",
+        "dynode_gains = [5, 4, 4]\ntail_fractions = [0.05, 0.01]\ntail_decays_ns = [100, 800]",
+    )
+    text = text.replace(
+        "bandwidth_mhz = 250", "bandwidth_mhz = 250\ncoupling_ns = 2000\nlimit_v = 1.5\nrecovery_ns = 20"
+    )
+    own = parse(text + "[jitter]\nenergy_rms = 0.02\ntrigger_ns = 0.1\nclock_ns = 0.05\n")
+    chain = own.default.chain
+    assert (chain.detector.tail_fractions, chain.detector.tail_decays_ns) == ((0.05, 0.01), (100, 800))
+    assert (chain.amplifier.coupling_ns, chain.amplifier.recovery_ns) == (2000, 20)
+    assert chain.jitter == own.of("deep").chain.jitter == ShotJitter(0.02, 0.1, 0.05)
+    # The tail is that of the tube, not of the diode of the deep channel.
+    assert own.of("deep").chain.detector.tail_fractions == ()
+    counter = 'preset = "spad"\n[detector]\nafterpulse_probability = 0.03\nafterpulse_decay_ns = 40'
+    assert parse(counter).default.chain.detector == SinglePhotonDetector(
+        0.5, 30.0, 100.0, afterpulse_probability=0.03, afterpulse_decay_ns=40
+    )
+
+
 def test_settings_replace_those_of_all_channels():
     own = parse(WHOLE).with_settings(0.5, None)
     assert (own.default.gain, own.of("deep").gain, own.of("deep").optical_density) == (0.5, 0.5, 0.5)
@@ -108,6 +130,12 @@ def test_every_instrument_has_a_receiver_with_sources():
         ('preset = "apd"\npulse_repetition_khz = 0', "pulse_repetition_khz = 0"),
         ('preset = "apd"\namplifier = 3', "amplifier = 3 must be a table"),
         ('preset = "apd"\n[amplifier]\nimpulse_response = 3', "impulse_response = 3 must be the name of a file"),
+        ('preset = "apd"\n[amplifier]\nrecovery_ns = 20', "recovery_ns = 20 needs a limit_v of the amplifier"),
+        ('preset = "apd"\n[detector]\ntail_fractions = 0.1', "detector: tail_fractions = 0.1 must be a list of num"),
+        ('preset = "apd"\n[detector]\ntail_fractions = ["a"]', "detector: tail_fractions"),
+        ('preset = "pmt"\n[detector]\nafterpulse_probability = 0.1', "afterpulse_probability is not known"),
+        ('preset = "apd"\n[jitter]\nenergy_rms = 2', "jitter: energy_rms = 2 must lie between 0 and 1"),
+        ('preset = "apd"\n[channels.deep.jitter]\nclock_ns = 1', "channels.deep: jitter is not known"),
         ('preset = "apd"\n[amplifier.limit_v]\nhigh = 3', "limit_v must be a value, not a table"),
     ],
 )

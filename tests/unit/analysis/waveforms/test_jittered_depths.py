@@ -1,0 +1,66 @@
+"""Stated errors of depths from records whose energy, trigger and clock fluctuate."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+from significance import largest_z
+
+from mitransient_lidar import results
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+from mitransient_lidar.physics.receiver.detectors import LinearDetector
+from mitransient_lidar.physics.receiver.electronics import Amplifier
+from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
+
+WIDTH, START, BINS = 0.5, 1380.0, 320
+SURFACE = 2e9 * 212.84 / 299792458
+PER_NS = 0.299792458 / (2 * 1.34)
+CHAIN = ReceiverChain(LinearDetector(0.5), Amplifier(1e5, 3.0))
+
+
+def lake(bottom_ns):
+    """A surface echo and a bottom echo of a level lake at nadir, without a column."""
+    edges = START + WIDTH * np.arange(BINS + 1)
+    sigma = 5.0 / FWHM_PER_SIGMA
+    energy = 3e-13 * np.diff(norm.cdf(edges, SURFACE, sigma)) + 6e-13 * np.diff(
+        norm.cdf(edges, SURFACE + bottom_ns, sigma)
+    )
+    power = energy[np.newaxis] / (WIDTH * 1e-9)
+    return results.build(
+        energy[np.newaxis],
+        0 * power,
+        power,
+        0 * power,
+        time=TimeAxis(START, WIDTH, BINS),
+        pixel_names=["single"],
+        pixel_centres_mrad=np.zeros((1, 2)),
+        attributes={
+            **{"altitude": 212.84, "off_nadir_deg": 0.0, "refractive_index": 1.34, "group_index": 1.34},
+            **{"pulse_fwhm_ns": 5.0, "response_time_ns": 0.0, "surface_time_ns": SURFACE, "layout": "1x1"},
+        },
+    )
+
+
+def depths(chain, depth_from):
+    record = detect_waveforms(lake(60.0), chain, shots=400, seed=2)
+    found = echo_table.extract(record, "gaussian", depth_from=depth_from).sel(echo="bottom").squeeze("pixel")
+    return found["depth_m"].values, found["depth_m_stderr"].values
+
+
+@pytest.mark.slow
+def test_trigger_and_clock_cancel_between_surface_and_bottom():
+    """The variance of z-scores is 1 with and without jitter, against the surface echo and the mean sea level."""
+    moved = replace(CHAIN, jitter=ShotJitter(energy_rms=0.05, trigger_ns=0.2, clock_ns=0.1))
+    table = {(chain, origin): depths(chain, origin) for chain in (CHAIN, moved) for origin in ("echo", "mean")}
+    for depth, stated in table.values():
+        z = (depth - depth.mean()) / stated
+        assert abs(z.var() - 1) < largest_z(400) * np.sqrt(2 / 400)
+    # 2.5 cm of range by trigger and clock count against the mean sea level only.
+    timing = PER_NS * np.hypot(0.2, 0.1)
+    assert table[moved, "mean"][1].min() > timing > 3 * table[CHAIN, "mean"][1].max()
+    assert table[moved, "echo"][1].mean() == pytest.approx(table[CHAIN, "echo"][1].mean(), rel=0.05)
