@@ -8,7 +8,8 @@ among them the scene and all parameters of its plugins (`loading.scene_record`),
 series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
 by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions; derivatives
 by parameters of the scene are in ``waveform_derivative`` and ``impulse_response_derivative``, over ``parameter`` and
-these, and the light in other water in ``waveform_reweighted`` and ``impulse_response_reweighted``, over ``case``.
+these, and the light in other water in ``waveform_reweighted`` and ``impulse_response_reweighted``, over ``case``. The
+power of batches of passes is in ``waveform_batch``, over ``batch`` and the same dimensions.
 
 EXR files round the values to 32 bits and store everything else exactly, without the light by origin; NetCDF files store
 everything exactly.
@@ -222,6 +223,25 @@ def add_reweighted(
     return _add(dataset, "reweighted", coords, arrays, lambda about: _suffixed(about, ", by case"))
 
 
+def add_batches(dataset: xr.Dataset, passes: Sequence[int], waveforms: npt.ArrayLike) -> xr.Dataset:
+    """Return a result of `build` with the mean power of each batch of passes, ``waveform_batch`` [W].
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result.
+    passes : sequence of int
+        Number of passes of each batch.
+    waveforms : array-like of shape (batch, pixel, time)
+        Mean power of these passes [W].
+    """
+    waveform = dataset["waveform"]
+    values = np.asarray(waveforms, dtype=np.float64).reshape(len(passes), *waveform.shape)
+    about = {"units": "W", "long_name": "received power by a batch of passes"}
+    counted = ("batch", np.array(passes), {"units": "1", "long_name": "number of passes of the batch"})
+    return dataset.assign(waveform_batch=(("batch", *waveform.dims), values, about)).assign_coords(batch_passes=counted)
+
+
 def _add(
     dataset: xr.Dataset,
     ending: str,
@@ -377,7 +397,7 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
             _write_exr(dataset, path, temporary)
         else:
             endings = "by_origin", "derivative", "reweighted"
-            large = [*_VARIABLES]
+            large = [*_VARIABLES, "waveform_batch"]
             large += [_with_ending(name, ending) for ending in endings for name in _VARIABLES]
             large = [name for name in large if name in dataset]
             netcdf.write_netcdf(dataset, temporary, large)
