@@ -22,7 +22,7 @@ Folder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the fil
 
 @render_options(
     *("target_error", "target_quantile", "max_time", "passes", "seed", "max_memory", "components", "derivatives"),
-    "variant",
+    *("batches", "variant"),
 )
 def render(
     scene: SceneOrResult,
@@ -41,8 +41,9 @@ def render(
 
     Writes DIR/<scene>.exr, .nc, .png and _layout.png (the pixels on the sea), and prints the paths. A scene with gates
     gives <scene>_gates.exr, _gates.png and _depth.png as well, or instead where memory is short. Light by origin and
-    derivatives are in the .nc file, and drawn in _components.png and _derivatives.png. The files appear together or not
-    at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second one on.
+    derivatives are in the .nc file, and drawn in _components.png and _derivatives.png; batches of passes are in the .nc
+    file. The files appear together or not at all. Ctrl-C, SIGTERM and SIGHUP keep the completed passes, from the second
+    one on.
     """
     params = parameters(define)
     name, text, _ = scene_of(scene, "render")
@@ -80,7 +81,7 @@ def _write(dataset: xr.Dataset, target: Path) -> None:
     from mitransient_lidar.results import gate_files
 
     if target.suffix == ".exr":
-        results.save(dataset.drop_dims(["gate", "origin", "parameter"], errors="ignore"), target)
+        results.save(dataset.drop_dims(["gate", "origin", "parameter", "batch"], errors="ignore"), target)
     elif target.suffix == ".nc":
         (results.save if "waveform" in dataset else gate_files.save_stack)(dataset, target)
     elif target.stem.endswith("_components"):

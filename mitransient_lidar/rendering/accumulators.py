@@ -32,6 +32,8 @@ logger = logging.getLogger(__name__)
 _BYTES_PER_KEPT_BIN = 96
 #: Memory of a bin when a pass is converted to gates, and of a gate that is kept, with its weights in the film.
 _BYTES_PER_PASSING_BIN, _BYTES_PER_KEPT_GATE = 8, 64
+#: Memory of a bin of a batch of passes: its sum, and the mean in the result.
+_BYTES_PER_BATCH = 16
 
 #: Pixels from which the error of a gate is estimated.
 _ERROR_PIXELS = 4096
@@ -123,6 +125,7 @@ class WaveformAccumulator(PassAccumulator):
         parameters: Sequence[Parameter] = (),
         reweighted: Sequence[Case] = (),
         differences: Differences | None = None,
+        batches: int = 0,
     ) -> None:
         super().__init__(scene, window, train)
         response = scene.receiver.optics.response_time_ns
@@ -132,6 +135,7 @@ class WaveformAccumulator(PassAccumulator):
         self._perturbed, self._differences = (PassStatistics(), PassStatistics()), differences
         self._scores = sum(one.perturbation is not None for one in self._parameters)
         self._parts = PassStatistics(), PassStatistics()
+        self._batches: list[FloatArray] = [np.zeros(())] * batches  # sums of the power of every batch
         self._weights = None if train is None else _weights(scene, train)
 
     @property
@@ -163,6 +167,9 @@ class WaveformAccumulator(PassAccumulator):
         self._energy.add(energy)
         self._power.add(power)
         self._inflation.add(power)
+        if self._batches:
+            number = (self._power.count - 1) % len(self._batches)
+            self._batches[number] = self._batches[number] + power
         if self._weights is not None:
             self.gates.add(energy @ self._weights)
 
@@ -206,6 +213,11 @@ class WaveformAccumulator(PassAccumulator):
                 check_share(case.label, share)
             labels, values = [case.label for case in self._cases], self._perturbations(slice(first, None, 2))
             built = results.add_reweighted(built, labels, shares, *values)
+        if self._batches:
+            count, batches = self._power.count, len(self._batches)
+            passes = [len(range(number, count, batches)) for number in range(min(batches, count))]
+            batch_means = [total / number for total, number in zip(self._batches, passes, strict=False)]
+            built = results.add_batches(built, passes, batch_means)
         if self.train is None:
             return built
         stack = self._gate_stack(built.coords, dict(built.attrs))
@@ -278,11 +290,13 @@ def choose_accumulator(
     parameters: Sequence[Parameter] = (),
     reweighted: Sequence[Case] = (),
     differences: Differences | None = None,
+    batches: int = 0,
 ) -> PassAccumulator:
     """Return the accumulator of the most quantities for film, means and errors in `max_memory` [GB].
 
     Depths of gates are relative to the mean time of the surface echo [ns], None without one. Light is separated by
-    `origins`, differentiated by `parameters`, some by `differences`, and `reweighted`, if there are any.
+    `origins`, differentiated by `parameters`, some by `differences`, and `reweighted`, if there are any. The power of
+    `batches` of passes is kept, too.
 
     Raises
     ------
@@ -297,13 +311,16 @@ def choose_accumulator(
     bins = each * (1 + len(origins)) * channels
     train = _placed(scene, surface_time_ns, float(window.start_ns.min()))
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
-    everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + gates
+    everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
-        return WaveformAccumulator(scene, window, train, origins, parameters, reweighted, differences)
+        return WaveformAccumulator(scene, window, train, origins, parameters, reweighted, differences, batches)
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
     if origins:
         size = size.replace(" takes", f" x {len(origins)} components takes")
         raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer bins or pixels")
+    if batches:
+        size = size.replace(" takes", f" with {batches} batches of passes takes")
+        raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer of them")
     if channels > 1:
         size = size.replace(" takes", f" x {channels} with derivatives takes")
         raise UserError(f"{size}: more than max_memory = {max_memory:g} GB allows; take fewer of them")

@@ -96,6 +96,8 @@ def recall(result: xr.Dataset | str | os.PathLike[str], options: Mapping[str, An
     if kind == "passive":
         own |= _frame_options(attributes, given)
     else:
+        if kind == "render" and "batches" in attributes:
+            own["batches"] = attributes["batches"]
         own["components"] = bool(attributes.get("components", 0))
         if "derivatives" in attributes:
             own["derivatives"] = np.atleast_1d(attributes["derivatives"]).tolist()

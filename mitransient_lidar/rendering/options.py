@@ -60,6 +60,14 @@ class RenderOptions:
         "Also differentiate the waveforms by this parameter, e.g. attenuation, bottom_reflectance or bottom_depth. "
         "Repeatable"
     )
+    batches: int | None = _option(
+        "Also keep the waveforms of this many batches of passes, from which a fit to the result takes the correlation "
+        "of its errors",
+        "2 to 256",
+        2,
+        256,
+        "batches",
+    )
     variant: str | None = _option("Mitsuba variant, e.g. llvm_ad_mono", attribute="variant")
 
     def __post_init__(self) -> None:

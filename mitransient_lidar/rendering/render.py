@@ -52,6 +52,7 @@ def render(
     pass_share: float | None = None,
     components: bool | None = None,
     derivatives: Sequence[str] | str | None = None,
+    batches: int | None = None,
     reweight: Sequence[Mapping[str, float]] | None = None,
     variant: str | None = None,
     progress: ProgressCallback | None = None,
@@ -103,6 +104,9 @@ def render(
         slope variance of the sea's ripples, without the change of `transport.ripple_focusing`. Derivatives by other
         numbers of the scene, such as ``bottom_depth`` or ``off_nadir_deg``, are central differences on common random
         numbers, which take two more renders each (`differences.Differences`).
+    batches
+        Number of batches of passes whose waveforms are kept, 2 to 256; none by default. They show how errors of
+        different bins are correlated, as a fit to the result needs to state its own errors.
     reweight
         Cases of other values of these parameters, each a dict such as ``{"attenuation": 0.32, "scattering": 0.16}``,
         whose light is estimated from the same paths. At most 32 cases, in which a fifth of the paths is effective.
@@ -123,8 +127,10 @@ def render(
         dimensions, whose sums over ``origin`` are the whole. With `derivatives`, ``waveform_derivative`` and
         ``impulse_response_derivative``, with standard errors, over ``parameter`` and the same dimensions. With
         `reweight`, ``waveform_reweighted`` and ``impulse_response_reweighted``, with standard errors, over ``case`` and
-        the same dimensions, and the coordinate ``effective_share``. After Ctrl-C it includes the completed
-        passes, and the attribute ``interrupted`` is 1. Of a result, as of the function that rendered it.
+        the same dimensions, and the coordinate ``effective_share``. With `batches`, ``waveform_batch`` [W], the
+        mean over each batch of passes (as many as the coordinate ``batch_passes`` says), over ``batch`` and the same
+        dimensions. After Ctrl-C it includes the completed passes, and the attribute ``interrupted`` is 1. Of a result,
+        as of the function that rendered it.
 
     Raises
     ------
@@ -224,7 +230,9 @@ def _render(
     described = describe_scene(lidar, probe, window, renderer.focusing)
     origins = renderer.classes.names if components else []
     surface = described.get("surface_time_ns")
-    accumulator = choose_accumulator(lidar, window, surface, max_memory, origins, parameters, reweighted, differences)
+    accumulator = choose_accumulator(
+        lidar, window, surface, max_memory, origins, parameters, reweighted, differences, options.batches or 0
+    )
     default = DEFAULT_GOAL if accumulator.train is None else DEFAULT_GATE_GOAL
 
     goal = Goal.from_options(options.target_error, options.max_time, options.passes, default, options.target_quantile)
@@ -267,6 +275,7 @@ def _render(
         max_memory_gb=max_memory,
         components=int(components),
         **({"derivatives": [one.name for one in parameters]} if parameters else {}),
+        **({"batches": options.batches} if options.batches else {}),
         elapsed_s=log.elapsed_s,
         error_median=log.error_median,
         error_p95=log.error_p95,

@@ -1,6 +1,7 @@
 """Datasets of results, and their files."""
 
 from mitransient_lidar.results.dataset import (
+    add_batches,
     add_components,
     add_derivatives,
     add_reweighted,
@@ -15,6 +16,7 @@ from mitransient_lidar.results.dataset import (
 )
 
 __all__ = [
+    "add_batches",
     "add_components",
     "add_derivatives",
     "add_reweighted",

@@ -8,7 +8,8 @@ among them the scene and all parameters of its plugins (`loading.scene_record`),
 series of shots has the dimension ``shot`` first, and the truth of each shot as coordinates. Light that was separated
 by its origin is in variables whose names end in ``_by_origin``, over ``origin`` and the other dimensions; derivatives
 by parameters of the scene are in ``waveform_derivative`` and ``impulse_response_derivative``, over ``parameter`` and
-these, and the light in other water in ``waveform_reweighted`` and ``impulse_response_reweighted``, over ``case``.
+these, and the light in other water in ``waveform_reweighted`` and ``impulse_response_reweighted``, over ``case``. The
+power of batches of passes is in ``waveform_batch``, over ``batch`` and the same dimensions.
 
 EXR files round the values to 32 bits and store everything else exactly, without the light by origin; NetCDF files store
 everything exactly.
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -149,14 +150,7 @@ def build_series(*arrays: npt.ArrayLike, **described: Any) -> xr.Dataset:
     return labelled.assign(data).assign_coords(shot=number)
 
 
-def add_components(
-    dataset: xr.Dataset,
-    origins: Sequence[str],
-    impulse_response: npt.ArrayLike,
-    impulse_response_stderr: npt.ArrayLike,
-    waveform: npt.ArrayLike,
-    waveform_stderr: npt.ArrayLike,
-) -> xr.Dataset:
+def add_components(dataset: xr.Dataset, origins: Sequence[str], *arrays: npt.ArrayLike) -> xr.Dataset:
     """Return a result of `build` or `build_series` with its light by origin.
 
     Parameters
@@ -165,20 +159,12 @@ def add_components(
         The result.
     origins : sequence of str
         Unique names of the origins.
-    impulse_response, impulse_response_stderr, waveform, waveform_stderr : array-like of shape (pixel, origin, time)
-        As for `build`, of each origin; of a series with the shots first.
+    arrays : array-like of shape (pixel, origin, time)
+        The four arrays of `build`, of each origin; of a series with the shots first.
     """
-    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
-    dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
-    data = {}
-    for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
-        values = np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0).reshape(len(origins), *shape)
-        described = {**about, "long_name": f"{about['long_name']}, by origin"}
-        if "ancillary_variables" in described:
-            described["ancillary_variables"] = by_origin(described["ancillary_variables"])
-        data[by_origin(name)] = (("origin", *dims), values, described)
-    names = ("origin", np.array(origins, dtype=str), {"long_name": "where the light comes from"})
-    return dataset.assign(data).assign_coords(origin=names)
+    values = [np.moveaxis(np.asarray(array, dtype=np.float64), -2, 0) for array in arrays]
+    coords = {"origin": (np.array(origins, dtype=str), {"long_name": "where the light comes from"})}
+    return _add(dataset, "by_origin", coords, values, lambda about: _suffixed(about, ", by origin"))
 
 
 def add_derivatives(
@@ -187,10 +173,7 @@ def add_derivatives(
     values: Sequence[float],
     units: Sequence[str],
     methods: Sequence[str],
-    impulse_response: npt.ArrayLike,
-    impulse_response_stderr: npt.ArrayLike,
-    waveform: npt.ArrayLike,
-    waveform_stderr: npt.ArrayLike,
+    *arrays: npt.ArrayLike,
 ) -> xr.Dataset:
     """Return a result of `build` or `build_series` with its derivatives by parameters.
 
@@ -201,29 +184,22 @@ def add_derivatives(
     names, values, units, methods : sequences
         Of each parameter: unique name, value at which the light was rendered, unit, and ``score`` or ``central
         differences``.
-    impulse_response, impulse_response_stderr, waveform, waveform_stderr : array-like of shape (parameter, pixel, time)
-        Derivatives of what `build` takes, by the parameter in its unit; of a series with the shots after the
+    arrays : array-like of shape (parameter, pixel, time)
+        Derivatives of the four arrays of `build` by the parameter in its unit; of a series with the shots after the
         parameters.
     """
-    arrays = (impulse_response, impulse_response_stderr, waveform, waveform_stderr)
-    dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
-    data = {}
-    for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
-        described = {
-            "units": f"{about['units']} per unit of the parameter",
-            "long_name": about["long_name"].replace("received", "derivative of the received"),
-        }
-        if "ancillary_variables" in about:
-            described["ancillary_variables"] = derivative_of(about["ancillary_variables"])
-        reshaped = np.asarray(array, dtype=np.float64).reshape(len(names), *shape)
-        data[derivative_of(name)] = (("parameter", *dims), reshaped, described)
     coords = {
-        "parameter": ("parameter", np.array(names, dtype=str), {"long_name": "parameter of the scene"}),
-        "parameter_value": ("parameter", np.array(values, dtype=np.float64), {"long_name": "value of the parameter"}),
-        "parameter_units": ("parameter", np.array(units, dtype=str), {"long_name": "unit of the parameter"}),
-        "parameter_method": ("parameter", np.array(methods, dtype=str), {"long_name": "estimate of the derivative"}),
+        "parameter": (np.array(names, dtype=str), {"long_name": "parameter of the scene"}),
+        "parameter_value": (np.array(values, dtype=np.float64), {"long_name": "value of the parameter"}),
+        "parameter_units": (np.array(units, dtype=str), {"long_name": "unit of the parameter"}),
+        "parameter_method": (np.array(methods, dtype=str), {"long_name": "estimate of the derivative"}),
     }
-    return dataset.assign(data).assign_coords(coords)
+
+    def described(about: Mapping[str, str]) -> dict[str, str]:
+        name = about["long_name"].replace("received", "derivative of the received")
+        return {"units": f"{about['units']} per unit of the parameter", "long_name": name}
+
+    return _add(dataset, "derivative", coords, arrays, described)
 
 
 def add_reweighted(
@@ -238,39 +214,65 @@ def add_reweighted(
     labels, shares : sequences
         Description of each case, and the share of the paths that are effective there, 0 to 1.
     arrays : array-like of shape (case, pixel, time)
-        Of each case what `build` takes: energy, its standard error, power, its standard error.
+        The four arrays of `build`, of each case.
     """
-    dims, shape = dataset["waveform"].dims, dataset["waveform"].shape
+    coords = {
+        "case": (np.array(labels, dtype=str), {"long_name": "values of parameters"}),
+        "effective_share": (np.array(shares), {"units": "1", "long_name": "share of the paths effective here"}),
+    }
+    return _add(dataset, "reweighted", coords, arrays, lambda about: _suffixed(about, ", by case"))
+
+
+def add_batches(dataset: xr.Dataset, passes: Sequence[int], waveforms: npt.ArrayLike) -> xr.Dataset:
+    """Return a result of `build` with the mean power of each batch of passes, ``waveform_batch`` [W].
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result.
+    passes : sequence of int
+        Number of passes of each batch.
+    waveforms : array-like of shape (batch, pixel, time)
+        Mean power of these passes [W].
+    """
+    waveform = dataset["waveform"]
+    values = np.asarray(waveforms, dtype=np.float64).reshape(len(passes), *waveform.shape)
+    about = {"units": "W", "long_name": "received power by a batch of passes"}
+    counted = ("batch", np.array(passes), {"units": "1", "long_name": "number of passes of the batch"})
+    return dataset.assign(waveform_batch=(("batch", *waveform.dims), values, about)).assign_coords(batch_passes=counted)
+
+
+def _add(
+    dataset: xr.Dataset,
+    ending: str,
+    coords: Mapping[str, tuple[npt.NDArray[Any], dict[str, str]]],
+    arrays: Sequence[npt.ArrayLike],
+    described: Callable[[Mapping[str, str]], dict[str, str]],
+) -> xr.Dataset:
+    """Return a result with other values of its four variables, under names with an ending.
+
+    The dimension of the first coordinate is added before those of the variables; `described` gives units and name.
+    """
+    dim, (dims, shape) = next(iter(coords)), (dataset["waveform"].dims, dataset["waveform"].shape)
     data = {}
     for (name, about), array in zip(_VARIABLES.items(), arrays, strict=True):
-        described = {**about, "long_name": f"{about['long_name']}, by case"}
-        if "ancillary_variables" in described:
-            described["ancillary_variables"] = reweighted(described["ancillary_variables"])
-        values = np.asarray(array, dtype=np.float64).reshape(len(labels), *shape)
-        data[reweighted(name)] = (("case", *dims), values, described)
-    coords = {
-        "case": ("case", np.array(labels, dtype=str), {"long_name": "values of parameters"}),
-        "effective_share": ("case", np.array(shares), {"units": "1", "long_name": "share of the paths effective here"}),
-    }
-    return dataset.assign(data).assign_coords(coords)
+        attributes = described(about)
+        if "ancillary_variables" in about:
+            attributes["ancillary_variables"] = _with_ending(about["ancillary_variables"], ending)
+        values = np.asarray(array, dtype=np.float64).reshape(len(coords[dim][0]), *shape)
+        data[_with_ending(name, ending)] = ((dim, *dims), values, attributes)
+    return dataset.assign(data).assign_coords({name: (dim, *about) for name, about in coords.items()})
 
 
-def reweighted(name: str) -> str:
-    """Return the name of a variable of a result for light in other water."""
+def _suffixed(about: Mapping[str, str], suffix: str) -> dict[str, str]:
+    """Return attributes of a variable with a suffix of its long name."""
+    return {**about, "long_name": about["long_name"] + suffix}
+
+
+def _with_ending(name: str, ending: str) -> str:
+    """Return the name of a variable with an ending, which precedes that of standard errors."""
     stem = name.removesuffix("_stderr")
-    return f"{stem}_reweighted{name[len(stem) :]}"
-
-
-def derivative_of(name: str) -> str:
-    """Return the name of the derivative of a variable of a result."""
-    stem = name.removesuffix("_stderr")
-    return f"{stem}_derivative{name[len(stem) :]}"
-
-
-def by_origin(name: str) -> str:
-    """Return the name of a variable of a result for light by origin."""
-    stem = name.removesuffix("_stderr")
-    return f"{stem}_by_origin{name[len(stem) :]}"
+    return f"{stem}_{ending}{name[len(stem) :]}"
 
 
 def record_dims(dataset: xr.Dataset, name: str, *, shots: bool = False) -> tuple[str, ...]:
@@ -394,8 +396,9 @@ def save(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
         if file_format == "exr":
             _write_exr(dataset, path, temporary)
         else:
-            ways = by_origin, derivative_of, reweighted
-            large = [*_VARIABLES, *(way(name) for way in ways for name in _VARIABLES)]
+            endings = "by_origin", "derivative", "reweighted"
+            large = [*_VARIABLES, "waveform_batch"]
+            large += [_with_ending(name, ending) for ending in endings for name in _VARIABLES]
             large = [name for name in large if name in dataset]
             netcdf.write_netcdf(dataset, temporary, large)
 

@@ -31,7 +31,7 @@ from mitransient_lidar.results.schema import check_attributes, check_coordinates
 _LOG = logging.getLogger(__name__)
 
 _CHANNELS = {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}
-_HISTOGRAM = ("impulse_response", "impulse_response_stderr", "waveform", "waveform_stderr")
+_OF_BINS = ("time", "origin", "parameter", "case", "batch")  # dimensions of results with time bins alone
 _HEADER = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
 _IDENTITY = "gateStackId"  # header attribute, equal in all files of a sequence and different between sequences
 _NUMBERED = re.compile(r"(.+)_gate(\d{3,})\.exr", re.IGNORECASE | re.DOTALL)
@@ -60,9 +60,7 @@ def check_stack(dataset: xr.Dataset) -> xr.Dataset:
             raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
     check_attributes("the gate stack", dataset.attrs)
     check_coordinates("the gate stack", dataset, "gate_energy")
-    gates = dataset.drop_vars([name for name in _HISTOGRAM if name in dataset])
-    unused = [name for name in gates.coords if name == "time" or "time" in gates[name].dims]
-    return gates.drop_vars(unused).transpose(*pixels, "gate", ...)
+    return dataset.drop_dims(_OF_BINS, errors="ignore").transpose(*pixels, "gate", ...)
 
 
 def save_stack(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:

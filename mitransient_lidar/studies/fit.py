@@ -27,6 +27,9 @@ from mitransient_lidar.rendering.render import render
 logger = logging.getLogger(__name__)
 
 _PILOT_PASSES, _MOST_PASSES = 16, 256  # of the first render, and most that are chosen
+#: Batches of passes that give the errors by the Monte Carlo of the model, besides those for each parameter: enough for
+#: their own noise to matter little, and few because each is kept.
+_BATCHES, _BATCHES_PER_PARAMETER, _MOST_BATCHES = 20, 4, 256
 _LARGEST_RATIO = 0.1  # variance by the Monte Carlo of the model over that of the waveforms
 
 
@@ -164,6 +167,7 @@ class _RenderedModel:
             passes=self.passes,
             seed=self.seed,
             derivatives=self.names,
+            batches=min(self.passes, _MOST_BATCHES, _BATCHES + _BATCHES_PER_PARAMETER * len(self.names)),
         )
         if dataset.attrs.get("interrupted"):
             raise KeyboardInterrupt

@@ -228,6 +228,21 @@ def test_passes_that_were_reduced_give_the_same_bits():
 
 
 @pytest.mark.slow
+def test_batches_of_passes_add_up_to_the_waveform(tmp_path):
+    options = {"passes": 5, "batches": 2, "pass_share": 0.02}
+    first = mitransient_lidar.render("table1", params={"layout": "1x1", "spectrum": "flat"}, **options)
+    assert first["batch_passes"].values.tolist() == [3, 2]
+    mean = first["waveform_batch"].weighted(first["batch_passes"]).mean("batch")
+    np.testing.assert_allclose(mean, first["waveform"], rtol=1e-12)
+    results.save(first, tmp_path / "a.nc")
+    again = mitransient_lidar.render(tmp_path / "a.nc")
+    assert_same_bits(first, again)
+    np.testing.assert_array_equal(first["waveform_batch"], again["waveform_batch"])
+    with pytest.raises(UserError, match="with 200 batches of passes takes"):
+        mitransient_lidar.render("table1", **{**options, "batches": 200, "max_memory": 0.001})
+
+
+@pytest.mark.slow
 def test_daylight_gives_the_same_bits(tmp_path):
     params = {"layout": "4x4", "surface_cell_size": 2}
     few = {"type": "passive_volpath", "paths_per_pass": 4096}

@@ -11,6 +11,7 @@ import numpy as np
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 
 _DEGENERATE = 0.999  # correlation of two parameters above which only one combination of them is known
+_SMOOTHED = 9  # samples over which variances are smoothed
 _SMALLEST = 1e-14  # eigenvalue of the scaled normal matrix, below which a combination of parameters is unknown
 
 
@@ -98,6 +99,7 @@ def estimate_errors(
     held: BoolArray,
     scaled: bool,
     known_noise: bool = True,
+    batches: Sequence[FloatArray | None] = (None, None),
 ) -> Errors:
     """Return the errors of the solution of a weighted least-squares problem.
 
@@ -117,6 +119,9 @@ def estimate_errors(
     known_noise
         Whether the errors of the waveforms are known. If not, all are the same, differences are in the unit of the
         waveforms, `noise` is 1, and the covariance is multiplied by the reduced chi-squared in any case.
+    batches
+        Deviations of the batches of passes of waveforms and model, in standard deviations, shape (batch, pixel, time),
+        whose outer products add up to the covariance of the errors; None where there are none.
 
     Notes
     -----
@@ -124,6 +129,14 @@ def estimate_errors(
     is (J^T J)^-1 J^T C J (J^T J)^-1, which is (J^T J)^-1 for independent errors. The chi-squared has the mean tr(Q C)
     and the variance 2 tr(Q C Q C) with Q = 1 - J (J^T J)^-1 J^T, those of a scaled chi-squared distribution
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110 (1946), doi:10.2307/3002019).
+
+    Errors of bins that are far apart agree, too, since they share paths, and their standard errors from few passes are
+    uncertain. With batches D of passes, J^T C J is therefore J^T D^T D J instead. The inverse of such an estimate with
+    f degrees of freedom, one less than batches, is on average too large by f/(f - P - 1) for P parameters (J. Hartlap,
+    P. Simon and P. Schneider, Astron. Astrophys. 464, 399 (2007), doi:10.1051/0004-6361:20066170). The covariance is
+    multiplied by this, so that the squared distance of estimates from the truth has the mean P. Where the share s of
+    the covariance is from batches, f is divided by s^2, as Satterthwaite does. Fewer than P + 3 batches are not used,
+    nor are any for the chi-squared.
     """
     influence = np.sqrt(np.sum(derivatives**2, axis=(1, 2)))
     known = (influence > 0) & ~held
@@ -135,9 +148,11 @@ def estimate_errors(
     # Residuals, from which unknown errors are taken, hold those of the model, too.
     kinds = [noise, model] if known_noise else [noise]
     parts = [
-        inverse @ (_correlated(scaled_derivatives, *errors).reshape(count, -1) @ flat.T) @ inverse
-        for errors in (noise, model)
+        inverse @ _projected(scaled_derivatives, errors, own) @ inverse
+        for errors, own in zip((noise, model), batches, strict=True)
     ]
+    known_parts = sum(parts[: len(kinds)], np.zeros_like(inverse))
+    widening = _widening(known_parts, [*zip(parts, batches, strict=True)][: len(kinds)])
     # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
     kept = eigenvalues > _SMALLEST * count
     basis = ((vectors[:, kept] / np.sqrt(eigenvalues[kept])).T @ flat).reshape(-1, *residuals.shape)
@@ -149,11 +164,41 @@ def estimate_errors(
     factor = chi_squared / expected if (scaled or not known_noise) and expected > 0 else 1.0
     place, unit = np.ix_(known, known), np.outer(influence[known], influence[known])
     covariance = np.full((held.size, held.size), np.nan)
-    covariance[place] = factor * sum(parts[: len(kinds)], np.zeros_like(inverse)) / unit
+    covariance[place] = factor * widening * known_parts / unit
     by_model = np.full(held.size, np.nan)
     by_model[known] = np.sqrt(np.maximum(np.diag(parts[1]), 0)) / influence[known]
     freedom = 2 * expected**2 / variance if variance > 0 else math.nan
     return Errors(covariance, by_model, influence, held, chi_squared, expected, freedom)
+
+
+def smoothed_variance(variance: FloatArray) -> FloatArray:
+    """Return the geometric mean of the variances of neighbouring samples, shape (pixel, time); 0 where they are 0."""
+    from scipy.ndimage import uniform_filter1d
+
+    positive = variance > 0
+    logarithms = np.log(variance, out=np.zeros_like(variance), where=positive)
+    sums, counts = (uniform_filter1d(one, _SMOOTHED, mode="constant") for one in (logarithms, positive.astype(float)))
+    return np.where(positive, np.exp(sums / np.where(positive, counts, 1.0)), 0.0)
+
+
+def _projected(
+    derivatives: FloatArray, errors: tuple[FloatArray, FloatArray], batches: FloatArray | None
+) -> FloatArray:
+    """Return J^T C J of derivatives, shape (parameter, pixel, time), by batches of passes where there are enough."""
+    count = len(derivatives)
+    flat = derivatives.reshape(count, -1)
+    if batches is None or len(batches) < count + 3:
+        return np.asarray(_correlated(derivatives, *errors).reshape(count, -1) @ flat.T)
+    across = flat @ batches.reshape(len(batches), -1).T
+    return np.asarray(across @ across.T)
+
+
+def _widening(covariance: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray | None]]) -> float:
+    """Return the factor of a covariance whose parts are partly estimated from batches; see `estimate_errors`."""
+    count = len(covariance)
+    known = [(part, len(own) - 1) for part, own in parts if own is not None and len(own) >= count + 3]
+    shares = [(float(np.trace(np.linalg.pinv(covariance) @ part)) / max(count, 1), freedom) for part, freedom in known]
+    return 1 / (1 - (count + 1) * sum(share**2 / freedom for share, freedom in shares))
 
 
 def _correlated(vectors: FloatArray, deviation: FloatArray, correlation: FloatArray) -> FloatArray:

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.analysis.information.errors import Errors, estimate_errors
-from mitransient_lidar.analysis.information.measured import Measured, Prediction, predict
+from mitransient_lidar.analysis.information.errors import Errors, estimate_errors, smoothed_variance
+from mitransient_lidar.analysis.information.measured import Measured, Prediction, best_offset, predict
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import limits, unit_of
 from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, integer
@@ -246,22 +245,16 @@ class WaveformFit:
         pixel, time), and variance of the waveforms, None if unknown.
         """
         model = self._prediction(values)
-        scale, offset = values.get(SCALE, 1.0), values.get(TIME_OFFSET, 0.0)
-        times = self.found.time_ns - offset
-        noise = model.noise_variance
-        if TIME_OFFSET not in values and np.array_equal(times, model.time_ns):
-            mean, slopes, by_model, change = model.mean, model.derivative, model.model_variance, np.zeros(())
-        else:
-            from scipy.interpolate import CubicSpline
-
-            # A pulse of a few bins is smooth: an interpolation by lines would flatten its peaks.
-            outside = (times < model.time_ns[0]) | (times > model.time_ns[-1])
-            spline = CubicSpline(model.time_ns, model.mean, axis=-1)
-            mean, change = (np.where(outside, 0.0, one(times)) for one in (spline, spline.derivative()))
-            slopes = np.where(outside, 0.0, CubicSpline(model.time_ns, model.derivative, axis=-1)(times))
-            by_model = _interpolated(times, model.time_ns, model.model_variance)
-            noise = None if noise is None else _interpolated(times, model.time_ns, noise)
-        rows = dict(zip(self.names, scale * slopes, strict=True)) | {SCALE: mean, TIME_OFFSET: -scale * change}
+        scale, times = values.get(SCALE, 1.0), self._model_times(values)
+        mean, slopes = (self._resampled(values, array) for array in (model.mean, model.derivative))
+        by_model, noise = (
+            None if variance is None else _interpolated(times, model.time_ns, variance)
+            for variance in (model.model_variance, model.noise_variance)
+        )
+        assert by_model is not None
+        rows = dict(zip(self.names, scale * slopes, strict=True)) | {SCALE: mean}
+        if TIME_OFFSET in values:
+            rows[TIME_OFFSET] = -scale * self._resampled(values, model.mean, order=1)
         derivative = np.array([rows[name] for name in values])
         if self.found.stderr is not None:
             noise = np.nan_to_num(self.found.stderr) ** 2
@@ -269,10 +262,28 @@ class WaveformFit:
             noise = noise / self.found.shots
         return scale * mean, derivative, scale**2 * by_model, noise
 
+    def _model_times(self, values: Mapping[str, float]) -> FloatArray:
+        """Return the times of the waveforms in the model [ns], shape (time,)."""
+        return self.found.time_ns - values.get(TIME_OFFSET, 0.0)
+
+    def _resampled(self, values: Mapping[str, float], array: FloatArray, order: int = 0) -> FloatArray:
+        """Return an array of the model, shape (..., pixel, time), or its derivative, at the times of the waveforms.
+
+        It is 0 outside the record of the model.
+        """
+        known, times = self._prediction(values).time_ns, self._model_times(values)
+        if order == 0 and np.array_equal(times, known):
+            return array
+        from scipy.interpolate import CubicSpline
+
+        # A pulse of a few bins is smooth: an interpolation by lines would flatten its peaks.
+        outside = (times < known[0]) | (times > known[-1])
+        return np.where(outside, 0.0, CubicSpline(known, array, axis=-1)(times, order))
+
     def _used(self, values: Mapping[str, float]) -> BoolArray:
         """Return which samples are fitted: those within the model for any offset that the round may reach."""
         model = self._prediction(values)
-        times = self.found.time_ns - values.get(TIME_OFFSET, 0.0)
+        times = self._model_times(values)
         margin = self._window(model) if TIME_OFFSET in values else 0.0
         rounding = 1e-6 * float(model.time_ns[1] - model.time_ns[0]) if model.time_ns.size > 1 else 0.0
         inside = (times >= model.time_ns[0] + margin - rounding) & (times <= model.time_ns[-1] - margin + rounding)
@@ -292,9 +303,14 @@ class WaveformFit:
         return np.asarray(used)
 
     def _weights(self, values: Mapping[str, float], used: BoolArray) -> FloatArray:
-        """Return 1 over the standard deviation of the difference of waveforms and model, 0 where it is not used."""
+        """Return 1 over the standard deviation of the difference of waveforms and model, 0 where it is not used.
+
+        Variances from few passes are smoothed, since bins of a variance that is low by chance would count too much.
+        """
         _, _, by_model, noise = self._at(values)
-        variance = np.ones_like(by_model) if noise is None else by_model + noise
+        if noise is not None and self.found.estimated:
+            noise = smoothed_variance(noise)
+        variance = np.ones_like(by_model) if noise is None else smoothed_variance(by_model) + noise
         weighted = used & (variance > 0)
         return np.where(weighted, 1 / np.sqrt(np.where(weighted, variance, 1.0)), 0.0)
 
@@ -352,7 +368,7 @@ class WaveformFit:
         """Return the starts with those of the time offset and of the scale, which follow from the first render."""
         values = np.nan_to_num(self.found.values)
         if TIME_OFFSET in self.nuisances and TIME_OFFSET not in starts:
-            starts[TIME_OFFSET] = _best_offset(self.found.time_ns, values, self._prediction(starts))
+            starts[TIME_OFFSET] = best_offset(self.found.time_ns, values, self._prediction(starts))
         if SCALE in self.nuisances and SCALE not in starts:
             mean, _, _, noise = self._at({**starts, SCALE: 1.0})
             weight = np.where(np.isfinite(self.found.values), 1.0, 0.0)
@@ -372,6 +388,10 @@ class WaveformFit:
         step, own_step = (float(np.median(np.diff(times))) for times in (self.found.time_ns, model.time_ns))
         distance = np.arange(0, model.correlation.size * own_step, step) / own_step
         lags = np.interp(distance, np.arange(model.correlation.size), model.correlation, right=0.0)
+        batches = self.found.batches, model.batches
+        if model.batches is not None:
+            scale = values.get(SCALE, 1.0)
+            batches = self.found.batches, scale * self._resampled(values, model.batches)
         return estimate_errors(
             weights * (np.nan_to_num(self.found.values) - mean),
             weights * derivative,
@@ -380,6 +400,7 @@ class WaveformFit:
             np.array([free.is_bound(values[free.name]) for free in self.free]),
             scale_errors,
             known_noise=noise is not None,
+            batches=[None if one is None else weights * one for one in batches],
         )
 
     def _dataset(
@@ -450,18 +471,6 @@ def _unit(name: str) -> str:
 def _interpolated(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
     """Return rows of values at other times, linear between the known ones, and 0 outside."""
     return np.array([np.interp(times, known, row, left=0.0, right=0.0) for row in values])
-
-
-def _best_offset(times: FloatArray, values: npt.ArrayLike, model: Prediction) -> float:
-    """Return the time [ns] that waveforms, shape (pixel, time), are later than a model, by their correlation."""
-    step = float(np.median(np.diff(model.time_ns)))
-    grid = np.arange(times[0], times[-1] + 0.5 * step, step)
-    total: FloatArray | float = 0.0
-    for row, mean in zip(np.asarray(values), model.mean, strict=True):
-        sampled = np.interp(grid, times, row)
-        total = total + np.correlate(sampled, mean, "full")
-    lag = int(np.argmax(total)) - (model.time_ns.size - 1)
-    return float(grid[0] + lag * step - model.time_ns[0])
 
 
 def describe_fit(fitted: xr.Dataset) -> list[str]:

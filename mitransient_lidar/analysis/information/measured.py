@@ -54,6 +54,10 @@ class Measured:
         Whether values and times are those of a model, so that neither scale nor offset are unknown.
     receiver, shots
         Receiver of a signal, None for waveforms, and number of records whose mean it is.
+    estimated
+        Whether `stderr` is from the spread of a few passes.
+    batches
+        Deviations of the waveforms of batches of passes, shape (batch, pixel, time); see `batch_deviations`.
     """
 
     values: FloatArray
@@ -64,6 +68,8 @@ class Measured:
     calibrated: bool = True
     receiver: ReceiverSettings | None = None
     shots: int = 1
+    estimated: bool = False
+    batches: FloatArray | None = None
 
     @property
     def pixel_dims(self) -> tuple[str, ...]:
@@ -87,6 +93,7 @@ class Prediction(NamedTuple):
     noise_variance: FloatArray | None  #: Of a record of the receiver, shape (pixel, time); None without one.
     valid: npt.NDArray[np.bool_]  #: Samples that are not saturated, shape (pixel, time).
     correlation: FloatArray  #: Of the Monte Carlo errors by the distance in samples, shape (lags,).
+    batches: FloatArray | None  #: Deviations by batches of passes, shape (batch, pixel, time); see `batch_deviations`.
 
 
 def measured(
@@ -129,7 +136,15 @@ def measured(
     dims = results.record_dims(source, "waveform")
     values = _by_pixel(source["waveform"], dims)
     stderr = _by_pixel(source["waveform_stderr"], dims) if "waveform_stderr" in source else None
-    found = Measured(values, stderr, _times(source), correlation(source.attrs), source["waveform"])
+    found = Measured(
+        values,
+        stderr,
+        _times(source),
+        correlation(source.attrs),
+        source["waveform"],
+        estimated=stderr is not None,
+        batches=None if stderr is None else batch_deviations(source, dims),
+    )
     return _with_noise(found, given)
 
 
@@ -160,10 +175,11 @@ def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Pred
                 f"{name} of the model has {np.count_nonzero(~np.isfinite(array))} values that are not finite"
             )
     error = np.nan_to_num(error)
-    times, lags = _times(dataset), correlation(dataset.attrs)
+    times, lags, batches = _times(dataset), correlation(dataset.attrs), batch_deviations(dataset, dims)
     if found.receiver is None:
-        return Prediction(times, light, slopes, error**2, None, np.ones(light.shape, dtype=bool), lags)
-    return _recorded(found.receiver, light, slopes, error, times, results.time_axis(dataset).bin_width_ns, lags)
+        return Prediction(times, light, slopes, error**2, None, np.ones(light.shape, dtype=bool), lags, batches)
+    width = results.time_axis(dataset).bin_width_ns
+    return _recorded(found.receiver, light, slopes, error, times, width, lags, batches)
 
 
 def _recorded(
@@ -174,10 +190,12 @@ def _recorded(
     times: FloatArray,
     width: float,
     lags: FloatArray,
+    batches: FloatArray | None,
 ) -> Prediction:
     """Return the mean record of light, shape (pixel, time), with derivatives and errors, by the receiver's closed form.
 
-    Errors of neighbouring bins of a render agree in sign, so that they are propagated as one change of the light.
+    Errors of neighbouring bins of a render agree in sign, so that they are propagated as one change of the light, as is
+    the deviation of each batch of passes.
     """
     largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=0)
     reach = np.divide(_STEP * light.max(), largest, out=np.zeros_like(largest), where=largest > 0)
@@ -188,14 +206,16 @@ def _recorded(
         filtered, background = 10.0**-density, 10.0**-density * sky
         steps = reach[:, pixel] * slopes[:, pixel]
         own = light[pixel : pixel + 1]
-        lit = np.concatenate([own, own + error[pixel], own + steps, own - steps])
+        deviations = np.zeros((0, own.size)) if batches is None else batches[:, pixel]
+        lit = np.concatenate([own, own + error[pixel], own + steps, own - steps, own + deviations])
         expected = chain.expected(filtered * np.maximum(lit, 0), width, np.full(len(lit), background))
         count = len(steps)
-        rise = expected.mean[2 : 2 + count] - expected.mean[2 + count :]
+        rise = expected.mean[2 : 2 + count] - expected.mean[2 + count : 2 + 2 * count]
         slope = np.divide(rise, 2 * reach[:, pixel], out=np.zeros_like(rise), where=reach[:, pixel] > 0)
         one = expected.mean[0], slope, (expected.mean[1] - expected.mean[0]) ** 2, expected.variance[0]
-        parts.append((*one, expected.saturation[0] < _SATURATED))
-    mean, slope, by_model, variance, valid = zip(*parts, strict=True)
+        moved = expected.mean[2 + 2 * count :] - expected.mean[0]
+        parts.append((*one, expected.saturation[0] < _SATURATED, moved))
+    mean, slope, by_model, variance, valid, moved = zip(*parts, strict=True)
     stride = receiver.chains[0].stride(width)
     return Prediction(
         times[::stride],
@@ -205,7 +225,34 @@ def _recorded(
         np.array(variance),
         np.array(valid),
         lags[::stride],
+        None if batches is None else np.stack(moved, axis=1),
     )
+
+
+def best_offset(times: FloatArray, values: npt.ArrayLike, model: Prediction) -> float:
+    """Return the time [ns] that waveforms, shape (pixel, time), are later than a model, by their correlation."""
+    step = float(np.median(np.diff(model.time_ns)))
+    grid = np.arange(times[0], times[-1] + 0.5 * step, step)
+    total: FloatArray | float = 0.0
+    for row, mean in zip(np.asarray(values), model.mean, strict=True):
+        sampled = np.interp(grid, times, row)
+        total = total + np.correlate(sampled, mean, "full")
+    lag = int(np.argmax(total)) - (model.time_ns.size - 1)
+    return float(grid[0] + lag * step - model.time_ns[0])
+
+
+def batch_deviations(dataset: xr.Dataset, dims: tuple[str, ...]) -> FloatArray | None:
+    """Return the deviations of a render's batches of passes from its mean, shape (batch, pixel, time), or None.
+
+    The sum of their outer products is an unbiased estimate of the covariance of the errors of all bins: deviations of
+    the means of n of N passes in B batches are multiplied by the root of n/N/(B - 1).
+    """
+    if "waveform_batch" not in dataset or dataset.sizes["batch"] < 2:
+        return None
+    passes, mean = dataset["batch_passes"].values, _by_pixel(dataset["waveform"], dims)
+    means = np.asarray(dataset["waveform_batch"].transpose("batch", *dims).values, dtype=np.float64)
+    factor = np.sqrt(passes / passes.sum() / (passes.size - 1))
+    return np.asarray((means.reshape(-1, *mean.shape) - mean) * factor[:, None, None])
 
 
 def correlation(attributes: Any) -> FloatArray:
@@ -292,7 +339,8 @@ def _with_noise(found: Measured, noise: float | None) -> Measured:
     """Return waveforms with a constant error instead of their own."""
     if noise is None:
         return found
-    return replace(found, stderr=np.full(found.values.shape, noise), correlation=np.ones(1))
+    stderr = np.full(found.values.shape, noise)
+    return replace(found, stderr=stderr, correlation=np.ones(1), estimated=False, batches=None)
 
 
 def _by_pixel(array: xr.DataArray, dims: tuple[str, ...]) -> FloatArray:

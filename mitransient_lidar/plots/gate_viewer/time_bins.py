@@ -42,7 +42,8 @@ def one_record(dataset: xr.Dataset) -> xr.Dataset:
         error = (error**2).sum("shot", skipna=False) ** 0.5 / values.sizes["shot"]
         values = values.mean("shot")
     pixels = [dim for dim in dims if dim not in ("shot", "time")]
-    own = {key: one for key, one in dataset.coords.items() if not {"shot", "origin", "parameter", "case"} & {*one.dims}}
+    others = {"shot", "origin", "parameter", "case", "batch"}
+    own = {key: one for key, one in dataset.coords.items() if not others & {*one.dims}}
     for angle in ("angle_x", "angle_y"):
         if angle not in own or set(own[angle].dims) != set(pixels):
             raise UserError(f"the result has no coordinate {angle} over ({', '.join(pixels)}): it has no map to draw")

@@ -156,6 +156,15 @@ def test_one_gate_and_unknown_depth(tmp_path):
     xr.testing.assert_identical(gate_files.open_stack(gate_files.save_sequence(stack, tmp_path, "s")[0]), stack)
 
 
+@pytest.mark.parametrize("dim", ["origin", "parameter", "batch"])
+def test_parts_and_derivatives_of_waveforms_are_left_out(dim, tmp_path):
+    """As of a render with gates and `components`, `derivatives` or `batches`, whose time bins another file holds."""
+    more = {"waveform_more": ((dim, "row", "column", "time"), np.ones((2, 4, 5, 7)))}
+    with_more = make().assign(more).assign_coords({f"{dim}_names": (dim, ["a", "b"])})
+    gate_files.save_stack(with_more, tmp_path / "gates.exr")
+    xr.testing.assert_identical(gate_files.open_stack(tmp_path / "gates.exr"), make())
+
+
 def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):
     stack = make()
     both = stack.transpose("gate", "column", "row").assign(

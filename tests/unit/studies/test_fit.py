@@ -53,6 +53,7 @@ def test_starts_are_those_of_the_scene_and_seeds_differ_from_the_result(renders)
         "scene": "table1",
         "params": {"wind_speed": 2, "attenuation": "0.3", "bottom_reflectance": "0.1"},
         "passes": 16,
+        "batches": 16,
         "seed": 6,
         "instrument": None,
     }
