@@ -13,6 +13,7 @@ from mitransient_lidar.physics.water.hapke import HapkeSurface
 from mitransient_lidar.physics.water.sediments import bottom_reflectance
 from mitransient_lidar.plugins.bases import recorded
 from mitransient_lidar.transport.nested_objects import create_object
+from mitransient_lidar.transport.opaque import opaque
 
 #: Values of the parameter ``model``.
 MODELS = ("lambertian", "hapke")
@@ -90,6 +91,10 @@ class Sediment(mi.BSDF):
             self.surface = particles.of_albedo("single_scattering_albedo", albedo)
         else:
             self.surface = particles.of_reflectance("reflectance", _reflectance(props))
+        self._albedo, self._r0 = opaque(self.surface.albedo), opaque(self.surface.diffusive_reflectance)
+        self._asymmetry, self._backward, self._amplitude, self._width = (
+            opaque(getattr(self.surface, name)) for name in _PARTICLES
+        )
         self.m_components = [mi.BSDFFlags.DiffuseReflection.value | mi.BSDFFlags.FrontSide.value]
         self.m_flags = self.m_components[0]
 
@@ -131,25 +136,24 @@ class Sediment(mi.BSDF):
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> tuple[mi.Color1f, mi.Float]:
         """Return BSDF times cosine, and density [1/sr]."""
-        surface = self.surface
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         active = active & (cos_i > 0) & (cos_o > 0) & ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         # sin^2(g/2), from the difference of the directions: the cosine of a small angle is 1 to rounding.
         s = dr.minimum(0.25 * dr.squared_norm(wo - si.wi), 1)
-        b, width = surface.lobe_asymmetry, surface.opposition_width
+        b, width = self._asymmetry, self._width
         # tan(g/2) = sin / cos, without a quotient that is infinite.
         sine, cosine = dr.sqrt(s), dr.sqrt(1 - s)
-        surge = surface.opposition_amplitude * width * cosine / (width * cosine + sine)
+        surge = self._amplitude * width * cosine / (width * cosine + sine)
         backward, forward = ((1 - b * b) * dr.rsqrt((1 - b) ** 2 + 4 * b * part) ** 3 for part in (s, 1 - s))
-        once = (1 + surge) * dr.fma(surface.backward_share, backward - forward, forward)
+        once = (1 + surge) * dr.fma(self._backward, backward - forward, forward)
         often = self._h_function(cos_i) * self._h_function(cos_o) - 1
-        value = surface.albedo * dr.inv_four_pi * (once + often) * cos_o / (cos_i + cos_o)
+        value = self._albedo * dr.inv_four_pi * (once + often) * cos_o / (cos_i + cos_o)
         return mi.Color1f(dr.select(active, value, 0)), dr.select(active, cos_o * dr.inv_pi, 0)
 
     def _h_function(self, cosine: mi.Float) -> mi.Float:
         """Return the H function of the surface (`HapkeSurface.h_function`)."""
-        x, r0 = dr.maximum(cosine, 1e-6), self.surface.diffusive_reflectance
-        return dr.rcp(1 - self.surface.albedo * x * (r0 + (0.5 - r0 * x) * dr.log(1 + dr.rcp(x))))
+        x, r0 = dr.maximum(cosine, 1e-6), self._r0
+        return dr.rcp(1 - self._albedo * x * (r0 + (0.5 - r0 * x) * dr.log(1 + dr.rcp(x))))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose no parameters: a changed bottom is loaded again."""

@@ -221,7 +221,7 @@ def test_column_and_bottom_of_layered_water(lidar_scene, case, integrator):
     significance.assert_equal(energy[:, :, 0, 1][:, seen], backscatter[seen], error=0.015, bias=2e-3)
 
 
-CLEAR_RIPPLED, TURBID_SMOOTH = (0.005, 0.05, 2e-3, 16, 2**14), (1e-5, 0.5, 0.4, 32, 2**16)
+CLEAR_RIPPLED, TURBID_SMOOTH = (0.005, 0.05, 2e-3, 16), (1e-5, 0.5, 0.4, 64)
 
 
 @pytest.mark.parametrize(
@@ -235,14 +235,14 @@ CLEAR_RIPPLED, TURBID_SMOOTH = (0.005, 0.05, 2e-3, 16, 2**14), (1e-5, 0.5, 0.4, 
 def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, integrator, case):
     """Ripples spread both: the echo falls to a tenth in half a metre. Thick cells lost 20 % of it.
 
-    In turbid water below a smooth sea scattered light leaves the view: thick cells lost 5 % of the first decimetre.
+    In turbid water below a smooth sea scattered light leaves the view: thick cells lost 6 % of the first decimetre.
 
     Slopes of the variance s^2 in each direction turn light and lines of sight by D s, D = 1 - 1/n, so that a share
     1 - exp(-R^2 / 2 (sigma^2 + 2 D^2 s^2 z^2)) of the light at the depth z lies within the view of radius R.
     """
     height, index, sigma, radius = 20.0, 1.34, 2e-3, 6e-3
     bin_ns, bins, parts = 0.5, 24, 16
-    variance, attenuation, scattering, count, paths = case
+    variance, attenuation, scattering, count = case
     properties = attenuation, scattering, 0.5 * scattering
     water = dict(zip(("attenuation", "scattering", "backscattering"), properties, strict=True))
     water |= {"phase_function": "hg", "phase_g": 0.0}
@@ -259,7 +259,7 @@ def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, int
         tx={**pose, "divergence_mrad": 2e3 * sigma / height},
         rx={**pose, **RECEIVER, "field_of_view_mrad": 2e3 * radius / height, "layout": "1x1"},
         film={"time_start_ns": float(surface_time_ns(height, 0.0)), "bin_width_ns": bin_ns, "bin_count": 10 * bins},
-        integrator={"type": integrator, "paths_per_pass": paths},
+        integrator={"type": integrator, "paths_per_pass": 2**14},
         sea={"slope_variance": str(2 * variance)},
         water={**water, "refractive_index": index, "group_index": GROUP_INDEX},
         bottom=None,
@@ -267,7 +267,8 @@ def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, int
     # Light of the surface falls into the first bin. The record goes on, as points are as far apart as it is long.
     found = passes(scene, count)[:, 0, 1:bins]
     significance.assert_equal(found, expected[1:], error=0.02, bias=0.01)
-    significance.assert_equal(found[:, :2], expected[1:3], error=0.02, bias=0.015)
+    # The first decimetre.
+    significance.assert_equal(found[:, :2], expected[1:3], error=0.02, bias=0.01)
 
 
 @pytest.mark.parametrize(

@@ -273,6 +273,10 @@ def kernels_of_pass(scene, sensor, integrator):
     return found
 
 
+#: Bubbles below the wind, and a bottom with an opposition effect.
+OPPOSED = {"bottom_model": "hapke", "bubble_wind_speed": 9}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["lidar_merging", "lidar_volpath"])
 @pytest.mark.parametrize(
@@ -287,6 +291,7 @@ def kernels_of_pass(scene, sensor, integrator):
             "table1", {"layout": "hex7"}, {"field_of_view_mrad": 20, "group_index": 1.36}, marks=pytest.mark.long
         ),
         ("ship_wake", STRATA, OTHER_STRATA),
+        ("table1", OPPOSED, {"bottom_reflectance": 0.2, "lobe_asymmetry": 0.2, "bubble_wind_speed": 11}),
     ],
     ids=lambda value: next(iter(value), "none") if isinstance(value, dict) else value,
 )

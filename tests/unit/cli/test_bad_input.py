@@ -288,7 +288,7 @@ def replaced(old, new):
         (replaced('<string name="divergence_mrad"', '<string name="divergense"'), "there is no parameter divergense"),
         (replaced('<float name="bin_width_ns"', '<float name="bin_with"'), "time_gated_film: there is no parameter"),
         (replaced('type="lidar_transmitter"', 'type="lidar_transmiter"'), "did you mean lidar_transmitter"),
-        (replaced('type="diffuse"', 'type="difuse"'), "did you mean diffuse"),
+        (replaced('type="sediment"', 'type="sedimnt"'), "did you mean sediment"),
         (replaced('"$aperture_area"', '"$aperture"'), "aperture_area = '$aperture' refers to an unknown parameter"),
         (replaced('"$aperture_area"', '"inf"'), "aperture_area = inf must be finite"),
         (replaced('"$aperture_area"', '""'), "aperture_area = '' is empty"),
