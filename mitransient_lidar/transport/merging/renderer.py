@@ -64,7 +64,8 @@ _PATCH_PER_SOLID = 2**-20
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 
 #: Thickness of the uppermost cells, over the depth at which the sea doubles the variance of the beam, over the depth at
-#: which neighbouring facets move light by their own side, and over the attenuation length.
+#: which neighbouring facets move light by their own side, and over the attenuation length; the last one for beams from
+#: whose width scattered light is lost within a cell.
 _UPPERMOST_PER_SPREAD, _UPPERMOST_PER_FACET, _UPPERMOST_PER_ATTENUATION = 0.25, 0.1, 0.05
 
 #: Least attenuation, against division by zero [1/m].
@@ -223,7 +224,7 @@ class MergingLayout:
         uppermost = min(
             _UPPERMOST_PER_SPREAD * profile.depth,
             _UPPERMOST_PER_FACET * scene.facet_size / profile.shift_by_facets,
-            _UPPERMOST_PER_ATTENUATION / max(float(column.attenuation[0]), _LEAST_ATTENUATION),
+            max(_UPPERMOST_PER_ATTENUATION / max(float(column.attenuation[0]), _LEAST_ATTENUATION), footprint),
         )
         grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
         patches = _patch_width(scene, width)
