@@ -123,7 +123,8 @@ def test_both_integrators_agree_under_water(build, passes, case):
     errors = [samples.std(axis=0, ddof=1) / np.sqrt(len(samples)) for samples in (merged, reference)]
     used = (errors[0] < 0.05 * means[0]) & (errors[1] < 0.05 * means[1])
     z = (np.maximum(np.abs(means[0] - means[1]) - 0.005 * means[1], 0) / np.hypot(*errors))[used]
-    assert used.sum() >= 3
+    # Beyond the critical angle the reference knows no light after the third gate.
+    assert used.sum() >= (3 if "critical" in case else 4)
     assert z.max() < largest_z(10, z.size), z
     assert errors[1][used].min() < 0.01 * means[1][used].max()
 
