@@ -134,6 +134,13 @@ def shrink(name, params):
     return params
 
 
+def summary(compared, found, scores):
+    """Return numbers of scenes, findings and comparisons, and the distribution of z."""
+    rms = float(np.sqrt(np.mean(np.square(scores)))) if scores else np.nan
+    beyond = " ".join(f"{np.sum(np.abs(scores) > limit)} beyond {limit}," for limit in (2, 3, 4))
+    return f"{compared} scenes, {found} with findings, {len(scores)} comparisons, {beyond} rms of z {rms:.3f}"
+
+
 def main():
     """Compare scenes and print the findings."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -152,7 +159,10 @@ def main():
         compared += 1
         scores += [row[4] for row in rows]
         worst = max(rows, key=lambda row: abs(row[4]), default=None)
-        print(f"{number}: {name}, {len(rows)} comparisons, largest {worst}", flush=True)
+        print(
+            f"{number}: {name}, {len(rows)} comparisons, largest {worst}; {summary(compared, found, scores)}",
+            flush=True,
+        )
         confirmed = findings(compare(name, params, confirming=True)) if findings(rows) else []
         for row in confirmed:
             print(f"  differs: {row[0]}, gate {row[1]}: {100 * row[2]:+.1f} +- {100 * row[3]:.1f} %, z {row[4]:.1f}")
@@ -160,8 +170,7 @@ def main():
             found += 1
             needed = params if options.no_shrink else shrink(name, params)
             print(f"  {name} " + " ".join(f"-D {key}={value!r}" for key, value in needed.items()), flush=True)
-    rms = float(np.sqrt(np.mean(np.square(scores)))) if scores else np.nan
-    print(f"{compared} scenes, {found} with findings, {len(scores)} comparisons, rms of z {rms:.3f}")
+    print(summary(compared, found, scores))
 
 
 if __name__ == "__main__":
