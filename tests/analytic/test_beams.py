@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from oracles.lidar_equation import bottom_energy
-from significance import FALSE_ALARM, largest_z
+from significance import FALSE_ALARM, assert_same, largest_z
 
 import mitransient_lidar
 from mitransient_lidar.analysis import comparison
@@ -137,3 +137,44 @@ def test_obscured_aperture_receives_its_open_share(lidar_scene, passes):
     np.testing.assert_allclose(obscured, 0.7 * whole, rtol=1e-4, atol=1e-6 * whole.max())
     results = [mitransient_lidar.render(scene, passes=2) for scene in scenes]
     assert [result.attrs["obscuration"] for result in results] == [0.0, 0.3]
+
+
+@pytest.mark.long
+def test_echoes_below_waves_that_are_shorter_than_the_beam(lidar_scene, passes, tmp_path):
+    """Waves of 15 cm below a beam of 20 cm focus light at 0.3 m.
+
+    Light and lines of sight through several facets meet at a point, so that layers of equal thickness, 0.9 m in this
+    record, had 1.8 times the light of the first two decimetres, and 0.82 of that around the focus.
+    """
+    side, cells, steepness, ripples = 10.24, 1024, 0.3, 0.002
+    number = 2 * np.pi / 0.15
+    line = (np.arange(cells) + 0.5) * side / cells - side / 2
+    inside = np.minimum(1, side / 2 - np.abs(line))
+    waves = [steepness / number * np.sin(number * line + phase) for phase in (0.0, 1.0)]
+    np.save(tmp_path / "sea.npy", (waves[0][:, None] + waves[1]) * inside[:, None] * inside)
+    found = {}
+    # A record of 200 ns: points, and with them layers, are as far apart as it is long.
+    for plugin, paths, count, bins in (("lidar_merging", 2**17, 64, 400), ("lidar_volpath", 2**17, 32, 80)):
+        scene = lidar_scene(
+            integrator={"type": plugin, "paths_per_pass": paths},
+            tx={"altitude": 100.0, "off_nadir_deg": 0.0, "divergence_mrad": 2.0},
+            rx={"altitude": 100.0, "off_nadir_deg": 0.0, "field_of_view_mrad": 6.0, "layout": "1x1"},
+            film={"time_start_ns": 665.1, "bin_width_ns": 0.5, "bin_count": bins},
+            sea={
+                "spectrum": "height_map",
+                "filename": str(tmp_path / "sea.npy"),
+                "map_size": side,
+                "slope_variance": str(steepness**2 + ripples),
+            },
+            water={
+                "attenuation": 0.1,
+                "scattering": 1e-3,
+                "backscattering": 5e-4,
+                "phase_function": "hg",
+                "phase_g": 0.0,
+            },
+            bottom=None,
+        )
+        # The surface, then 0.2, 0.9, 1.3 and 4.5 m below it.
+        found[plugin] = np.add.reduceat(passes(scene, count)[:, 0], [5, 8, 16, 28, 68], axis=1)[:, :4]
+    assert_same(found["lidar_merging"], found["lidar_volpath"], error=0.02, bias=0.03)
