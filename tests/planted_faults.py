@@ -74,7 +74,12 @@ FAULTS = (
     ),
     # The cosine of the photon stays in the BSDF of merges on solids.
     Fault("cosine_at_the_bottom", f"{_M}/merge.py", "outgoing, within)[0] / cosine", "outgoing, within)[0]"),
-    Fault("merged_light_2_percent_more", f"{_M}/merge.py", "= points.weight / vol", "= 1.02 * points.weight / vol"),
+    Fault(
+        *("merged_light_2_percent_more", f"{_M}/merge.py"),
+        "= throughput * typical / cell",
+        "= 1.02 * throughput * typical / cell",
+        count=2,
+    ),
     Fault(
         "phase_index_times_water_leg",
         f"{_T}/volpath.py",
@@ -124,8 +129,7 @@ FAULTS = (
     ),
     # Light in a plume scatters at bubbles too often instead of the water, though as often in all.
     Fault(
-        "too_many_bubbles",
-        "plugins/layered_water.py",
+        *("too_many_bubbles", f"{_T}/medium/water.py"),
         "() * (bubbles + flight.attenuation(layer)) <",
         "() * flight.attenuation(layer) <",
     ),

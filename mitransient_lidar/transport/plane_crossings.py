@@ -130,7 +130,7 @@ class Crossings:
 
         Inactive lanes are stored, too: light that never ends its segment in clear water is inactive but crosses planes.
         """
-        wet = path.in_water & path.before_first_solid & ~path.outside_surface
+        wet = path.in_water & path.before_first_solid & ~path.lost
         enters = wet & ~path.entered
         path.entry = dr.select(enters, path.point, path.entry)
         path.entry_direction = dr.select(enters, path.direction, path.entry_direction)
@@ -149,7 +149,7 @@ class Crossings:
         dr.scatter(self._direction, mi.Vector4f(along.x, along.y, along.z, length), slot, keep)
         entry = mi.Vector4f(path.entry.x, path.entry.y, path.entry.z, path.entry_length)
         dr.scatter(self._entry, entry, slot, keep)
-        dr.scatter(self._entry_direction, mi.Vector4f(into.x, into.y, into.z, path.weight), slot, keep)
+        dr.scatter(self._entry_direction, mi.Vector4f(into.x, into.y, into.z, path.throughput), slot, keep)
         path.active &= ~path.entered | (path.length - path.entry_length < self._longest)
         return path.offset
 
@@ -246,7 +246,7 @@ class CrossingTracer:
             # Infinite length: no record ends the paths.
             walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, np.inf)
             end = walk.run(path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False)
-            outside = sent[np.array(end.outside_surface)].sum()
+            outside = sent[np.array(end.lost)].sum()
             crossings, wanted = segments.finalize()
             if wanted <= segments.capacity:
                 absolute = crossings.length + scene.relative(pose).range

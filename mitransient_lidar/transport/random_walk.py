@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.path_step import PathStep, Vertex
@@ -31,9 +32,8 @@ class RandomWalkPath(Path):
         path. With the scattering coefficient b [1/m] and the phase function p [1/sr] of events, it is V / (b p) for a
         merge in cells of volume V, and d^2 / (T b p b' p') times a rate for a connection over the distance d with the
         transmittance T of scattering.
-    outside_surface
-        Whether the path has entered the water outside the surface mesh, through level water: such paths measure the
-        loss.
+    lost
+        Whether the path has entered the water outside the surface mesh, as in `Contribution`.
     lane, points
         Number of the path, and of its points in the water so far.
     inverse
@@ -46,13 +46,13 @@ class RandomWalkPath(Path):
     points: mi.UInt32
     mis_partial_sum: mi.Float
     inverse: mi.Float
-    outside_surface: mi.Bool
+    lost: mi.Bool
     offset: mi.Float
 
     @property
-    def weight(self) -> mi.Float:
-        """Throughput, negative for paths outside the surface mesh."""
-        return dr.select(self.outside_surface, -self.throughput, self.throughput)
+    def contribution(self) -> Contribution:
+        """What the path carries up to its last vertex."""
+        return Contribution(self.throughput, self.lost, self.sums)
 
     @classmethod
     def start(
@@ -68,7 +68,7 @@ class RandomWalkPath(Path):
             points=mi.UInt32(0),
             mis_partial_sum=mi.Float(0),
             inverse=mi.Float(0),
-            outside_surface=mi.Bool(False),
+            lost=mi.Bool(False),
             offset=offset,
         )
 
@@ -229,7 +229,7 @@ class RandomWalk:
         path.direction = dr.select(outside, entered, path.direction)
         path.throughput *= dr.select(outside, 4 * index / (1 + index) ** 2, 1)
         path.in_water |= outside
-        path.outside_surface |= outside
+        path.lost |= outside
 
 
 def _shading_correction(si: mi.SurfaceInteraction3f, incoming: mi.Vector3f, outgoing: mi.Vector3f) -> mi.Float:

@@ -143,14 +143,15 @@ class WaterConnections:
         total += y * (rates.volume(other.point) + rates.in_water * other.edge)
         total += rates.in_water * x * y * pending
         scale = rates.in_water * pairs.partners * _POINTS_PER_CONNECTION
-        energy = scale * point.weight * other.weight * transmittance / total
+        received, sent = point.contribution, other.contribution
+        energy = scale * received.throughput * sent.throughput * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
         ray = mi.Ray3f(point.point, direction)
         ray.maxt = distance
         clear = scene.is_clear(point.point.z) & scene.is_clear(other.point.z)
         active &= ~scene.ray_test(ray, active & ~clear)
         length, depth, perturbed = point.length + other.length, -point.point.z, scene.perturbations
-        sums = perturbed.along(joined(point.sums, other.sums), depth, -direction.z, distance)
+        sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_event(sums, -other.point.z, other.direction, -direction)
         self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active, sums)
@@ -160,7 +161,8 @@ class WaterConnections:
         pairs = self._pairs(light.photons * np.arange(self._shots.count + 1), stream)
         point, patches = pairs.point, patches.of(pairs.lanes)
         place, photon = light.connectable(pairs.partner)
-        exists = pairs.exists & (photon.weight != 0)
+        received, sent = point.contribution, photon.contribution
+        exists = pairs.exists & (sent.throughput != 0)
         direction, distance, transmittance, pending = self._segment(point, place)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance
         ray = mi.Ray3f(point.point, direction)
@@ -173,11 +175,11 @@ class WaterConnections:
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
         scale = self.rates.on_solids * pairs.partners * _POINTS_PER_CONNECTION
-        energy = scale * point.weight * photon.weight * bsdf * transmittance / total
+        energy = scale * received.throughput * sent.throughput * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length
         depth, perturbed = -point.point.z, self.scene.perturbations
-        sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)
+        sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_solid(sums, si.shape)
         self._receive(point, photon, solid, direction, 1, length, distance, energy, active, sums, on_solid=True)
