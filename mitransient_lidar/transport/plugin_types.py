@@ -60,9 +60,10 @@ class SeaSurface(Protocol):
     slope_variance: float
     cell_size: float
     beam_wave: float
+    instruments: Sequence[Instrument] | None
 
     def fit(self, instruments: Sequence[Instrument]) -> bool:
-        """Choose the automatic values for the lasers and receivers of the scene, once; return whether any changed."""
+        """Choose the automatic values for lasers and receivers; return whether the mesh has changed."""
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""

@@ -77,7 +77,7 @@ def find_receiver(sensor: mi.Sensor) -> Receiver:
 
 
 def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
-    """Set the automatic values of each ``ocean_surface`` from the lasers and receivers of the scene, once.
+    """Set the automatic values of each ``ocean_surface`` that has none from the lasers and receivers of the scene.
 
     A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
     the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
@@ -97,7 +97,7 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
             pixels = receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
             instruments.append(Instrument.receiver(*place, pixels.field_of_view, side))
-    if any([sea.fit(instruments) for sea in seas_of(scene)]):
+    if any([sea.fit(instruments) for sea in seas_of(scene) if sea.instruments is None]):
         scene.parameters_changed([])
 
 
