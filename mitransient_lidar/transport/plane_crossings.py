@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque
@@ -227,8 +228,8 @@ class CrossingTracer:
         self._depths, self._photons = depths, photons
         self._beam = BeamSampler(scene.transmitter, scene.receiver)
         self._segments = _SEGMENTS
-        sine = np.sqrt(1 - scene.transmitter.pose.axis[2] ** 2) / scene.refractive_index
-        longest = _LONGEST_WAY * depths[-1] / np.sqrt(1 - sine**2)
+        down = -refract_level(scene.transmitter.pose.axis, scene.refractive_index)[2]
+        longest = _LONGEST_WAY * depths[-1] / down
         absorption = scene.required_water.column.absorption.min()
         if absorption > 0:
             longest = min(longest, -np.log(_SMALLEST_REST) / absorption)
