@@ -11,7 +11,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Instrument, Resolution
+from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, recorded
 from mitransient_lidar.transport.medium.water import Water
@@ -150,8 +150,8 @@ class OceanSurface(mi.Mesh):
 
     def __init__(self, props: RecordedProperties) -> None:
         self._values: dict[str, Any] = {}
-        #: Lasers and receivers for which automatic values are chosen; None before `fit`.
-        self.instruments: Sequence[Instrument] | None = None
+        #: Footprints for which automatic values are chosen; None before `fit`.
+        self.footprints: Sequence[Footprint] | None = None
         waits = bool(props.take(WAITS, False))
 
         def get(name: str, default: Any) -> Any:
@@ -175,17 +175,17 @@ class OceanSurface(mi.Mesh):
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         fill_mesh(self, mesh)
 
-    def fit(self, instruments: Sequence[Instrument]) -> bool:
-        """Choose the automatic values for lasers and receivers; return whether the mesh has changed."""
+    def fit(self, footprints: Sequence[Footprint]) -> bool:
+        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
 
         def get(name: str, _: Any) -> Any:
             return self._values[name]
 
-        former, self.instruments = self._resolution, instruments
-        self._resolution = Resolution.read(get, instruments)
+        former, self.footprints = self._resolution, footprints
+        self._resolution = Resolution.read(get, footprints)
         if self._resolution == former:
             return False
-        self._use(SeaSurface.read(get, instruments))
+        self._use(SeaSurface.read(get, footprints))
         fill_mesh(self, self.sea.mesh())
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)

@@ -94,7 +94,7 @@ FAULTS = (
     ),
     Fault("one_bin_late", f"{_T}/histogram.py", "minimum(mi.UInt32(position),", "minimum(mi.UInt32(position) + 1,"),
     # The last part of a segment that crosses edges has the coefficient of the layer where it starts.
-    Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.attenuation(end)", "downward * here"),
+    Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.coefficient(end)", "downward * here"),
     # The balance heuristic of beam and view takes the view for 3 % smaller than it is.
     Fault("share_of_photons_in_view", f"{_T}/laser/beam_sampler.py", "opaque(1 / self.view", "opaque(1.03 / self.view"),
     Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
@@ -130,8 +130,8 @@ FAULTS = (
     # Light in a plume scatters at bubbles too often instead of the water, though as often in all.
     Fault(
         *("too_many_bubbles", f"{_T}/medium/water.py"),
-        "() * (bubbles + flight.attenuation(layer)) <",
-        "() * flight.attenuation(layer) <",
+        "() * (bubbles + flight.coefficient(layer)) <",
+        "() * flight.coefficient(layer) <",
     ),
     # Sampled phase functions have other values than evaluated ones.
     Fault(

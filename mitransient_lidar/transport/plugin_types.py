@@ -11,7 +11,7 @@ from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea import sea_surface
-from mitransient_lidar.physics.sea.resolution import Instrument
+from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.pose import Pose
 
@@ -60,10 +60,10 @@ class SeaSurface(Protocol):
     slope_variance: float
     cell_size: float
     beam_wave: float
-    instruments: Sequence[Instrument] | None
+    footprints: Sequence[Footprint] | None
 
-    def fit(self, instruments: Sequence[Instrument]) -> bool:
-        """Choose the automatic values for lasers and receivers; return whether the mesh has changed."""
+    def fit(self, footprints: Sequence[Footprint]) -> bool:
+        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""

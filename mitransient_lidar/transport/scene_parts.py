@@ -10,7 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.sea.resolution import Instrument
+from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
 from mitransient_lidar.transport.plugin_types import Daylight, GatedFilm, SeaSurface, Transmitter
@@ -82,22 +82,22 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
     A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
     the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
     """
-    instruments = []
+    footprints = []
     for emitter in (model or scene).emitters():
         if not isinstance(emitter, Transmitter):
             continue
         if place := _seen_sea(emitter.pose):
             spreads = emitter.angular_spread, emitter.widest_angular_spread
-            instruments.append(Instrument.laser(*place, spreads))
+            footprints.append(Footprint.laser(*place, spreads))
         else:
-            instruments.append(_without_sea(emitter.pose))
+            footprints.append(_without_sea(emitter.pose))
     for sensor in (model or scene).sensors():
         receiver = getattr(sensor, "receiver", None)
         if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
             pixels = receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
-            instruments.append(Instrument.receiver(*place, pixels.field_of_view, side))
-    if any([sea.fit(instruments) for sea in seas_of(scene) if sea.instruments is None]):
+            footprints.append(Footprint.receiver(*place, pixels.field_of_view, side))
+    if any([sea.fit(footprints) for sea in seas_of(scene) if sea.footprints is None]):
         scene.parameters_changed([])
 
 
@@ -116,10 +116,10 @@ def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
     return (float(spot[0]), float(spot[1])), height, float(np.deg2rad(min(off_vertical, 89.9)))
 
 
-def _without_sea(pose: Pose) -> Instrument:
-    """Return an instrument that needs no waves: those above it when it looks down under water."""
+def _without_sea(pose: Pose) -> Footprint:
+    """Return a footprint that needs no waves: those above it when it looks down under water."""
     place = float(pose.origin[0]), float(pose.origin[1])
-    return Instrument(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
+    return Footprint(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
 
 
 def seas_of(scene: mi.Scene) -> list[SeaSurface]:

@@ -41,7 +41,7 @@ _GUIDING_ASYMMETRY = 0.87
 #: Asymmetry of the lobe on solids where it has a probability of its own: closer to that of the sun's light under water.
 _SOLID_GUIDING_ASYMMETRY = 0.95
 
-#: Radiance under water over its mean that the roulette expects far from the emitter's direction.
+#: Radiance under water far from the emitter's direction, over the mean of all directions, that the roulette assumes.
 _DIFFUSE_RADIANCE = 0.5
 
 #: Number of the random streams within a pass.

@@ -20,7 +20,7 @@ from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, Ta
 from mitransient_lidar.transport.nested_objects import create_object
 
 #: Phase functions that ``layered_water`` creates.
-KINDS = ("fournier_forand", "petzold", "hg")
+PHASE_FUNCTIONS = ("fournier_forand", "petzold", "hg")
 
 #: Beyond this number of different mixtures, bb/b and share of pure water are rounded to this step of their logarithms.
 _MOST_FUNCTIONS, _STEP = 16, 0.02
@@ -78,7 +78,7 @@ class LayerPhases:
     nested
         Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
     kind
-        One of `KINDS`, used where none is nested.
+        One of `PHASE_FUNCTIONS`, used where none is nested.
     phase_g
         Mean cosine for ``hg``.
     water_scattering

@@ -46,7 +46,7 @@ def store_points(
         points.contribution,
         points.mis_partial_sum,
         position,
-        points.edge,
+        points.inverse_density,
         mi.Bool(False),
         points.label,
     )
@@ -74,10 +74,10 @@ def merge_in_water(
     mei.p, mei.wi = points.point, -points.direction
     mei.sh_frame = mi.Frame3f(mei.wi)
     layer = water.flight.layer_at(-points.point.z)
-    scatterers = [(water.phases.at(layer), water.scattering_flight.attenuation(layer))]
+    scatterers = [(water.phases.at(layer), water.scattering_flight.coefficient(layer))]
     if water.plume is not None:
         scatterers.append((water.plume_phase, water.plume.scattering_at(points.point)))
-    absorption = water.absorption_flight.attenuation(layer)
+    absorption = water.absorption_flight.coefficient(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
     subpath = SensorSubpath.at(record, points, mi.UInt32(0))
     first, end = photons.find(cell.bucket, mi.Bool(True))
@@ -93,7 +93,7 @@ def merge_in_water(
         shared, shares = mi.Float(0), []
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
-            own = (typical + connections * (points.edge + photon.edge)) / (scattering * value[0])
+            own = (typical + connections * (points.inverse_density + photon.inverse_density)) / (scattering * value[0])
             shares.append(dr.rcp(own + points.mis_partial_sum + photon.mis_partial_sum))
             shared += shares[-1]
         # The photon continues to the plane through the point normal to its direction, so that times do not blur.
@@ -125,7 +125,7 @@ def merge_on_solids(
     against `connections`, a share of all pairs, that make the same path.
     """
 
-    def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
+    def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, inverse_density: mi.Float, active: mi.Bool) -> None:
         if photons is None:
             return
         patch, random = patches.locate(si), mi.PCG32(rng)
@@ -137,7 +137,7 @@ def merge_on_solids(
         covered = patches.inverse_share(patch, si.shape, random, active & (first < end))
         weight = path.throughput * covered / patch.area
         typical = patches.typical_area(si)
-        connection = connections * edge / dr.abs(dr.dot(si.n, path.direction))
+        connection = connections * inverse_density / dr.abs(dr.dot(si.n, path.direction))
 
         def add(index: mi.UInt32) -> tuple[mi.UInt32]:
             within = index < end

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.contribution import Contribution, split_flag, with_flag
-from mitransient_lidar.transport.merging.patches import Patch
+from mitransient_lidar.transport.merging.patches import SolidPatch
 from mitransient_lidar.transport.opaque import opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Perturbations, SumStore
@@ -36,7 +36,7 @@ class Photon:
         As in `RandomWalkPath`.
     position
         Scalar product of position and direction [m].
-    edge
+    inverse_density
         As in `SegmentPoints`; 0 on solids.
     connectable
         Whether it can be connected from elsewhere, on solids.
@@ -49,7 +49,7 @@ class Photon:
     contribution: Contribution
     mis_partial_sum: mi.Float
     position: mi.Float
-    edge: mi.Float
+    inverse_density: mi.Float
     connectable: mi.Bool
     label: mi.UInt32
 
@@ -65,43 +65,43 @@ class _PhotonStore:
     Each is two packets of four numbers that are read together, with flags in signs (`with_flag`), sums of
     perturbations, and a label if these are kept:
 
-    ===========  ===========================================================================================
-    ``_course``  x and y of the direction, ``edge`` with the flag ``connectable``, length
-    ``_rest``    `Contribution.packed`, ``mis_partial_sum`` with the sign of the direction's z, tag, position
-    ===========  ===========================================================================================
+    ==============  ==============================================================================================
+    ``_direction``  x and y of the direction, ``inverse_density`` with the flag ``connectable``, length
+    ``_factors``    `Contribution.packed`, ``mis_partial_sum`` with the flag of a direction upwards, tag, position
+    ==============  ==============================================================================================
     """
 
     def __init__(self, size: int, labelled: bool, perturbations: int) -> None:
         # Two arrays: a second write to the same one would compute all photons again.
-        self._course, self._rest = (dr.empty(mi.Float, 4 * size) for _ in range(2))
+        self._direction, self._factors = (dr.empty(mi.Float, 4 * size) for _ in range(2))
         self._label = dr.zeros(mi.UInt32, size) if labelled else None
         self._sums = SumStore(size, perturbations)
 
     def write(self, photon: Photon, tag: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
         """Store photons and their tags, and compute what is stored."""
         direction, carried = photon.direction, photon.contribution
-        edge = with_flag(photon.edge, photon.connectable)
+        inverse_density = with_flag(photon.inverse_density, photon.connectable)
         summed = with_flag(photon.mis_partial_sum, direction.z > 0)
-        course = mi.Vector4f(direction.x, direction.y, edge, photon.length)
-        rest = mi.Vector4f(carried.packed(), summed, dr.reinterpret_array(mi.Float, tag), photon.position)
-        dr.scatter(self._course, course, place, active)
-        dr.scatter(self._rest, rest, place, active)
+        where = mi.Vector4f(direction.x, direction.y, inverse_density, photon.length)
+        factors = mi.Vector4f(carried.packed(), summed, dr.reinterpret_array(mi.Float, tag), photon.position)
+        dr.scatter(self._direction, where, place, active)
+        dr.scatter(self._factors, factors, place, active)
         if self._label is not None:
             dr.scatter(self._label, photon.label, place, active)
         self._sums.write(carried.sums, place, active)
-        dr.eval(self._course, self._rest, self._label, self._sums.packets)
+        dr.eval(self._direction, self._factors, self._label, self._sums.packets)
 
     def read(self, place: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
         """Return photons and their tags."""
-        x, y, edge, length = dr.gather(mi.Vector4f, self._course, place, active)
-        packed, summed, tag, position = dr.gather(mi.Vector4f, self._rest, place, active)
-        edge, connectable = split_flag(edge)
+        x, y, inverse_density, length = dr.gather(mi.Vector4f, self._direction, place, active)
+        packed, summed, tag, position = dr.gather(mi.Vector4f, self._factors, place, active)
+        inverse_density, connectable = split_flag(inverse_density)
         mis_partial_sum, up = split_flag(summed)
         z = dr.sqrt(dr.maximum(1 - x * x - y * y, 0))
         direction = mi.Vector3f(x, y, dr.select(up, z, -z))
         label = mi.UInt32(0) if self._label is None else dr.gather(mi.UInt32, self._label, place, active)
         carried = Contribution.unpacked(packed, self._sums.read(place, active))
-        photon = Photon(direction, length, carried, mis_partial_sum, position, edge, connectable, label)
+        photon = Photon(direction, length, carried, mis_partial_sum, position, inverse_density, connectable, label)
         return photon, dr.reinterpret_array(mi.UInt32, tag)
 
 
@@ -197,7 +197,9 @@ class PhotonBuffer:
         self._sums = SumStore(capacity, perturbations.count)
         self._connectable_sums = SumStore(photons, perturbations.count)
 
-    def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool, connectable: mi.Bool) -> None:
+    def add(
+        self, path: RandomWalkPath, place: mi.Point3f, patch: SolidPatch, active: mi.Bool, connectable: mi.Bool
+    ) -> None:
         """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
         keep = active & (slot < self._capacity)

@@ -338,7 +338,9 @@ class MergingRenderer(PassRenderer):
         path.sums = scene.perturbations.at_laser(path.sums, scene.transmitter.profile, angles.x, angles.y)
         walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates.of(lanes))
 
-        def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
+        def store(
+            path: RandomWalkPath, si: mi.SurfaceInteraction3f, inverse_density: mi.Float, active: mi.Bool
+        ) -> None:
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
             once = ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
             hits.add(path, si.p, patches.locate(si), active, active & once & path.before_first_solid)

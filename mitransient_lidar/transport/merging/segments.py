@@ -36,9 +36,10 @@ class SegmentPoints:
         What the path carries up to the point, with its throughput times the track length of the point [m].
     mis_partial_sum
         As in `RandomWalkPath`.
-    edge
-        For the last scattering event, 1 / (b p) times the squared distance from it over the transmittance of scattering
-        on the way; 0 if the segment starts elsewhere.
+    inverse_density
+        Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]:
+        1 / (b p) times the squared distance from it over the transmittance of scattering on the way; 0 if the segment
+        starts elsewhere.
     label
         Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
     surface_length
@@ -50,7 +51,7 @@ class SegmentPoints:
     length: mi.Float
     contribution: Contribution
     mis_partial_sum: mi.Float
-    edge: mi.Float
+    inverse_density: mi.Float
     label: mi.UInt32
     surface_length: mi.Float
 
@@ -70,7 +71,7 @@ class _Segment:
     length: mi.Float
     contribution: Contribution
     mis_partial_sum: mi.Float
-    inverse: mi.Float
+    inverse_scattering_density: mi.Float
     surface_length: mi.Float
     label: mi.UInt32
 
@@ -80,11 +81,11 @@ class _SegmentStore:
 
     Each is three packets of four numbers that are read together, a label, and sums of perturbations:
 
-    ==============  ===========================================================================
+    ==============  ==============================================================================================
     ``_start``      x, y and z of the start, offset of the first point
     ``_direction``  x, y and z of the direction, length
-    ``_factors``    `Contribution.packed`, ``mis_partial_sum``, ``inverse``, ``surface_length``
-    ==============  ===========================================================================
+    ``_factors``    `Contribution.packed`, ``mis_partial_sum``, ``inverse_scattering_density``, ``surface_length``
+    ==============  ==============================================================================================
     """
 
     def __init__(self, size: int, perturbations: int) -> None:
@@ -95,7 +96,7 @@ class _SegmentStore:
     def write(self, path: RandomWalkPath, label: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
         """Store the next segment of each path."""
         start, direction, carried = path.point, path.direction, path.contribution
-        factors = carried.packed(), path.mis_partial_sum, path.inverse, path.surface_length
+        factors = carried.packed(), path.mis_partial_sum, path.inverse_scattering_density, path.surface_length
         dr.scatter(self._label, label, place, active)
         dr.scatter(self._start, mi.Vector4f(start.x, start.y, start.z, path.offset), place, active)
         dr.scatter(self._direction, mi.Vector4f(direction.x, direction.y, direction.z, path.length), place, active)
@@ -202,8 +203,8 @@ class SegmentBuffer:
         depth, downward = -segment.start.z, -segment.direction.z
         absorption = self._water.absorption_flight.optical_depth(depth, downward, along)
         scattering = self._water.scattering_flight.optical_depth(depth, downward, along)
-        inverse, carried = segment.inverse, segment.contribution
-        edge = dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0)
+        inverse, carried = segment.inverse_scattering_density, segment.contribution
+        inverse_density = dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0)
         # A segment lies in one index layer, and may begin on its boundary.
         layers = self._water.index_layers
         group = layers.group(layers.at(depth + 0.5 * downward * along))
@@ -215,7 +216,7 @@ class SegmentBuffer:
             segment.length + along * group,
             Contribution(throughput, carried.lost, sums),
             segment.mis_partial_sum,
-            edge,
+            inverse_density,
             segment.label,
             segment.surface_length,
         )

@@ -25,11 +25,13 @@ def test_photons_are_stored_without_loss():
     direction = random.normal(size=(3, count))
     direction /= np.linalg.norm(direction, axis=0)
     numbers = random.exponential(size=(6, count)) * (random.random((6, count)) < 0.7)
-    throughput, summed, edge, length, position, change = map(mi.Float, np.float32(numbers))
+    throughput, summed, inverse_density, length, position, change = map(mi.Float, np.float32(numbers))
     lost, connectable = (mi.Bool(random.random(count) < 0.5) for _ in range(2))
     label, tag = (mi.UInt32(random.integers(2**32, size=count)) for _ in range(2))
     carried = Contribution(throughput, lost, [change])
-    photon = Photon(mi.Vector3f(np.float32(direction)), length, carried, summed, -position, edge, connectable, label)
+    photon = Photon(
+        mi.Vector3f(np.float32(direction)), length, carried, summed, -position, inverse_density, connectable, label
+    )
     bucket = random.permutation(count)
     photons = PhotonMap(count, mi.UInt32(bucket), dr.zeros(mi.Float, count), 8, True, 1)
     photons.fill(photon, tag)
@@ -41,7 +43,7 @@ def test_photons_are_stored_without_loss():
     pairs = [(found_tag, tag), (found.direction.x, photon.direction.x), (found.direction.y, photon.direction.y)]
     pairs += zip((*found.contribution.sums, found.contribution.throughput), (change, throughput), strict=True)
     pairs += [(found.contribution.lost, lost)]
-    names = ("length", "mis_partial_sum", "position", "edge", "connectable", "label")
+    names = ("length", "mis_partial_sum", "position", "inverse_density", "connectable", "label")
     pairs += [(vars(found)[name], vars(photon)[name]) for name in names]
     for stored, given in pairs:
         np.testing.assert_array_equal(np.array(stored), np.array(given))
