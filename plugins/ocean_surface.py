@@ -14,8 +14,8 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, recorded
-from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.nested_objects import create_object
+from mitransient_lidar.transport.plugin_types import WaterMedium
 
 #: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` knows the lidar.
 WAITS = "_waits"
@@ -162,8 +162,7 @@ class OceanSurface(mi.Mesh):
         #: Resolution of the mesh; None for a level plane in its place.
         self._resolution = None if waits else Resolution.read(get, ())
         children = [child for _, child in props.objects()]
-        media = (getattr(child, "water", None) for child in children if isinstance(child, mi.Medium))
-        water = next((medium for medium in media if isinstance(medium, Water)), None)
+        water = next((child.water for child in children if isinstance(child, WaterMedium)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
         if self.has_ripples:
             props["ripples"] = self._ripples(1.34 if water is None else water.refractive_index)

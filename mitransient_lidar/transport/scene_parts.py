@@ -13,7 +13,14 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.plugin_types import Daylight, GatedFilm, SeaSurface, Transmitter
+from mitransient_lidar.transport.plugin_types import (
+    Daylight,
+    GatedFilm,
+    LidarSensor,
+    SeaSurface,
+    Transmitter,
+    WaterMedium,
+)
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
@@ -70,10 +77,9 @@ def find_lidar_scene(
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
     """Return the receiver of a sensor plugin; raise UserError when the sensor has none."""
-    receiver = getattr(sensor, "receiver", None)
-    if not isinstance(receiver, Receiver):
+    if not isinstance(sensor, LidarSensor):
         raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
-    return receiver
+    return sensor.receiver
 
 
 def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
@@ -92,9 +98,8 @@ def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
         else:
             footprints.append(_without_sea(emitter.pose))
     for sensor in (model or scene).sensors():
-        receiver = getattr(sensor, "receiver", None)
-        if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
-            pixels = receiver.pixels
+        if isinstance(sensor, LidarSensor) and (place := _seen_sea(sensor.receiver.pose)):
+            pixels = sensor.receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
             footprints.append(Footprint.receiver(*place, pixels.field_of_view, side))
     if any([sea.fit(footprints) for sea in seas_of(scene) if sea.footprints is None]):
@@ -144,12 +149,12 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
             continue
         if shape.exterior_medium() is not None:
             raise UserError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
-        water = getattr(shape.interior_medium(), "water", None)
-        if not isinstance(water, Water):
+        medium = shape.interior_medium()
+        if not isinstance(medium, WaterMedium):
             raise UserError(f"shape {shape.id()!r}: its interior medium must be layered_water")
         surfaces.append(shape)
-        if not any(water is other for other in waters):
-            waters.append(water)
+        if not any(medium.water is other for other in waters):
+            waters.append(medium.water)
     for shape in solids_of(scene, surfaces):
         name = shape.id()
         if isinstance(shape, SeaSurface):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -364,7 +363,7 @@ class PathTracer:
             return depth
         return depth - dr.select(active, self._absorption.optical_depth(-point.z, -direction.z, length), 0)
 
-    def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> Any:
+    def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> mi.Float | float:
         """Return the probability of the lobe towards the emitter.
 
         On solids with a probability of their own it is that times the share of the emitter's light that is scattered

@@ -9,7 +9,6 @@ make its path.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -222,6 +221,6 @@ class WaterConnections:
     ) -> None:
         """Add the energy of connected paths to the record."""
         subpath = SensorSubpath.at(self.record, point, solid)
-        group: Any = self._water.index_layers.group(mi.UInt32(0))
+        group = self._water.index_layers.group(mi.UInt32(0))
         length = length + distance * group
         subpath.add(self.record, light, events, length, energy, active, sums, [direction], on_solid)
