@@ -46,6 +46,13 @@ class RecordedProperties(mi.Properties):
             if name in self and self[name] == "":
                 del self[name]
 
+    def take(self, name: str, default: Any) -> Any:
+        """Remove a parameter that is not recorded, and return its value or the default."""
+        value = super().get(name, default)
+        if super().__contains__(name):
+            del self[name]
+        return value
+
     def _kept(self, name: str, value: Any) -> Any:
         self.values[name] = None if isinstance(value, str) and value == "" else value
         return value
@@ -67,8 +74,13 @@ def recorded(plugin: Callable[[RecordedProperties], Any]) -> Callable[[mi.Proper
         for name in used:
             props.mark_queried(name)
         # Mitsuba's base classes read some themselves.
-        others = {name: props[name] for name in used if name not in own.values and name not in children}
-        made.parameters = {"type": props.plugin_name(), **own.values, **others, **children}
+        others = [name for name in used if name in left and name not in own.values and name not in children]
+        made.parameters = {
+            "type": props.plugin_name(),
+            **own.values,
+            **{name: props[name] for name in others},
+            **children,
+        }
         return made
 
     return construct

@@ -11,11 +11,14 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Instrument, Resolution
+from mitransient_lidar.physics.sea.resolution import SIZE_MARGIN, Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
-from mitransient_lidar.plugins.bases import fill_mesh, recorded
-from mitransient_lidar.transport.medium.water import Water
+from mitransient_lidar.plugins.bases import RecordedProperties, fill_mesh, recorded
 from mitransient_lidar.transport.nested_objects import create_object
+from mitransient_lidar.transport.plugin_types import WaterMedium
+
+#: Parameter of the loader: whether the mesh is a level plane until `OceanSurface.fit` knows the lidar.
+WAITS = "_waits"
 
 
 class OceanSurface(mi.Mesh):
@@ -145,21 +148,21 @@ class OceanSurface(mi.Mesh):
         {'type': 'ocean_surface', 'wind_speed': 3.0, 'interior': {'type': 'layered_water'}}
     """
 
-    #: Whether new seas are level planes until `fit`: while a scene loads that fits its seas at once.
-    is_placeholder = False
-
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: RecordedProperties) -> None:
         self._values: dict[str, Any] = {}
-        self._fitted, self._waits = False, OceanSurface.is_placeholder
+        #: Footprints for which automatic values are chosen; None before `fit`.
+        self.footprints: Sequence[Footprint] | None = None
+        waits = bool(props.take(WAITS, False))
 
         def get(name: str, default: Any) -> Any:
             self._values[name] = props.get(name, default)
             return self._values[name]
 
-        self._use(SeaSurface.read(get, is_placeholder=self._waits))
+        self._use(SeaSurface.read(get, is_placeholder=waits))
+        #: Resolution of the mesh; None for a level plane in its place.
+        self._resolution = None if waits else Resolution.read(get, ())
         children = [child for _, child in props.objects()]
-        media = (getattr(child, "water", None) for child in children if isinstance(child, mi.Medium))
-        water = next((medium for medium in media if isinstance(medium, Water)), None)
+        water = next((child.water for child in children if isinstance(child, WaterMedium)), None)
         self.has_ripples = not any(isinstance(child, mi.BSDF) for child in children)
         if self.has_ripples:
             props["ripples"] = self._ripples(1.34 if water is None else water.refractive_index)
@@ -171,18 +174,17 @@ class OceanSurface(mi.Mesh):
         super().__init__("ocean_surface", len(mesh.vertices), len(mesh.faces), props, has_vertex_texcoords=True)
         fill_mesh(self, mesh)
 
-    def fit(self, instruments: Sequence[Instrument]) -> bool:
-        """Choose the automatic values for the lasers and receivers of the scene, once; return whether any changed."""
-        if self._fitted:
-            return False
-        self._fitted = True
+    def fit(self, footprints: Sequence[Footprint]) -> bool:
+        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
 
         def get(name: str, _: Any) -> Any:
             return self._values[name]
 
-        if not self._waits and Resolution.read(get, instruments) == Resolution.read(get, ()):
+        former, self.footprints = self._resolution, footprints
+        self._resolution = Resolution.read(get, footprints)
+        if self._resolution == former:
             return False
-        self._use(SeaSurface.read(get, instruments))
+        self._use(SeaSurface.read(get, footprints))
         fill_mesh(self, self.sea.mesh())
         if self.sea.slope_series is not None:
             self.bsdf().set_slopes(self.ripple_variance, self.sea.slope_series)

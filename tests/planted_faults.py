@@ -74,7 +74,12 @@ FAULTS = (
     ),
     # The cosine of the photon stays in the BSDF of merges on solids.
     Fault("cosine_at_the_bottom", f"{_M}/merge.py", "outgoing, within)[0] / cosine", "outgoing, within)[0]"),
-    Fault("merged_light_2_percent_more", f"{_M}/merge.py", "= points.weight / vol", "= 1.02 * points.weight / vol"),
+    Fault(
+        *("merged_light_2_percent_more", f"{_M}/merge.py"),
+        "= throughput * typical / cell",
+        "= 1.02 * throughput * typical / cell",
+        count=2,
+    ),
     Fault(
         "phase_index_times_water_leg",
         f"{_T}/volpath.py",
@@ -89,7 +94,7 @@ FAULTS = (
     ),
     Fault("one_bin_late", f"{_T}/histogram.py", "minimum(mi.UInt32(position),", "minimum(mi.UInt32(position) + 1,"),
     # The last part of a segment that crosses edges has the coefficient of the layer where it starts.
-    Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.attenuation(end)", "downward * here"),
+    Fault("layer_above_its_edge", f"{_T}/medium/free_flight.py", "downward * self.coefficient(end)", "downward * here"),
     # The balance heuristic of beam and view takes the view for 3 % smaller than it is.
     Fault("share_of_photons_in_view", f"{_T}/laser/beam_sampler.py", "opaque(1 / self.view", "opaque(1.03 / self.view"),
     Fault("absorption_twice_up_to_points", f"{_M}/segments.py", "dr.exp(-absorption)", "dr.exp(-2 * absorption)"),
@@ -124,10 +129,9 @@ FAULTS = (
     ),
     # Light in a plume scatters at bubbles too often instead of the water, though as often in all.
     Fault(
-        "too_many_bubbles",
-        "plugins/layered_water.py",
-        "() * (bubbles + flight.attenuation(layer)) <",
-        "() * flight.attenuation(layer) <",
+        *("too_many_bubbles", f"{_T}/medium/water.py"),
+        "() * (bubbles + flight.coefficient(layer)) <",
+        "() * flight.coefficient(layer) <",
     ),
     # Sampled phase functions have other values than evaluated ones.
     Fault(

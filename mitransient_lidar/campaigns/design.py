@@ -31,7 +31,7 @@ from mitransient_lidar.core.validation import (
 )
 
 #: Kinds of designs: every combination; points of a sequence, of a Latin hypercube, or random ones; rows of a file.
-KINDS = ("grid", "sobol", "latin_hypercube", "random", "table")
+DESIGN_KINDS = ("grid", "sobol", "latin_hypercube", "random", "table")
 
 #: Contents of a store that a campaign may keep.
 KEPT = ("waveform", "stderr", "components", "echoes", "truth")
@@ -84,7 +84,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Design:
-    """Choice of the runs: `kind` (one of `KINDS`), `count` of runs, places on each sea (`shots`), `seed`, and table."""
+    """Choice of the runs: `kind` (`DESIGN_KINDS`), `count` of runs, places on each sea (`shots`), `seed`, and table."""
 
     kind: str = "sobol"
     count: int | None = None
@@ -333,8 +333,8 @@ def _design(given: Mapping[str, Any]) -> Design:
     """Check the design of a file."""
     check_keys("design", given, [one.name for one in fields(Design)])
     kind = given.get("kind", "table" if "file" in given else "sobol")
-    if kind not in KINDS:
-        raise UserError(f"design.kind = {shown(kind)} must be one of {', '.join(KINDS)}")
+    if kind not in DESIGN_KINDS:
+        raise UserError(f"design.kind = {shown(kind)} must be one of {', '.join(DESIGN_KINDS)}")
     file, count = given.get("file"), given.get("count")
     if (file is not None) != (kind == "table") or not isinstance(file, (str, type(None))):
         raise UserError(f"design.file = {shown(file)} must name a CSV file for kind = 'table', and only for it")

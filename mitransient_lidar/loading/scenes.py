@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,10 +22,6 @@ from mitransient_lidar.loading.scene_record import SceneRecord
 
 if TYPE_CHECKING:
     import mitsuba as mi
-
-#: Options of Mitsuba's loaders. Optimisation would merge a bottom and a target of one material into a shape without a
-#: name; loading in several threads saves no time.
-_LOADING = {"parallel": False, "optimize": False}
 
 
 @dataclass(frozen=True)
@@ -101,8 +97,8 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
     given = scene.scene_dict() if isinstance(scene, SceneRecord) else scene
     check_dict(given)
     record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
-    with as_user_error(), _placeholder_seas():
-        loaded = mi.load_dict({"type": "scene", **given}, **_LOADING)
+    with as_user_error(), _own_file_resolver():
+        loaded = _instantiate(lambda config: mi.parser.parse_dict(config, {"type": "scene", **given}))
     return LoadedScene(loaded, "scene", {}, record)
 
 
@@ -122,8 +118,8 @@ def _load_xml(
     check(document)
     record = SceneRecord.of_document(document, former)
     text = record.place_files(document)
-    with as_user_error(document), _placeholder_seas(), _folder_of_files(document.folder):
-        loaded = mi.load_string(text, **_LOADING)
+    with as_user_error(document), _own_file_resolver(document.folder):
+        loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
     if not isinstance(loaded, mi.Scene):
         raise UserError(f"scene {document.name} holds a {type(loaded).__name__}: its root element must be <scene>")
     if unused := [name for name in document.parameters if name not in document.used]:
@@ -144,32 +140,38 @@ def _tell_missing_part(scene: mi.Scene, unused: list[str]) -> None:
             raise UserError(f"{part}: the scene has none, and its parameters {listed} are used by nothing")
 
 
+def _instantiate(parse: Callable[[Any], Any]) -> Any:
+    """Return the object of a scene that a function parses, with seas whose meshes wait for `fit_seas`."""
+    import mitsuba as mi
+
+    from mitransient_lidar.plugins.ocean_surface import WAITS
+
+    config = mi.parser.ParserConfig(mi.variant())
+    # Merging would make of a bottom and a target of one material a shape without a name. Several threads save no time.
+    config.merge_equivalent = config.merge_meshes = config.parallel = False
+    parsed = parse(config)
+    for node in parsed.nodes:
+        if node.props.plugin_name() == "ocean_surface":
+            node.props[WAITS] = True
+    mi.parser.transform_all(config, parsed)
+    return mi.parser.instantiate(config, parsed)
+
+
 @contextlib.contextmanager
-def _folder_of_files(folder: Path) -> Iterator[None]:
+def _own_file_resolver(folder: Path | None = None) -> Iterator[None]:
     """Add a folder to those in which Mitsuba looks for files; remove it, and those of ``<path>``, afterwards."""
     import mitsuba as mi
 
     resolver = mi.file_resolver()
     former = [str(path) for path in resolver]
-    resolver.prepend(str(folder.resolve()))
+    if folder is not None:
+        resolver.prepend(str(folder.resolve()))
     try:
         yield
     finally:
         resolver.clear()
         for path in former:
             resolver.append(path)
-
-
-@contextlib.contextmanager
-def _placeholder_seas() -> Iterator[None]:
-    """Load seas as level planes: their meshes are made once the lidar is known."""
-    from mitransient_lidar.plugins.ocean_surface import OceanSurface
-
-    OceanSurface.is_placeholder = True
-    try:
-        yield
-    finally:
-        OceanSurface.is_placeholder = False
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.flights.positions import PointClass
 from mitransient_lidar.flights.products import Flown
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.plots import drawing
 
 #: Colour and name of the points of a class.
@@ -127,8 +128,7 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     for shot in seen[:: max(len(seen) // _MOST_WAVEFORMS, 1)]:
         way = _PER_NS * (start[shot] + (np.arange(signal.shape[-1]) + 0.5) * width)
         to_sea = -origin[shot, 2] / axis[shot, 2]
-        down = axis[shot] / index
-        down[2] = -np.sqrt(1 - down[:2] @ down[:2])
+        down = refract_level(axis[shot], index)
         # In the air up to the sea level, below it at the group velocity of the water.
         wet_way = np.maximum(way - to_sea, 0) / group
         place = origin[shot] + np.minimum(way, to_sea)[:, None] * axis[shot] + wet_way[:, None] * down

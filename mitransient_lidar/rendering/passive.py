@@ -113,9 +113,7 @@ def render_passive(
     for frame in range(frames):
         moved = _moved(scene, params, frame * step) if frames > 1 else (scene, params)
         session = open_scene(*moved, variant)
-        own = session.scene.integrator()
-        default = own if getattr(own, "passive", False) else "passive_volpath"
-        chosen = choose_integrator(session.scene, default if integrator is None else integrator, passive=True)
+        chosen = choose_integrator(session.scene, integrator, passive=True)
         renderer = chosen.prepare(session.scene, session.sensor)
         if frame == 0:
             described, first = _describe(renderer), session

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mitransient_lidar.transport.pose import Pose
 
 #: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
-KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
+SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 
 #: Longest side of the sea that is searched [m].
 _LARGEST_SEARCH = 512.0
@@ -90,7 +90,7 @@ class SeaMap:
     def find(self, kind: str, slope_sigmas: float, count: int, apart: float) -> list[Shot]:
         """Return the places with the slopes nearest to those of a kind, at least `apart` metres from each other."""
         spread = np.sqrt([np.mean(self.along**2), np.mean(self.across**2)])
-        wanted = slope_sigmas * np.array(KINDS[kind]) * spread
+        wanted = slope_sigmas * np.array(SLOPE_KINDS[kind]) * spread
         distance = np.hypot((self.along - wanted[0]) / spread[0], (self.across - wanted[1]) / spread[1])
         if not (nearest := float(np.min(distance, initial=np.inf))) <= _NEAREST:
             raise UserError(

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+    from mitransient_lidar.transport.plugin_types import LidarIntegrator
 
 logger = logging.getLogger(__name__)
 
@@ -94,8 +95,10 @@ def open_scene(
     return Session(loaded.scene, sensors[0], loaded.name, loaded.parameters, loaded.record)
 
 
-def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Any:
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> LidarIntegrator:
     """Return an integrator from its name, a dict or itself, by default that of the scene.
+
+    For `passive` the default is ``passive_volpath`` if that of the scene is not one for daylight.
 
     Raises
     ------
@@ -104,8 +107,13 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
     """
     import mitsuba as mi
 
+    from mitransient_lidar.transport.plugin_types import LidarIntegrator
+
+    own = scene.integrator()
+    if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):
+        wanted = "passive_volpath"
     if wanted is None:
-        chosen = scene.integrator()
+        chosen = own
     elif isinstance(wanted, mi.Integrator):
         chosen = wanted
     else:
@@ -115,9 +123,9 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> An
         check_dict(given)
         with as_user_error():
             chosen = mi.load_dict(given, parallel=False)
-    if not hasattr(chosen, "plugin") and isinstance(wanted, str):
+    if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):
         raise UserError(f"integrator = {wanted!r} is not a lidar integrator: use lidar_merging or lidar_volpath")
-    if not hasattr(chosen, "plugin"):
+    if not isinstance(chosen, LidarIntegrator):
         raise UserError("integrator: the scene has no lidar integrator; add <integrator type='lidar_merging'/>")
     if passive and not chosen.passive:
         raise UserError(f"integrator = {chosen.plugin!r} renders no images by daylight: use 'passive_volpath'")

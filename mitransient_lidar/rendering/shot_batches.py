@@ -37,9 +37,9 @@ _MOST_BINS = 2**26
 #: Fewest and most passes that are repeated until an error is reached.
 _PASSES_FOR_ERROR, MOST_PASSES_FOR_ERROR = 4, 400
 
-#: Share of the paths with which the fewest passes reach an error in the published geometry under waves of 6 m/s, that
-#: error, and the exponent of the paths in the error of a pass.
-_SHARE, _ERROR, _EXPONENT = 0.05, 0.05, 0.65
+#: Share of the paths with which the fewest passes reach an error in the published geometry under waves of 6 m/s, and
+#: that error; the error of a pass falls with its number of paths to this exponent.
+_KNOWN_SHARE, _KNOWN_ERROR, _ERROR_EXPONENT = 0.05, 0.05, 0.65
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ def _arrays(pair: tuple[PassStatistics, PassStatistics]) -> tuple[FloatArray, ..
 
 def share_for_error(error: float) -> float:
     """Return the share of the paths of a full pass for passes that are repeated until a relative error is reached."""
-    return float(np.clip(_SHARE * (_ERROR / error) ** (1 / _EXPONENT), SMALLEST_SHARE, 1.0))
+    return float(np.clip(_KNOWN_SHARE * (_KNOWN_ERROR / error) ** (1 / _ERROR_EXPONENT), SMALLEST_SHARE, 1.0))
 
 
 def relative_errors(power: FloatArray, stderr: FloatArray, window: ErrorWindow) -> FloatArray:

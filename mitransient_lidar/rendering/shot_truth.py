@@ -13,7 +13,10 @@ from mitransient_lidar.physics.water.water_types import InherentProperties
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitransient_lidar.physics.sea.sea_surface import SeaSurface
     from mitransient_lidar.rendering.shot_poses import ShotPoses
+    from mitransient_lidar.transport.medium.water import Water
+    from mitransient_lidar.transport.plugin_types import Transmitter
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Reach of the mean over the beam's footprint, in its standard deviations, and smallest number of cells in one of them.
@@ -39,7 +42,7 @@ _DESCRIBED = {
 }
 
 
-def truth_coordinates(sea: Any, lidar: LidarScene, shots: ShotPoses) -> dict[str, Any]:
+def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPoses) -> dict[str, Any]:
     """Return the coordinates over ``shot`` of shots over a sea of an ``ocean_surface``, with units and descriptions.
 
     Places, slopes and depths as of `shot_series.render_shots`, and in scenes with water its coefficients
@@ -71,7 +74,7 @@ def truth_coordinates(sea: Any, lidar: LidarScene, shots: ShotPoses) -> dict[str
     }
 
 
-def water_means(water: Any, depth: FloatArray) -> dict[str, FloatArray]:
+def water_means(water: Water, depth: FloatArray) -> dict[str, FloatArray]:
     """Return the mean coefficients of a ``layered_water`` from the mean sea level to depths [m], bubbles left out.
 
     They are ``true_absorption``, ``true_scattering``, ``true_backscattering``, ``true_attenuation`` and ``true_kd``
@@ -121,14 +124,16 @@ def solids_below(
     return np.where(valid, np.array(si.p.z, dtype=np.float64), np.nan), target
 
 
-def sea_of(scene: mi.Scene) -> Any:
+def sea_of(scene: mi.Scene) -> SeaSurface | None:
     """Return the sea of an ``ocean_surface``, None without one."""
     from mitransient_lidar.transport.scene_parts import seas_of
 
     return next((found.sea for found in seas_of(scene)), None)
 
 
-def footprint_means(sea: Any, transmitter: Any, x: float, y: float, turn: float = 0.0) -> tuple[float, float, float]:
+def footprint_means(
+    sea: SeaSurface | None, transmitter: Transmitter, x: float, y: float, turn: float = 0.0
+) -> tuple[float, float, float]:
     """Return the slopes along the lidar's azimuth and to its left [1] and the height [m] at a place [m] of a sea.
 
     They are means over the beam's footprint on the mean sea level, an elliptic Gaussian, and 0 without waves. The lidar
@@ -143,7 +148,9 @@ def footprint_means(sea: Any, transmitter: Any, x: float, y: float, turn: float 
     azimuth += turn
     reach = max(math.ceil(_REACH * along / sea.cell_size), _FEWEST_CELLS)
     steps = np.arange(-reach, reach + 1)
-    lines_x, lines_y = ((round(place / sea.cell_size) + steps) * sea.cell_size for place in (x, y))
+    lines_x, lines_y = (
+        np.asarray((round(place / sea.cell_size) + steps) * sea.cell_size, dtype=np.float64) for place in (x, y)
+    )
     heights = sea.heights(lines_x, lines_y)
     up, right = np.gradient(heights, sea.cell_size)
     cos, sin = math.cos(azimuth), math.sin(azimuth)

@@ -182,7 +182,7 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     if getattr(lidar.bottoms[0].bsdf(), "parameters", {}).get("type") == "sediment":
         raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
-    si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.clear_water[1])))
+    si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1])))
     box = lidar.bottoms[0].bbox()
     depth, height = -float(si.p.z[0]), float(box.max.z - box.min.z)
     if not depth > 0:

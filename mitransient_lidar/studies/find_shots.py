@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, integer, positive
-from mitransient_lidar.rendering.sea_map import KINDS, SeaMap, Shot, footprint, transmitter_of
+from mitransient_lidar.rendering.sea_map import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import render_shots
 
@@ -78,7 +78,7 @@ def find_shots(
     loaded = open_scene(scene, params).scene
     sea = SeaMap.of_scene(loaded)
     apart = 4 * footprint(transmitter_of(loaded))[1]
-    return [shot for kind in KINDS for shot in sea.find(kind, slope_sigmas, count, apart)]
+    return [shot for kind in SLOPE_KINDS for shot in sea.find(kind, slope_sigmas, count, apart)]
 
 
 def shots_at(scene: Any, places: Sequence[tuple[float, float]], params: Mapping[str, Any] | None = None) -> list[Shot]:

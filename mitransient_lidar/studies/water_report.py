@@ -19,7 +19,7 @@ from mitransient_lidar.physics.water.water_types import water_of
 #: Maps angles [rad] to p [1/sr].
 PhaseFunction = Callable[[npt.ArrayLike], FloatArray]
 
-KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
+REPORTED_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "profile", "pure")
 
 #: Default of ``profile_tolerance`` of the medium ``layered_water``.
 DEFAULT_TOLERANCE = 0.01
@@ -67,8 +67,8 @@ def describe_water(
     UserError
         As for `water_of`, or if the file cannot be read.
     """
-    if kind not in KINDS:
-        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+    if kind not in REPORTED_KINDS:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(REPORTED_KINDS)}")
     index = float(seawater.refractive_index(wavelength_nm, temperature, salinity))
     group = float(seawater.group_index(wavelength_nm, temperature, salinity))
     if kind == "profile":

@@ -94,8 +94,8 @@ class PathStep:
         wet = path.active & path.in_water
         distance = scene.water.free_flight(self.flight, path.point, path.direction, rng)
         end = dr.fma(path.direction.z, distance, path.point.z)
-        clear = wet & scene.is_clear(path.point.z) & scene.is_clear(end)
-        si = scene.ray_intersect(path.ray(), path.active & ~clear)
+        empty = wet & scene.is_empty(path.point.z) & scene.is_empty(end)
+        si = scene.ray_intersect(path.ray(), path.active & ~empty)
         reach, at_boundary = mi.Float(si.t), no
         layers = scene.water.index_layers
         if layers.count > 1:

@@ -90,13 +90,13 @@ class SumStore:
         self._count = count
         self.packets = [dr.empty(mi.Float, 4 * size) for _ in range(-(-count // 4))]
 
-    def write(self, sums: Sums, place: mi.UInt32, active: Any) -> None:
+    def write(self, sums: Sums, place: mi.UInt32, active: mi.Bool) -> None:
         """Store sums."""
         padded = [*sums, *[mi.Float(0)] * (-len(sums) % 4)]
         for number, packet in enumerate(self.packets):
             dr.scatter(packet, mi.Vector4f(*padded[4 * number : 4 * number + 4]), place, active)
 
-    def read(self, place: mi.UInt32, active: Any = True) -> Sums:
+    def read(self, place: mi.UInt32, active: mi.Bool | bool = True) -> Sums:
         """Return sums."""
         found = [value for packet in self.packets for value in dr.gather(mi.Vector4f, packet, place, active)]
         return found[: self._count]
@@ -199,7 +199,9 @@ class Perturbations:
         """Return the sums of paths that start."""
         return [mi.Float(0) for _ in self.perturbations]
 
-    def along(self, sums: Sums, depth: mi.Float, downward: mi.Float, length: mi.Float, active: Any = True) -> Sums:
+    def along(
+        self, sums: Sums, depth: mi.Float, downward: mi.Float, length: mi.Float, active: mi.Bool | bool = True
+    ) -> Sums:
         """Return sums beyond segments in water: depth of their start [m], downward component, length [m]."""
         found = []
         for before, layers in zip(sums, self._layers, strict=True):
@@ -215,8 +217,8 @@ class Perturbations:
         depth: mi.Float,
         before: mi.Vector3f,
         after: mi.Vector3f,
-        share: Any = None,
-        active: Any = True,
+        share: mi.Float | None = None,
+        active: mi.Bool | bool = True,
     ) -> Sums:
         """Return sums beyond scattering events by water, from one direction to another.
 
@@ -241,7 +243,7 @@ class Perturbations:
             found.append(total)
         return found
 
-    def at_solid(self, sums: Sums, shape: mi.ShapePtr, active: Any = True) -> Sums:
+    def at_solid(self, sums: Sums, shape: mi.ShapePtr, active: mi.Bool | bool = True) -> Sums:
         """Return sums beyond reflections by solids."""
         found = []
         for total, solids in zip(sums, self._solids, strict=True):

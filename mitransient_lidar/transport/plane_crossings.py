@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque
@@ -130,7 +131,7 @@ class Crossings:
 
         Inactive lanes are stored, too: light that never ends its segment in clear water is inactive but crosses planes.
         """
-        wet = path.in_water & path.before_first_solid & ~path.outside_surface
+        wet = path.in_water & path.before_first_solid & ~path.lost
         enters = wet & ~path.entered
         path.entry = dr.select(enters, path.point, path.entry)
         path.entry_direction = dr.select(enters, path.direction, path.entry_direction)
@@ -149,7 +150,7 @@ class Crossings:
         dr.scatter(self._direction, mi.Vector4f(along.x, along.y, along.z, length), slot, keep)
         entry = mi.Vector4f(path.entry.x, path.entry.y, path.entry.z, path.entry_length)
         dr.scatter(self._entry, entry, slot, keep)
-        dr.scatter(self._entry_direction, mi.Vector4f(into.x, into.y, into.z, path.weight), slot, keep)
+        dr.scatter(self._entry_direction, mi.Vector4f(into.x, into.y, into.z, path.throughput), slot, keep)
         path.active &= ~path.entered | (path.length - path.entry_length < self._longest)
         return path.offset
 
@@ -227,8 +228,8 @@ class CrossingTracer:
         self._depths, self._photons = depths, photons
         self._beam = BeamSampler(scene.transmitter, scene.receiver)
         self._segments = _SEGMENTS
-        sine = np.sqrt(1 - scene.transmitter.pose.axis[2] ** 2) / scene.refractive_index
-        longest = _LONGEST_WAY * depths[-1] / np.sqrt(1 - sine**2)
+        down = -refract_level(scene.transmitter.pose.axis, scene.refractive_index)[2]
+        longest = _LONGEST_WAY * depths[-1] / down
         absorption = scene.required_water.column.absorption.min()
         if absorption > 0:
             longest = min(longest, -np.log(_SMALLEST_REST) / absorption)
@@ -246,7 +247,7 @@ class CrossingTracer:
             # Infinite length: no record ends the paths.
             walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver.pose, np.inf)
             end = walk.run(path, rng, mi.UInt32(0), segments, on_solid=lambda *_: None, past_solids=False)
-            outside = sent[np.array(end.outside_surface)].sum()
+            outside = sent[np.array(end.lost)].sum()
             crossings, wanted = segments.finalize()
             if wanted <= segments.capacity:
                 absolute = crossings.length + scene.relative(pose).range

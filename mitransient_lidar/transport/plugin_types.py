@@ -7,13 +7,16 @@ from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea import sea_surface
-from mitransient_lidar.physics.sea.resolution import Instrument
+from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
+from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
 @runtime_checkable
@@ -50,6 +53,57 @@ class Daylight(Protocol):
     daylight: str
 
 
+class Sun(Daylight, Protocol):
+    """The emitter ``sun``: unit direction to it, irradiance on a plane normal to its rays [W m^-2 nm^-1]."""
+
+    zenith_deg: float
+    direction: FloatArray
+    irradiance: float
+    sampled_irradiance: float
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Float:
+        """Return the radiance in a direction [W m^-2 sr^-1 nm^-1]."""
+
+    def sample(self, u: mi.Point2f) -> mi.Vector3f:
+        """Map uniform numbers to directions of the disc."""
+
+
+class Sky(Daylight, Protocol):
+    """The emitter ``sky``: unit direction to the sun of a clear one, irradiance [W m^-2 nm^-1]."""
+
+    distribution: str
+    sun: FloatArray
+    irradiance: float
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Float:
+        """Return the radiance in a direction [W m^-2 sr^-1 nm^-1]."""
+
+
+@runtime_checkable
+class LidarSensor(Protocol):
+    """The sensors ``multipixel_receiver`` and ``pixel_fov``."""
+
+    receiver: Receiver
+
+
+@runtime_checkable
+class WaterMedium(Protocol):
+    """The medium ``layered_water``."""
+
+    water: Water
+
+
+@runtime_checkable
+class LidarIntegrator(Protocol):
+    """The integrators ``lidar_merging``, ``lidar_volpath`` and ``passive_volpath``."""
+
+    plugin: str
+    passive: bool
+
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor, **options: Any) -> Any:
+        """Return the renderer of passes of a scene."""
+
+
 @runtime_checkable
 class SeaSurface(Protocol):
     """The shape ``ocean_surface``: slope variances, lengths [m]."""
@@ -60,9 +114,10 @@ class SeaSurface(Protocol):
     slope_variance: float
     cell_size: float
     beam_wave: float
+    footprints: Sequence[Footprint] | None
 
-    def fit(self, instruments: Sequence[Instrument]) -> bool:
-        """Choose the automatic values for the lasers and receivers of the scene, once; return whether any changed."""
+    def fit(self, footprints: Sequence[Footprint]) -> bool:
+        """Choose the automatic values for footprints of lasers and receivers; return whether the mesh has changed."""
 
     def scaled_ripples(self, refractive_index: float, factor: float) -> mi.BSDF:
         """Return the BSDF of ripples whose slope variances are those of the sea times a factor."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.path_step import PathStep, Vertex
@@ -31,13 +32,12 @@ class RandomWalkPath(Path):
         path. With the scattering coefficient b [1/m] and the phase function p [1/sr] of events, it is V / (b p) for a
         merge in cells of volume V, and d^2 / (T b p b' p') times a rate for a connection over the distance d with the
         transmittance T of scattering.
-    outside_surface
-        Whether the path has entered the water outside the surface mesh, through level water: such paths measure the
-        loss.
+    lost
+        Whether the path has entered the water outside the surface mesh, as in `Contribution`.
     lane, points
         Number of the path, and of its points in the water so far.
-    inverse
-        1 / (b p) of the last vertex if it is a scattering event in the water, else 0.
+    inverse_scattering_density
+        1 / (b p) of the last vertex [m sr] if it is a scattering event in the water, else 0.
     offset
         Distance from the last vertex to the next point along the path [m].
     """
@@ -45,14 +45,14 @@ class RandomWalkPath(Path):
     lane: mi.UInt32
     points: mi.UInt32
     mis_partial_sum: mi.Float
-    inverse: mi.Float
-    outside_surface: mi.Bool
+    inverse_scattering_density: mi.Float
+    lost: mi.Bool
     offset: mi.Float
 
     @property
-    def weight(self) -> mi.Float:
-        """Throughput, negative for paths outside the surface mesh."""
-        return dr.select(self.outside_surface, -self.throughput, self.throughput)
+    def contribution(self) -> Contribution:
+        """What the path carries up to its last vertex."""
+        return Contribution(self.throughput, self.lost, self.sums)
 
     @classmethod
     def start(
@@ -67,8 +67,8 @@ class RandomWalkPath(Path):
             lane=dr.arange(mi.UInt32, count),
             points=mi.UInt32(0),
             mis_partial_sum=mi.Float(0),
-            inverse=mi.Float(0),
-            outside_surface=mi.Bool(False),
+            inverse_scattering_density=mi.Float(0),
+            lost=mi.Bool(False),
             offset=offset,
         )
 
@@ -80,7 +80,7 @@ class Segments(Protocol):
         """Store the next segment of each path and return the offset of the first point beyond its end [m]."""
 
 
-#: Callback at solids: paths, interaction, `edge` of the segment as in `SegmentPoints`, active lanes.
+#: Callback at solids: paths, interaction, `inverse_density` there as in `SegmentPoints`, active lanes.
 Action = Callable[[RandomWalkPath, mi.SurfaceInteraction3f, mi.Float, mi.Bool], None]
 
 #: Callback at first hits: paths, interaction, active lanes.
@@ -162,7 +162,8 @@ class RandomWalk:
             path.throughput *= dr.select(wet, dr.exp(-absorption), 1)
             path.sums = perturbations.along(path.sums, path.depth, path.downward, vertex.length, wet & path.active)
             depth = self._water.scattering_flight.optical_depth(path.depth, path.downward, vertex.length)
-            edge = dr.select(path.inverse > 0, path.inverse * dr.square(vertex.length) * dr.exp(depth), 0)
+            inverse = path.inverse_scattering_density
+            inverse_density = dr.select(inverse > 0, inverse * dr.square(vertex.length) * dr.exp(depth), 0)
             step.arrive(path, vertex)
             by_surface = path.length + self._to_go.distance(path.point)
             path.surface_length = dr.select(first & vertex.at_sea, by_surface, path.surface_length)
@@ -170,8 +171,8 @@ class RandomWalk:
                 on_first_hit(path, vertex.si, first & (vertex.at_sea | (vertex.on_solid & ~wet)))
             hit = vertex.on_solid & wet
             # Most segments end in the water: the action is skipped where no path of a packet meets a solid.
-            dr.if_stmt((path, vertex.si, edge, hit), hit, on_solid, lambda *_: None, label="solid")
-            self._redirect(path, rng, vertex, edge)
+            dr.if_stmt((path, vertex.si, inverse_density, hit), hit, on_solid, lambda *_: None, label="solid")
+            self._redirect(path, rng, vertex, inverse_density)
             self._enter_outside(path, vertex.outside)
             step.cross_boundary(path, vertex.at_boundary & path.active)
             if not past_solids:
@@ -197,7 +198,7 @@ class RandomWalk:
         spare = self._path_end - path.length - self._to_go.distance(path.point)
         return spare / (self._water.index_layers.group(path.index_layer) - dr.dot(away, path.direction) / distance)
 
-    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex, edge: mi.Float) -> None:
+    def _redirect(self, path: RandomWalkPath, rng: mi.PCG32, vertex: Vertex, inverse_density: mi.Float) -> None:
         """Draw the next direction."""
         step, si = self._step, vertex.si
         pick, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -208,8 +209,8 @@ class RandomWalk:
         b_p = self._water.coefficient(self._water.scattering_flight, event.scatterer, path.point) * weight[0] * pdf
         inverse = dr.select(vertex.scattered, dr.rcp(b_p), 0)
         if self._rates is not None:
-            path.mis_partial_sum += inverse * (self._rates.volume(path.point) + self._rates.in_water * edge)
-        path.inverse = inverse
+            path.mis_partial_sum += inverse * (self._rates.volume(path.point) + self._rates.in_water * inverse_density)
+        path.inverse_scattering_density = inverse
         path.scatterings += dr.select(vertex.scattered, mi.UInt32(1), 0)
         direction = dr.select(vertex.scattered, dr.normalize(natural), si.to_world(bs.wo))
         factor = dr.select(vertex.scattered, weight[0], dr.select(vertex.on_surface, bsdf_weight[0], 1))
@@ -229,7 +230,7 @@ class RandomWalk:
         path.direction = dr.select(outside, entered, path.direction)
         path.throughput *= dr.select(outside, 4 * index / (1 + index) ** 2, 1)
         path.in_water |= outside
-        path.outside_surface |= outside
+        path.lost |= outside
 
 
 def _shading_correction(si: mi.SurfaceInteraction3f, incoming: mi.Vector3f, outgoing: mi.Vector3f) -> mi.Float:

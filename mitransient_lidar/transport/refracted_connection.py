@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -331,7 +330,11 @@ def connect_laser(scene: LidarScene, si: mi.SurfaceInteraction3f, active: mi.Boo
 
 
 def connect_sun(
-    scene: WaterScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, irradiance: Any, active: mi.Bool
+    scene: WaterScene,
+    si: mi.SurfaceInteraction3f,
+    direction: mi.Vector3f,
+    irradiance: mi.Float | float,
+    active: mi.Bool,
 ) -> mi.Float:
     """Connect surface points to an emitter at infinity in a unit direction, as `connect_laser` does to the laser.
 

@@ -142,7 +142,7 @@ class WaterScene:
         return [solid for solid in self.solids if not any(solid is bottom for bottom in bottoms)]
 
     @property
-    def clear_water(self) -> tuple[float, float]:
+    def empty_heights(self) -> tuple[float, float]:
         """Heights of the top of the highest solid and of the lowest point of the sea: no shape lies between [m]."""
         highest = max((float(solid.bbox().max.z) for solid in self.solids), default=-np.inf)
         return highest, min((float(surface.bbox().min.z) for surface in self.surfaces), default=-np.inf)
@@ -278,9 +278,9 @@ class WaterScene:
         # A margin of a millimetre for points that lie on the surface to rounding.
         return dr.select(in_water, z > opaque(highest + 1e-3), z < opaque(lowest - 1e-3))
 
-    def is_clear(self, z: mi.Float) -> mi.Bool:
-        """Return whether heights [m] lie in `clear_water`: lines between two of them meet no shape."""
-        lowest, highest = (opaque(z) for z in self.clear_water)
+    def is_empty(self, z: mi.Float) -> mi.Bool:
+        """Return whether heights [m] lie in `empty_heights`: lines between two of them meet no shape."""
+        lowest, highest = (opaque(z) for z in self.empty_heights)
         return (z > lowest) & (z < highest)
 
     def is_surface(self, shape: mi.ShapePtr) -> mi.Bool:

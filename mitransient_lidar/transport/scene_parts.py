@@ -10,10 +10,17 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.physics.sea.resolution import Instrument
+from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.plugin_types import Daylight, GatedFilm, SeaSurface, Transmitter
+from mitransient_lidar.transport.plugin_types import (
+    Daylight,
+    GatedFilm,
+    LidarSensor,
+    SeaSurface,
+    Transmitter,
+    WaterMedium,
+)
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
@@ -70,34 +77,32 @@ def find_lidar_scene(
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
     """Return the receiver of a sensor plugin; raise UserError when the sensor has none."""
-    receiver = getattr(sensor, "receiver", None)
-    if not isinstance(receiver, Receiver):
+    if not isinstance(sensor, LidarSensor):
         raise UserError("sensor: the lidar integrators need a multipixel_receiver or pixel_fov")
-    return receiver
+    return sensor.receiver
 
 
 def fit_seas(scene: mi.Scene, model: mi.Scene | None = None) -> None:
-    """Set the automatic values of each ``ocean_surface`` from the lasers and receivers of the scene, once.
+    """Set the automatic values of each ``ocean_surface`` that has none from the lasers and receivers of the scene.
 
     A plugin does not know its siblings while a scene loads: this is done for loaded scenes, before they are used. With
     the lasers and receivers of a `model` instead, the meshes of both scenes have the same cells and waves.
     """
-    instruments = []
+    footprints = []
     for emitter in (model or scene).emitters():
         if not isinstance(emitter, Transmitter):
             continue
         if place := _seen_sea(emitter.pose):
             spreads = emitter.angular_spread, emitter.widest_angular_spread
-            instruments.append(Instrument.laser(*place, spreads))
+            footprints.append(Footprint.laser(*place, spreads))
         else:
-            instruments.append(_without_sea(emitter.pose))
+            footprints.append(_without_sea(emitter.pose))
     for sensor in (model or scene).sensors():
-        receiver = getattr(sensor, "receiver", None)
-        if isinstance(receiver, Receiver) and (place := _seen_sea(receiver.pose)):
-            pixels = receiver.pixels
+        if isinstance(sensor, LidarSensor) and (place := _seen_sea(sensor.receiver.pose)):
+            pixels = sensor.receiver.pixels
             side = float(np.sqrt(pixels.area / pixels.count))
-            instruments.append(Instrument.receiver(*place, pixels.field_of_view, side))
-    if any([sea.fit(instruments) for sea in seas_of(scene)]):
+            footprints.append(Footprint.receiver(*place, pixels.field_of_view, side))
+    if any([sea.fit(footprints) for sea in seas_of(scene) if sea.footprints is None]):
         scene.parameters_changed([])
 
 
@@ -116,10 +121,10 @@ def _seen_sea(pose: Pose) -> tuple[tuple[float, float], float, float] | None:
     return (float(spot[0]), float(spot[1])), height, float(np.deg2rad(min(off_vertical, 89.9)))
 
 
-def _without_sea(pose: Pose) -> Instrument:
-    """Return an instrument that needs no waves: those above it when it looks down under water."""
+def _without_sea(pose: Pose) -> Footprint:
+    """Return a footprint that needs no waves: those above it when it looks down under water."""
     place = float(pose.origin[0]), float(pose.origin[1])
-    return Instrument(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
+    return Footprint(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
 
 
 def seas_of(scene: mi.Scene) -> list[SeaSurface]:
@@ -144,12 +149,12 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
             continue
         if shape.exterior_medium() is not None:
             raise UserError(f"shape {shape.id()!r}: the water must be its interior medium and its exterior empty")
-        water = getattr(shape.interior_medium(), "water", None)
-        if not isinstance(water, Water):
+        medium = shape.interior_medium()
+        if not isinstance(medium, WaterMedium):
             raise UserError(f"shape {shape.id()!r}: its interior medium must be layered_water")
         surfaces.append(shape)
-        if not any(water is other for other in waters):
-            waters.append(water)
+        if not any(medium.water is other for other in waters):
+            waters.append(medium.water)
     for shape in solids_of(scene, surfaces):
         name = shape.id()
         if isinstance(shape, SeaSurface):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -41,7 +40,7 @@ _GUIDING_ASYMMETRY = 0.87
 #: Asymmetry of the lobe on solids where it has a probability of its own: closer to that of the sun's light under water.
 _SOLID_GUIDING_ASYMMETRY = 0.95
 
-#: Radiance under water over its mean that the roulette expects far from the emitter's direction.
+#: Radiance under water far from the emitter's direction, over the mean of all directions, that the roulette assumes.
 _DIFFUSE_RADIANCE = 0.5
 
 #: Number of the random streams within a pass.
@@ -364,7 +363,7 @@ class PathTracer:
             return depth
         return depth - dr.select(active, self._absorption.optical_depth(-point.z, -direction.z, length), 0)
 
-    def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> Any:
+    def _guiding_probability(self, vertex: Vertex, emitter: EmitterDirection) -> mi.Float | float:
         """Return the probability of the lobe towards the emitter.
 
         On solids with a probability of their own it is that times the share of the emitter's light that is scattered

@@ -13,13 +13,13 @@ WATER = {"layer_tops": "0, 2, 5", "refractive_index": "1.34, 1.6, 1.2", "group_i
 
 
 def across(theta):
-    """Return how far a ray gets sideways from the receiver to the bottom [m], and its angles in the index_layers."""
+    """Return how far a ray gets sideways from the receiver to the bottom [m], and its angles in the index layers."""
     phi = np.arcsin(np.sin(theta) / INDEX)
     return HEIGHT * np.tan(theta) + np.sum(THICKNESS * np.tan(phi)), phi
 
 
 def bottom_echo(attenuation, reflectance):
-    """Return arrival [ns] and energy [J] of a narrow beam's echo from the bottom below three index_layers.
+    """Return arrival [ns] and energy [J] of a narrow beam's echo from the bottom below three index layers.
 
     The solid angle of the aperture from the bottom is that of the bundle of rays: sideways its width grows by
     offset / sin(phi), in the plane of incidence by cos(theta) d(offset)/d(phi), with phi at the bottom.

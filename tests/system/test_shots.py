@@ -43,10 +43,10 @@ def test_slopes_are_means_over_the_footprint(sea):
 @pytest.mark.slow
 def test_each_kind_of_shot_has_the_slope_that_it_is_named_for(sea):
     found = shots.find_shots("fig09_2x2", WAVES, slope_sigmas=1.5, count=3)
-    assert [shot.kind for shot in found] == [kind for kind in shots.KINDS for _ in range(3)]
+    assert [shot.kind for shot in found] == [kind for kind in shots.SLOPE_KINDS for _ in range(3)]
     spread = sea.along.std(), sea.across.std()
     for shot in found:
-        wanted = shots.KINDS[shot.kind]
+        wanted = shots.SLOPE_KINDS[shot.kind]
         assert shot.along == pytest.approx(1.5 * wanted[0] * spread[0], abs=0.1 * spread[0])
         assert shot.across == pytest.approx(1.5 * wanted[1] * spread[1], abs=0.1 * spread[1])
         assert sea.slope_at(shot.x, shot.y) == pytest.approx((shot.along, shot.across))
@@ -87,7 +87,7 @@ def test_found_shots_are_drawn_on_their_sea(tmp_path):
     assert (rendered.azimuth, rendered.scene) == (0.0, "small")
     assert rendered.beam_spread == pytest.approx((1.064 / math.cos(math.radians(20)), 1.064), rel=1e-3)
     panels = [ax for ax in plot_found_shots(rendered).axes if ax.get_ylabel() == "power (mW)"]
-    assert [ax.get_title().split()[0] for ax in panels] == list(shots.KINDS)
+    assert [ax.get_title().split()[0] for ax in panels] == list(shots.SLOPE_KINDS)
     np.testing.assert_allclose(panels[0].lines[2].get_ydata(), 1e3 * rendered.results[0].waveform[2])
 
 

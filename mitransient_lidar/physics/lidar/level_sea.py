@@ -9,12 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, finite_array
+from mitransient_lidar.physics.lidar.refraction import tangent_in_air
 
 #: Directions nearer to the horizon than this sine are taken as horizontal.
 _SMALLEST_DESCENT = 1e-9
-
-#: Steps of Newton's method, and the relative change at which it ends.
-_STEPS, _CHANGE = 60, 1e-14
 
 
 @dataclass(frozen=True)
@@ -81,19 +79,7 @@ class LevelSea:
         offset, height = points[..., :2] - origin[:2], float(origin[2])
         target = np.linalg.norm(offset, axis=-1)
         layers = list(zip(self.refractive_index, self._thickness(-points[..., 2]), strict=True))
-        # The horizontal distance is a concave, increasing function of the tangent of the angle in the air: Newton's
-        # method from 0 cannot overshoot.
-        tangent = np.zeros_like(target)
-        for _ in range(_STEPS):
-            reached, rise = height * tangent, np.full_like(target, height)
-            for n, thickness in layers:
-                root = np.sqrt(n**2 + (n**2 - 1) * tangent**2)
-                reached, rise = reached + thickness * tangent / root, rise + thickness * n**2 / root**3
-            change = (target - reached) / rise
-            tangent = tangent + change
-            if np.all(np.abs(change) <= _CHANGE * tangent):
-                break
-        in_water = height * tangent / np.where(target > 0, target, 1)
+        in_water = height * tangent_in_air(target, height, layers) / np.where(target > 0, target, 1)
         drop = np.where(points[..., 2] < height, height - points[..., 2], np.nan)
         share = np.where(points[..., 2] > 0, height / drop, np.where(target > 0, in_water, 0))
         return np.asarray(origin[:2] + offset * share[..., None])

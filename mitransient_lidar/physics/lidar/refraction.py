@@ -1,9 +1,11 @@
-"""Refraction at a level sea surface: angles, Fresnel transmission, focusing, and the time of the surface echo.
+"""Refraction at a level sea surface: directions, Fresnel transmission, focusing, and the time of the surface echo.
 
 Angles are from the vertical, `theta` in air and `phi` in water; n is the index of water relative to air.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -12,10 +14,38 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, non_negative_array, positive
 
+#: Steps of Newton's method, and the relative change at which it ends.
+_STEPS, _CHANGE = 60, 4e-16
+
 
 def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
     """Angle of refraction [rad] in water of relative index `n` >= 1 for angles `theta` [rad] in air."""
     return np.asarray(np.arcsin(np.sin(finite_array("theta", theta)) / in_range("n", n, 1, np.inf)))
+
+
+def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
+    """Return unit directions refracted from air into water by a facet, shape (..., 2 or 3).
+
+    Parameters
+    ----------
+    direction
+        Unit directions of propagation in the air, shape (..., 2 or 3).
+    normal
+        Normals of the facets into the air, of any length, of the same shape.
+    n
+        Refractive index of the water relative to air, at least 1.
+    """
+    unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    cosine = -np.sum(direction * unit, axis=-1, keepdims=True)
+    in_water = np.sqrt(1 - (1 - cosine**2) / n**2)
+    return np.asarray(direction / n + (cosine / n - in_water) * unit)
+
+
+def refract_level(direction: FloatArray, n: float) -> FloatArray:
+    """Return unit directions refracted downwards by the level surface, as `refract` does by a facet, shape (..., 3)."""
+    horizontal = direction[..., :2] / n
+    down = -np.sqrt(1 - np.sum(horizontal**2, axis=-1, keepdims=True))
+    return np.concatenate([horizontal, down], axis=-1)
 
 
 def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
@@ -71,17 +101,36 @@ def refracted_path(
     )
     if np.any(h <= 0):
         raise UserError(f"height = {h.min():g} must be greater than 0")
-    # The distance is a concave, increasing function of t = tan(theta): Newton's method from 0 cannot overshoot.
-    target = np.abs(rho)
-    t = np.zeros_like(target)
-    for _ in range(60):
-        root = np.sqrt(n**2 + (n**2 - 1) * t**2)
-        change = (target - h * t - d * t / root) / (h + d * n**2 / root**3)
-        t = t + change
-        if np.all(np.abs(change) <= 4e-16 * t):
-            break
-    theta = np.copysign(np.arctan(t), rho)
+    theta = np.copysign(np.arctan(tangent_in_air(np.abs(rho), h, [(n, d)])), rho)
     return theta, snell(theta, n)
+
+
+def tangent_in_air(
+    distance: FloatArray, height: FloatArray | float, layers: Sequence[tuple[float, FloatArray]]
+) -> FloatArray:
+    """Return the tangents of the angles from the vertical in air of rays from a point in air to one in the water.
+
+    Parameters
+    ----------
+    distance
+        Horizontal distance of the points [m], at least 0.
+    height
+        Height of the upper point above the surface [m], positive; it broadcasts with the distance.
+    layers
+        Refractive index and thickness [m] of each layer of water above the lower point; thicknesses broadcast, too.
+    """
+    # The distance is a concave, increasing function of the tangent: Newton's method from 0 cannot overshoot.
+    t = np.zeros_like(distance)
+    for _ in range(_STEPS):
+        missing, rise = distance - height * t, height + np.zeros_like(t)
+        for n, thickness in layers:
+            root = np.sqrt(n**2 + (n**2 - 1) * t**2)
+            missing, rise = missing - thickness * t / root, rise + thickness * n**2 / root**3
+        change = missing / rise
+        t = t + change
+        if np.all(np.abs(change) <= _CHANGE * t):
+            break
+    return np.asarray(t)
 
 
 def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt.ArrayLike, n: float) -> FloatArray:

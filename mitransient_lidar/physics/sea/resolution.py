@@ -41,8 +41,8 @@ Get = Callable[[str, Any], Any]
 
 
 @dataclass(frozen=True)
-class Instrument:
-    """A laser or a receiver above the sea."""
+class Footprint:
+    """Footprint of a laser or a receiver on the sea."""
 
     aim: tuple[float, float]  #: Point where its axis meets the mean sea level [m].
     altitude: float  #: Height above the mean sea level [m].
@@ -54,16 +54,16 @@ class Instrument:
     @classmethod
     def laser(
         cls, aim: tuple[float, float], altitude: float, off_nadir: float, spreads: tuple[float, float]
-    ) -> Instrument:
-        """Return a laser whose beam has the given narrowest and widest standard deviation [rad]."""
+    ) -> Footprint:
+        """Return that of a laser whose beam has the given narrowest and widest standard deviation [rad]."""
         narrow, wide = spreads
         return cls(aim, altitude, off_nadir, True, _BEAM_HALF_WIDTH * wide, narrow)
 
     @classmethod
     def receiver(
         cls, aim: tuple[float, float], altitude: float, off_nadir: float, field_of_view: float, pixel: float
-    ) -> Instrument:
-        """Return a receiver of a full angle and a typical side of a pixel [rad]."""
+    ) -> Footprint:
+        """Return that of a receiver of a full angle and a typical side of a pixel [rad]."""
         return cls(aim, altitude, off_nadir, False, 0.5 * field_of_view, pixel)
 
     @property
@@ -100,15 +100,15 @@ class Resolution:
     beam_wave: float  #: The shortest waves that the beam alone needs, not shorter than those.
 
     @classmethod
-    def read(cls, get: Get, instruments: Sequence[Instrument]) -> Resolution:
+    def read(cls, get: Get, footprints: Sequence[Footprint]) -> Resolution:
         """Read the parameters of the plugin ``ocean_surface``, and choose those that are ``auto``.
 
         Parameters
         ----------
         get
             Function (name, default) -> value of a parameter.
-        instruments
-            Lasers and receivers above the sea. Values of the parameters ``altitude``, ``off_nadir_deg``,
+        footprints
+            Those of the lasers and receivers above the sea. Values of the parameters ``altitude``, ``off_nadir_deg``,
             ``divergence_mrad`` (or another definition) and ``field_of_view_mrad`` replace theirs.
 
         Raises
@@ -118,7 +118,7 @@ class Resolution:
         """
         cell, side = read_length(get, "cell_size"), read_length(get, "refined_size")
         size, wave = read_length(get, "size"), read_length(get, "shortest_wave")
-        found = _with_own_values(get, instruments)
+        found = _with_own_values(get, footprints)
         areas = [_square(found), _square([each for each in found if each.is_laser] or found)]
         centre = tuple(
             automatic if value == "auto" else finite(name, value)
@@ -147,38 +147,38 @@ class Resolution:
         return cls((centre[0], centre[1]), cell, patch, size, own, beam)
 
 
-def _square(instruments: Sequence[Instrument]) -> tuple[float, float, float]:
+def _square(footprints: Sequence[Footprint]) -> tuple[float, float, float]:
     """Return centre (x, y) and side [m] of the square that holds the footprints."""
-    if not instruments:
+    if not footprints:
         return 0.0, 0.0, (_DEFAULT_SIZE - SIZE_MARGIN) / _SIZE_PER_FOOTPRINT
     low, high = (
-        [pick(each.aim[axis] + sign * each.half_side for each in instruments) for axis in (0, 1)]
+        [pick(each.aim[axis] + sign * each.half_side for each in footprints) for axis in (0, 1)]
         for pick, sign in ((min, -1), (max, 1))
     )
-    if len({each.aim for each in instruments}) == 1:
-        return *instruments[0].aim, 2 * max(each.half_side for each in instruments)
+    if len({each.aim for each in footprints}) == 1:
+        return *footprints[0].aim, 2 * max(each.half_side for each in footprints)
     return 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), max(high[0] - low[0], high[1] - low[1])
 
 
-def _with_own_values(get: Get, instruments: Sequence[Instrument]) -> list[Instrument]:
-    """Return the instruments with the values that the sea's own parameters give."""
+def _with_own_values(get: Get, footprints: Sequence[Footprint]) -> list[Footprint]:
+    """Return the footprints with the values that the sea's own parameters give."""
     altitude, off_nadir, field = get("altitude", None), get("off_nadir_deg", None), get("field_of_view_mrad", None)
     altitude = None if altitude is None else positive("altitude", altitude)
     off_nadir = None if off_nadir is None else math.radians(in_range("off_nadir_deg", off_nadir, 0.0, 89.9))
     field = None if field is None else 1e-3 * positive("field_of_view_mrad", field)
     divergence = read_divergence(get)
-    found = list(instruments)
+    found = list(footprints)
     if altitude is not None and not found:
         pose = (0.0, 0.0), altitude, math.radians(20.0)
         spread = 0.5 * _DIVERGENCE
-        found = [Instrument.laser(*pose, (spread, spread)), Instrument.receiver(*pose, _FIELD_OF_VIEW, math.inf)]
+        found = [Footprint.laser(*pose, (spread, spread)), Footprint.receiver(*pose, _FIELD_OF_VIEW, math.inf)]
     own = []
     for each in found:
         each = replace(each, altitude=altitude or each.altitude)
         each = each if off_nadir is None else replace(each, off_nadir=off_nadir)
         if each.is_laser and divergence is not None:
             spread = 0.5 * divergence
-            each = Instrument.laser(each.aim, each.altitude, each.off_nadir, (spread, spread))
+            each = Footprint.laser(each.aim, each.altitude, each.off_nadir, (spread, spread))
         elif not each.is_laser and field is not None:
             each = replace(each, half_angle=0.5 * field)
         own.append(each)

@@ -19,7 +19,7 @@ from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, GramCharlierS
 from mitransient_lidar.physics.sea.height_maps import HeightMap, read_height_map
 from mitransient_lidar.physics.sea.kelvin_wake import kelvin_wake
 from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, PeriodicHeights, realise_heights
-from mitransient_lidar.physics.sea.resolution import Get, Instrument, Resolution, read_length
+from mitransient_lidar.physics.sea.resolution import Footprint, Get, Resolution, read_length
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh, grid_indices, joined, triangulate
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum, SeaState
 from mitransient_lidar.physics.sea.swell import SwellSpectrum
@@ -83,15 +83,15 @@ class SeaSurface:
     waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
 
     @classmethod
-    def read(cls, get: Get, instruments: Sequence[Instrument] = (), is_placeholder: bool = False) -> SeaSurface:
+    def read(cls, get: Get, footprints: Sequence[Footprint] = (), is_placeholder: bool = False) -> SeaSurface:
         """Build a sea from parameters of the plugin ``ocean_surface``.
 
         Parameters
         ----------
         get
             Function (name, default) -> value of a parameter.
-        instruments
-            Lasers and receivers above the sea, for its automatic values.
+        footprints
+            Those of the lasers and receivers above the sea, for its automatic values.
         is_placeholder
             Whether to check the parameters only, and return a sea without waves.
 
@@ -110,7 +110,7 @@ class SeaSurface:
         slope_variance = get("slope_variance", "cox_munk")
         seed = integer("surface_seed", get("surface_seed", 1), 0, 2**53)
         wake = _read_wake(get)
-        resolution = Resolution.read(get, instruments)
+        resolution = Resolution.read(get, footprints)
         period = read_length(get, "period")
         time = finite("time", get("time", 0.0))
         depth = positive("water_depth", get("water_depth", DEEP))

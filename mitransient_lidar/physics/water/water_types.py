@@ -37,7 +37,7 @@ _NODES = 32768
 #: b, bb and the scattering by molecules bw [1/m].
 Scattered = tuple[float, float, float]
 
-KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure")
+WATER_KINDS = ("jerlov", "chlorophyll", "kd", "secchi", "petzold", "pure")
 """Quantities that give a water; see `water_of`."""
 
 #: bb/b of particles in the open ocean (Westberry et al. 2010).
@@ -316,8 +316,8 @@ def water_of(
     UserError
         If the kind is unknown, or a value is missing, not a number or out of range.
     """
-    if kind not in KINDS:
-        raise UserError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+    if kind not in WATER_KINDS:
+        raise UserError(f"kind = {kind!r} must be one of {', '.join(WATER_KINDS)}")
     if kind == "pure":
         if value is not None:
             raise UserError(f"value = {value!r} must be left out for pure sea water")

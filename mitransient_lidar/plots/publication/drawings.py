@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.refraction import refract
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.plots.publication.waves import refracted
 from mitransient_lidar.studies.publication.geometry import LAYOUT_SCENES, System, outlines
 from mitransient_lidar.studies.publication.renders import Renders
 
@@ -99,7 +99,7 @@ def _draw_section(ax: Axes, numbers: System, lines: np.ndarray, heights: np.ndar
         slope = (heights[first + 1] - heights[first]) / (lines[1] - lines[0])
         point = 0.5 * np.array([lines[first] + lines[first + 1], heights[first] + heights[first + 1]])
         start = point - 0.8 * down
-        end = point + 2.0 * refracted(down, np.array([-slope, 1.0]), numbers.refractive_index)
+        end = point + 2.0 * refract(down, np.array([-slope, 1.0]), numbers.refractive_index)
         ax.plot([start[0], point[0]], [start[1], point[1]], color=_BEAM, linewidth=1)
         ax.plot([point[0], end[0]], [point[1], end[1]], color=_BEAM, linestyle="--", linewidth=1)
     ax.set(xlabel="x (m)", ylabel="z (m)", aspect="equal")

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mitransient_lidar.physics.lidar.refraction import refract
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication.waveforms import add_pixel_legend, draw_waveforms
 from mitransient_lidar.plots.studies.find_shots import draw_sea
@@ -54,7 +55,7 @@ def paths(renders: Renders) -> Figure:
     for ax, slope, name in zip(figure.subplots(1, 2), (places[0].along, places[2].along), "AB", strict=True):
         down = np.array([math.sin(system.off_nadir), -math.cos(system.off_nadir)])
         # A face towards the lidar rises away from it.
-        ray = refracted(down, np.array([-slope, 1.0]), system.refractive_index)
+        ray = refract(down, np.array([-slope, 1.0]), system.refractive_index)
         path = system.bottom_depth / -ray[1]
         end = path * ray
         ax.plot([-1.5, 1.5], [-1.5 * slope, 1.5 * slope], color="#3f8fc9", linewidth=2)
@@ -68,17 +69,6 @@ def paths(renders: Renders) -> Figure:
         ax.set(xlabel="x (m)", ylabel="z (m)", xlim=(-2, 3), aspect="equal")
         drawing.add_grid(ax, hide=("top", "right"))
     return figure
-
-
-def refracted(direction: np.ndarray, normal: np.ndarray, index: float) -> np.ndarray:
-    """Return a unit direction refracted from air into water by Snell's law, shape (..., 2 or 3).
-
-    The normal, of any length, points into the air; `index` is that of the water relative to air.
-    """
-    unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    cosine = -np.sum(direction * unit, axis=-1, keepdims=True)
-    in_water = np.sqrt(1 - (1 - cosine**2) / index**2)
-    return np.asarray(direction / index + (cosine / index - in_water) * unit)
 
 
 def _draw_places(renders: Renders, axes: Sequence[Axes], number: str) -> None:

@@ -36,8 +36,8 @@ class LayeredFlight:
         # The layer whose upper edge is the last one at or above the depth.
         return dr.binary_search(0, self.count - 1, lambda i: dr.gather(mi.Float, self._top, i + 1) <= depth)
 
-    def attenuation(self, layer: mi.UInt32) -> mi.Float:
-        """Return the beam attenuation c [1/m] of a layer."""
+    def coefficient(self, layer: mi.UInt32) -> mi.Float:
+        """Return the coefficient of a layer [1/m]: attenuation, or scattering or absorption alone, as in the column."""
         return self._look_up(self._attenuation, layer)
 
     def albedo(self, layer: mi.UInt32) -> mi.Float:
@@ -56,7 +56,7 @@ class LayeredFlight:
         It starts at a depth [m], negative in a wave crest, in a unit direction of the component `downward`.
         """
         layer = self.layer_at(depth)
-        here = self.attenuation(layer)
+        here = self.coefficient(layer)
         within = optical_depth / here  # infinite in clear water
         if self.count == 1:
             return within
@@ -75,7 +75,7 @@ class LayeredFlight:
         # Counted from the edge through which it enters the last layer, so that nearly level flights keep their length.
         enter = dr.select(downward > 0, last, dr.minimum(last + 1, self.count - 1))
         between = (dr.gather(mi.Float, self._edge, enter) - from_edge) / downward
-        last_part = dr.maximum(beyond - between, _SMALLEST_OPTICAL_DEPTH) / self.attenuation(last)
+        last_part = dr.maximum(beyond - between, _SMALLEST_OPTICAL_DEPTH) / self.coefficient(last)
         to_last = (dr.gather(mi.Float, self._top, enter) - dr.gather(mi.Float, self._top, edge)) / downward
         through = to_edge + to_last + last_part
         return dr.select((beyond > 0) & (to_edge < dr.inf), through, within)
@@ -92,7 +92,7 @@ class LayeredFlight:
     def optical_depth(self, depth: mi.Float, downward: mi.Float, length: mi.Float) -> mi.Float:
         """Return the optical depth of a segment: depth of its start [m], downward component, length [m]."""
         layer = self.layer_at(depth)
-        here = self.attenuation(layer)
+        here = self.coefficient(layer)
         if self.count == 1:
             return here * length
         to_edge, edge = self._way_out(layer, depth, downward)
@@ -101,7 +101,7 @@ class LayeredFlight:
         # The last part is counted from the edge through which the segment enters the layer where it ends.
         enter = dr.select(downward > 0, end, dr.minimum(end + 1, self.count - 1))
         between = (dr.gather(mi.Float, self._edge, enter) - dr.gather(mi.Float, self._edge, edge)) / downward
-        last_part = (end_depth - dr.gather(mi.Float, self._top, enter)) / downward * self.attenuation(end)
+        last_part = (end_depth - dr.gather(mi.Float, self._top, enter)) / downward * self.coefficient(end)
         # To rounding, a nearly horizontal segment may pass an edge without leaving the layer.
         within = (length <= to_edge) | (end == layer)
         return dr.select(within, here * length, here * to_edge + between + last_part)

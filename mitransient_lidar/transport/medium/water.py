@@ -99,7 +99,7 @@ class Water:
         if self.plume is None:
             return layer
         bubbles = self.plume.scattering_at(point)
-        is_bubble = rng.next_float32() * (bubbles + flight.attenuation(layer)) < bubbles
+        is_bubble = rng.next_float32() * (bubbles + flight.coefficient(layer)) < bubbles
         return dr.select(is_bubble, mi.UInt32(self.column.count), layer)
 
     def is_water(self, scatterer: mi.UInt32) -> mi.Bool:
@@ -109,10 +109,10 @@ class Water:
     def coefficient(self, flight: LayeredFlight, scatterer: mi.UInt32, point: mi.Point3f) -> mi.Float:
         """Return the coefficient in `flight` of the scatterer of an event at a point [1/m]."""
         if self.plume is None:
-            return flight.attenuation(scatterer)
+            return flight.coefficient(scatterer)
         layer = dr.minimum(scatterer, self.column.count - 1)
         bubbles = self.plume.scattering_of_event(point)
-        return dr.select(scatterer == self.column.count, bubbles, flight.attenuation(layer))
+        return dr.select(scatterer == self.column.count, bubbles, flight.coefficient(layer))
 
     def albedo(self, scatterer: mi.UInt32) -> mi.Float:
         """Return the single-scattering albedo of a scatterer; bubbles absorb nothing."""
@@ -124,7 +124,7 @@ class Water:
     def coefficients_at(self, point: mi.Point3f) -> tuple[mi.Float, mi.Float]:
         """Return attenuation and scattering at points [1/m], bubbles included."""
         layer = self.flight.layer_at(-point.z)
-        attenuation = self.flight.attenuation(layer)
+        attenuation = self.flight.coefficient(layer)
         scattering = self.flight.albedo(layer) * attenuation
         if self.plume is None:
             return attenuation, scattering

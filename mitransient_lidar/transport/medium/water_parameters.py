@@ -14,13 +14,12 @@ from mitransient_lidar.physics.water.bubbles import CLEAN_BACKSCATTER, STRONGEST
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 from mitransient_lidar.physics.water.profiles import read_profile
-from mitransient_lidar.physics.water.water_types import KINDS as WATERS
-from mitransient_lidar.physics.water.water_types import water_of
+from mitransient_lidar.physics.water.water_types import WATER_KINDS, water_of
 from mitransient_lidar.transport.medium.bubble_layer import BubbleLayer
 from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.medium.water_phases import KINDS, LayerPhases, ScattererPhases
+from mitransient_lidar.transport.medium.water_phases import PHASE_FUNCTIONS, LayerPhases, ScattererPhases
 from mitransient_lidar.transport.nested_objects import create_object
 
 #: Attenuation, scattering and backscattering [1/m] unless they are given.
@@ -28,7 +27,7 @@ _DEFAULTS = {"attenuation": 0.3, "scattering": 0.15, "backscattering": 0.006}
 
 #: Parameters for which an empty text counts as not given.
 MAY_BE_EMPTY = (
-    *("layer_tops", *_DEFAULTS, "water_scattering", "chi_p", *WATERS, "profile"),
+    *("layer_tops", *_DEFAULTS, "water_scattering", "chi_p", *WATER_KINDS, "profile"),
     *("bubble_void_fraction", "bubble_depth"),
 )
 
@@ -65,8 +64,8 @@ def read_water(
             in_range(name, value, low, 2.0)
     kind = props.get("phase_function", "fournier_forand")
     phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
-    if kind not in KINDS:
-        raise UserError(f"phase_function = {kind!r} must be one of {', '.join(KINDS)}")
+    if kind not in PHASE_FUNCTIONS:
+        raise UserError(f"phase_function = {kind!r} must be one of {', '.join(PHASE_FUNCTIONS)}")
     plume, ratio = _bubbles(props)
     if not _is_given(props, "pure") and (nested or kind != "fournier_forand"):
         molecules = np.zeros(1)
@@ -100,7 +99,7 @@ def _column(props: mi.Properties) -> tuple[WaterColumn, np.ndarray]:
     """
     tolerance = props.get("profile_tolerance", 0.01)
     wavelength = positive("wavelength_nm", props["wavelength_nm"]) if "wavelength_nm" in props else None
-    ways = [name for name in (*WATERS, "profile") if _is_given(props, name)]
+    ways = [name for name in (*WATER_KINDS, "profile") if _is_given(props, name)]
     own = [name for name in ("layer_tops", *_DEFAULTS) if name in props]
     if not ways:
         values = {name: props.get(name, default) for name, default in _DEFAULTS.items()}

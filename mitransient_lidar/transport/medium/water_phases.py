@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +20,15 @@ from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase, Ta
 from mitransient_lidar.transport.nested_objects import create_object
 
 #: Phase functions that ``layered_water`` creates.
-KINDS = ("fournier_forand", "petzold", "hg")
+PHASE_FUNCTIONS = ("fournier_forand", "petzold", "hg")
+
+
+@runtime_checkable
+class HasTable(Protocol):
+    """Phase functions that are tables."""
+
+    tabulated: TabulatedPhase
+
 
 #: Beyond this number of different mixtures, bb/b and share of pure water are rounded to this step of their logarithms.
 _MOST_FUNCTIONS, _STEP = 16, 0.02
@@ -46,7 +54,7 @@ class ScattererPhases:
         numbers = {key: number for number, key in enumerate(different)}
         self._of_scatterer = [numbers[id(phase)] for phase in self.phases]
         self._different = list(different.values())
-        tables = [phase.tabulated.table for phase in self._different if hasattr(phase, "tabulated")]
+        tables = [phase.tabulated.table for phase in self._different if isinstance(phase, HasTable)]
         alike = len(tables) == len(self._different) and len({(table.count, table.log_s0) for table in tables}) == 1
         self._stack = TabulatedPhase(*tables) if alike and self._single is None else None
         self._numbers: mi.UInt32 | None = None
@@ -78,7 +86,7 @@ class LayerPhases:
     nested
         Phase functions of the particles by name: one for all layers, or ``phase_0``, ``phase_1``, ...; or none.
     kind
-        One of `KINDS`, used where none is nested.
+        One of `PHASE_FUNCTIONS`, used where none is nested.
     phase_g
         Mean cosine for ``hg``.
     water_scattering
@@ -200,9 +208,8 @@ def _mixed(
 
 def table_of(phase: mi.PhaseFunction) -> PowerLawTable:
     """Return a phase function as a table: its own, or one of its values."""
-    if hasattr(phase, "tabulated"):
-        table: PowerLawTable = phase.tabulated.table
-        return table
+    if isinstance(phase, HasTable):
+        return phase.tabulated.table
     s = np.exp(DEFAULT_LOG_S0 * np.linspace(1, 0, DEFAULT_COUNT))
     mei = dr.zeros(mi.MediumInteraction3f, len(s))
     mei.wi = mi.Vector3f(0, 0, -1)

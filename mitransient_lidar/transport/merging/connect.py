@@ -9,7 +9,6 @@ make its path.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -136,21 +135,22 @@ class WaterConnections:
         point, exists = pairs.point, pairs.exists
         other, scene, rates = light.points(pairs.partner), self.scene.of(pairs.lanes), self.rates.of(pairs.lanes)
         direction, distance, transmittance, pending = self._segment(point, other.point)
-        x = self._inverse(point.point, point.direction, direction, exists)
-        y = self._inverse(other.point, other.direction, -direction, exists)
+        x = self._inverse_scattering_density(point.point, point.direction, direction, exists)
+        y = self._inverse_scattering_density(other.point, other.direction, -direction, exists)
         total = point.mis_partial_sum + other.mis_partial_sum
-        total += x * (rates.volume(point.point) + rates.in_water * point.edge)
-        total += y * (rates.volume(other.point) + rates.in_water * other.edge)
+        total += x * (rates.volume(point.point) + rates.in_water * point.inverse_density)
+        total += y * (rates.volume(other.point) + rates.in_water * other.inverse_density)
         total += rates.in_water * x * y * pending
         scale = rates.in_water * pairs.partners * _POINTS_PER_CONNECTION
-        energy = scale * point.weight * other.weight * transmittance / total
+        received, sent = point.contribution, other.contribution
+        energy = scale * received.throughput * sent.throughput * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
         ray = mi.Ray3f(point.point, direction)
         ray.maxt = distance
-        clear = scene.is_clear(point.point.z) & scene.is_clear(other.point.z)
-        active &= ~scene.ray_test(ray, active & ~clear)
+        empty = scene.is_empty(point.point.z) & scene.is_empty(other.point.z)
+        active &= ~scene.ray_test(ray, active & ~empty)
         length, depth, perturbed = point.length + other.length, -point.point.z, scene.perturbations
-        sums = perturbed.along(joined(point.sums, other.sums), depth, -direction.z, distance)
+        sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_event(sums, -other.point.z, other.direction, -direction)
         self._receive(point, other, mi.UInt32(0), direction, 2, length, distance, energy, active, sums)
@@ -160,7 +160,8 @@ class WaterConnections:
         pairs = self._pairs(light.photons * np.arange(self._shots.count + 1), stream)
         point, patches = pairs.point, patches.of(pairs.lanes)
         place, photon = light.connectable(pairs.partner)
-        exists = pairs.exists & (photon.weight != 0)
+        received, sent = point.contribution, photon.contribution
+        exists = pairs.exists & (sent.throughput != 0)
         direction, distance, transmittance, pending = self._segment(point, place)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance
         ray = mi.Ray3f(point.point, direction)
@@ -169,15 +170,15 @@ class WaterConnections:
         active = exists & si.is_valid() & (dr.abs(si.t - distance) < tolerance)
         outgoing = si.to_local(-photon.direction)
         bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, active)[0] / dr.abs(dr.dot(si.n, photon.direction))
-        x = self._inverse(point.point, point.direction, direction, active)
+        x = self._inverse_scattering_density(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
         scale = self.rates.on_solids * pairs.partners * _POINTS_PER_CONNECTION
-        energy = scale * point.weight * photon.weight * bsdf * transmittance / total
+        energy = scale * received.throughput * sent.throughput * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length
         depth, perturbed = -point.point.z, self.scene.perturbations
-        sums = perturbed.along(joined(point.sums, photon.sums), depth, -direction.z, distance)
+        sums = perturbed.along(joined(received.sums, sent.sums), depth, -direction.z, distance)
         sums = perturbed.at_event(sums, depth, point.direction, direction)
         sums = perturbed.at_solid(sums, si.shape)
         self._receive(point, photon, solid, direction, 1, length, distance, energy, active, sums, on_solid=True)
@@ -192,7 +193,9 @@ class WaterConnections:
         scattering = self._water.scattering_flight.optical_depth(depth, downward, distance)
         return direction, distance, dr.exp(-absorption), dr.square(distance) * dr.exp(scattering)
 
-    def _inverse(self, point: mi.Point3f, before: mi.Vector3f, after: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def _inverse_scattering_density(
+        self, point: mi.Point3f, before: mi.Vector3f, after: mi.Vector3f, active: mi.Bool
+    ) -> mi.Float:
         """Return 1 / (b p) of scattering events from one direction to another."""
         water = self._water
         mei = dr.zeros(mi.MediumInteraction3f)
@@ -200,7 +203,7 @@ class WaterConnections:
         mei.sh_frame = mi.Frame3f(mei.wi)
         layer = water.flight.layer_at(-point.z)
         value, _ = water.phases.at(layer).eval_pdf(mi.PhaseFunctionContext(), mei, after, active)
-        return dr.rcp(water.scattering_flight.attenuation(layer) * value[0])
+        return dr.rcp(water.scattering_flight.coefficient(layer) * value[0])
 
     def _receive(
         self,
@@ -218,6 +221,6 @@ class WaterConnections:
     ) -> None:
         """Add the energy of connected paths to the record."""
         subpath = SensorSubpath.at(self.record, point, solid)
-        group: Any = self._water.index_layers.group(mi.UInt32(0))
+        group = self._water.index_layers.group(mi.UInt32(0))
         length = length + distance * group
         subpath.add(self.record, light, events, length, energy, active, sums, [direction], on_solid)

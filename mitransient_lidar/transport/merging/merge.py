@@ -34,7 +34,8 @@ def store_points(
     points = segments.points(index)
     bucket = cells.locate(points.point, points.direction, points.unscattered).bucket
     u = segments.random(index, shots)
-    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, classes.labels_orders)
+    kept = classes.labels_orders, len(points.contribution.sums)
+    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, *kept)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     tag = cells.locate(points.point, points.direction, points.unscattered).tag
@@ -42,12 +43,12 @@ def store_points(
     photon = Photon(
         points.direction,
         points.length,
-        points.weight,
+        points.contribution,
         points.mis_partial_sum,
         position,
-        points.edge,
+        points.inverse_density,
+        mi.Bool(False),
         points.label,
-        points.sums,
     )
     photons.fill(photon, tag)
     return photons
@@ -73,16 +74,17 @@ def merge_in_water(
     mei.p, mei.wi = points.point, -points.direction
     mei.sh_frame = mi.Frame3f(mei.wi)
     layer = water.flight.layer_at(-points.point.z)
-    scatterers = [(water.phases.at(layer), water.scattering_flight.attenuation(layer))]
+    scatterers = [(water.phases.at(layer), water.scattering_flight.coefficient(layer))]
     if water.plume is not None:
         scatterers.append((water.plume_phase, water.plume.scattering_at(points.point)))
-    absorption = water.absorption_flight.attenuation(layer)
+    absorption = water.absorption_flight.coefficient(layer)
     group = water.index_layers.group(water.index_layers.at(-points.point.z))
     subpath = SensorSubpath.at(record, points, mi.UInt32(0))
     first, end = photons.find(cell.bucket, mi.Bool(True))
     typical = cells.typical_volume(points.point)
-    weight = points.weight * typical / cell.volume
-    weight_of_unscattered = points.weight * typical / cell.volume_of_unscattered
+    throughput, sums_before = points.contribution.throughput, points.contribution.sums
+    weight = throughput * typical / cell.volume
+    weight_of_unscattered = throughput * typical / cell.volume_of_unscattered
 
     def merge(index: mi.UInt32) -> tuple[mi.UInt32]:
         active = index < end
@@ -91,17 +93,18 @@ def merge_in_water(
         shared, shares = mi.Float(0), []
         for phase, scattering in scatterers:
             value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, -photon.direction, active)
-            own = (typical + connections * (points.edge + photon.edge)) / (scattering * value[0])
+            own = (typical + connections * (points.inverse_density + photon.inverse_density)) / (scattering * value[0])
             shares.append(dr.rcp(own + points.mis_partial_sum + photon.mis_partial_sum))
             shared += shares[-1]
         # The photon continues to the plane through the point normal to its direction, so that times do not blur.
         beyond = dr.dot(points.point, photon.direction) - photon.position
         factor = dr.select(photon.unscattered, weight_of_unscattered, weight)
-        energy = factor * photon.weight * shared * dr.exp(-absorption * beyond)
+        energy = factor * photon.contribution.throughput * shared * dr.exp(-absorption * beyond)
         length = points.length + photon.length + beyond * group
         by_water = None if len(scatterers) == 1 else shares[0] / shared
         depth, light = -points.point.z, -photon.direction
-        sums = perturbations.at_event(joined(points.sums, photon.sums), depth, points.direction, light, by_water)
+        sums = joined(sums_before, photon.contribution.sums)
+        sums = perturbations.at_event(sums, depth, points.direction, light, by_water)
         subpath.add(record, photon, 1, length, energy, active, sums)
         return (index + 1,)
 
@@ -122,7 +125,7 @@ def merge_on_solids(
     against `connections`, a share of all pairs, that make the same path.
     """
 
-    def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
+    def merge(path: RandomWalkPath, si: mi.SurfaceInteraction3f, inverse_density: mi.Float, active: mi.Bool) -> None:
         if photons is None:
             return
         patch, random = patches.locate(si), mi.PCG32(rng)
@@ -130,10 +133,11 @@ def merge_on_solids(
         solid = record.classes.solid(si.shape)
         sums = record.histogram.perturbations.at_solid(path.sums, si.shape)
         events = path.scatterings, path.reversals
-        subpath = SensorSubpath(pixel, *events, solid, path.direction, path.weight, path.surface_length)
-        weight = path.weight * patches.inverse_share(patch, si.shape, random, active & (first < end)) / patch.area
+        subpath = SensorSubpath(pixel, *events, solid, path.direction, path.lost, path.surface_length)
+        covered = patches.inverse_share(patch, si.shape, random, active & (first < end))
+        weight = path.throughput * covered / patch.area
         typical = patches.typical_area(si)
-        connection = connections * edge / dr.abs(dr.dot(si.n, path.direction))
+        connection = connections * inverse_density / dr.abs(dr.dot(si.n, path.direction))
 
         def add(index: mi.UInt32) -> tuple[mi.UInt32]:
             within = index < end
@@ -144,10 +148,12 @@ def merge_on_solids(
             # the true surface, which is divided out.
             cosine = dr.abs(dr.dot(si.n, photon.direction))
             bsdf = si.bsdf().eval(mi.BSDFContext(), si, outgoing, within)[0] / cosine
-            share = typical / dr.fma(connection, photon.edge, typical)
-            energy = weight * photon.weight * bsdf * share
+            connected = dr.select(photon.connectable, connection, 0)
+            share = typical / (connected + typical)
+            energy = weight * photon.contribution.throughput * bsdf * share
             lit, length = within & (bsdf > 0), path.length + photon.length
-            subpath.add(record, photon, 0, length, energy, lit, joined(sums, photon.sums), on_solid=True)
+            total = joined(sums, photon.contribution.sums)
+            subpath.add(record, photon, 0, length, energy, lit, total, on_solid=True)
             return (index + 1,)
 
         dr.while_loop((first,), lambda index: index < end, add, label="merge on solids")
@@ -164,14 +170,14 @@ class SensorSubpath:
     reversals: mi.UInt32
     solid: mi.UInt32
     direction: mi.Vector3f
-    weight: mi.Float
+    lost: mi.Bool
     surface_length: mi.Float
 
     @classmethod
     def at(cls, record: PassRecord, point: SegmentPoints, solid: mi.UInt32) -> SensorSubpath:
         """Return the parts up to points of the receiver's paths."""
         events = record.classes.unpack(point.label)
-        return cls(*events, solid, point.direction, point.weight, point.surface_length)
+        return cls(*events, solid, point.direction, point.contribution.lost, point.surface_length)
 
     def add(
         self,
@@ -188,10 +194,10 @@ class SensorSubpath:
         """Add complete paths to a record, with a number of scattering `events` where the parts meet.
 
         `sums` are those of the perturbations of the complete paths, `on_solid` is whether they have met a solid,
-        `between` are the directions of segments between the receiver's part and the light's. Paths of which one part
-        lies outside the surface mesh count as lost.
+        `between` are the directions of segments between the receiver's part and the light's. Paths with a lost part are
+        lost.
         """
-        outside = (self.weight < 0) | (light.weight < 0)
+        lost = self.lost | light.contribution.lost
         order, reversals = self.scatterings + events, self.reversals
         _, before, reversed_before = record.classes.unpack(light.label)
         order = order + before
@@ -202,6 +208,5 @@ class SensorSubpath:
                 reversals = reversals + dr.select(here * following < 0, mi.UInt32(1), 0)
             reversals = reversals + reversed_before
         echo = Echo(self.surface_length, on_solid)
-        inside = active & ~outside
-        record.receive(self.pixel, order, reversals, self.solid, length, dr.abs(energy), inside, echo, sums)
-        record.lose(dr.abs(energy), active & outside)
+        record.receive(self.pixel, order, reversals, self.solid, length, energy, active & ~lost, echo, sums)
+        record.lose(energy, active & lost)

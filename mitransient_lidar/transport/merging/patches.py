@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
-from mitransient_lidar.transport.merging.rings import BeamRings, Sector
+from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_index
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.scene import LidarScene
@@ -40,7 +40,7 @@ _MOST_COVERAGE_SAMPLES = 1000
 
 
 @dataclass(frozen=True)
-class Patch:
+class SolidPatch:
     """Piece of a solid's surface.
 
     Attributes
@@ -67,7 +67,7 @@ class Patch:
     area: mi.Float
     corner: mi.Point3f
     height: mi.Float
-    sector: Sector
+    sector: RingSector
     axis: mi.UInt32
     faces: mi.Float
 
@@ -163,7 +163,7 @@ class SolidPatches:
         patches._start = lanes.shot << (2 * self._side_bits)
         return patches
 
-    def locate(self, si: mi.SurfaceInteraction3f) -> Patch:
+    def locate(self, si: mi.SurfaceInteraction3f) -> SolidPatch:
         """Return the patches of points on solids."""
         axis, normal = self._projection(si)
         along_x, along_y = axis == 0, axis == 1
@@ -184,7 +184,7 @@ class SolidPatches:
         height = _LEVEL_WIDTHS * dr.select(level_patch, sector.outer - sector.inner, self.width)
         start = dr.floor(w / height + self._shift.x)
         level = dr.select(self._is_bounded(si.shape), mi.UInt32(mi.Int32(start) + ORIGIN), 0)
-        return Patch(
+        return SolidPatch(
             bucket=self._start + (low_bits(i, bits) | (low_bits(j, bits) << bits)),
             tag=low_bits(i >> bits, 6)
             | (low_bits(j >> bits, 6) << 6)
@@ -231,7 +231,7 @@ class SolidPatches:
         """Return whether a solid may end inside the region."""
         return is_one_of(shape, self._bounded)
 
-    def inverse_share(self, patch: Patch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
+    def inverse_share(self, patch: SolidPatch, shape: mi.ShapePtr, rng: mi.PCG32, active: mi.Bool) -> mi.Float:
         """Return an estimate of 1 / (covered share of the patch's square), for patches cut by edges.
 
         The mean of the number of random points in the square up to the first one on the patch (Booth 2007,

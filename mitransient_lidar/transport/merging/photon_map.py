@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.merging.patches import Patch
+from mitransient_lidar.transport.contribution import Contribution, split_flag, with_flag
+from mitransient_lidar.transport.merging.patches import SolidPatch
 from mitransient_lidar.transport.opaque import opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.perturbations import Perturbations, Sums, SumStore
+from mitransient_lidar.transport.perturbations import Perturbations, SumStore
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes
 
@@ -29,33 +30,79 @@ class Photon:
         Unit direction of propagation.
     length
         Optical length of its path from the laser [m].
-    weight
-        Energy [J], in the water times track length [J m]; negative for paths outside the surface mesh.
+    contribution
+        What its path carries: energy [J], in the water times track length [J m].
     mis_partial_sum
         As in `RandomWalkPath`.
     position
         Scalar product of position and direction [m].
-    edge
-        As in `SegmentPoints`; on solids 1 for light that can be connected, else 0.
+    inverse_density
+        As in `SegmentPoints`; 0 on solids.
+    connectable
+        Whether it can be connected from elsewhere, on solids.
     label
         Scattering events and reversals of its path (`PathClasses.pack`).
-    sums
-        Sums of the perturbations of its path.
     """
 
     direction: mi.Vector3f
     length: mi.Float
-    weight: mi.Float
+    contribution: Contribution
     mis_partial_sum: mi.Float
     position: mi.Float
-    edge: mi.Float
+    inverse_density: mi.Float
+    connectable: mi.Bool
     label: mi.UInt32
-    sums: Sums
 
     @property
     def unscattered(self) -> mi.Bool:
         """Whether no event in the water has scattered the path: its sum has no terms."""
         return self.mis_partial_sum == 0
+
+
+class _PhotonStore:
+    """Stored photons.
+
+    Each is two packets of four numbers that are read together, with flags in signs (`with_flag`), sums of
+    perturbations, and a label if these are kept:
+
+    ==============  ==============================================================================================
+    ``_direction``  x and y of the direction, ``inverse_density`` with the flag ``connectable``, length
+    ``_factors``    `Contribution.packed`, ``mis_partial_sum`` with the flag of a direction upwards, tag, position
+    ==============  ==============================================================================================
+    """
+
+    def __init__(self, size: int, labelled: bool, perturbations: int) -> None:
+        # Two arrays: a second write to the same one would compute all photons again.
+        self._direction, self._factors = (dr.empty(mi.Float, 4 * size) for _ in range(2))
+        self._label = dr.zeros(mi.UInt32, size) if labelled else None
+        self._sums = SumStore(size, perturbations)
+
+    def write(self, photon: Photon, tag: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
+        """Store photons and their tags, and compute what is stored."""
+        direction, carried = photon.direction, photon.contribution
+        inverse_density = with_flag(photon.inverse_density, photon.connectable)
+        summed = with_flag(photon.mis_partial_sum, direction.z > 0)
+        where = mi.Vector4f(direction.x, direction.y, inverse_density, photon.length)
+        factors = mi.Vector4f(carried.packed(), summed, dr.reinterpret_array(mi.Float, tag), photon.position)
+        dr.scatter(self._direction, where, place, active)
+        dr.scatter(self._factors, factors, place, active)
+        if self._label is not None:
+            dr.scatter(self._label, photon.label, place, active)
+        self._sums.write(carried.sums, place, active)
+        dr.eval(self._direction, self._factors, self._label, self._sums.packets)
+
+    def read(self, place: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
+        """Return photons and their tags."""
+        x, y, inverse_density, length = dr.gather(mi.Vector4f, self._direction, place, active)
+        packed, summed, tag, position = dr.gather(mi.Vector4f, self._factors, place, active)
+        inverse_density, connectable = split_flag(inverse_density)
+        mis_partial_sum, up = split_flag(summed)
+        z = dr.sqrt(dr.maximum(1 - x * x - y * y, 0))
+        direction = mi.Vector3f(x, y, dr.select(up, z, -z))
+        label = mi.UInt32(0) if self._label is None else dr.gather(mi.UInt32, self._label, place, active)
+        carried = Contribution.unpacked(packed, self._sums.read(place, active))
+        photon = Photon(direction, length, carried, mis_partial_sum, position, inverse_density, connectable, label)
+        return photon, dr.reinterpret_array(mi.UInt32, tag)
 
 
 class PhotonMap:
@@ -75,9 +122,13 @@ class PhotonMap:
         Expected number of photons that are kept of a bucket with more.
     labelled
         Whether labels are kept.
+    perturbations
+        Number of sums that are kept.
     """
 
-    def __init__(self, buckets: int, bucket: mi.UInt32, u: mi.Float, most: int, labelled: bool) -> None:
+    def __init__(
+        self, buckets: int, bucket: mi.UInt32, u: mi.Float, most: int, labelled: bool, perturbations: int
+    ) -> None:
         counts = dr.zeros(mi.UInt32, buckets)
         dr.scatter_add(counts, mi.UInt32(1), bucket)
         self._bucket, self._most = bucket, most
@@ -89,28 +140,13 @@ class PhotonMap:
         dr.eval(self._found, self._rank, self._kept, self._counts)
         self._end = dr.cumsum(self._counts)
         self.count = int(self._end[buckets - 1])
-        # Two arrays: a second write to the same one would compute all photons again.
-        self._course, self._rest = mi.Float(), mi.Float()
-        self._label = dr.zeros(mi.UInt32, self.count) if labelled else None
-        self._sums = SumStore(self.count, 0)
+        self._photons = _PhotonStore(self.count, labelled, perturbations)
 
     def fill(self, photon: Photon, tag: mi.UInt32) -> None:
         """Store the photons in the order of their buckets, with their cells' tags."""
         place = dr.gather(mi.UInt32, self._end, self._bucket) - 1 - self._rank
-        weight = photon.weight * self._scale()
-        self._course, self._rest = (dr.empty(mi.Float, 4 * self.count) for _ in range(2))
-        # The sign bit of the sum is that of the direction's z component.
-        up = dr.select(photon.direction.z > 0, mi.UInt32(1 << 31), 0)
-        summed = dr.reinterpret_array(mi.Float, dr.reinterpret_array(mi.UInt32, photon.mis_partial_sum) | up)
-        course = mi.Vector4f(photon.direction.x, photon.direction.y, photon.edge, photon.length)
-        rest = mi.Vector4f(weight, summed, dr.reinterpret_array(mi.Float, tag), photon.position)
-        dr.scatter(self._course, course, place, self._kept)
-        dr.scatter(self._rest, rest, place, self._kept)
-        if self._label is not None:
-            dr.scatter(self._label, photon.label, place, self._kept)
-        self._sums = SumStore(self.count, len(photon.sums))
-        self._sums.write(photon.sums, place, self._kept)
-        dr.eval(self._course, self._rest, self._end, self._label, self._sums.packets)
+        scaled = replace(photon, contribution=photon.contribution.scaled(self._scale()))
+        self._photons.write(scaled, tag, place, self._kept)
         self._bucket = self._found = self._rank = self._counts = mi.UInt32()
         self._kept = mi.Bool()
 
@@ -131,15 +167,7 @@ class PhotonMap:
 
     def photon(self, index: mi.UInt32, active: mi.Bool) -> tuple[Photon, mi.UInt32]:
         """Return photons and their tags."""
-        x, y, edge, length = dr.gather(mi.Vector4f, self._course, index, active)
-        weight, summed, tag, position = dr.gather(mi.Vector4f, self._rest, index, active)
-        up = (dr.reinterpret_array(mi.UInt32, summed) >> 31) > 0
-        z = dr.sqrt(dr.maximum(1 - x * x - y * y, 0))
-        z = dr.select(up, z, -z)
-        label = mi.UInt32(0) if self._label is None else dr.gather(mi.UInt32, self._label, index, active)
-        sums = self._sums.read(index, active)
-        photon = Photon(mi.Vector3f(x, y, z), length, weight, dr.abs(summed), position, edge, label, sums)
-        return photon, dr.reinterpret_array(mi.UInt32, tag)
+        return self._photons.read(index, active)
 
 
 class PhotonBuffer:
@@ -159,15 +187,19 @@ class PhotonBuffer:
         self._patch = dr.empty(mi.UInt32, 2 * capacity)
         self._lane = dr.empty(mi.UInt32, capacity)
         self._label = dr.empty(mi.UInt32, capacity if classes.labels_orders else 1)
+        # Of each hit: direction and length; `Contribution.packed` and whether it is connectable.
         self._record = dr.empty(mi.Float, 4 * capacity)
-        self._weight = dr.empty(mi.Float, 2 * capacity)
-        self._place = dr.zeros(mi.Float, 4 * photons)
+        self._carried = dr.empty(mi.Float, 2 * capacity)
+        # Of the connectable hit of each path: direction and length; `Contribution.packed` and place.
         self._connectable = dr.zeros(mi.Float, 4 * photons)
+        self._place = dr.zeros(mi.Float, 4 * photons)
         self._connectable_label = dr.zeros(mi.UInt32, photons if classes.labels_orders else 1)
         self._sums = SumStore(capacity, perturbations.count)
         self._connectable_sums = SumStore(photons, perturbations.count)
 
-    def add(self, path: RandomWalkPath, place: mi.Point3f, patch: Patch, active: mi.Bool, connectable: mi.Bool) -> None:
+    def add(
+        self, path: RandomWalkPath, place: mi.Point3f, patch: SolidPatch, active: mi.Bool, connectable: mi.Bool
+    ) -> None:
         """Store light that has met patches of solids at places [m]; at most one hit of a path is `connectable`."""
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), active)
         keep = active & (slot < self._capacity)
@@ -175,9 +207,10 @@ class PhotonBuffer:
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
         dr.scatter(self._lane, path.lane, slot, keep)
         dr.scatter(self._record, where, slot, keep)
-        dr.scatter(self._weight, mi.Vector2f(path.weight, dr.select(connectable, mi.Float(1), 0)), slot, keep)
+        carried = path.contribution.packed()
+        dr.scatter(self._carried, mi.Vector2f(carried, dr.select(connectable, mi.Float(1), 0)), slot, keep)
         dr.scatter(self._connectable, where, path.lane, connectable)
-        dr.scatter(self._place, mi.Vector4f(path.weight, place.x, place.y, place.z), path.lane, connectable)
+        dr.scatter(self._place, mi.Vector4f(carried, place.x, place.y, place.z), path.lane, connectable)
         if self._classes.labels_orders:
             label = self._classes.pack(mi.UInt32(0), path.scatterings, path.reversals)
             dr.scatter(self._label, label, slot, keep)
@@ -187,7 +220,7 @@ class PhotonBuffer:
 
     def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, or None, and their number, stored or not."""
-        dr.eval(self._stored, self._patch, self._lane, self._record, self._weight, self._label)
+        dr.eval(self._stored, self._patch, self._lane, self._record, self._carried, self._label)
         dr.eval(self._connectable, self._place, self._connectable_label)
         dr.eval(self._sums.packets, self._connectable_sums.packets)
         wanted = int(self._stored[0])
@@ -200,18 +233,20 @@ class PhotonBuffer:
         key = dr.reinterpret_array(mi.UInt32, x) ^ dr.reinterpret_array(mi.UInt32, length)
         lanes = Lanes.of_paths(dr.gather(mi.UInt32, self._lane, index), self._shots, self.photons)
         u = mi.sample_tea_float32(lanes.number, key)
-        photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, self._classes.labels_orders)
+        carried, connectable = dr.gather(mi.Vector2f, self._carried, index)
+        contribution, zero = Contribution.unpacked(carried, self._sums.read(index)), mi.Float(0)
+        kept = self._classes.labels_orders, len(contribution.sums)
+        photons = PhotonMap(buckets, bucket, u, PHOTONS_OF_PATCH, *kept)
         label = dr.gather(mi.UInt32, self._label, index) if self._classes.labels_orders else mi.UInt32(0)
-        weight, first = dr.gather(mi.Vector2f, self._weight, index)
-        sums, zero = self._sums.read(index), mi.Float(0)
-        photons.fill(Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, first, label, sums), tag)
+        hit = Photon(mi.Vector3f(x, y, z), length, contribution, zero, zero, zero, connectable > 0, label)
+        photons.fill(hit, tag)
         return photons, wanted
 
     def connectable(self, index: mi.UInt32) -> tuple[mi.Point3f, Photon]:
-        """Return the hits of paths by number that can be connected [m], and their photons, of weight 0 for none."""
+        """Return the hits of paths by number that can be connected [m], and their photons, of throughput 0 for none."""
         x, y, z, length = dr.gather(mi.Vector4f, self._connectable, index)
-        weight, px, py, pz = dr.gather(mi.Vector4f, self._place, index)
+        carried, px, py, pz = dr.gather(mi.Vector4f, self._place, index)
         label = dr.gather(mi.UInt32, self._connectable_label, index) if self._classes.labels_orders else mi.UInt32(0)
-        sums, zero = self._connectable_sums.read(index), mi.Float(0)
-        photon = Photon(mi.Vector3f(x, y, z), length, weight, zero, zero, mi.Float(1), label, sums)
+        contribution, zero = Contribution.unpacked(carried, self._connectable_sums.read(index)), mi.Float(0)
+        photon = Photon(mi.Vector3f(x, y, z), length, contribution, zero, zero, zero, mi.Bool(True), label)
         return mi.Point3f(px, py, pz), photon

@@ -12,6 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
@@ -76,8 +77,9 @@ class Region:
 
     def below(self, scene: LidarScene, depth: float) -> Region:
         """Return the region that holds light and view down to a depth [m], along their axes in level water."""
-        sines = [pose.axis[:2] / scene.refractive_index for pose in (scene.transmitter.pose, scene.receiver.pose)]
-        shifts = [np.zeros(2), *(depth * sine / np.sqrt(1 - sine @ sine) for sine in sines)]
+        poses = scene.transmitter.pose, scene.receiver.pose
+        axes = [refract_level(pose.axis, scene.refractive_index) for pose in poses]
+        shifts = [np.zeros(2), *(depth * axis[:2] / -axis[2] for axis in axes)]
         low, high = np.array(self.low) + np.min(shifts, axis=0), np.array(self.high) + np.max(shifts, axis=0)
         return Region.between(low, high, _SPREAD_PER_DEPTH * depth)
 
@@ -92,8 +94,7 @@ class Region:
         """Return the mean distance in the water along the axis to a solid, or to the depth of the record's end [m]."""
         transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
         spot = transmitter.ground_point()
-        sine = transmitter.axis[:2] / scene.refractive_index
-        down = np.append(sine, -np.sqrt(1 - sine @ sine))
+        down = refract_level(transmitter.axis, scene.refractive_index)
         air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
         longest = (scene.axis.path_end - air) / (2 * scene.group_index)
         # From the mean sea level: below the deepest trough, which lies anywhere, may be below a shallow bottom here.

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.merging.cells import MOST_BUCKET_BITS, RefractedProfile, WaterCells, WaterGrid
 from mitransient_lidar.transport.merging.connect import ConnectionRates, WaterConnections
@@ -213,8 +214,7 @@ class MergingLayout:
         width = options.cell_size or min(widths)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
-        sine = np.hypot(*pose.axis[:2]) / scene.refractive_index
-        depth = reach * float(np.sqrt(1 - sine**2))
+        depth = reach * -float(refract_level(pose.axis, scene.refractive_index)[2])
         heights = SurfaceHeights(scene, region, depth)
         beam = scene.transmitter.profile
         squares = np.square([np.cos(beam.rotation), np.sin(beam.rotation)])
@@ -338,7 +338,9 @@ class MergingRenderer(PassRenderer):
         path.sums = scene.perturbations.at_laser(path.sums, scene.transmitter.profile, angles.x, angles.y)
         walk = RandomWalk(scene, mi.TransportMode.Importance, scene.receiver_pose, scene.axis.path_end, rates.of(lanes))
 
-        def store(path: RandomWalkPath, si: mi.SurfaceInteraction3f, edge: mi.Float, active: mi.Bool) -> None:
+        def store(
+            path: RandomWalkPath, si: mi.SurfaceInteraction3f, inverse_density: mi.Float, active: mi.Bool
+        ) -> None:
             # Light may pass a null interface and meet another solid: only one hit of a path can be connected.
             once = ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
             hits.add(path, si.p, patches.locate(si), active, active & once & path.before_first_solid)

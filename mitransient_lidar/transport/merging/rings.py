@@ -30,7 +30,7 @@ CORE_PER_SPREAD = 2.0
 
 
 @dataclass(frozen=True)
-class Sector:
+class RingSector:
     """Sector of a ring.
 
     Attributes
@@ -148,7 +148,9 @@ class BeamRings:
         x = self._spot[0] + self._entry.x + self.shear[0] * depth + ax * along - ay * across
         return x, self._spot[1] + self._entry.y + self.shear[1] * depth + ay * along + ax * across
 
-    def sector(self, along: mi.Float, across: mi.Float, core: mi.Float, width: mi.Float, shift: mi.Point2f) -> Sector:
+    def sector(
+        self, along: mi.Float, across: mi.Float, core: mi.Float, width: mi.Float, shift: mi.Point2f
+    ) -> RingSector:
         """Return the sectors at offsets, of rings of a `width` over the core radius, shifted by random numbers."""
         radius = dr.sqrt(along * along + across * across)
         ring = dr.floor(dr.asinh(radius / core) / width + shift.x)
@@ -157,13 +159,13 @@ class BeamRings:
         count = dr.maximum(dr.round(dr.pi * (outer + inner) / (outer - inner)), 1)
         turn = dr.atan2(across, along) * dr.inv_two_pi + shift.y
         number = dr.minimum(dr.floor((turn - dr.floor(turn)) * count), count - 1)
-        return Sector(mi.UInt32(ring), mi.UInt32(number), inner, outer, dr.rcp(count))
+        return RingSector(mi.UInt32(ring), mi.UInt32(number), inner, outer, dr.rcp(count))
 
-    def area(self, sector: Sector) -> mi.Float:
+    def area(self, sector: RingSector) -> mi.Float:
         """Return the areas of sectors on the level sea [m^2]."""
         return dr.pi * (sector.outer - sector.inner) * (sector.outer + sector.inner) * sector.share / self.cosine
 
-    def draw(self, sector: Sector, shift: mi.Point2f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
+    def draw(self, sector: RingSector, shift: mi.Point2f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Map uniform numbers to offsets, uniform in sectors."""
         radius = dr.sqrt(dr.lerp(dr.square(sector.inner), dr.square(sector.outer), u))
         sin, cos = dr.sincos(dr.two_pi * ((mi.Float(sector.number) + v) * sector.share - shift.y))

@@ -8,9 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
-from mitransient_lidar.transport.perturbations import Sums, SumStore
+from mitransient_lidar.transport.perturbations import SumStore
 from mitransient_lidar.transport.random_walk import RandomWalkPath
 from mitransient_lidar.transport.rng import Lanes, Shots
 from mitransient_lidar.transport.scene import LidarScene
@@ -31,36 +32,99 @@ class SegmentPoints:
         Unit direction of the segment.
     length
         Optical length of the path up to the point [m].
-    weight
-        Throughput of the path up to the point times the track length of the point [m]; negative for paths outside the
-        surface mesh.
+    contribution
+        What the path carries up to the point, with its throughput times the track length of the point [m].
     mis_partial_sum
         As in `RandomWalkPath`.
-    edge
-        For the last scattering event, 1 / (b p) times the squared distance from it over the transmittance of scattering
-        on the way; 0 if the segment starts elsewhere.
+    inverse_density
+        Reciprocal of the density, per volume, with which the last scattering event sends paths to the point [m^3]:
+        1 / (b p) times the squared distance from it over the transmittance of scattering on the way; 0 if the segment
+        starts elsewhere.
     label
         Label of the path, with its scattering events and reversals so far (`PathClasses.pack`).
     surface_length
         As of the path [m].
-    sums
-        Sums of the perturbations of the path up to the point.
     """
 
     point: mi.Point3f
     direction: mi.Vector3f
     length: mi.Float
-    weight: mi.Float
+    contribution: Contribution
     mis_partial_sum: mi.Float
-    edge: mi.Float
+    inverse_density: mi.Float
     label: mi.UInt32
     surface_length: mi.Float
-    sums: Sums
 
     @property
     def unscattered(self) -> mi.Bool:
         """Whether no event in the water has scattered the path: its sum has no terms."""
         return self.mis_partial_sum == 0
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """A stored segment: its start [m], and the path's properties there as in `RandomWalkPath`."""
+
+    start: mi.Point3f
+    offset: mi.Float
+    direction: mi.Vector3f
+    length: mi.Float
+    contribution: Contribution
+    mis_partial_sum: mi.Float
+    inverse_scattering_density: mi.Float
+    surface_length: mi.Float
+    label: mi.UInt32
+
+
+class _SegmentStore:
+    """Stored segments.
+
+    Each is three packets of four numbers that are read together, a label, and sums of perturbations:
+
+    ==============  ==============================================================================================
+    ``_start``      x, y and z of the start, offset of the first point
+    ``_direction``  x, y and z of the direction, length
+    ``_factors``    `Contribution.packed`, ``mis_partial_sum``, ``inverse_scattering_density``, ``surface_length``
+    ==============  ==============================================================================================
+    """
+
+    def __init__(self, size: int, perturbations: int) -> None:
+        self._start, self._direction, self._factors = (dr.empty(mi.Float, 4 * size) for _ in range(3))
+        self._label = dr.empty(mi.UInt32, size)
+        self._sums = SumStore(size, perturbations)
+
+    def write(self, path: RandomWalkPath, label: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
+        """Store the next segment of each path."""
+        start, direction, carried = path.point, path.direction, path.contribution
+        factors = carried.packed(), path.mis_partial_sum, path.inverse_scattering_density, path.surface_length
+        dr.scatter(self._label, label, place, active)
+        dr.scatter(self._start, mi.Vector4f(start.x, start.y, start.z, path.offset), place, active)
+        dr.scatter(self._direction, mi.Vector4f(direction.x, direction.y, direction.z, path.length), place, active)
+        dr.scatter(self._factors, mi.Vector4f(*factors), place, active)
+        self._sums.write(carried.sums, place, active)
+
+    def read(self, place: mi.UInt32) -> _Segment:
+        """Return segments."""
+        x, y, z, offset = dr.gather(mi.Vector4f, self._start, place)
+        dx, dy, dz, length = dr.gather(mi.Vector4f, self._direction, place)
+        packed, mis_partial_sum, inverse, surface_length = dr.gather(mi.Vector4f, self._factors, place)
+        carried = Contribution.unpacked(packed, self._sums.read(place))
+        label = dr.gather(mi.UInt32, self._label, place)
+        return _Segment(
+            mi.Point3f(x, y, z),
+            offset,
+            mi.Vector3f(dx, dy, dz),
+            length,
+            carried,
+            mis_partial_sum,
+            inverse,
+            surface_length,
+            label,
+        )
+
+    def evaluate(self) -> None:
+        """Compute what is stored."""
+        dr.eval(self._label, self._start, self._direction, self._factors, self._sums.packets)
 
 
 class SegmentBuffer:
@@ -81,11 +145,7 @@ class SegmentBuffer:
         self._stored = dr.zeros(mi.UInt32, 1)
         self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)
-        self._label = dr.empty(mi.UInt32, capacity)
-        self._start = dr.empty(mi.Float, 4 * capacity)
-        self._direction = dr.empty(mi.Float, 4 * capacity)
-        self._weight = dr.empty(mi.Float, 4 * capacity)
-        self._sums = SumStore(capacity, self._perturbations.count)
+        self._segments = _SegmentStore(capacity, self._perturbations.count)
         self._first = mi.UInt32()
         self._slot = mi.UInt32()
 
@@ -96,21 +156,15 @@ class SegmentBuffer:
         slot = dr.scatter_inc(self._stored, mi.UInt32(0), number > 0)
         keep = (number > 0) & (slot < self._capacity)
         dr.scatter(self._place, mi.Point2u(path.lane, path.points), slot, keep)
-        dr.scatter(self._label, self._classes.pack(label, path.scatterings, path.reversals), slot, keep)
-        dr.scatter(self._start, mi.Vector4f(path.point.x, path.point.y, path.point.z, path.offset), slot, keep)
-        direction = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
-        dr.scatter(self._direction, direction, slot, keep)
-        weight = mi.Vector4f(path.weight, path.mis_partial_sum, path.inverse, path.surface_length)
-        dr.scatter(self._weight, weight, slot, keep)
-        self._sums.write(path.sums, slot, keep)
+        self._segments.write(path, self._classes.pack(label, path.scatterings, path.reversals), slot, keep)
         path.points += number
         dr.scatter(self._of_path, path.points, path.lane, number > 0)
         return dr.select(active, dr.fma(mi.Float(number), self.spacing, path.offset - length), path.offset)
 
     def finalize(self) -> tuple[int, int]:
         """Assign numbers to the points; return their number and that of the segments, stored or not."""
-        dr.eval(self._stored, self._of_path, self._place, self._label, self._start, self._direction, self._weight)
-        dr.eval(self._sums.packets)
+        dr.eval(self._stored, self._of_path, self._place)
+        self._segments.evaluate()
         end = dr.cumsum(self._of_path)
         last = dr.arange(mi.UInt32, self._shots) * self._paths + (self._paths - 1)
         self.first_points[1:] = np.array(dr.gather(mi.UInt32, end, last))
@@ -144,26 +198,25 @@ class SegmentBuffer:
     def points(self, index: mi.UInt32) -> SegmentPoints:
         """Return points by number."""
         first = dr.gather(mi.UInt32, self._first, index)
-        segment = dr.gather(mi.UInt32, self._slot, first)
-        x, y, z, offset = dr.gather(mi.Vector4f, self._start, segment)
-        dx, dy, dz, length = dr.gather(mi.Vector4f, self._direction, segment)
-        throughput, mis_partial_sum, inverse, surface_length = dr.gather(mi.Vector4f, self._weight, segment)
-        along = dr.fma(mi.Float(index - first), self.spacing, offset)
-        direction = mi.Vector3f(dx, dy, dz)
-        absorption = self._water.absorption_flight.optical_depth(-z, -dz, along)
-        scattering = self._water.scattering_flight.optical_depth(-z, -dz, along)
-        edge = dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0)
+        segment = self._segments.read(dr.gather(mi.UInt32, self._slot, first))
+        along = dr.fma(mi.Float(index - first), self.spacing, segment.offset)
+        depth, downward = -segment.start.z, -segment.direction.z
+        absorption = self._water.absorption_flight.optical_depth(depth, downward, along)
+        scattering = self._water.scattering_flight.optical_depth(depth, downward, along)
+        inverse, carried = segment.inverse_scattering_density, segment.contribution
+        inverse_density = dr.select(inverse > 0, inverse * dr.square(along) * dr.exp(scattering), 0)
         # A segment lies in one index layer, and may begin on its boundary.
         layers = self._water.index_layers
-        group = layers.group(layers.at(-z - 0.5 * dz * along))
+        group = layers.group(layers.at(depth + 0.5 * downward * along))
+        throughput = carried.throughput * dr.exp(-absorption) * self.spacing
+        sums = self._perturbations.along(carried.sums, depth, downward, along)
         return SegmentPoints(
-            mi.Point3f(x, y, z) + direction * along,
-            direction,
-            length + along * group,
-            throughput * dr.exp(-absorption) * self.spacing,
-            mis_partial_sum,
-            edge,
-            dr.gather(mi.UInt32, self._label, segment),
-            surface_length,
-            self._perturbations.along(self._sums.read(segment), -z, -dz, along),
+            segment.start + segment.direction * along,
+            segment.direction,
+            segment.length + along * group,
+            Contribution(throughput, carried.lost, sums),
+            segment.mis_partial_sum,
+            inverse_density,
+            segment.label,
+            segment.surface_length,
         )

@@ -12,7 +12,6 @@ from scipy.special import erf
 import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.publication import figures as publication
-from mitransient_lidar.plots.publication.waves import refracted
 from mitransient_lidar.rendering.sea_map import SeaMap
 from mitransient_lidar.studies.publication import echoes, layers, measures, targets
 from mitransient_lidar.studies.publication.measures import Series, Waveform
@@ -134,16 +133,6 @@ def test_table_of_statements(tmp_path):
     assert tuple(header) == COLUMNS
     expected = ["fig10", "a, b", "q", "4 to 5", "4.2", "0.02", "partly", "0.25"]
     assert row == [*expected, "place; holds at 25 % of 8 places", "facets"]
-
-
-def test_refraction_of_a_ray_at_a_slope():
-    """Sines of the angles to the normal are in the ratio of the index, and the ray stays in their plane."""
-    down = np.array([math.sin(0.35), 0.1, -1.0])
-    down /= np.linalg.norm(down)
-    normal = np.array([-0.2, 0.1, 1.0])
-    ray, unit = refracted(down, normal, 1.34), normal / np.linalg.norm(normal)
-    assert np.linalg.norm(ray) == pytest.approx(1)
-    np.testing.assert_allclose(np.cross(down, unit), 1.34 * np.cross(ray, unit), atol=1e-12)
 
 
 def test_names_are_checked(tmp_path):

@@ -36,9 +36,9 @@ def test_seabed_and_bubbles_are_made_without_the_loader(monkeypatch):
 def test_all_loading_is_serial(monkeypatch):
     """Mitsuba's own plugins are found in one thread."""
     asked = []
-    load_string = mi.load_string
+    instantiate = mi.parser.instantiate
     monkeypatch.setattr(
-        mi, "load_string", lambda *texts, **options: asked.append(options) or load_string(*texts, **options)
+        mi.parser, "instantiate", lambda config, parsed: asked.append(config.parallel) or instantiate(config, parsed)
     )
     load("table1", {"spectrum": "flat"})
-    assert [options["parallel"] for options in asked] == [False]
+    assert asked == [False]

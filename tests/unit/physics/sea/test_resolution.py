@@ -7,7 +7,7 @@ import pytest
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
-from mitransient_lidar.physics.sea.resolution import Instrument, Resolution
+from mitransient_lidar.physics.sea.resolution import Footprint, Resolution
 from mitransient_lidar.physics.sea.sea_surface import SeaSurface
 
 TILT = math.radians(20)
@@ -17,13 +17,13 @@ def lidar(altitude=200.0, divergence=10e-3, field_of_view=30e-3, pixel=13e-3, ai
     """Return a laser and a receiver of one pose."""
     pose = aim, altitude, off_nadir
     return [
-        Instrument.laser(*pose, (0.5 * divergence, 0.5 * divergence)),
-        Instrument.receiver(*pose, field_of_view, pixel),
+        Footprint.laser(*pose, (0.5 * divergence, 0.5 * divergence)),
+        Footprint.receiver(*pose, field_of_view, pixel),
     ]
 
 
-def choose(instruments, **parameters):
-    return Resolution.read(lambda name, default: parameters.get(name, default), instruments)
+def choose(footprints, **parameters):
+    return Resolution.read(lambda name, default: parameters.get(name, default), footprints)
 
 
 @pytest.mark.parametrize("altitude", [5.0, 200.0, 3000.0, 5e5])
@@ -71,10 +71,10 @@ def test_large_patches_have_fewer_cells_in_a_wave():
 
 
 def test_the_waves_do_not_depend_on_the_cells():
-    instruments = lidar(field_of_view=0.01, pixel=1e-4)
-    automatic = choose(instruments)
+    footprints = lidar(field_of_view=0.01, pixel=1e-4)
+    automatic = choose(footprints)
     for cell in (0.01, 0.3):
-        other = choose(instruments, cell_size=cell)
+        other = choose(footprints, cell_size=cell)
         assert (other.shortest_wave, other.beam_wave) == (automatic.shortest_wave, automatic.beam_wave)
 
 

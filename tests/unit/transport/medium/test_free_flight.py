@@ -132,5 +132,5 @@ def test_a_layer_owns_its_upper_edge_and_the_first_one_the_crests(name):
     expected = np.concatenate([np.arange(column.count), np.arange(column.count - 1), [0, column.count - 1]])
     layer = flight.layer_at(mi.Float(depths))
     np.testing.assert_array_equal(np.broadcast_to(np.array(layer), expected.shape), expected)
-    np.testing.assert_allclose(np.array(flight.attenuation(layer)), column.attenuation[expected[: len(layer)]])
+    np.testing.assert_allclose(np.array(flight.coefficient(layer)), column.attenuation[expected[: len(layer)]])
     np.testing.assert_allclose(np.array(flight.albedo(layer)), column.albedo[expected[: len(layer)]], rtol=1e-6)
