@@ -82,6 +82,11 @@ class Path:
         """Return the next segment as a ray."""
         return mi.Ray3f(self.point, self.direction)
 
+    def optical_length(self, distance: mi.Float, index_layers: IndexLayers | None) -> mi.Float:
+        """Return the optical length of a distance along the next segment [m]."""
+        group = mi.Float(1) if index_layers is None else index_layers.group(self.index_layer)
+        return distance * dr.select(self.in_water, group, 1)
+
     @staticmethod
     def initial(
         scene: WaterScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, active: mi.Bool
@@ -113,8 +118,6 @@ def advance(path: Path, index_layers: IndexLayers | None, distance: mi.Float, po
     On surfaces `point`, the intersection, is more accurate than distance times direction. Without water there are no
     index layers.
     """
-    group = mi.Float(1) if index_layers is None else index_layers.group(path.index_layer)
-    length = distance * dr.select(path.in_water, group, 1)
-    path.length = dr.select(path.active, path.length + length, path.length)
+    path.length += dr.select(path.active, path.optical_length(distance, index_layers), 0)
     path.point = dr.select(path.active, point, path.point)
     path.at_start &= ~path.active

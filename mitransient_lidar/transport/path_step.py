@@ -143,7 +143,11 @@ class PathStep:
         path.active &= path.throughput > 0
         path.before_first_solid &= ~(vertex.on_solid & ~passes)
         path.in_water = dr.select(vertex.at_sea, bs.wo.z < 0, path.in_water)
-        path.point = dr.select(vertex.on_surface, self.scene.spawn_ray(vertex.si, direction).o, path.point)
+        # The next segment begins beside the surface, 0.1 mm or more beyond the vertex.
+        start = self.scene.spawn_ray(vertex.si, direction).o
+        skipped = path.optical_length(dr.dot(start - vertex.si.p, direction), self.scene.index_layers)
+        path.length += dr.select(vertex.on_surface & path.active, skipped, 0)
+        path.point = dr.select(vertex.on_surface, start, path.point)
         before = mi.Float(path.direction.z)
         turned = path.active & (vertex.on_surface | vertex.scattered)
         path.direction = dr.select(turned, direction, path.direction)

@@ -306,7 +306,9 @@ class PathTracer:
         crossing = dr.select(met, above, si)
         direct = vertex.at_sea | (vertex.on_solid & ~vertex.in_water)
         radiance, air_length = light.connect(crossing, emitter, met | direct)
-        water_length = dr.select(met, top.optical_length + above.t * opaque(scene.group_index), 0)
+        skipped = path.optical_length(dr.dot(ray.o - path.point, up), scene.index_layers)
+        in_water = skipped + top.optical_length + above.t * opaque(scene.group_index)
+        water_length = dr.select(met, in_water, 0)
         energy = light.weight * path.throughput * factor * radiance
         if self.options.complement_only:
             energy = dr.select(self._merged(path, vertex, first), 0, energy)
