@@ -212,7 +212,7 @@ def _record_channel(
     signal, saturated = receiver.apply(power, width, shots, seeds[1], background, series=series, common_seed=seeds[0])
     number = len(signal)
     expected = receiver.expected(power, width, background)
-    snr = receiver.snr(power, width, background)
+    snr = receiver.snr(power, width, background, expected)
     stride = receiver.stride(width)
     time = dataset["time"][::stride]
     forms = [expected.mean, np.sqrt(expected.variance), snr, expected.saturation]

@@ -28,6 +28,7 @@ from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import FARTHEST
 
 if TYPE_CHECKING:
+    from mitransient_lidar.rendering.shot_batches import ShotBatches
     from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.rendering.shot_scene import ShotScene
     from mitransient_lidar.transport.scene import LidarScene
@@ -212,7 +213,7 @@ class FlightRenderer:
         poses = poses.delayed(further % width)
         error = plan.target_error
         effort = (2, SMALLEST_SHARE, None) if few_paths else (MOST_PASSES_FOR_ERROR, share_for_error(error), error)
-        batches = scene.batches(*effort)
+        batches = _batches(scene, *effort)
         if plan.max_time is not None:
             batches = batches.limited(effort[0], plan.max_time)
         sea = sea_of(scene.session.scene)
@@ -275,6 +276,12 @@ def _shot_scene(
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
     return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)
+
+
+@functools.lru_cache(maxsize=2)
+def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -> ShotBatches:
+    """Return the shots of a scene in batches, whose solids and buffers serve all of them."""
+    return scene.batches(passes, share, error)
 
 
 def _lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
@@ -419,7 +426,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
 
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:
     """Return an array of shots, without the name of their dimension."""
-    ordered = values.transpose("shot", ...)
+    # Without the coordinates, which take longer than the values.
+    ordered = values.variable.transpose("shot", ...)
     dims = tuple(str(dim) for dim in ordered.dims if dim != "shot")
     return Array(dims, np.asarray(ordered, dtype=dtype), _plain(ordered.attrs))
 
