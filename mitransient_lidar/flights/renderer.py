@@ -161,6 +161,8 @@ class FlightRenderer:
 
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
         """Return arrays of few paths, the coordinates of their dimensions, and the attributes of echoes."""
+        # So few paths may be brighter than the flight: their gain is their own.
+        inputs = {name: column for name, column in inputs.items() if not name.startswith(tuple(SETTINGS))}
         arrays, echoes = self._stacked(inputs, few_paths=True)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
         found = {
