@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 #: Largest range of angles from nadir [deg], and ratio of heights and of ranges, of the pulses that share a lidar.
 _ANGLES, _HEIGHTS = 2.0, 1.1
 
-#: Largest angle by which pixels may be turned about their line of sight [deg].
+#: Largest angle by which pixels may be turned about their line of sight [deg]: their lines of sight and the corrections
+#: of their depths are those of pixels at the far and the near side of the beam, as in the lidar of the group.
 _LARGEST_TURN = 15.0
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
