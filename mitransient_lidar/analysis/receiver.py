@@ -147,9 +147,7 @@ def _channels(
     background_power: npt.ArrayLike | xr.DataArray,
 ) -> tuple[Receiver, list[tuple[Channel, list[int]]], FloatArray]:
     """Return the receiver, its channels with the numbers of their pixels, and the background."""
-    receiver = receiver_of("chain", chain) if chain is not None else _own_receiver(dataset)
-    if gain is not None or optical_density is not None:
-        receiver = receiver.with_settings(gain, optical_density)
+    receiver = receiver_of_result(dataset, chain, gain, optical_density)
     dims = tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot")
     sky = _background(dataset, background_power, dims)
     if dims != ("pixel",):
@@ -161,9 +159,20 @@ def _channels(
     return receiver, list(groups.values()), sky
 
 
-def _own_receiver(dataset: xr.Dataset) -> Receiver:
-    """Return the receiver of a result's instrument, or the preset ``apd`` where it has none."""
-    return instrument_receiver(str(dataset.attrs.get("instrument", ""))) or receiver_named("apd")
+def receiver_of_result(
+    dataset: xr.Dataset,
+    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
+    gain: Setting | None = None,
+    optical_density: Setting | None = None,
+) -> Receiver:
+    """Return the receiver that `detect_waveforms` would use, with its settings, of which some may be 'auto'."""
+    if chain is not None:
+        receiver = receiver_of("chain", chain)
+    else:
+        receiver = instrument_receiver(str(dataset.attrs.get("instrument", ""))) or receiver_named("apd")
+    if gain is None and optical_density is None:
+        return receiver
+    return receiver.with_settings(gain, optical_density)
 
 
 def _joined(parts: list[xr.Dataset], places: list[list[int]]) -> xr.Dataset:
@@ -212,7 +221,7 @@ def _record_channel(
     signal, saturated = receiver.apply(power, width, shots, seeds[1], background, series=series, common_seed=seeds[0])
     number = len(signal)
     expected = receiver.expected(power, width, background)
-    snr = receiver.snr(power, width, background)
+    snr = receiver.snr(power, width, background, expected)
     stride = receiver.stride(width)
     time = dataset["time"][::stride]
     forms = [expected.mean, np.sqrt(expected.variance), snr, expected.saturation]

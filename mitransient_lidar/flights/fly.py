@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 #: Name of the store in the folder of a flight.
 STORE = "flight.zarr"
 
-#: Pulses of a shard, whose process takes about as long as 60 of them to start.
-_SHARD = 512
+#: Fewest and most pulses of a shard, whose process takes as long to start as 120 of them, and shards of a flight.
+_FEWEST, _MOST, _SHARDS = 512, 1024, 8
 
 #: Pulses whose arrays show those of the store.
 _SAMPLE = 2
@@ -52,7 +52,8 @@ def fly(
     workers, scheduler
         As for `campaigns.sweep.sweep`.
     shard_size
-        Pulses of a shard, which one process renders and writes, by default 512. The bits depend on it.
+        Pulses of a shard, which one process renders and writes, by default an eighth of them, but 512 to 1024. The bits
+        depend on it.
     progress
         Called with a `rendering.passes.Progress` about every second.
 
@@ -90,5 +91,6 @@ def _prepare(plan: FlightPlan, path: Path, shard_size: int | None) -> Store:
         return store
     renderer, columns = FlightRenderer.of(plan)
     arrays, coordinates, attributes = renderer.sample({name: column[:_SAMPLE] for name, column in columns.items()})
-    size = min(_SHARD, len(columns["pulse"])) if shard_size is None else shard_size
+    count = len(columns["pulse"])
+    size = min(max(-(-count // _SHARDS), _FEWEST), _MOST, count) if shard_size is None else shard_size
     return Store.create(path, renderer, columns, arrays, coordinates, size, attributes)

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import uniform_filter1d
 
-from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.campaigns.runs import Array
@@ -21,6 +19,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses
+from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
@@ -28,6 +27,7 @@ from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import FARTHEST
 
 if TYPE_CHECKING:
+    from mitransient_lidar.rendering.shot_batches import ShotBatches
     from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.rendering.shot_scene import ShotScene
     from mitransient_lidar.transport.scene import LidarScene
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 #: Largest range of angles from nadir [deg], and ratio of heights and of ranges, of the pulses that share a lidar.
 _ANGLES, _HEIGHTS = 2.0, 1.1
 
-#: Largest angle by which pixels may be turned about their line of sight [deg].
+#: Largest angle by which pixels may be turned about their line of sight [deg]: their lines of sight and the corrections
+#: of their depths are those of pixels at the far and the near side of the beam, as in the lidar of the group.
 _LARGEST_TURN = 15.0
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
@@ -44,8 +45,8 @@ _BATCH, _STILL_S = 64, 0.05
 #: Rounding of times over the time in which waves stand still.
 _ROUNDING = 1e-6
 
-#: Bins whose relative standard errors are pooled, and whose mean power they are relative to.
-_POOLED_BINS, _MEAN_BINS = 21, 5
+#: Pulses of a flight that automatic settings of its receiver are chosen from, and passes of each.
+_PROBES, _PROBE_PASSES = 128, 4
 
 #: Places of a group of pulses that decide how long their record is.
 _PLACES = 6
@@ -116,19 +117,28 @@ class FlightRenderer:
             If the flight or its scene is invalid, the bottom does not cover it, or its echo is outside the record.
         """
         poses = plan.poses()
-        record = scene_of(plan)
+        scene = scene_of(plan)
         columns = _columns(poses)
         longest, start = None, np.empty(len(poses.time_s))
         for group in np.unique(columns["group"]):
             rows = np.flatnonzero(columns["group"] == group)
-            own = _record_of(plan, record, {name: column[rows] for name, column in columns.items()})
+            own = _record_of(plan, scene, {name: column[rows] for name, column in columns.items()})
             start[rows] = own.start_ns
             if longest is None or own.bin_count > longest.bin_count:
                 longest = own
-        return cls(plan, record, longest), {**columns, "record_start_ns": start}
+        renderer = cls(plan, scene, longest)
+        columns["record_start_ns"] = start
+        if has_automatic_settings(plan, scene.instrument):
+            settings = chosen_settings(renderer._probes(columns), plan)
+            columns |= {name: np.full(start.shape, value) for name, value in settings.items()}
+        return renderer, columns
 
     def describe_input(self, name: str, column: Column) -> dict[str, Any]:
         """Return the attributes of an input of the pulses."""
+        for setting, text in SETTINGS.items():
+            if name.startswith(setting):
+                number = name.removeprefix(setting)
+                return {"units": "1", "long_name": f"{text} of channel {number} of the receiver, chosen for the flight"}
         unit, text = _INPUTS[name]
         return {"units": unit, "long_name": text}
 
@@ -152,6 +162,8 @@ class FlightRenderer:
 
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
         """Return arrays of few paths, the coordinates of their dimensions, and the attributes of echoes."""
+        # So few paths may be brighter than the flight: their gain is their own.
+        inputs = {name: column for name, column in inputs.items() if not name.startswith(tuple(SETTINGS))}
         arrays, echoes = self._stacked(inputs, few_paths=True)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
         found = {
@@ -168,18 +180,11 @@ class FlightRenderer:
 
     def _stacked(self, inputs: Mapping[str, Column], few_paths: bool = False) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes."""
-        series, later = self._render(inputs, few_paths)
+        passes = (2, SMALLEST_SHARE, None) if few_paths else self._passes(until_error=True)
+        series, later = self._render(inputs, passes)
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
-        plan = self.plan
-        recorded = detect_waveforms(
-            series,
-            plan.receiver,
-            seed=int(np.random.SeedSequence([plan.seed, int(inputs["pulse"][0]), 1]).generate_state(1)[0]),
-            background_power=plan.background_power_w,
-            gain=plan.gain,
-            optical_density=plan.optical_density,
-        )
-        echoes = extract(recorded, plan.estimator)
+        recorded = record(series, self.plan, inputs)
+        echoes = extract(recorded, self.plan.estimator)
         pixels = recorded.sizes["pixel"]
         start = float(recorded.attrs["time_start_ns"]) + later
         about = {"units": "ns", "long_name": "time of the start of the first sample after the pulse"}
@@ -197,9 +202,29 @@ class FlightRenderer:
             found[f"echo_{name}"] = _single(values, dtype)
         return found, echoes
 
-    def _render(self, inputs: Mapping[str, Column], few_paths: bool) -> tuple[xr.Dataset, FloatArray]:
-        """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
+    def _passes(self, *, until_error: bool) -> tuple[int, float, float | None]:
+        """Return the most passes of pulses, the share of the paths of a full one, and the error that ends them."""
         from mitransient_lidar.rendering.shot_batches import MOST_PASSES_FOR_ERROR, share_for_error
+
+        error = self.plan.target_error
+        share = share_for_error(error)
+        return (MOST_PASSES_FOR_ERROR, share, error) if until_error else (_PROBE_PASSES, share, None)
+
+    def _probes(self, columns: Mapping[str, Column]) -> Iterator[xr.Dataset]:
+        """Return the waveforms of pulses that are spread over the flight, those of a group together."""
+        count = len(columns["pulse"])
+        rows = np.unique(np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int))
+        for group in np.unique(columns["group"][rows]):
+            own = rows[columns["group"][rows] == group]
+            for part in np.array_split(own, -(-own.size // _BATCH)):
+                yield self._render(
+                    {name: column[part] for name, column in columns.items()}, self._passes(until_error=False)
+                )[0]
+
+    def _render(
+        self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
+    ) -> tuple[xr.Dataset, FloatArray]:
+        """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
         from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
         plan, axis = self.plan, self.axis
@@ -210,11 +235,9 @@ class FlightRenderer:
         # Records start at whole bins after the pulse, as the clock of a digitizer that the pulse starts.
         further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * axis.bin_width_ns
         poses = poses.delayed(further % width)
-        error = plan.target_error
-        effort = (2, SMALLEST_SHARE, None) if few_paths else (MOST_PASSES_FOR_ERROR, share_for_error(error), error)
-        batches = scene.batches(*effort)
+        batches = _batches(scene, *passes)
         if plan.max_time is not None:
-            batches = batches.limited(effort[0], plan.max_time)
+            batches = batches.limited(passes[0], plan.max_time)
         sea = sea_of(scene.session.scene)
         if not plan.still_sea:
             time_s = _STILL_S * (np.floor(float(inputs["time_s"][0]) / _STILL_S + _ROUNDING) + 0.5)
@@ -232,22 +255,6 @@ class FlightRenderer:
         attributes = scene.attributes(used=batches.used_values, passes=max(record.passes for record in records))
         series = scene.dataset(joined, [], attributes).assign_coords(truth_coordinates(sea, scene.lidar, poses))
         return series, 1e9 / C0 * (further - further % width)
-
-
-def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
-    """Return standard errors that are at least those which neighbouring bins have, relative to the waveforms.
-
-    A standard error of a few passes is itself uncertain by a third: where it is too small by chance, what a render left
-    of its noise would count as an echo. The mean square of the relative error of 21 bins has enough degrees of freedom.
-    """
-    power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
-    # A mean over bins, since one that is low by chance is so in both.
-    level = uniform_filter1d(np.abs(power), _MEAN_BINS, axis=-1, mode="nearest")
-    square = np.divide(error, level, out=np.zeros_like(error), where=level > 0) ** 2
-    # Running sums leave rounding errors below 0.
-    mean = np.maximum(uniform_filter1d(square, _POOLED_BINS, axis=-1, mode="nearest"), 0)
-    pooled = level * np.sqrt(mean)
-    return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
 
 
 def scene_of(plan: FlightPlan) -> SceneRecord:
@@ -275,6 +282,12 @@ def _shot_scene(
 
     params = {**renderer.plan.parameters, "off_nadir_deg": angle_deg, "altitude": height}
     return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)
+
+
+@functools.lru_cache(maxsize=2)
+def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -> ShotBatches:
+    """Return the shots of a scene in batches, whose solids and buffers serve all of them."""
+    return scene.batches(passes, share, error)
 
 
 def _lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]:
@@ -419,7 +432,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
 
 def _single(values: xr.DataArray, dtype: npt.DTypeLike = np.float32) -> Array:
     """Return an array of shots, without the name of their dimension."""
-    ordered = values.transpose("shot", ...)
+    # Without the coordinates, which take longer than the values.
+    ordered = values.variable.transpose("shot", ...)
     dims = tuple(str(dim) for dim in ordered.dims if dim != "shot")
     return Array(dims, np.asarray(ordered, dtype=dtype), _plain(ordered.attrs))
 

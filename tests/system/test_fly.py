@@ -9,6 +9,7 @@ import time
 import laspy
 import numpy as np
 import pytest
+import significance
 from command_line import assert_refused, run
 from oracles import las_reader
 from significance import largest_z
@@ -24,7 +25,7 @@ FLIGHT = {
     "scene": "flight",
     "instrument": "published_airborne",
     "target_error": 0.1,
-    "still_sea": True,
+    "seed": 1,
     "parameters": {
         **{"spectrum": "flat", "bottom_ripple_height": 0, "bottom_slope_x_deg": 2, "bottom_slope_y_deg": -1},
         **{"bottom_size": 400, "cube_size": 2, "cube_x": 3, "cube_depth": 5},
@@ -56,19 +57,42 @@ duration_s = 0.1
 """
 
 
+def seeded(seed):
+    """Return the flight with other paths, records and motions of its platform."""
+    seed += significance.seed_shift
+    noise = {**FLIGHT["platform"]["noise"], "seed": seed}
+    return {**FLIGHT, "seed": seed, "platform": {**FLIGHT["platform"], "noise": noise}}
+
+
 @pytest.mark.slow
-def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path):
-    """All round the compass, with a rolling platform, over a slope: a wrong azimuth, sign or index is metres off."""
-    points = fly(FLIGHT, tmp_path, workers=1)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed):
+    """All round the compass, with a rolling platform, over a slope: a wrong azimuth, sign or index is metres off.
+
+    Errors of the method are common to all pulses: the mean error of a pulse lies within the stated one, but for what
+    the spread of the pulses explains. Bottoms without refraction are 0.2 m too high and 0.6 m too far off.
+    """
+    points = fly(seeded(seed), tmp_path, workers=1)
     kind, pixels = points["kind"].values, 4
     assert np.count_nonzero(kind == 41) == np.count_nonzero(kind == 40) == 24 * pixels
-    error = points["z"].values - points["true_z"].values
-    stated = points["vertical_uncertainty"].values
     bottom = (kind == 40) & ~points["true_target"].values
+    vertical = points["vertical_uncertainty"].values
+    above = points["z"].values - points["true_z"].values
     for own in (kind == 41, bottom):
-        assert np.all(np.abs(error[own]) < 6 * stated[own])
-        assert np.abs(np.mean(error[own])) < 0.25
-        assert 0.01 < np.median(stated[own]) < 0.4
+        assert np.median(vertical[own]) < 0.12
+        assert_within(above, vertical, own, points)
+    flown = Flown.of(Store(tmp_path / STORE))
+    horizontal = points["horizontal_uncertainty"].values / np.sqrt(2)
+    assert np.median(horizontal[bottom]) < 0.1
+    beside = np.column_stack([points["x"], points["y"]]) - refracted_places(points, flown)
+    axis = flown.vectors("axis")[points["shot"].values, :2]
+    ahead = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    away, across = np.sum(beside * ahead, axis=1), beside[:, 1] * ahead[:, 0] - beside[:, 0] * ahead[:, 1]
+    for error in (*beside.T, away, across):
+        assert_within(error, horizontal, bottom, points)
+    # One gain in all batches.
+    assert np.unique(flown.values("gain")).size == 1
+    assert len(np.unique(np.floor(flown.values("time_s") / 0.05 + 1e-6))) >= 2
     # The bottom falls to -y and rises to +x: its height is that of the place that was found.
     x, y, z = (points[name].values[bottom] for name in "xyz")
     design = np.column_stack([x, y, np.ones_like(x)])
@@ -81,11 +105,38 @@ def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path):
         assert abs(z_score) < largest_z(24)
     assert np.ptp(x) > 100
     assert np.ptp(y) > 100
-    store = Store(tmp_path / STORE)
-    assert np.all(store.status() == DONE)
+    assert np.all(flown.store.status() == DONE)
     lines = describe_points(points)
     assert lines[1].startswith("water surface")
-    assert_files(tmp_path, points, Flown.of(store))
+    assert_files(tmp_path, points, flown)
+
+
+def assert_within(error, stated, own, points):
+    """Errors of points within 6 stated ones, and the mean over the pulses within the stated and its own error."""
+    assert np.all(np.abs(error[own]) < 6 * stated[own])
+    shot = points["shot"].values
+    # Pixels of a pulse share its noise.
+    means = np.array([np.mean(error[own & (shot == pulse)]) for pulse in np.unique(shot[own])])
+    limit = np.median(stated[own]) + largest_z(len(means)) * np.std(means, ddof=1) / np.sqrt(len(means))
+    assert np.abs(np.mean(means)) < limit, (np.mean(means), limit)
+
+
+def refracted_places(points, flown):
+    """Return where refracted lines of sight meet the plane of the bottom below a level sea: x and y [m]."""
+    shot, pixel = points["shot"].values, points["pixel"].values
+    origin, axis, far, left = (flown.vectors(name)[shot] for name in ("origin", "axis", "far", "left"))
+    sight = [1e-3 * flown.coordinate(name)[pixel][:, None] for name in ("sight_x", "sight_y")]
+    line = axis + sight[0] * far + sight[1] * left
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    sea = origin - line * (origin[:, 2:] / line[:, 2:])
+    bent = line / flown.attributes["refractive_index"]
+    bent[:, 2] = -np.sqrt(1 - np.sum(bent[:, :2] ** 2, axis=1))
+    # The bottom is z = s . (x, y) + h.
+    bed = (points["kind"].values == 40) & ~points["true_target"].values
+    places = np.column_stack([points["x"], points["y"], np.ones(len(bed))])
+    (*slopes, height), *_ = np.linalg.lstsq(places[bed], points["true_z"].values[bed], rcond=None)
+    way = (sea[:, :2] @ slopes + height) / (bent[:, 2] - bent[:, :2] @ slopes)
+    return (sea + way[:, None] * bent)[:, :2]
 
 
 def assert_files(folder, points, flown):

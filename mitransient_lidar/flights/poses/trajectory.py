@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicSpline
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.toml_files import check_keys, required
@@ -21,6 +22,12 @@ from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, 
 
 #: Kinds of platforms of a plan.
 KINDS = ("lines", "mast", "csv", "sbet")
+
+#: Interpolation between records.
+INTERPOLATIONS = ("linear", "cubic")
+
+#: Longest time between records that splines go through, with its rounding, and fewest of such records [s].
+_DENSE_S, _FEWEST_DENSE = 1.0 + 1e-6, 3
 
 #: Most pulses of a flight.
 _MOST_PULSES = 10**8
@@ -46,7 +53,8 @@ class Trajectory:
     """Position and attitude of a platform over time, and its flight lines.
 
     Axes of the platform are x to the right, y forward and z up. Between records, positions and angles are linear in
-    time, and angles take the shorter way round.
+    time, or cubic splines (twice differentiable, not-a-knot ends) through records that follow each other within 1 s,
+    and linear elsewhere. Angles take the shorter way round.
 
     Parameters
     ----------
@@ -58,6 +66,8 @@ class Trajectory:
         Attitudes [deg], shape (n,): right side down, nose up, and clockwise from north.
     rotation_spec
         Order of the rotations, as in `attitude.rotation_matrices`.
+    interpolation
+        ``linear``, or ``cubic`` for records of a motion that is smooth.
     lines
         First and last time [s] of each flight line, within the records and in order, shape (lines, 2); by default one
         line from the first record to the last.
@@ -65,7 +75,8 @@ class Trajectory:
     Raises
     ------
     UserError
-        For arrays of other shapes, and for the first record that is not finite or not later than the one before.
+        For arrays of other shapes, another interpolation, and for the first record that is not finite or not later than
+        the one before.
     """
 
     time_s: FloatArray
@@ -74,13 +85,16 @@ class Trajectory:
     pitch_deg: FloatArray
     yaw_deg: FloatArray
     rotation_spec: str = "aerospace"
+    interpolation: str = "linear"
     lines: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
     def __post_init__(self) -> None:
         for one in fields(self):
-            if one.name != "rotation_spec":
+            if one.name not in ("rotation_spec", "interpolation"):
                 object.__setattr__(self, one.name, _array(one.name, getattr(self, one.name)))
         check_rotation_spec(self.rotation_spec)
+        if self.interpolation not in INTERPOLATIONS:
+            raise UserError(f"interpolation = {shown(self.interpolation)} must be one of {', '.join(INTERPOLATIONS)}")
         count = self.time_s.size
         for name in Records._fields:
             shape, wanted = getattr(self, name).shape, (count, 3) if name == "position" else (count,)
@@ -106,8 +120,9 @@ class Trajectory:
             Table with ``kind``: ``lines`` and ``mast`` have the keys of `straight_lines.straight_lines` and
             `straight_lines.fixed_platform`; ``csv`` has ``file`` and ``rotation_spec`` (``ARINC 705``, as HELIOS++),
             ``sbet`` has ``file`` and ``epsg``. Files may also have ``origin``, the position of the origin of the scene
-            in the coordinates of the file [m], whose height is that of the mean sea level (0, 0, 0); and ``lines_s``, a
-            list of the first and last time of each flight line [s] (one line, of all records).
+            in the coordinates of the file [m], whose height is that of the mean sea level (0, 0, 0); ``interpolation``
+            (``cubic``); and ``lines_s``, a list of the first and last time of each flight line [s] (one line, of all
+            records).
         folder
             Folder from which relative paths of files count.
 
@@ -125,7 +140,7 @@ class Trajectory:
         if kind == "mast":
             return cls(*fixed_platform(given))
         where, own = f"a platform of kind {kind!r}", "rotation_spec" if kind == "csv" else "epsg"
-        check_keys(where, given, ("kind", "file", own, "origin", "lines_s"))
+        check_keys(where, given, ("kind", "file", own, "origin", "interpolation", "lines_s"))
         file = required(where, given, "file")
         if not isinstance(file, str):
             raise UserError(f"file = {shown(file)} must be the path of a trajectory")
@@ -136,7 +151,8 @@ class Trajectory:
         path = Path(folder) / file
         records = read_text_records(path) if kind == "csv" else read_sbet_records(path, required(where, given, "epsg"))
         records = records._replace(position=records.position - origin)
-        return cls(*records, rotation_spec=spec, lines=finite_array("lines_s", given.get("lines_s", ())))
+        lines = finite_array("lines_s", given.get("lines_s", ()))
+        return cls(*records, spec, given.get("interpolation", "cubic"), lines)
 
     def at(self, times: npt.ArrayLike) -> PlatformPoses:
         """Return the poses at times [s], shape (n,); raise `UserError` for a time that is on no flight line."""
@@ -147,14 +163,28 @@ class Trajectory:
             raise UserError(
                 f"time = {time[row]:g} s (number {row + 1}) is on no flight line: the lines are {self._lines_text()}"
             )
-        position = np.column_stack([np.interp(time, self.time_s, one) for one in self.position.T])
-        roll, pitch, yaw = (
-            np.interp(time, self.time_s, np.unwrap(angle, period=360.0))
-            for angle in (self.roll_deg, self.pitch_deg, self.yaw_deg)
-        )
+        values = self._interpolated(time)
+        position, (roll, pitch, yaw) = values[:, :3], values[:, 3:].T
         roll, pitch, yaw = 180 - (180 - roll) % 360, 180 - (180 - pitch) % 360, yaw % 360
         rotation = rotation_matrices(roll, pitch, yaw, self.rotation_spec)
         return PlatformPoses(time, position, roll, pitch, yaw, rotation, line)
+
+    def _interpolated(self, time: FloatArray) -> FloatArray:
+        """Return positions [m] and angles [deg], which may exceed a turn, at times on flight lines, shape (n, 6)."""
+        records = self.time_s
+        angles = (np.unwrap(angle, period=360.0) for angle in (self.roll_deg, self.pitch_deg, self.yaw_deg))
+        values = np.column_stack([self.position, *angles])
+        found = np.column_stack([np.interp(time, records, one) for one in values.T])
+        if self.interpolation == "linear":
+            return found
+        ends = np.flatnonzero(np.diff(records) > _DENSE_S) + 1
+        bounds = np.concatenate([[0], ends, [records.size]])
+        for run in np.flatnonzero(np.diff(bounds) >= _FEWEST_DENSE):
+            own = slice(bounds[run], bounds[run + 1])
+            within = (time >= records[own][0]) & (time <= records[own][-1])
+            if np.any(within):
+                found[within] = CubicSpline(records[own], values[own])(time[within])
+        return found
 
     def pulse_times(self, pulse_rate_hz: float) -> FloatArray:
         """Return the times [s] of pulses on all flight lines, shape (pulses,); each line begins with a pulse.

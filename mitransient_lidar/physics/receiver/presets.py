@@ -42,7 +42,7 @@ _BLOCK = 2**20  # samples drawn at a time, which limits the memory of a thread
 _RARE = 1e-3  # share of records in which a single event is higher than stated
 _OVERLAPPING = 3.0  # events in a bin above which they are no longer single
 _HEADROOM = 6.0  # standard deviations of noise below the upper limit of samples in range
-_STRONGEST = 16  # records that an attenuation is fitted to
+_STRONGEST = 16  # records that a gain or an attenuation is fitted to
 _DARKEST = math.log(1e12)  # largest attenuation that is tried
 _MOST_STEPS, _IN_RANGE = 20, 1e-9  # steps of fitting a gain, and the relative excess at which they end
 
@@ -224,18 +224,22 @@ class ReceiverChain:
         0 where the dynodes of a photomultiplier would have to attenuate.
         """
         factor, chain = 1.0, self
+        light, sky = self._light(power, bin_width_ns, background)
         # Behind a photomultiplier, the noise of the amplifier stays and the excess noise grows.
-        for _ in range(_MOST_STEPS):
+        for step in range(_MOST_STEPS):
             if chain.amplifier is None or not math.isfinite(top := chain.readout(bin_width_ns).top_v):
                 break
-            highest = float(chain._highest(power, bin_width_ns, background, samples).max())
-            if highest <= top * (1 + _IN_RANGE):
+            highest = chain._highest(light, bin_width_ns, sky, samples)
+            if highest.max() <= top * (1 + _IN_RANGE):
                 break
-            factor *= top / highest
+            factor *= top / float(highest.max())
             try:
                 chain = self.with_gain(factor)
             except UserError:
                 return 0.0
+            if step == 0:
+                strongest = np.argsort(highest)[-_STRONGEST:]
+                light, sky = light[strongest], sky[strongest]
         return factor
 
     def fitting_attenuation(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> float:
@@ -305,16 +309,26 @@ class ReceiverChain:
         peak = float(low_pass.weights.max()) * self.volts_per_electron(bin_width_ns)
         return (charge * peak).reshape(np.shape(power)[:-1])
 
-    def snr(self, power: npt.ArrayLike, bin_width_ns: float, background: npt.ArrayLike = 0.0) -> FloatArray:
+    def snr(
+        self,
+        power: npt.ArrayLike,
+        bin_width_ns: float,
+        background: npt.ArrayLike = 0.0,
+        lit: Expected | None = None,
+    ) -> FloatArray:
         """Return the signal-to-noise ratio of the samples of one shot, shape (..., sample).
 
         The mean above that without signal is divided by the standard deviation with signal: 0 without signal, infinite
         without noise, and NaN where most samples are saturated. For the mean of n shots the ratio is sqrt(n) times
-        larger. The arguments are those of `apply`.
+        larger. `lit` is `expected` of the other arguments where it is known; these are those of `apply`.
         """
-        lit = self.expected(power, bin_width_ns, background)
-        dark = self.expected(np.zeros(np.shape(power)), bin_width_ns, background)
-        rise = lit.mean - dark.mean
+        if lit is None:
+            lit = self.expected(power, bin_width_ns, background)
+        # Records of one background share that without signal.
+        sky = np.broadcast_to(non_negative_array("background", background), np.shape(power)[:-1])
+        levels, level = np.unique(sky, return_inverse=True)
+        dark = self.expected(np.zeros((levels.size, np.shape(power)[-1])), bin_width_ns, levels)
+        rise = lit.mean - dark.mean[level.reshape(sky.shape)]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(rise == 0, 0, rise / np.sqrt(lit.variance))
         return np.where(lit.saturation > 0.5, np.nan, ratio)

@@ -101,9 +101,25 @@ class Receiver:
         channels = {name: replace(one, **given) for name, one in self.channels.items()}
         return replace(self, default=replace(self.default, **given), channels=channels)
 
+    def with_channel_settings(self, settings: Mapping[int, tuple[Setting, Setting]]) -> Receiver:
+        """Return the receiver with other gains and filters, by the number of the channel in `all_channels`."""
+        changed = self.all_channels
+        for number, (gain, density) in settings.items():
+            changed[number] = replace(changed[number], gain=gain, optical_density=density)
+        return replace(self, default=changed[0], channels=dict(zip(self.channels, changed[1:], strict=True)))
+
+    @property
+    def all_channels(self) -> list[Channel]:
+        """The default channel, and the others in the order of `channels`."""
+        return [self.default, *self.channels.values()]
+
     def of(self, pixel: str) -> Channel:
         """Return the channel of a pixel."""
-        return self.channels.get(pixel, self.default)
+        return self.all_channels[self.number_of(pixel)]
+
+    def number_of(self, pixel: str) -> int:
+        """Return the number of the channel of a pixel in `all_channels`."""
+        return 1 + list(self.channels).index(pixel) if pixel in self.channels else 0
 
 
 def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:

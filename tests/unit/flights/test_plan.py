@@ -4,14 +4,10 @@ import json
 
 import numpy as np
 import pytest
-import significance
-import xarray as xr
-from scipy.stats import t
-from significance import largest_count
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.plan import FlightPlan, flights
-from mitransient_lidar.flights.renderer import FlightRenderer, _columns, pooled_errors
+from mitransient_lidar.flights.renderer import FlightRenderer, _columns
 
 LINE = {"kind": "lines", "start": [-20.0, 0.0], "heading_deg": 90.0, "speed": 20.0, "height": 200.0, "duration_s": 2.0}
 PALMER = {"kind": "palmer", "nadir_angle_deg": 20.0, "rate_hz": 10.0}
@@ -103,22 +99,3 @@ def test_paths_are_those_of_the_folder(tmp_path):
     assert plan.corrections == str(tmp_path / "table.nc")
     # Workers read the stored text elsewhere.
     assert json.loads(plan.text)["receiver"]["chain"] == str(tmp_path / "own.toml")
-
-
-def test_pooled_errors_keep_noise_of_few_passes_from_being_echoes():
-    """Means of 6 passes about a column: 5 of their own standard errors are exceeded by one bin in 240 (Student's t)."""
-    rng = np.random.default_rng(4 + significance.seed_shift)
-    column = np.exp(-0.05 * np.arange(120))
-    passes = column * (1 + 0.3 * rng.standard_normal((6, 500, 2, 120)))
-    waveform, stderr = (
-        xr.DataArray(values, dims=("shot", "pixel", "time"))
-        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(6))
-    )
-    found = pooled_errors(waveform, stderr)
-    assert np.all(found >= stderr)
-    off = np.abs(waveform - column)
-    bins = off.size
-    assert np.count_nonzero(off > 5 * stderr) > 0.5 * bins * 2 * t.sf(5, 5)
-    assert np.count_nonzero(off > 5 * found) <= largest_count(bins, 2 * t.sf(5, 20))
-    # They are true ones on average, but for what the larger of two errors adds.
-    assert 1.0 < float(np.sqrt(np.mean((found / column) ** 2))) / (0.3 / np.sqrt(6)) < 1.25

@@ -28,6 +28,55 @@ def test_interpolation_is_linear_and_exact_at_the_records():
     np.testing.assert_array_equal(poses.line, 0)
 
 
+def smooth_motion(time):
+    """Return a turn of 500 m at 60 m/s with a heave of 1 m/s^2, and its roll, pitch and heading [deg]."""
+    turned = 60 * time / 500
+    heave = 2.5 * np.sin(2 * np.pi * time / 10)
+    position = np.column_stack([500 * (1 - np.cos(turned)), 500 * np.sin(turned), 300 + heave])
+    roll, pitch = 36 + 2 * np.sin(2 * np.pi * time / 8), np.sin(2 * np.pi * time / 10)
+    return position, roll, pitch, np.degrees(turned) % 360
+
+
+@pytest.mark.parametrize(("interval", "of_position", "of_angles"), [(1.0, 3e-3, 0.02), (0.5, 2e-4, 1e-3)])
+def test_splines_follow_a_smooth_motion(interval, of_position, of_angles):
+    """Straight lines between records of 1 s are off by 0.9 m in the turn, 0.1 m in height and 0.15 degrees of roll."""
+    records, time = np.arange(0, 61 + interval / 2, interval), np.linspace(0, 60, 5001)
+    position, *angles = smooth_motion(time)
+    errors = {}
+    for kind in ("linear", "cubic"):
+        poses = Trajectory(records, *smooth_motion(records), interpolation=kind).at(time)
+        found = poses.roll_deg, poses.pitch_deg, poses.yaw_deg
+        inner = (time > 5 * interval) & (time < 60 - 4 * interval)
+        errors[kind] = (
+            np.abs(poses.position - position)[inner].max(),
+            max(np.abs((one - true + 180) % 360 - 180)[inner].max() for one, true in zip(found, angles, strict=True)),
+            # Ends have a record less beside them.
+            np.abs(poses.position - position).max(),
+        )
+    assert errors["cubic"][0] < of_position
+    assert errors["cubic"][1] < of_angles
+    assert errors["cubic"][2] < 0.2 * errors["linear"][2]
+    # In a turn of the radius r, a chord of the length v dt is (v dt)^2 / 8 r away.
+    assert errors["linear"][0] > 0.9 * (60 * interval) ** 2 / (8 * 500)
+
+
+def test_splines_end_where_records_are_far_apart():
+    """Waypoints, and a gap between two flight lines: straight lines, which the records beside do not feel."""
+    time = np.array([0, 10, 20, 20.5, 21, 21.5, 22, 40, 40.5, 41, 41.5])
+    x = np.array([0, 100, 0, 10, 20, 30, 40, 900, 890, 880, 870])
+    zeros = np.zeros(time.size)
+    records = time, np.column_stack([x, zeros, zeros]), zeros, zeros, zeros
+    times = np.array([3, 15, 20.25, 21.9, 30, 40.1, 41.2])
+    linear, cubic = (Trajectory(*records, interpolation=kind).at(times) for kind in ("linear", "cubic"))
+    np.testing.assert_allclose(cubic.position, linear.position, atol=1e-9)
+    np.testing.assert_allclose(cubic.position[:, 0], [30, 50, 5, 38, 40 + 860 * 8 / 18, 898, 876], atol=1e-9)
+
+
+def test_unknown_interpolation_is_refused():
+    with pytest.raises(UserError, match="interpolation = 'quintic' must be one of linear, cubic"):
+        _trajectory([0, 1], interpolation="quintic")
+
+
 def test_headings_pass_north_the_short_way():
     yaw = _trajectory([0, 1, 2, 3], [350, 10, -10, 710]).at([0, 0.25, 0.5, 0.75, 1.75, 2.5]).yaw_deg
     # 350 to 10 is 20 degrees to the right; 10 to -10 is 20 to the left; -10 and 710 are the same.

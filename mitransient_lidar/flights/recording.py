@@ -1,0 +1,97 @@
+"""Recording of rendered pulses: the receiver of a flight, whose automatic settings are chosen once for all pulses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import uniform_filter1d
+
+from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result
+from mitransient_lidar.campaigns.design import Column
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.physics.receiver.receiver_files import Receiver
+
+#: Bins whose relative standard errors are pooled, and whose mean power they are relative to.
+_POOLED_BINS, _MEAN_BINS = 21, 5
+
+#: Names of the inputs of pulses that hold a setting of a channel, which end in its number.
+SETTINGS = {"receiver_gain_": "factor of the gain", "receiver_density_": "optical density of the filter"}
+
+
+def record(series: xr.Dataset, plan: FlightPlan, inputs: Mapping[str, Column]) -> xr.Dataset:
+    """Return the record of pulses that are rendered together, as of `detect_waveforms`, with the settings in inputs.
+
+    Channels whose settings the inputs do not hold choose them for these pulses alone.
+    """
+    return detect_waveforms(
+        series,
+        _receiver(series, plan).with_channel_settings(_stored(inputs)),
+        seed=int(np.random.SeedSequence([plan.seed, int(inputs["pulse"][0]), 1]).generate_state(1)[0]),
+        background_power=plan.background_power_w,
+    )
+
+
+def chosen_settings(probes: Iterable[xr.Dataset], plan: FlightPlan) -> dict[str, float]:
+    """Return the settings of automatic channels, as inputs of pulses: those with which no probe saturates.
+
+    Parameters
+    ----------
+    probes
+        Rendered pulses of the flight, in parts.
+    plan
+        The flight.
+    """
+    gains: dict[int, float] = {}
+    densities: dict[int, float] = {}
+    for series in probes:
+        receiver = _receiver(series, plan)
+        recorded = detect_waveforms(series, receiver, background_power=plan.background_power_w)
+        pixels = recorded["pixel"].values
+        used = (np.broadcast_to(recorded.attrs[name], len(pixels)) for name in ("gain", "optical_density"))
+        for pixel, gain, density in zip(pixels, *used, strict=True):
+            channel = receiver.of(str(pixel))
+            if "auto" in (channel.gain, channel.optical_density):
+                number = receiver.number_of(str(pixel))
+                gains[number] = min(float(gain), gains.get(number, np.inf))
+                densities[number] = max(float(density), densities.get(number, 0.0))
+    return {
+        f"{name}{number}": value
+        for name, values in zip(SETTINGS, (gains, densities), strict=True)
+        for number, value in values.items()
+    }
+
+
+def has_automatic_settings(plan: FlightPlan, instrument: str | None) -> bool:
+    """Return whether the receiver of a flight with the scene's instrument chooses a gain or a filter."""
+    receiver = _receiver(xr.Dataset(attrs={"instrument": instrument or ""}), plan)
+    return any("auto" in (channel.gain, channel.optical_density) for channel in receiver.all_channels)
+
+
+def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
+    """Return standard errors that are at least those which neighbouring bins have, relative to the waveforms.
+
+    A standard error of a few passes is itself uncertain by a third: where it is too small by chance, what a render left
+    of its noise would count as an echo. The mean square of the relative error of 21 bins has enough degrees of freedom.
+    """
+    power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
+    # A mean over bins, since one that is low by chance is so in both.
+    level = uniform_filter1d(np.abs(power), _MEAN_BINS, axis=-1, mode="nearest")
+    square = np.divide(error, level, out=np.zeros_like(error), where=level > 0) ** 2
+    # Running sums leave rounding errors below 0.
+    mean = np.maximum(uniform_filter1d(square, _POOLED_BINS, axis=-1, mode="nearest"), 0)
+    pooled = level * np.sqrt(mean)
+    return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
+
+
+def _receiver(series: xr.Dataset, plan: FlightPlan) -> Receiver:
+    """Return the receiver of a flight, with its settings, of which some may be automatic."""
+    return receiver_of_result(series, plan.receiver, plan.gain, plan.optical_density)
+
+
+def _stored(inputs: Mapping[str, Column]) -> dict[int, tuple[float, float]]:
+    """Return gains and optical densities in the inputs of pulses, by the number of the channel."""
+    gain, density = SETTINGS
+    numbers = [int(name.removeprefix(gain)) for name in inputs if name.startswith(gain)]
+    return {number: (float(inputs[f"{gain}{number}"][0]), float(inputs[f"{density}{number}"][0])) for number in numbers}

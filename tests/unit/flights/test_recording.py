@@ -1,0 +1,85 @@
+"""Records of the pulses of a flight: automatic settings of the receiver, and errors of renders."""
+
+import numpy as np
+import pytest
+import significance
+import xarray as xr
+from scipy.stats import t
+from significance import largest_count
+
+from mitransient_lidar.analysis.receiver import detect_waveforms
+from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.recording import chosen_settings, has_automatic_settings, pooled_errors, record
+
+FLIGHT = {"scene": "flight", "platform": {}, "scanner": {}, "pulses": {"rate_hz": 100}}
+
+
+def rendered(instrument, pixels, *peaks):
+    """Return echoes of these peak powers [W], one a pulse, in all pixels, of which the second has a third."""
+    time = np.arange(80) + 0.5
+    share = np.where(np.arange(len(pixels)) == 1, 1 / 3, 1.0)[:, None]
+    power = np.array(peaks)[:, None, None] * share * np.exp(-0.5 * ((time - 30) / 2.2) ** 2)
+    return xr.Dataset(
+        {"waveform": (("shot", "pixel", "time"), power, {"units": "W"})},
+        {"pixel": pixels, "time": ("time", time, {"units": "ns"}), "shot": np.arange(len(peaks))},
+        {"time_start_ns": 0.0, "bin_width_ns": 1.0, "instrument": instrument},
+    )
+
+
+def test_all_pulses_have_the_gain_of_the_brightest_probe():
+    plan, pixels = FlightPlan.of(FLIGHT), ["red", "green"]
+    bright, dim = (rendered("published_airborne", pixels, *peaks) for peaks in ((1e-4, 3e-5), (2e-5, 1e-5)))
+    settings = chosen_settings([dim, bright], plan)
+    gain = detect_waveforms(bright).attrs["gain"]
+    assert settings == {"receiver_gain_0": gain, "receiver_density_0": 0.0}
+    assert 0 < gain < 0.5 * detect_waveforms(dim).attrs["gain"]
+    inputs = {"pulse": np.array([3, 4]), **{name: np.full(2, value) for name, value in settings.items()}}
+    recorded = [record(series, plan, inputs) for series in (bright, dim)]
+    assert [one.attrs["gain"] for one in recorded] == [gain, gain]
+    assert not recorded[0]["saturated"].any()
+    # Amplitudes of two batches are those of their light.
+    high, low = (one["signal_mean"].max("time").values for one in recorded)
+    np.testing.assert_allclose(low[0] / high[0], 0.2, rtol=0.02)
+    # A pulse brighter than all probes saturates.
+    assert record(rendered("published_airborne", pixels, 3e-4), plan, inputs)["saturated"].any()
+
+
+def test_each_channel_has_its_own_gain():
+    """The deep pixel has a third of the light, and about three times the gain."""
+    plan, pixels = FlightPlan.of(FLIGHT), ["shallow_0", "deep"]
+    series = rendered("teledyne_czmil", pixels, 1e-2)
+    settings = chosen_settings([series], plan)
+    assert settings.keys() == {f"receiver_{name}_{number}" for name in ("gain", "density") for number in (0, 1)}
+    inputs = {"pulse": np.array([0]), **{name: np.array([value]) for name, value in settings.items()}}
+    assert record(series, plan, inputs).attrs["gain"] == detect_waveforms(series).attrs["gain"]
+    assert settings["receiver_gain_1"] > 1.5 * settings["receiver_gain_0"]
+
+
+@pytest.mark.parametrize(
+    ("receiver", "instrument", "automatic"),
+    [({}, "published_airborne", True), ({"gain": 0.1}, "published_airborne", False), ({"chain": "apd"}, "", False)],
+)
+def test_settings_that_are_given_are_kept(receiver, instrument, automatic):
+    plan = FlightPlan.of({**FLIGHT, "receiver": receiver})
+    assert has_automatic_settings(plan, instrument) is automatic
+    settings = chosen_settings([rendered(instrument, ["red", "green"], 1e-4)], plan)
+    assert bool(settings) is automatic
+
+
+def test_pooled_errors_keep_noise_of_few_passes_from_being_echoes():
+    """Means of 6 passes about a column: 5 of their own standard errors are exceeded by one bin in 240 (Student's t)."""
+    rng = np.random.default_rng(4 + significance.seed_shift)
+    column = np.exp(-0.05 * np.arange(120))
+    passes = column * (1 + 0.3 * rng.standard_normal((6, 500, 2, 120)))
+    waveform, stderr = (
+        xr.DataArray(values, dims=("shot", "pixel", "time"))
+        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(6))
+    )
+    found = pooled_errors(waveform, stderr)
+    assert np.all(found >= stderr)
+    off = np.abs(waveform - column)
+    bins = off.size
+    assert np.count_nonzero(off > 5 * stderr) > 0.5 * bins * 2 * t.sf(5, 5)
+    assert np.count_nonzero(off > 5 * found) <= largest_count(bins, 2 * t.sf(5, 20))
+    # They are true ones on average, but for what the larger of two errors adds.
+    assert 1.0 < float(np.sqrt(np.mean((found / column) ** 2))) / (0.3 / np.sqrt(6)) < 1.25
