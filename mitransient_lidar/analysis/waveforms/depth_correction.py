@@ -92,11 +92,10 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
 
         ``depth_m_method_error`` is the root of the sum of the squares of
 
-        - the spread in the table beyond the error by noise there; where that error exceeds the spread,
-          ``depth_m_stderr`` is reduced to the spread. The square of a spread from n places counts n/(n - 3) times, so
-          that the mean square of error over stated error is 1 (Student's distribution);
+        - the spread in the table beyond the error by noise there, of waves with the mean over the waters; where the
+          error by noise exceeds the spread, ``depth_m_stderr`` is reduced to the spread;
         - the error of the mean bias over the places of a sea with waves, spread/sqrt(n);
-        - the error of biases between nodes, and beyond the ends of the table: see `_walks`;
+        - the error of biases between nodes, and beyond the ends of the table, as of random walks: see Notes;
         - the rounding of the surface's time to a bin of the render, the largest of the pixels; see
           `depth_errors.rounding_ns`.
 
@@ -104,6 +103,17 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
     ------
     UserError
         If the table is of another instrument, lacks an estimator or a pixel, or the wind is not known.
+
+    Notes
+    -----
+    The linear interpolation of a random walk between nodes at the distances g and h has the variance rate times
+    g h/(g + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of
+    geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
+    mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
+    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.57 of their squared
+    difference over the distance, the mean ratio of both rates in six tables; one node gives 0. Cells in which fewer of
+    the shots have a depth count only where no other ones do. Without any bias of an estimator in a pixel, depths and
+    errors stay as they are.
     """
     instrument = found.attrs.get("instrument", "")
     if instrument != table.attrs["instrument"]:
@@ -143,7 +153,7 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
             target[e, p] = _interpolated(values, water, _place_of(depths, at))
         by_depth = _at_row(rate["depth"], water) * _walked(depths, at)
         between = _at_row(rate["off_nadir_deg"], water) * by_angle + float(rate["water"]) * by_water
-        variance[e, p] += by_depth + between
+        variance[e, p] += by_depth + between if one["bias"].notnull().any() else np.nan
     amount[..., :2] = 0.0
 
     def of_echoes(values: FloatArray) -> xr.DataArray:
@@ -160,7 +170,7 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
     stated = {
         "depth_m": found["depth_m"] - correction.fillna(0),
         "depth_m_stderr": found["depth_m_stderr"] * of_echoes(share).where(behind, 1.0),
-        "depth_m_method_error": found["depth_m_method_error"].where(~behind, error),
+        "depth_m_method_error": found["depth_m_method_error"].where(~behind | error.isnull(), error),
     }
     added = {name: values.assign_attrs(found[name].attrs) for name, values in stated.items()}
     corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described)})
@@ -170,7 +180,7 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
 def _learnt(table: xr.Dataset) -> xr.Dataset:
     """Return a table with the biases that count, the variance of depths without noise, and the share of the noise.
 
-    The variables added are ``uncertain``, the variance of the mean bias, ``variance`` [m^2], and ``noise_share``.
+    The variables added are ``variance`` [m^2], that of the mean bias included, and ``noise_share``.
     """
     waves = table["wind_speed"] > 0
     usual = table["found"] >= _USUAL
@@ -187,22 +197,16 @@ def _learnt(table: xr.Dataset) -> xr.Dataset:
     beyond = beyond.mean("water").where(waves, beyond).clip(min=0).where(left.notnull())
     return table[list(_TABLE)].assign(
         bias=table["bias"] * certain,
-        uncertain=uncertain,
         variance=beyond + uncertain,
         noise_share=np.sqrt((left / noise).where(noise > 0, 1.0).clip(max=1)),
     )
 
 
 def _walks(learnt: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return the variance by which biases change along the axes of a table, per unit of the axis [m^2].
+    """Return the rates of the random walks of biases along the axes of a table [m^2 per unit], as `correct_depths`.
 
-    Biases are taken as random walks between nodes, whose linear interpolation between neighbours at the distances
-    g and h has the variance rate times g h/(g + h), and rate times g beyond an end (kriging with a linear variogram;
-    G. Matheron, Principles of geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The
-    rate is the mean over the cells of the lowest wind in which half of the shots have a depth: of the squared
-    differences from the interpolation between the neighbours, each left out in turn, over g h/(g + h); with two nodes,
-    0.57 of the squared differences over the distance. Those of ``off_nadir_deg`` and ``depth`` are over water; a water
-    without them has the mean of the others, 0 without any.
+    Those of ``off_nadir_deg`` and ``depth`` are over water; a water without them has the mean of the others, 0 without
+    any.
     """
     calm = learnt.isel(wind_speed=0)
     bias = calm["bias"].where(calm["found"] >= _USUAL)
@@ -218,7 +222,7 @@ def _walks(learnt: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 def _rate(bias: xr.DataArray, nodes: xr.DataArray, axis: str) -> xr.DataArray:
-    """Return the squared changes of biases along an axis over its unit; see `_walks`."""
+    """Return the squared changes of biases along an axis over its unit; see `correct_depths`."""
     count = bias.sizes[axis]
     if count > 2:
         parts = [slice(i, count - 2 + i) for i in range(3)]
@@ -303,7 +307,7 @@ def _place_of(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
 
 
 def _walked(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
-    """Return g h/(g + h) of values at the distances g and h from nodes, g beyond an end, and 0 of NaN; see `_walks`."""
+    """Return g h/(g + h) of values at the distances g and h from nodes, g beyond an end, and 0 of NaN."""
     known = np.sort(nodes[np.isfinite(nodes)])
     if not known.size:
         return np.zeros(np.shape(values))

@@ -86,6 +86,28 @@ def test_one_estimator_has_no_dimension_and_ends_hold_beyond():
     np.testing.assert_allclose(level["depth_m"].values[0, 0, 3], 6 - (0.15 + 0.09 + 0.03))
 
 
+def test_errors_grow_beyond_the_ends_of_a_table():
+    """The bias of the middle depth is 3 cm off the line through the others: a rate of 3^2/2 cm^2/m."""
+    made = table()
+    made["bias"][{"depth": 1}] += 0.03
+    bottom = correct_depths(echoes([10.0, 12.0, 14.0], several=False), made, 0.0).sel(echo="bottom", pixel="red")
+    squares = bottom["depth_m_method_error"].values ** 2
+    np.testing.assert_allclose(np.diff(squares), 2 * 0.03**2 / 2, rtol=1e-6)
+    np.testing.assert_allclose(bottom["depth_correction_m"], bottom["depth_correction_m"][0])
+
+
+def test_noise_in_the_table_counts_once():
+    """Of a spread of 5 cm, 3 cm are the noise that the shots state; 8 cm of noise are reduced to the 5 cm."""
+    made = table()
+    made["bias"][:] = 0.0
+    made["spread"][:] = 0.05
+    for noise, method, share in ((0.03, 0.04, 1.0), (0.08, 0.0, 0.05 / 0.08)):
+        made["noise_error"][:] = noise
+        bottom = correct_depths(echoes([6.0]), made).sel(echo="bottom")
+        np.testing.assert_allclose(bottom["depth_m_method_error"], method, atol=1e-9)
+        np.testing.assert_allclose(bottom["depth_m_stderr"], 0.02 * share)
+
+
 def test_a_bias_within_its_error_counts_little():
     made = table().assign_attrs(shots=4)
     made["bias"][:], made["spread"][:] = 0.02, 0.08
@@ -142,7 +164,9 @@ def test_unknown_cells_take_the_nearest_known_one():
     corrected = correct_depths(echoes([10.0], several=False), made)
     np.testing.assert_allclose(corrected["depth_m"].values[0, 0, 3], 10 - (0.15 + 0.06 + 0.09 + 0.03))
     made["bias"][:] = np.nan
-    np.testing.assert_allclose(correct_depths(echoes([10.0]), made).sel(echo="bottom")["depth_m"], 10)
+    bottom = correct_depths(echoes([10.0]), made).sel(echo="bottom")
+    for name, unchanged in (("depth_m", 10), ("depth_m_stderr", 0.02), ("depth_m_method_error", 0.05)):
+        np.testing.assert_allclose(bottom[name], unchanged)
 
 
 def test_summary_of_depths():
