@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms import depth_correction
 from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
     correct_depths,
@@ -156,6 +157,27 @@ def test_stated_errors_hold_for_biases_that_walk_between_nodes():
     error = squares.std(ddof=1) / np.sqrt(squares.size)
     assert error < 0.12
     assert abs(squares.mean() - 1) < 4 * error
+
+
+def test_the_rate_of_two_nodes_is_that_of_shipped_tables():
+    """Rates of left-out nodes over those of differences of the same nodes, along depths and waters of six tables."""
+    names = (
+        "leica_chiroptera4x",
+        "published_airborne",
+        "riegl_vq840g",
+        "riegl_vq840gl",
+        "riegl_vq880g2",
+        "usgs_eaarl_b",
+    )
+    ratios = []
+    for name in names:
+        calm = depth_correction._learnt(corrections_for(name, "auto").sel(estimator=["gaussian"])).isel(wind_speed=0)
+        bias = calm["bias"].where(calm["found"] >= 0.5)
+        for axis, nodes in (("depth", calm["depth"]), ("water", calm["attenuation"])):
+            whole = bias.where(bias.notnull().all(axis))
+            differences = whole.diff(axis) ** 2 / np.abs(nodes.diff(axis))
+            ratios.append(float(depth_correction._rate(whole, nodes, axis).mean() / differences.mean()))
+    assert np.mean(ratios) == pytest.approx(depth_correction._OF_TWO, abs=0.005)
 
 
 def test_unknown_cells_take_the_nearest_known_one():
