@@ -281,6 +281,7 @@ def _record_channel(
         **dataset.attrs,
         "time_start_ns": float(time[0]) - 0.5 * width * stride,
         "bin_width_ns": width * stride,
+        "rendered_bin_width_ns": width,
         "shots": len(signal),
         "background_power_w": np.ravel(sky).tolist() if np.ndim(sky) else float(sky),
         **dict(_described("receiver", receiver)),

@@ -129,7 +129,8 @@ def depth_bias(
     Raises
     ------
     UserError
-        If the instrument is unknown, or a number or parameter is out of range.
+        If the instrument is unknown, a number or parameter is out of range, or the receiver counts photons and has
+        less than one count in the brightest sample of a record.
     """
     own = read_instrument(instrument)
     usual = float(next(one.value for one in own.parameters if one.name == "off_nadir_deg"))
@@ -175,6 +176,7 @@ def depth_bias(
                 _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
             else:
                 recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
+                _check_counts(recorded)
                 cells[place] = _cell(recorded, estimators, corrections)
                 pixels = [str(name) for name in recorded["pixel"].values]
                 geometry = {name: float(recorded.attrs[name]) for name in _GEOMETRY if name in recorded.attrs}
@@ -226,6 +228,17 @@ def _is_lost(shallower: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether a bottom was found at one of the smaller depths, and none at the last of them."""
     found = [bool(np.any(cell["found"] > 0)) for cell in shallower]
     return any(found) and not found[-1]
+
+
+def _check_counts(recorded: xr.Dataset) -> None:
+    """Refuse records of photon counters in which the brightest sample has less than one count on average."""
+    brightest = float(recorded["signal_mean"].max())
+    counts = recorded["signal"].attrs["units"] == "1" and float(recorded["event_height"].max()) > 0
+    if counts and brightest < 1:
+        raise UserError(
+            f"receiver = {recorded.attrs['receiver']!r} must give at least 1 count in the brightest sample of a "
+            f"record, but gives {brightest:.2g}: single photons are no waveform to measure a depth in"
+        )
 
 
 def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Dataset | None) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms.depth_errors import rendered_bin_ns, rounding_ns
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag, has_echo
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative
@@ -22,10 +23,12 @@ from mitransient_lidar.results.geometry import required_number
 #: Dimensions of a table that depths are interpolated in, in this order, before estimator and pixel.
 AXES = ("off_nadir_deg", "wind_speed", "water", "depth")
 
-_TABLE = ("bias", "spread", "found", "attenuation")
-_LEAST_ERROR = 0.01  # of a corrected depth [m]
-#: Error of biases between the nodes of a table, relative: that of 32 cells of level seas at other angles and depths.
-_OF_BIAS = 0.25
+_TABLE = ("bias", "spread", "found", "noise_error", "attenuation")
+#: Share of shots with a depth from which a bias counts for the changes between nodes; fewest places of a spread.
+_USUAL, _FEWEST = 0.5, 4.0
+#: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
+#: and waters, over a level sea, of the first six shipped tables.
+_OF_TWO = 0.57
 _NEAR = 2.0  # largest error of a depth that counts [m]
 
 
@@ -82,16 +85,35 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
     Returns
     -------
     xarray.Dataset
-        The echoes with ``depth_m`` less the bias, ``depth_correction_m`` (what was subtracted), and as
-        ``depth_m_method_error`` the spread that is left in renders with a quarter of the bias, the error of biases
-        between nodes. Errors are interpolated linearly in the angle from nadir, the wind, the attenuation of the column
-        (the median over the waveforms), and the depth; outside the table they are those of its ends. A bias counts with
-        the share bias^2/(bias^2 + spread^2/n), for n places of a sea.
+        The echoes with ``depth_m`` less the bias and ``depth_correction_m``, what was subtracted. Biases are
+        interpolated linearly in the angle from nadir, the wind, the attenuation of the column (the median over the
+        waveforms), and the depth; outside the table they are those of its ends. A bias counts with the share
+        bias^2/(bias^2 + spread^2/n), for n places of a sea.
+
+        ``depth_m_method_error`` is the root of the sum of the squares of
+
+        - the spread in the table beyond the error by noise there, of waves with the mean over the waters; where the
+          error by noise exceeds the spread, ``depth_m_stderr`` is reduced to the spread;
+        - the error of the mean bias over the places of a sea with waves, spread/sqrt(n);
+        - the error of biases between nodes, and beyond the ends of the table, as of random walks: see Notes;
+        - the rounding of the surface's time to a bin of the render, the largest of the pixels; see
+          `depth_errors.rounding_ns`.
 
     Raises
     ------
     UserError
         If the table is of another instrument, lacks an estimator or a pixel, or the wind is not known.
+
+    Notes
+    -----
+    The linear interpolation of a random walk between nodes at the distances g and h has the variance rate times
+    g h/(g + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of
+    geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
+    mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
+    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.57 of their squared
+    difference over the distance, the mean ratio of both rates in six tables; one node gives 0. Cells in which fewer of
+    the shots have a depth count only where no other ones do. Without any bias of an estimator in a pixel, depths and
+    errors stay as they are.
     """
     instrument = found.attrs.get("instrument", "")
     if instrument != table.attrs["instrument"]:
@@ -105,46 +127,113 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
             raise UserError(f"the corrections lack the {name} {missing[0]!r}")
     several = "estimator" in found.dims
     names = found["estimator"].values if several else found.attrs["estimators"]
-    # Biases that are small beside their own error, over the places of a sea, count little.
-    noise = (table["spread"] ** 2 / float(table.attrs.get("shots", np.inf))).fillna(0)
-    certain = table["bias"] ** 2 / (table["bias"] ** 2 + noise).where(lambda square: square > 0, 1.0)
-    table = table.assign(bias=table["bias"] * certain)
-    own_table = table.sel(pixel=found["pixel"].values, estimator=list(names))
+    learnt = _learnt(table.sel(pixel=found["pixel"].values, estimator=list(names)))
     wind = _wind(found) if wind_speed is None else non_negative("wind_speed", wind_speed)
-    place = {"off_nadir_deg": required_number(found.attrs, "off_nadir_deg"), "wind_speed": wind}
-    cell = own_table[list(_TABLE)]
-    for axis, value in place.items():
+    angle = required_number(found.attrs, "off_nadir_deg")
+    cell, rates = learnt, _walks(learnt)
+    for axis, value in (("off_nadir_deg", angle), ("wind_speed", wind)):
         nodes = table[axis].values
         cell = (
             cell.interp({axis: float(np.clip(value, nodes[0], nodes[-1]))}) if nodes.size > 1 else cell.isel({axis: 0})
         )
-    # Shape (water, depth, estimator, pixel).
-    bias, spread = (cell[name].transpose("water", "depth", "estimator", "pixel").values for name in ("bias", "spread"))
-    attenuation = cell["attenuation"].transpose("water", ...).values
+    attenuation, depths = cell["attenuation"].values, table["depth"].values
+    opacity = _median(found["attenuation"].values)
+    water = _place_of(attenuation, opacity)
+    by_angle = _walked(table["off_nadir_deg"].values, angle)
+    by_water = _walked(attenuation, opacity)
     depth = found["depth_m"] if several else found["depth_m"].expand_dims(estimator=list(names))
     arranged = depth.transpose("estimator", "pixel", ..., "echo")
-    amount, left = (np.zeros(arranged.shape) for _ in range(2))
-    water = _place_of(attenuation, _median(found["attenuation"].values))
-    nodes = table["depth"].values
-    for e in range(arranged.shape[0]):
-        for p in range(arranged.shape[1]):
-            for values, target in ((bias, amount), (spread, left)):
-                target[e, p] = _interpolated(values[:, :, e, p], water, _place_of(nodes, arranged.values[e, p]))
+    amount, variance, share = (np.zeros(arranged.shape) for _ in range(3))
+    for e, p in np.ndindex(arranged.shape[:2]):
+        at = arranged.values[e, p]
+        one = cell.isel(estimator=e, pixel=p)
+        rate = {axis: of.isel(estimator=e, pixel=p).values for axis, of in rates.items()}
+        for name, target in (("bias", amount), ("variance", variance), ("noise_share", share)):
+            values = one[name].transpose("water", "depth").values
+            target[e, p] = _interpolated(values, water, _place_of(depths, at))
+        by_depth = _at_row(rate["depth"], water) * _walked(depths, at)
+        between = _at_row(rate["off_nadir_deg"], water) * by_angle + float(rate["water"]) * by_water
+        variance[e, p] += by_depth + between if one["bias"].notnull().any() else np.nan
     amount[..., :2] = 0.0
-    correction = arranged.copy(data=np.where(np.isfinite(arranged.values), amount, np.nan)).transpose(*depth.dims)
-    error = arranged.copy(data=np.maximum(np.hypot(left, _OF_BIAS * amount), _LEAST_ERROR)).transpose(*depth.dims)
-    if not several:
-        correction, error = correction.isel(estimator=0, drop=True), error.isel(estimator=0, drop=True)
-    correction = correction.transpose(*found["depth_m"].dims)
-    behind = xr.DataArray([False, False, True, True], dims="echo")
-    method = found["depth_m_method_error"].where(~behind | correction.isnull(), error.transpose(*correction.dims))
+
+    def of_echoes(values: FloatArray) -> xr.DataArray:
+        whole = arranged.copy(data=np.where(np.isfinite(arranged.values), values, np.nan)).transpose(*depth.dims)
+        return (whole if several else whole.isel(estimator=0, drop=True)).transpose(*found["depth_m"].dims)
+
+    correction, error = of_echoes(amount), of_echoes(np.sqrt(variance))
+    if "surface_spread" in found.coords and "depth_per_ns" in found.coords:
+        rounding = found["depth_per_ns"] * rounding_ns(found["surface_spread"], rendered_bin_ns(found.attrs))
+        # A pixel without light of the surface has the time of another one.
+        error = (error**2 + rounding.max("pixel") ** 2).transpose(*correction.dims) ** 0.5
+    behind = xr.DataArray([False, False, True, True], dims="echo") & correction.notnull()
     described = {"units": "m", "long_name": "mean error that was subtracted from the depth"}
-    corrected = found.assign(
-        depth_m=(found["depth_m"] - correction.fillna(0)).assign_attrs(found["depth_m"].attrs),
-        depth_m_method_error=method.assign_attrs(found["depth_m_method_error"].attrs),
-        depth_correction_m=correction.assign_attrs(described),
-    )
+    stated = {
+        "depth_m": found["depth_m"] - correction.fillna(0),
+        "depth_m_stderr": found["depth_m_stderr"] * of_echoes(share).where(behind, 1.0),
+        "depth_m_method_error": found["depth_m_method_error"].where(~behind | error.isnull(), error),
+    }
+    added = {name: values.assign_attrs(found[name].attrs) for name, values in stated.items()}
+    corrected = found.assign(added | {"depth_correction_m": correction.assign_attrs(described)})
     return corrected.assign_attrs(depth_corrections=table.attrs["instrument"])
+
+
+def _learnt(table: xr.Dataset) -> xr.Dataset:
+    """Return a table with the biases that count, the variance of depths without noise, and the share of the noise.
+
+    The variables added are ``variance`` [m^2], that of the mean bias included, and ``noise_share``.
+    """
+    waves = table["wind_speed"] > 0
+    usual = table["found"] >= _USUAL
+    counts = usual | ~usual.any(("water", "depth"))
+    table = table.assign({name: table[name].where(counts) for name in ("bias", "spread", "noise_error")})
+    records = float(table.attrs.get("records", 1))
+    shots = table["found"] * float(table.attrs.get("shots", np.inf))
+    number = shots.where(waves, records * shots).clip(min=_FEWEST)
+    uncertain = (table["spread"] ** 2 / number).where(waves, 0.0).fillna(0)
+    certain = table["bias"] ** 2 / (table["bias"] ** 2 + uncertain).where(lambda total: total > 0, 1.0)
+    left = table["spread"] ** 2 / (1 - 1 / number)
+    noise = table["noise_error"] ** 2
+    beyond = left - noise
+    beyond = beyond.mean("water").where(waves, beyond).clip(min=0).where(left.notnull())
+    return table[list(_TABLE)].assign(
+        bias=table["bias"] * certain,
+        variance=beyond + uncertain,
+        noise_share=np.sqrt((left / noise).where(noise > 0, 1.0).clip(max=1)),
+    )
+
+
+def _walks(learnt: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the rates of the random walks of biases along the axes of a table [m^2 per unit], as `correct_depths`.
+
+    Those of ``off_nadir_deg`` and ``depth`` are over water; a water without them has the mean of the others, 0 without
+    any.
+    """
+    calm = learnt.isel(wind_speed=0)
+    bias = calm["bias"].where(calm["found"] >= _USUAL)
+    rates: dict[str, xr.DataArray] = {}
+    for axis in ("off_nadir_deg", "depth", "water"):
+        nodes = calm["attenuation"] if axis == "water" else calm[axis]
+        rate = _rate(bias, nodes, axis)
+        rate = rate.mean([dim for dim in rate.dims if dim == axis or dim not in ("water", "estimator", "pixel")])
+        if axis != "water":
+            rate = rate.fillna(rate.mean("water")).transpose("water", ...)
+        rates[axis] = rate.fillna(0)
+    return rates
+
+
+def _rate(bias: xr.DataArray, nodes: xr.DataArray, axis: str) -> xr.DataArray:
+    """Return the squared changes of biases along an axis over its unit; see `correct_depths`."""
+    count = bias.sizes[axis]
+    if count > 2:
+        parts = [slice(i, count - 2 + i) for i in range(3)]
+        before, here, after = (bias.isel({axis: part}).drop_vars(axis) for part in parts)
+        places = [nodes.isel({axis: part}).drop_vars(axis) for part in parts]
+        g, h = np.abs(places[1] - places[0]), np.abs(places[2] - places[1])
+        rate: xr.DataArray = (here - (h * before + g * after) / (g + h)) ** 2 * (g + h) / (g * h)
+        if rate.notnull().any():
+            return rate
+    differences: xr.DataArray = _OF_TWO * bias.diff(axis) ** 2 / np.abs(nodes.diff(axis))
+    return differences
 
 
 def summarize_depths(found: xr.Dataset, truth: npt.ArrayLike) -> dict[str, FloatArray]:
@@ -215,6 +304,24 @@ def _place_of(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
         return np.zeros(np.shape(values))
     order = order[np.argsort(nodes[order])]
     return np.asarray(np.interp(np.nan_to_num(values, nan=float(nodes[order[0]])), nodes[order], order.astype(float)))
+
+
+def _walked(nodes: FloatArray, values: npt.ArrayLike) -> FloatArray:
+    """Return g h/(g + h) of values at the distances g and h from nodes, g beyond an end, and 0 of NaN."""
+    known = np.sort(nodes[np.isfinite(nodes)])
+    if not known.size:
+        return np.zeros(np.shape(values))
+    at = np.nan_to_num(values, nan=float(known[0]))
+    after = np.searchsorted(known, at)
+    before, after = np.maximum(after - 1, 0), np.minimum(after, known.size - 1)
+    low, high = np.abs(at - known[before]), np.abs(known[after] - at)
+    inside = before != after
+    return np.asarray(np.where(inside, low * high / np.where(inside, low + high, 1.0), low))
+
+
+def _at_row(values: FloatArray, row: FloatArray) -> float:
+    """Return the value of a row between rows."""
+    return float(np.interp(row, np.arange(values.size), values))
 
 
 def _interpolated(values: FloatArray, row: FloatArray, column: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray
 from mitransient_lidar.core.constants import C0
@@ -96,7 +97,7 @@ class DepthErrors:
         height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
         gain = _column_gain(attributes, geometry)
-        bin_ns = optional_number(attributes, "bin_width_ns") or 0.0
+        bin_ns = rendered_bin_ns(attributes)
         return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
     def of_surface(self, faint: BoolArray) -> FloatArray:
@@ -104,15 +105,12 @@ class DepthErrors:
 
         The light of a surface echo comes from few places in the pixel, and its time is that of these places. Without a
         distinct (`faint`) echo, it is that of the column's onset. Echo and column overlap by a pulse, which limits the
-        accuracy even of a narrow beam. Light of a short spread s that is rendered into one bin of the width w has the
-        time of its middle: the error is w/sqrt(12), times exp(-2 pi^2 (s/w)^2), as the error of the centroid of a
-        Gaussian in bins.
+        accuracy even of a narrow beam. `rounding_ns` is added.
         """
         share = np.where(faint, _OF_COLUMN, _OF_LEVEL_SURFACE if self.slope == 0 else _OF_WAVES)
         overlap = np.where(faint, _OF_LOST_PULSE, _OF_PULSE) * self.pulse_ns
         spread = self.lines.surface_spread
-        rounding = self.bin_ns / math.sqrt(12) * np.exp(-2 * (math.pi * spread / max(self.bin_ns, 1e-9)) ** 2)
-        return np.asarray(np.hypot(np.hypot(share * spread, overlap), rounding))
+        return np.asarray(np.hypot(np.hypot(share * spread, overlap), rounding_ns(spread, self.bin_ns)))
 
     def of_echoes(
         self,
@@ -199,6 +197,22 @@ class DepthErrors:
         mean = np.sum(weight * np.nan_to_num(time), axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
         farthest = _FARTHEST_NEIGHBOUR * self.pulse_ns
         return np.asarray(np.where(total > 0, np.clip(time - mean, -farthest, farthest), 0).reshape(time_ns.shape))
+
+
+def rendered_bin_ns(attributes: Attributes) -> float:
+    """Return the width of the bins of a result's render [ns], 0 if unknown; those of a record may be wider."""
+    widths = (optional_number(attributes, name) for name in ("rendered_bin_width_ns", "bin_width_ns"))
+    return next((width for width in widths if width is not None), 0.0)
+
+
+def rounding_ns(spread_ns: npt.ArrayLike, bin_ns: float) -> FloatArray:
+    """Return the error of the time of light that is rendered into bins [ns], of the shape of its spread.
+
+    Light of a short spread s in one bin of the width w has the time of its middle: the error is w/sqrt(12), times
+    exp(-2 pi^2 (s/w)^2), as the error of the centroid of a Gaussian in bins.
+    """
+    relative = np.asarray(spread_ns) / max(bin_ns, 1e-9)
+    return np.asarray(bin_ns / math.sqrt(12) * np.exp(-2 * (math.pi * relative) ** 2))
 
 
 def mean_slope(attributes: Attributes, width: float) -> float:

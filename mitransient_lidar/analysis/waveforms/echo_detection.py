@@ -32,7 +32,7 @@ class EchoFlag(IntFlag):
     SATURATED = 2  # the detector or the digitiser was at its limit
     MERGED = 4  # less than an echo width from another echo
     CUT = 8  # extends beyond an end of the record
-    POOR_FIT = 16  # too few usable samples, or a fit that has not converged
+    POOR_FIT = 16  # too few usable samples, a fit that has not converged, or one with a doubtful amplitude
     SCATTERED_LIGHT = 64  # the beam does not light the pixel: the light has been scattered, and the depth is too large
     FEW_EVENTS = 128  # no higher than single events of the detector, such as dark counts: may be noise
     NO_SURFACE_LIGHT = 32  # the beam does not light the surface in the pixel, or the first echo is not the surface's

@@ -33,7 +33,7 @@ ESTIMATORS = ("threshold", "leading_edge", "peak", "centroid", "gaussian", "deco
 ECHOES = ("surface", "column", "target", "bottom")
 _TYPICAL_DECAY = 0.03  # of a column that is too short for a fit [1/ns]
 _TYPICAL_SLOPE_VARIANCE = 0.04  # of a sea without the attribute surface_slope_variance
-_SIGNIFICANT = 3.0  # standard errors of the amplitude of a surface echo that is distinct from the column
+_SIGNIFICANT = 3.0  # standard errors of the amplitude of an echo that is distinct from the column and other echoes
 _TAIL = 2e-4  # of an echo, relative to its peak, that does not disturb the column
 _LEVEL = 0.2  # typical deviation of the column at the surface from the one below, relative
 _FAINT = 0.02  # smallest level of the threshold estimator, relative to the amplitude
@@ -140,7 +140,7 @@ def extract(
     has the flag ``no_surface_light``, ``surface_time_ns`` from the other pixels of its shot, and echoes with the flag
     ``scattered_light``. Echoes no higher than single events of the detector have the flag ``few_events``. The estimator
     ``gaussian`` flags a surface echo of less than 3 standard errors as ``no_echo``; its time is that of the column's
-    onset.
+    onset. A target or bottom of less has the flag ``poor_fit``.
 
     ``depth_m_stderr`` is the error by noise and by the jitter of the record's trigger and clocks, which cancels where
     the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for ``gaussian``
@@ -323,7 +323,9 @@ def _with_depths(
         measured = time[:, number, 0]
         faint = np.isnan(measured)
         if estimator == "gaussian":
-            faint |= table["amplitude"][:, number, 0] < _SIGNIFICANT * table["amplitude_stderr"][:, number, 0]
+            weak = table["amplitude"][:, number] < _SIGNIFICANT * table["amplitude_stderr"][:, number]
+            faint |= weak[:, 0]
+            table["flags"][:, number, 2:] |= np.where(weak[:, 2:], int(EchoFlag.POOR_FIT), 0)
         found = surface_times(
             measured.reshape(shots, -1),
             error[:, number, 0].reshape(shots, -1),

@@ -293,12 +293,15 @@ class ReceiverChain:
         """Return the height in the samples that a single event exceeds in one of a thousand records, shape (...).
 
         Events are those of light and dark counts; where many overlap, only a few of each bin count. Their charges are
-        gamma-distributed, as those of `LinearDetector`. 0 without an amplifier, or where events are rarer.
+        gamma-distributed, as those of `LinearDetector`. 1 for photon counters, 0 of other detectors without an
+        amplifier, or where events are rarer.
         """
         from scipy.stats import gamma
 
         light, sky = self._light(power, bin_width_ns, background)
-        if self.amplifier is None or isinstance(self.detector, SinglePhotonDetector):
+        if isinstance(self.detector, SinglePhotonDetector):
+            return np.ones(np.shape(power)[:-1])
+        if self.amplifier is None:
             return np.zeros(np.shape(power)[:-1])
         low_pass = self.low_pass(bin_width_ns)
         events = self.events(light, bin_width_ns, sky)

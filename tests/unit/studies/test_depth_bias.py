@@ -29,6 +29,7 @@ def rendered(monkeypatch):
     monkeypatch.setattr(study, "render_shots", render)
     monkeypatch.setattr(study, "detect_waveforms", lambda result, *options: result)
     monkeypatch.setattr(study, "_cell", cell)
+    monkeypatch.setattr(study, "_check_counts", lambda recorded: None)
     return depths
 
 
@@ -45,6 +46,22 @@ def test_bottoms_below_a_lost_one_are_not_rendered(rendered):
     assert [state.done for state in states] == list(range(1, 13))
     assert table["attenuation"].item(0) == pytest.approx(0.2)
     assert table.attrs["altitude"] == 150
+
+
+@pytest.mark.parametrize(
+    ("units", "event", "brightest", "refused"),
+    [("1", 1.0, 0.8, True), ("1", 1.0, 1.5, False), ("1", 0.0, 0.8, False), ("V", 0.01, 0.8, False)],
+)
+def test_records_of_single_photons_are_refused(units, event, brightest, refused):
+    """Photon counters with less than a count in every sample, not electrons without noise, nor volts."""
+    signal = xr.DataArray(np.zeros(3), dims="time", attrs={"units": units})
+    data = {"signal": signal, "signal_mean": ("time", [0.0, brightest, 0.1]), "event_height": ("pixel", [event])}
+    recorded = xr.Dataset(data, attrs={"receiver": "icesat2_atlas"})
+    if not refused:
+        study._check_counts(recorded)
+        return
+    with pytest.raises(UserError, match=r"receiver = 'icesat2_atlas' must give at least 1 count .* gives 0.8"):
+        study._check_counts(recorded)
 
 
 def test_a_table_needs_a_depth_below_the_waves(rendered):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms import depth_correction
 from mitransient_lidar.analysis.waveforms.depth_correction import (
     AXES,
     correct_depths,
@@ -30,6 +31,7 @@ def table(instrument="riegl_vq840g"):
     spread = xr.zeros_like(bias) + 0.01 * depth
     level = attenuation + xr.zeros_like(angle) + xr.zeros_like(wind)
     data = {"bias": bias, "spread": spread, "found": xr.ones_like(bias), "attenuation": level}
+    data["noise_error"] = xr.zeros_like(bias)
     made = xr.Dataset(data).transpose(..., "estimator", "pixel")
     return made.transpose(*AXES, "estimator", "pixel").assign_attrs(instrument=instrument)
 
@@ -66,7 +68,10 @@ def test_the_bias_of_the_place_between_nodes_is_subtracted():
             bias = factor * (0.15 + 0.06 + 0.09 + 0.005 * np.array([4.0, 8.0])) + p
             np.testing.assert_allclose(bottom["depth_m"].values[:2, p, e], np.array([4.0, 8.0]) - bias)
             np.testing.assert_allclose(bottom["depth_correction_m"].values[:2, p, e], bias)
-            left = np.hypot([0.04, 0.08], 0.25 * bottom["depth_correction_m"].values[:2, p, e])
+            # The bias is linear in depth; of two nodes, the walk's variance in the middle is 0.57 of a quarter of the
+            # squared difference. The nodes' spreads are 2, 6 and 10 cm.
+            between = 0.57 * 0.25 * factor**2 * (0.1**2 + 0.12**2)
+            left = np.sqrt(0.5 * np.array([0.02**2 + 0.06**2, 0.06**2 + 0.1**2]) + between)
             np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], left)
     assert np.isnan(bottom["depth_m"].values[2]).all()
     surface = corrected.sel(echo="surface")
@@ -82,11 +87,97 @@ def test_one_estimator_has_no_dimension_and_ends_hold_beyond():
     np.testing.assert_allclose(level["depth_m"].values[0, 0, 3], 6 - (0.15 + 0.09 + 0.03))
 
 
+def test_errors_grow_beyond_the_ends_of_a_table():
+    """The bias of the middle depth is 3 cm off the line through the others: a rate of 3^2/2 cm^2/m."""
+    made = table()
+    made["bias"][{"depth": 1}] += 0.03
+    bottom = correct_depths(echoes([10.0, 12.0, 14.0], several=False), made, 0.0).sel(echo="bottom", pixel="red")
+    squares = bottom["depth_m_method_error"].values ** 2
+    np.testing.assert_allclose(np.diff(squares), 2 * 0.03**2 / 2, rtol=1e-6)
+    np.testing.assert_allclose(bottom["depth_correction_m"], bottom["depth_correction_m"][0])
+
+
+def test_noise_in_the_table_counts_once():
+    """Of a spread of 5 cm, 3 cm are the noise that the shots state; 8 cm of noise are reduced to the 5 cm."""
+    made = table()
+    made["bias"][:] = 0.0
+    made["spread"][:] = 0.05
+    for noise, method, share in ((0.03, 0.04, 1.0), (0.08, 0.0, 0.05 / 0.08)):
+        made["noise_error"][:] = noise
+        bottom = correct_depths(echoes([6.0]), made).sel(echo="bottom")
+        np.testing.assert_allclose(bottom["depth_m_method_error"], method, atol=1e-9)
+        np.testing.assert_allclose(bottom["depth_m_stderr"], 0.02 * share)
+
+
 def test_a_bias_within_its_error_counts_little():
     made = table().assign_attrs(shots=4)
     made["bias"][:], made["spread"][:] = 0.02, 0.08
-    corrected = correct_depths(echoes([6.0]), made).sel(echo="bottom")
-    np.testing.assert_allclose(corrected["depth_correction_m"], 0.02 * 0.2)
+    for wind, share in ((6.0, 0.2), (0.0, 1.0)):  # a level sea has one place
+        corrected = correct_depths(echoes([6.0]), made, wind).sel(echo="bottom")
+        np.testing.assert_allclose(corrected["depth_correction_m"], 0.02 * share)
+
+
+def stated(seed, realisations=20):
+    """Mean squares of error over stated error of the shots of independent tables with biases of random walks.
+
+    Biases are the sum of a walk in angle, one in attenuation and one in depth; nodes are at every second step, shots at
+    the others. Waves spread depths by 4 cm beside a noise of 3 cm, which the shots state.
+    """
+    rng = np.random.default_rng(seed)
+    steps, places, total = (20, 20, 24), 24, np.hypot(0.04, 0.03)
+    squares = []
+    for _ in range(realisations):
+        walks = [np.cumsum(0.02 * rng.normal(size=count)) for count in steps]
+        bias = walks[0][:, None, None] + walks[1][:, None] + walks[2]
+        nodes = bias[::2, ::2, ::2]
+        waves = total * np.sqrt(rng.chisquare(places - 1, nodes.shape) / places)
+        mean = nodes + total * rng.normal(size=nodes.shape) / np.sqrt(places)
+        # Over a level sea, the first wind, biases are exact.
+        values = {"bias": (nodes, mean), "spread": (0 * nodes, waves), "noise_error": (0 * nodes, 0 * nodes + 0.03)}
+        values["found"] = 0 * nodes + 1, 0 * nodes + 1
+        data = {name: (AXES, np.stack(pair, axis=1)) for name, pair in values.items()}
+        axes = {"off_nadir_deg": np.arange(0.0, 20, 2), "wind_speed": [0.0, 5.0], "depth": np.arange(1.0, 25, 2)}
+        axes["water"] = [str(number) for number in range(10)]
+        known = xr.Dataset(data, axes, {"shots": places, "records": 60, "instrument": "riegl_vq840g"})
+        known = known.expand_dims(estimator=["gaussian"], pixel=["red"], axis=(4, 5))
+        known["attenuation"] = AXES[:3], np.broadcast_to(0.1 + 0.1 * np.arange(10), (10, 2, 10)).copy()
+        angle, water = 2 * rng.integers(0, 9, 2) + 1
+        steps_deep = 2 * rng.integers(0, 11, 400) + 1
+        error = bias[angle, water, steps_deep] + total * rng.normal(size=400)
+        found = echoes(1.0 + steps_deep + error, 0.1 + 0.05 * water, ["red"], False, off_nadir_deg=float(angle))
+        found["depth_m_stderr"][:] = 0.03
+        bottom = correct_depths(found, known, wind_speed=5.0).sel(echo="bottom").isel(pixel=0)
+        whole = np.hypot(bottom["depth_m_stderr"], bottom["depth_m_method_error"])
+        squares.append(float(np.mean(((bottom["depth_m"] - 1.0 - steps_deep) / whole) ** 2)))
+    return np.array(squares)
+
+
+def test_stated_errors_hold_for_biases_that_walk_between_nodes():
+    squares = stated(1)
+    error = squares.std(ddof=1) / np.sqrt(squares.size)
+    assert error < 0.12
+    assert abs(squares.mean() - 1) < 4 * error
+
+
+def test_the_rate_of_two_nodes_is_that_of_shipped_tables():
+    """Rates of left-out nodes over those of differences of the same nodes, along depths and waters of six tables."""
+    names = (
+        "leica_chiroptera4x",
+        "published_airborne",
+        "riegl_vq840g",
+        "riegl_vq840gl",
+        "riegl_vq880g2",
+        "usgs_eaarl_b",
+    )
+    ratios = []
+    for name in names:
+        calm = depth_correction._learnt(corrections_for(name, "auto").sel(estimator=["gaussian"])).isel(wind_speed=0)
+        bias = calm["bias"].where(calm["found"] >= 0.5)
+        for axis, nodes in (("depth", calm["depth"]), ("water", calm["attenuation"])):
+            whole = bias.where(bias.notnull().all(axis))
+            differences = whole.diff(axis) ** 2 / np.abs(nodes.diff(axis))
+            ratios.append(float(depth_correction._rate(whole, nodes, axis).mean() / differences.mean()))
+    assert np.mean(ratios) == pytest.approx(depth_correction._OF_TWO, abs=0.005)
 
 
 def test_unknown_cells_take_the_nearest_known_one():
@@ -95,7 +186,9 @@ def test_unknown_cells_take_the_nearest_known_one():
     corrected = correct_depths(echoes([10.0], several=False), made)
     np.testing.assert_allclose(corrected["depth_m"].values[0, 0, 3], 10 - (0.15 + 0.06 + 0.09 + 0.03))
     made["bias"][:] = np.nan
-    np.testing.assert_allclose(correct_depths(echoes([10.0]), made).sel(echo="bottom")["depth_m"], 10)
+    bottom = correct_depths(echoes([10.0]), made).sel(echo="bottom")
+    for name, unchanged in (("depth_m", 10), ("depth_m_stderr", 0.02), ("depth_m_method_error", 0.05)):
+        np.testing.assert_allclose(bottom[name], unchanged)
 
 
 def test_summary_of_depths():

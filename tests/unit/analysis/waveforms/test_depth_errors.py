@@ -66,6 +66,7 @@ def test_light_in_bins_has_the_error_of_its_centroid(spread):
     shares = np.diff(ndtr((edges - places[:, np.newaxis]) / max(spread, 1e-9)), axis=1)
     expected = np.std(shares @ (0.5 * (edges[1:] + edges[:-1])) - places)
     one = errors(bin_width_ns=1.0)
+    assert errors(bin_width_ns=1.0, rendered_bin_width_ns=0.5).bin_ns == 0.5  # a record of wider samples
     one = replace(one, lines=replace(one.lines, surface_spread=np.full(2, spread)))
     faint = np.zeros(2, dtype=bool)
     found = one.of_surface(faint)[0] ** 2 - replace(one, bin_ns=0.0).of_surface(faint)[0] ** 2

@@ -188,6 +188,19 @@ def test_a_surface_echo_within_its_error_is_not_listed():
     assert np.isfinite(table["depth_m"].sel(echo="bottom")).all()
 
 
+def test_a_bottom_within_its_error_is_flagged():
+    """Bottoms of 230 standard errors, and some of less than 3 that a low threshold finds."""
+    normal = np.random.default_rng(3).normal(size=(4, BINS))
+    for noise, doubtful in ((1e-6, False), (1e-4, True)):
+        dataset = result(np.stack([waveform()] * 4) + noise * normal)
+        bottom = echo_table.extract(dataset, noise=noise, threshold=1.0).sel(echo="bottom")
+        weak = (bottom["amplitude"] < 3 * bottom["amplitude_stderr"]).values
+        assert weak.any() == doubtful
+        flagged = (bottom["flags"].values & int(EchoFlag.POOR_FIT)) != 0
+        assert flagged[weak].all()
+        assert doubtful or not flagged.any()
+
+
 def test_rows_say_why_a_depth_is_unknown():
     dark = 0 * TIME
     surface_only = echo(SURFACE, 3e-13)

@@ -225,3 +225,5 @@ def test_single_events_exceed_the_stated_height_in_one_of_a_thousand_records():
     highest = chain.apply(np.zeros(bins), width, records, 5).signal.max(axis=-1)
     # Two events in a response are higher; those between two samples, and before the record, lower.
     assert 0.2e-3 < np.mean(highest > height) < 2e-3
+    # A photon counter reports single events as counts of 1.
+    assert RECEIVERS["spad_array"].event_height(np.zeros(bins), width) == 1
