@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, shown
 from mitransient_lidar.flights.sea_surface import Facets, SeaSurface
+from mitransient_lidar.physics.lidar.refraction import refract
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -173,7 +174,7 @@ class RefractedPaths:
         cos_level = np.sqrt(1 - (1 - direction[:, 2] ** 2) / n**2)
         arrival = timing.surface_range + group * timing.depth / cos_level
         length = np.where(in_water, (arrival - distance) / group, 0.0)
-        refracted, _ = _refract(direction, normal, n)
+        refracted = refract(direction, normal, n)
         return cls(origin, direction, refracted, distance, length, facets, in_water, on_model, timing, n, group)
 
     @property
@@ -246,12 +247,10 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ni,ni->n", a, b))
 
 
-def _refract(direction: FloatArray, normal: FloatArray, n: float) -> tuple[FloatArray, FloatArray]:
-    """Return refracted directions, and the factor f = c/n - c_w of the unit normals, shapes (N, 3) and (N,)."""
-    unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+def _factor(direction: FloatArray, unit: FloatArray, n: float) -> FloatArray:
+    """Return the factor f = c/n - c_w of the unit normals in refracted directions, shape (N,)."""
     c = -_dot(direction, unit)
-    factor = c / n - np.sqrt(1 - (1 - c**2) / n**2)
-    return direction / n + factor[:, None] * unit, factor
+    return np.asarray(c / n - np.sqrt(1 - (1 - c**2) / n**2))
 
 
 def _bent(direction: FloatArray, normal: FloatArray, n: float, change: FloatArray) -> FloatArray:
@@ -264,7 +263,7 @@ def _tilted(direction: FloatArray, normal: FloatArray, n: float) -> list[FloatAr
     """Return the derivatives of the refracted direction by the rises of the surface towards +x and +y, shape (N, 3)."""
     size = np.linalg.norm(normal, axis=1, keepdims=True)
     unit = normal / size
-    _, factor = _refract(direction, normal, n)
+    factor = _factor(direction, unit, n)
     derivatives = []
     for axis in range(2):
         change = -np.eye(3)[axis] / size
@@ -275,6 +274,6 @@ def _tilted(direction: FloatArray, normal: FloatArray, n: float) -> list[FloatAr
 
 
 def _slope_of_factor(direction: FloatArray, unit: FloatArray, n: float) -> FloatArray:
-    """Return df/dc = (1 - c/(n c_w))/n of the factor f of `_refract`, shape (N,)."""
+    """Return df/dc = (1 - c/(n c_w))/n of the factor f of `_factor`, shape (N,)."""
     c = -_dot(direction, unit)
     return np.asarray((1 - c / (n * np.sqrt(1 - (1 - c**2) / n**2))) / n)

@@ -59,7 +59,7 @@ class Scanner(ABC):
 
     @staticmethod
     def of(given: Mapping[str, Any]) -> Scanner:
-        """Return the scanner of the table ``[scanner]`` of a plan: its ``kind``, one of `KINDS`, and its parameters.
+        """Return the scanner of the table ``[scanner]`` of a plan: ``kind`` (`SCANNER_KINDS`) and its parameters.
 
         Raises
         ------
@@ -67,15 +67,15 @@ class Scanner(ABC):
             For a key or a value that is not allowed or is missing.
         """
         kind = required("[scanner]", given, "kind")
-        if not isinstance(kind, str) or kind not in KINDS:
-            raise UserError(f"kind = {shown(kind)} of a scanner must be one of {', '.join(KINDS)}")
-        where, parameters = f"a scanner of kind {kind!r}", fields(KINDS[kind])
+        if not isinstance(kind, str) or kind not in SCANNER_KINDS:
+            raise UserError(f"kind = {shown(kind)} of a scanner must be one of {', '.join(SCANNER_KINDS)}")
+        where, parameters = f"a scanner of kind {kind!r}", fields(SCANNER_KINDS[kind])
         values = {name: value for name, value in given.items() if name != "kind"}
         check_keys(where, values, [one.name for one in parameters])
         for one in parameters:
             if one.default is MISSING:
                 required(where, given, one.name)
-        return KINDS[kind](**values)
+        return SCANNER_KINDS[kind](**values)
 
     def directions(self, times: npt.ArrayLike) -> ScanDirections:
         """Return the directions of pulses at times [s], shape (n,); raise `UserError` for times that are not finite."""
@@ -281,7 +281,7 @@ class Fixed(Scanner):
 
 
 #: Kinds of scanners of a plan.
-KINDS: dict[str, type[Scanner]] = {
+SCANNER_KINDS: dict[str, type[Scanner]] = {
     "palmer": Palmer,
     "semi_arc": SemiArc,
     "oscillating": Oscillating,

@@ -21,7 +21,7 @@ from mitransient_lidar.flights.poses.straight_lines import fixed_platform, strai
 from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
 
 #: Kinds of platforms of a plan.
-KINDS = ("lines", "mast", "csv", "sbet")
+PLATFORM_KINDS = ("lines", "mast", "csv", "sbet")
 
 #: Interpolation between records.
 INTERPOLATIONS = ("linear", "cubic")
@@ -132,8 +132,8 @@ class Trajectory:
             For a key or a value that is not allowed or is missing, and for a file that cannot be read.
         """
         kind = required("[platform]", given, "kind")
-        if kind not in KINDS:
-            raise UserError(f"kind = {shown(kind)} of a platform must be one of {', '.join(KINDS)}")
+        if kind not in PLATFORM_KINDS:
+            raise UserError(f"kind = {shown(kind)} of a platform must be one of {', '.join(PLATFORM_KINDS)}")
         if kind == "lines":
             records, lines = straight_lines(given)
             return cls(*records, lines=lines)
