@@ -225,8 +225,8 @@ def detect(
     max_time: Annotated[
         float | None,
         typer.Option(
-            help="Begin no further depth of --depths after this many seconds, and leave it out; the target as it is "
-            "always is rendered (greater than 0)."
+            help="Begin no further depth of --depths after this many seconds, and leave it out; the scene's own depth "
+            "is always rendered (greater than 0)."
         ),
     ] = None,
     seed: Seed = 0,

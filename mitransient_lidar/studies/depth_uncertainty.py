@@ -150,4 +150,6 @@ def describe_depth_uncertainty(found: xr.Dataset) -> list[str]:
         residual = np.sqrt((cell["vertical_residual"] ** 2).mean())
         text += "".join(f"{100 * float(cell[f'vertical_{name}']):>{8 - number}.2f}" for number, name in enumerate("ab"))
         lines.append(f"{text}{100 * float(residual):>10.2f}")
+    if left_out := found.attrs.get("seas_left_out"):
+        lines.append(f"- also stands for {left_out} seas that were left out by max_time")
     return lines
