@@ -23,7 +23,7 @@ from mitransient_lidar.physics.receiver.receiver_files import receiver as receiv
 
 _LOG = logging.getLogger(__name__)
 
-_DENSEST = 12.0  # largest optical density
+DENSEST = 12.0  # largest optical density
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 
@@ -348,7 +348,7 @@ def _in_range(
         name = "gain" if gain == "auto" else "optical_density"
         raise UserError(f"{name} = 'auto' needs a receiver with an amplifier: without one, nothing saturates")
     background = np.broadcast_to(sky, light.shape[:-1])
-    wanted = 0.0 if density == "auto" else in_range("optical_density", density, 0, _DENSEST)
+    wanted = 0.0 if density == "auto" else in_range("optical_density", density, 0, DENSEST)
     used = chain if gain in ("auto", 1) else chain.with_gain(finite("gain", gain))
     attenuation = used.fitting_attenuation(light, width, background)
     if math.isinf(attenuation) and density == "auto":

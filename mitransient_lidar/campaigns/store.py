@@ -47,7 +47,7 @@ _FEWEST, _MOST, _SHARDS = 8, 1024, 16
 _MOST_BYTES = 2**29
 
 #: Most runs of a shard that is asked for, and of a chunk of an array of all runs.
-_LARGEST = 10**6
+LARGEST_SHARD = 10**6
 
 #: Suffix of parameters of the scene that have the name of a variable.
 _INPUT = "_input"
@@ -111,7 +111,7 @@ class Store:
             self._renderer_type().check(self.text)
             #: Number of runs, and of runs of a shard.
             self.count = integer("runs", self.attributes["runs"], 1, MOST_RUNS)
-            self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, _LARGEST)
+            self.shard_size = integer("shard_size", self.attributes["shard_size"], 1, LARGEST_SHARD)
             self.variables = [str(name) for name in self.attributes["variables"]]
         except _DAMAGE as error:
             raise UserError(f"{path} is no store of a campaign or a flight, or is damaged.") from error
@@ -147,7 +147,7 @@ class Store:
         count = len(next(iter(columns.values())))
         bytes_of_run = sum(array.values.nbytes for array in arrays.values())
         size = _shard_size(count, bytes_of_run)
-        size = size if shard_size is None else integer("shard_size", shard_size, 1, _LARGEST)
+        size = size if shard_size is None else integer("shard_size", shard_size, 1, LARGEST_SHARD)
         # Beside its place, so that a store is always whole.
         temporary = temporary_beside(path)
         try:
@@ -277,7 +277,7 @@ class Store:
         for name in {*names, *of_runs}:
             array = self.array(name)
             if name not in of_runs:
-                lost = [one for one in range(-(-[*array.shape, 1][0] // _LARGEST)) if not self._has(name, one)]
+                lost = [one for one in range(-(-[*array.shape, 1][0] // LARGEST_SHARD)) if not self._has(name, one)]
                 if lost and array.size:
                     raise UserError(f"{self.path} is damaged: it has lost {name}.")
             elif array.shape[:1] != (self.count,) or array.chunks[:1] != (min(self.shard_size, self.count),):
@@ -451,13 +451,13 @@ def _fill(
             array[...] = whole.astype(str) if is_text else whole
 
     for name, found in coordinates.items():
-        make(name, found, found.values, chunk=_LARGEST)
+        make(name, found, found.values, chunk=LARGEST_SHARD)
     numbers = np.arange(count)
     named = {"units": "1", "long_name": f"number of the {renderer.unit}"}
-    make("run", Array(("run",), numbers, named), numbers, chunk=_LARGEST)
+    make("run", Array(("run",), numbers, named), numbers, chunk=LARGEST_SHARD)
     for name, column in columns.items():
         described = renderer.describe_input(name, column)
-        make(inputs[name], Array(("run",), column, described), column, chunk=_LARGEST)
+        make(inputs[name], Array(("run",), column, described), column, chunk=LARGEST_SHARD)
     make("status", Array((), np.zeros((), dtype=np.uint8), _STATUS))
     make("error", Array((), np.array("", dtype=object), {"long_name": "why the run failed"}))
     for name, found in arrays.items():

@@ -36,10 +36,17 @@ def bounds(
         ),
     ] = None,
     gain: Annotated[
-        str | None, typer.Option(help="Factor of the receiver's gain, or auto for the largest without saturation.")
+        str | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="Factor of the receiver's gain, greater than 0, or auto for the largest without saturation.",
+        ),
     ] = None,
     optical_density: Annotated[
-        str | None, typer.Option(help="Optical density of a filter, or auto for the least without saturation.")
+        str | None,
+        typer.Option(
+            metavar="DENSITY", help="Optical density of a filter, 0 to 12, or auto for the least without saturation."
+        ),
     ] = None,
     background_power_w: Annotated[
         float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
@@ -56,6 +63,10 @@ def bounds(
         int, typer.Option(help="Independent renders of each design, 2 to 1000; 3 or more give errors.")
     ] = 4,
     passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 2 to 100 000.")] = 16,
+    max_time: Annotated[
+        float | None,
+        typer.Option(help="Begin no further design after this many seconds, and leave it out (greater than 0)."),
+    ] = None,
     seed: Seed = 0,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file; also writes the data as .nc and .csv.")
@@ -95,6 +106,7 @@ def bounds(
             nuisances=nuisances,
             renders=renders,
             passes=passes,
+            max_time=max_time,
             seed=seed,
             progress=progress,
             **settings,

@@ -31,10 +31,16 @@ def sweep(
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
     ] = None,
     shard_size: Annotated[
-        int | None, typer.Option(help="Runs that one process renders and writes, 1 to 1 000 000.")
+        int | None,
+        typer.Option(
+            help="Runs that one process renders and writes, 1 to 1 000 000; by default a sixteenth of them, but 8 to "
+            "1024."
+        ),
     ] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Render runs that have failed again.")] = False,
-    row: Annotated[int | None, typer.Option(help="Render the run of this number alone, to a NetCDF file.")] = None,
+    row: Annotated[
+        int | None, typer.Option(help="Render the run of this number alone, from 0, to a NetCDF file.")
+    ] = None,
     show: Annotated[
         bool, typer.Option("--show", help="Draw a sample of a store, its distributions and responses.")
     ] = False,

@@ -9,19 +9,31 @@ import typer
 
 from mitransient_lidar.cli.files import announced, check_suffix, check_targets, check_writable, write_netcdf
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import OUTPUT, RECEIVERS, Define, Quiet, Seed, numbers, parameters
+from mitransient_lidar.cli.options import OUTPUT, RECEIVERS, Define, Quiet, numbers, parameters
 from mitransient_lidar.core.errors import UserError
+
+_WINDS = "Wind speeds, at least 0, ascending; 0 for a level sea with ripples."
+SeaTime = Annotated[
+    float | None,
+    typer.Option(help="Render no sea after this many seconds; those left out are NaN in the table (greater than 0)."),
+]
+SeaSeed = Annotated[int, typer.Option(help="Seed of the random numbers, 0 to 2^31.")]
 
 
 def depth_bias(
     instrument: Annotated[str, typer.Argument(metavar="INSTRUMENT", help="Name of the instrument.")],
     define: Define = None,
     angles: Annotated[
-        str | None, typer.Option(metavar="DEGREES", help="Angles from nadir; the instrument's and 5 more by default.")
+        str | None,
+        typer.Option(
+            metavar="DEGREES", help="Angles from nadir, at least 0, ascending; the instrument's and 5 more by default."
+        ),
     ] = None,
-    winds: Annotated[str, typer.Option(metavar="M/S", help="Wind speeds; 0 for a level sea with ripples.")] = "0,3,6",
+    winds: Annotated[str, typer.Option(metavar="M/S", help=_WINDS)] = "0,3,6",
     waters: Annotated[str, typer.Option(metavar="TYPES", help="Jerlov types from clear to turbid.")] = "IB,1C,5C",
-    depths: Annotated[str, typer.Option(metavar="M", help="Depths of the bottom.")] = "3,6,10",
+    depths: Annotated[
+        str, typer.Option(metavar="M", help="Depths of the bottom, greater than 0, ascending.")
+    ] = "3,6,10",
     scene: Annotated[str, typer.Option(help="Scene whose sea, water and bottom count.")] = "table1",
     receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's.")] = None,
     shots: Annotated[int, typer.Option(help="Random places of a sea with waves, 2 to 10 000.")] = 12,
@@ -32,7 +44,8 @@ def depth_bias(
             metavar="FILE", help="Table of another seed to also correct the depths by; auto for the shipped one."
         ),
     ] = None,
-    seed: Seed = 1,
+    max_time: SeaTime = None,
+    seed: SeaSeed = 1,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="NetCDF file; output/INSTRUMENT_depths.nc by default.")
     ] = None,
@@ -72,6 +85,7 @@ def depth_bias(
             receiver=receiver,
             shots=shots,
             records=records,
+            max_time=max_time,
             seed=seed,
             corrections=former,
             progress=progress,
@@ -91,18 +105,20 @@ def tpu(
     instrument: Annotated[str, typer.Argument(metavar="INSTRUMENT", help="Name of the instrument.")],
     define: Define = None,
     altitudes: Annotated[
-        str | None, typer.Option(metavar="M", help="Heights of the lidar; the instrument's by default.")
+        str | None,
+        typer.Option(metavar="M", help="Heights of the lidar, greater than 0, ascending; the instrument's by default."),
     ] = None,
     angles: Annotated[
-        str | None, typer.Option(metavar="DEGREES", help="Angles from nadir; the instrument's by default.")
+        str | None,
+        typer.Option(metavar="DEGREES", help="Angles from nadir, at least 0, ascending; the instrument's by default."),
     ] = None,
-    winds: Annotated[str, typer.Option(metavar="M/S", help="Wind speeds; 0 for a level sea with ripples.")] = (
-        "1,3,5,7,9"
-    ),
+    winds: Annotated[str, typer.Option(metavar="M/S", help=_WINDS)] = ("1,3,5,7,9"),
     waters: Annotated[str, typer.Option(metavar="TYPES", help="Jerlov types from clear to turbid.")] = (
         "III,1C,3C,5C,7C,9C"
     ),
-    depths: Annotated[str, typer.Option(metavar="M", help="Depths of the bottom.")] = "1,1.5,3,6,10",
+    depths: Annotated[
+        str, typer.Option(metavar="M", help="Depths of the bottom, greater than 0, ascending.")
+    ] = "1,1.5,3,6,10",
     scene: Annotated[str, typer.Option(help="Scene whose sea, water and bottom count.")] = "table1",
     receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's.")] = None,
     estimator: Annotated[str, typer.Option(help="Estimator of depths, as of waveforms.")] = "gaussian",
@@ -112,10 +128,17 @@ def tpu(
         str,
         typer.Option(metavar="FILE", help="Table of depth-bias to also correct the depths by, auto or none."),
     ] = "auto",
-    pointing_mrad: Annotated[float, typer.Option(help="Standard deviation of the beam's direction, each axis.")] = 0.1,
-    position_m: Annotated[float, typer.Option(help="Standard deviation of the horizontal position, each axis.")] = 0.05,
-    height_m: Annotated[float, typer.Option(help="Standard deviation of the height of the sea surface.")] = 0.05,
-    seed: Seed = 1,
+    pointing_mrad: Annotated[
+        float, typer.Option(help="Standard deviation of the beam's direction, each axis, at least 0.")
+    ] = 0.1,
+    position_m: Annotated[
+        float, typer.Option(help="Standard deviation of the horizontal position, each axis, at least 0.")
+    ] = 0.05,
+    height_m: Annotated[
+        float, typer.Option(help="Standard deviation of the height of the sea surface, at least 0.")
+    ] = 0.05,
+    max_time: SeaTime = None,
+    seed: SeaSeed = 1,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
@@ -151,6 +174,7 @@ def tpu(
             records=records,
             scene=scene,
             receiver=receiver,
+            max_time=max_time,
             seed=seed,
             corrections=None if corrections == "none" else corrections_for(instrument, corrections),
             progress=progress,
@@ -162,6 +186,8 @@ def tpu(
         for height in found["altitude"].values:
             for angle in found["off_nadir_deg"].values:
                 one = found.sel(altitude=height, off_nadir_deg=angle)
+                if one["found"].isnull().all():  # for lack of time
+                    continue
                 stem = f"{instrument}_{height:g}m_{angle:g}deg"
                 plot_uncertainty(one, output / f"{stem}_tvu.png")
                 plot_orders(one, output / f"{stem}_orders.png")

@@ -9,7 +9,7 @@ import typer
 
 from mitransient_lidar.cli.files import check_writable
 from mitransient_lidar.cli.messages import reporting
-from mitransient_lidar.cli.options import OUTPUT, Quiet, Seed
+from mitransient_lidar.cli.options import OUTPUT, Quiet
 
 
 def figures(
@@ -17,11 +17,13 @@ def figures(
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Figures, as fig09; all by default.")
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and table.")] = OUTPUT / "figures",
-    target_error: Annotated[float, typer.Option(help="Relative standard error of the median bin.")] = 0.01,
+    target_error: Annotated[
+        float, typer.Option(help="Relative standard error of the median bin, greater than 0.")
+    ] = 0.01,
     max_time: Annotated[
         float | None, typer.Option(help="Begin no further figure after this many seconds (greater than 0).")
     ] = None,
-    seed: Seed = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers, 0 to 10^6.")] = 0,
     quiet: Quiet = False,
 ) -> None:
     """Make the figures of the published model again.

@@ -45,7 +45,8 @@ def fit(
         typer.Option("--free-time/--fixed-time", help="Fit the time offset, as by default of CSV files."),
     ] = None,
     noise: Annotated[
-        float | None, typer.Option(help="Standard deviation of every sample, in the unit of the waveforms.")
+        float | None,
+        typer.Option(help="Standard deviation of every sample, in the unit of the waveforms, greater than 0."),
     ] = None,
     receiver: Annotated[
         str | None, typer.Option(help="Receiver of a signal, by default the one that it names.")
@@ -56,7 +57,13 @@ def fit(
     passes: Annotated[
         int | None, typer.Option(help="Passes of each render, 2 to 10^9; by default by the errors of the waveforms.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all renders; by default not that of the result.")] = None,
+    max_time: Annotated[
+        float | None,
+        typer.Option(help="Try no step after this many seconds, so that the fit may not converge (greater than 0)."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of all renders, -2^63 to 2^63 - 1; by default not that of the result.")
+    ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the files.")] = OUTPUT,
     quiet: Quiet = False,
 ) -> None:
@@ -89,6 +96,7 @@ def fit(
             receiver=receiver,
             scale_errors=scale_errors,
             passes=passes,
+            max_time=max_time,
             seed=seed,
             progress=progress,
         )

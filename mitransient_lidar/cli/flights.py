@@ -27,7 +27,11 @@ def fly(
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
     ] = None,
     shard_size: Annotated[
-        int | None, typer.Option(help="Pulses that one process renders and writes, at least 1; by default 512.")
+        int | None,
+        typer.Option(
+            help="Pulses that one process renders and writes, 1 to 1 000 000; by default an eighth of them, but "
+            "512 to 1024."
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

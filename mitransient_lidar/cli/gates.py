@@ -18,15 +18,23 @@ if TYPE_CHECKING:
 
 def gates(
     stack: Annotated[Path, typer.Argument(metavar="STACK", help="An EXR or NetCDF result that kept its histogram.")],
-    start_ns: Annotated[float | None, typer.Option(help="Start of the first gate, at half height [ns].")] = None,
-    start_depth: Annotated[
-        float | None, typer.Option(help="Depth of its start on the axis [m], instead of a time.")
+    start_ns: Annotated[
+        float | None, typer.Option(help="Start of the first gate, at half height [ns], any number.")
     ] = None,
-    width_ns: Annotated[float | None, typer.Option(help="Width of a gate between half heights [ns].")] = None,
-    step_ns: Annotated[float | None, typer.Option(help="Time from gate to gate [ns]; by default the width.")] = None,
+    start_depth: Annotated[
+        float | None, typer.Option(help="Depth of its start on the axis [m], any number, instead of a time.")
+    ] = None,
+    width_ns: Annotated[
+        float | None, typer.Option(help="Width of a gate between half heights [ns], greater than 0.")
+    ] = None,
+    step_ns: Annotated[
+        float | None, typer.Option(help="Time from gate to gate [ns], greater than 0; by default the width.")
+    ] = None,
     count: Annotated[int, typer.Option(help="Number of gates, 1 to 100 000.")] = 1,
-    rise_ns: Annotated[float, typer.Option(help="10-90 % time of the rising edge [ns].")] = 0.0,
-    fall_ns: Annotated[float, typer.Option(help="90-10 % time of the falling edge [ns].")] = 0.0,
+    rise_ns: Annotated[
+        float, typer.Option(help="10-90 % time of the rising edge [ns], at least 0; both edges at most 1.18 widths.")
+    ] = 0.0,
+    fall_ns: Annotated[float, typer.Option(help="90-10 % time of the falling edge [ns], at least 0.")] = 0.0,
     profile: Annotated[
         Path | None, typer.Option(help="Measured gate instead of width and edges: columns time [ns], transmission.")
     ] = None,

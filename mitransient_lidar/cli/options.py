@@ -28,7 +28,7 @@ SceneOrResult = Annotated[
 Define = Annotated[
     list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Set a parameter of the scene. Repeatable.")
 ]
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers, at least 0.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers, 0 to 2^53.")]
 MaxTime = Annotated[
     float | None, typer.Option(help="Stop before this many seconds, with fewer passes (greater than 0).")
 ]

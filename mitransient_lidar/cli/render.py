@@ -113,11 +113,14 @@ def passive(
     define: Define = None,
     output: Folder = OUTPUT,
     frames: Annotated[
-        int | None, typer.Option(help="Number of frames of an animation, at least 1, which is the default.")
+        int | None, typer.Option(help="Number of frames of an animation, 1 to 10 000; 1 by default.")
     ] = None,
-    frame_step: Annotated[float | None, typer.Option(help="Time between frames [s], 0.1 by default.")] = None,
+    frame_step: Annotated[
+        float | None, typer.Option(help="Time between frames [s], greater than 0; 0.1 by default.")
+    ] = None,
     filter_width_nm: Annotated[
-        float | None, typer.Option(help="Width of the receiver's filter [nm], for the power of the daylight.")
+        float | None,
+        typer.Option(help="Width of the receiver's filter [nm], greater than 0, for the power of the daylight."),
     ] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw the image, or animate the frames.")] = True,
     quiet: Quiet = False,

@@ -25,7 +25,9 @@ def plot(
     output: DrawingOnly = None,
     log: Annotated[bool, typer.Option("--log", help="Logarithmic power axis only.")] = False,
     linear: Annotated[bool, typer.Option("--linear", help="Linear power axis only.")] = False,
-    shot: Annotated[int | None, typer.Option(help="Number of a shot of a series; by default the mean of all.")] = None,
+    shot: Annotated[
+        int | None, typer.Option(help="Number of a shot of a series, from 0; by default the mean of all.")
+    ] = None,
     components: Annotated[
         bool, typer.Option("--components", help="Draw the light by origin instead, to FILE_components.png.")
     ] = False,
@@ -72,7 +74,9 @@ def view(
         Path | None, typer.Option("-o", "--output", help="HTML file to write; by default a temporary one.")
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
-    shot: Annotated[int | None, typer.Option(help="Number of a shot of a series; by default the mean of all.")] = None,
+    shot: Annotated[
+        int | None, typer.Option(help="Number of a shot of a series, from 0; by default the mean of all.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Show a result in the browser: a map of the pixels at each time, and the waveforms of those that are clicked.
@@ -126,18 +130,19 @@ def record(
     gain: Annotated[
         str | None,
         typer.Option(
-            metavar="FACTOR", help="Factor of the amplifier's gain, or auto; by default the receiver's, or 1."
+            metavar="FACTOR",
+            help="Factor of the amplifier's gain, greater than 0, or auto; by default the receiver's, or 1.",
         ),
     ] = None,
     optical_density: Annotated[
         str | None,
         typer.Option(
             metavar="DENSITY",
-            help="Optical density of a filter before the detector, or auto; by default the receiver's, or 0.",
+            help="Optical density of a filter before the detector, 0 to 12, or auto; by default the receiver's, or 0.",
         ),
     ] = None,
     shots: Annotated[
-        int, typer.Option(help="Number of records of each waveform with independent noise, at least 1.")
+        int, typer.Option(help="Number of records of each waveform with independent noise, 1 to 10^9.")
     ] = 1,
     background_power_w: Annotated[
         float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")

@@ -24,18 +24,19 @@ def retrieve(
         str | None,
         typer.Option(
             metavar="ALONG,ACROSS",
-            help="Standard deviations of the slopes of an unknown sea; by default those of a series.",
+            help="Standard deviations of the slopes of an unknown sea, greater than 0; by default those of a series.",
         ),
     ] = None,
     wind_speed: Annotated[
-        float | None, typer.Option(metavar="M/S", help="Wind speed over the sea; by default that of the scene.")
+        float | None,
+        typer.Option(metavar="M/S", help="Wind speed over the sea, 1 to 30; by default that of the scene."),
     ] = None,
     wind_direction_deg: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Direction that the wind blows towards, from +x."),
+        typer.Option(metavar="DEG", help="Direction that the wind blows towards, from +x, any angle."),
     ] = None,
     efficiency: Annotated[
-        float | None, typer.Option(help="Two-way efficiency of optics and air; by default that of the scene.")
+        float | None, typer.Option(help="Two-way efficiency of optics and air, 0 to 1; by default that of the scene.")
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="NetCDF file for all estimates.")] = None,
     figure: Annotated[

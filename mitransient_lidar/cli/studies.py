@@ -93,7 +93,7 @@ def shots(
     move_target: Annotated[
         bool, typer.Option("--move-target", help="Keep the target's place relative to the aim of each shot.")
     ] = False,
-    seed: Annotated[int | None, typer.Option(help="Seed of random places, 1 by default.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of random places, 0 to 2^53; 1 by default.")] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="NetCDF file of all shots.")] = OUTPUT / "shots.nc",
     quiet: Quiet = False,
     **options: Any,
@@ -140,7 +140,7 @@ def shot_statistics(
     max_time: Annotated[
         float | None, typer.Option(help="Stop before this many seconds, with fewer shots (greater than 0).")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of their places.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of their places, 0 to 2^53.")] = 1,
     output: Figure = OUTPUT / "shot_statistics.png",
     quiet: Quiet = False,
 ) -> None:
@@ -167,7 +167,14 @@ def target_signal(
         float, typer.Option(help="Largest offset of these places along each axis [m], greater than 0.")
     ] = 2.0,
     passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 16 to 100 000.")] = 64,
-    seed: Seed = 0,
+    max_time: Annotated[
+        float | None,
+        typer.Option(
+            help="Stop before this many seconds, shared among the places, with fewer passes, 16 of each place or "
+            "more (greater than 0)."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers, -2^63 to 2^63 - 1.")] = 0,
     output: Figure = OUTPUT / "target_signal.png",
     quiet: Quiet = False,
 ) -> None:
@@ -180,12 +187,12 @@ def target_signal(
     from mitransient_lidar.plots.studies.target_signal import plot_target_map, plot_target_signal
     from mitransient_lidar.studies import target_signal as study
 
-    options: dict[str, Any] = {"target_id": target_id, "passes": passes, "seed": seed}
+    options: dict[str, Any] = {"target_id": target_id, "passes": passes, "max_time": max_time, "seed": seed}
+    offsets = study.grid_offsets(grid, max_offset)
     with reporting(quiet) as progress:
         if grid == 1:
             found = study.target_signal(scene, params, progress=progress, **options)
         else:
-            offsets = study.grid_offsets(grid, max_offset)
             found = study.target_map(scene, params, x=offsets, y=offsets, progress=progress, **options)
     write_figure(found, output, plot_target_signal if grid == 1 else plot_target_map)
     _print(study.describe_target(found) if grid == 1 else study.describe_map(found))
@@ -200,13 +207,14 @@ def detect(
         float, typer.Option(help="Required probability of detection, above that of false alarm and below 1.")
     ] = 0.9,
     depths: Annotated[
-        str | None, typer.Option(metavar="D1,D2,...", help="Further depths of the target [m], increasing.")
+        str | None,
+        typer.Option(metavar="D1,D2,...", help="Further depths of the target [m], greater than 0, increasing."),
     ] = None,
     shots: Annotated[
         int, typer.Option(help="Number of simulated shots with and without the target, 100 to 100 000.")
     ] = 10_000,
     clutter: Annotated[
-        int, typer.Option(help="Number of seas whose differences count as noise; 0: one known sea.")
+        int, typer.Option(help="Number of seas whose differences count as noise, 4 to 1000; 0: one known sea.")
     ] = 0,
     renders: Annotated[int, typer.Option(help="Renders of one sea, 3 to 1000; their spread gives the intervals.")] = 4,
     target_id: TargetId = "target",
@@ -214,6 +222,13 @@ def detect(
         float, typer.Option(help="Power of the daylight on each pixel [W], at least 0.")
     ] = 0.0,
     passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 16 to 100 000.")] = 16,
+    max_time: Annotated[
+        float | None,
+        typer.Option(
+            help="Begin no further depth of --depths after this many seconds, and leave it out; the scene's own depth "
+            "is always rendered (greater than 0)."
+        ),
+    ] = None,
     seed: Seed = 0,
     output: Figure = OUTPUT / "detection.png",
     quiet: Quiet = False,
@@ -241,6 +256,7 @@ def detect(
             target_id=target_id,
             background_power_w=background_power_w,
             passes=passes,
+            max_time=max_time,
             seed=seed,
             progress=progress,
         )
@@ -250,7 +266,9 @@ def detect(
 
 def beam_spread(
     scene: Scene,
-    depths: Annotated[str, typer.Option(metavar="D1,D2,...", help="Depths below the mean sea level [m].")],
+    depths: Annotated[
+        str, typer.Option(metavar="D1,D2,...", help="Depths below the mean sea level [m], greater than 0.")
+    ],
     define: Define = None,
     passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 2 to 10 000.")] = 8,
     max_time: MaxTime = None,
@@ -300,11 +318,24 @@ def fov_sweep(
     scene: Scene,
     define: Define = None,
     fov_mrad: Annotated[
-        str, typer.Option(metavar="F1,F2,...", help="Full angles of the fields of view [mrad].")
+        str, typer.Option(metavar="F1,F2,...", help="Full angles of the fields of view [mrad], greater than 0.")
     ] = "2,5,10,20,50,100",
-    min_depth: Annotated[float, typer.Option(help="Depth where the slope of the signal begins [m].")] = 1.0,
-    max_depth: Annotated[float, typer.Option(help="Depth where it ends [m].")] = 5.0,
+    min_depth: Annotated[
+        float,
+        typer.Option(help="Depth where the slope of the signal begins [m], at least 0 and below the surface echo."),
+    ] = 1.0,
+    max_depth: Annotated[
+        float,
+        typer.Option(help="Depth where it ends [m], greater than 0 and than --min-depth, above bottom and targets."),
+    ] = 5.0,
     passes: Annotated[int, typer.Option(help="Number of independent passes of each render, 4 to 10 000.")] = 48,
+    max_time: Annotated[
+        float | None,
+        typer.Option(
+            help="Stop before this many seconds, without the widest fields of view, but with the narrowest one "
+            "(greater than 0)."
+        ),
+    ] = None,
     seed: Seed = 0,
     output: Figure = OUTPUT / "fov_sweep.png",
     quiet: Quiet = False,
@@ -316,6 +347,7 @@ def fov_sweep(
     from mitransient_lidar.studies import fov_sweep as study
 
     options: dict[str, Any] = {"min_depth": min_depth, "max_depth": max_depth, "passes": passes, "seed": seed}
+    options["max_time"] = max_time
     with reporting(quiet) as progress:
         found = study.fov_sweep(scene, wanted, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_fov_sweep)
@@ -359,10 +391,14 @@ def water(
             "or a profile's file: .csv, .txt, .dat, .tsv or .nc.",
         ),
     ] = None,
-    wavelength: Annotated[float, typer.Option(help="Wavelength [nm].")] = 532.0,
-    temperature: Annotated[float, typer.Option(help="Temperature [degrees Celsius], for the indices.")] = 20.0,
-    salinity: Annotated[float, typer.Option(help="Salinity [per mille], for the indices.")] = 35.0,
-    tolerance: Annotated[float, typer.Option(help="Largest relative error of layers that replace a profile.")] = 0.01,
+    wavelength: Annotated[
+        float, typer.Option(help="Wavelength [nm], 400 to 700; less of Jerlov's and Petzold's waters.")
+    ] = 532.0,
+    temperature: Annotated[float, typer.Option(help="Temperature [degrees Celsius], 0 to 30, for the indices.")] = 20.0,
+    salinity: Annotated[float, typer.Option(help="Salinity [per mille], 0 to 40, for the indices.")] = 35.0,
+    tolerance: Annotated[
+        float, typer.Option(help="Largest relative error of layers that replace a profile, 1e-5 to 0.5.")
+    ] = 0.01,
     output: DrawingOnly = None,
 ) -> None:
     """Print the optical properties of a water and its parameters."""

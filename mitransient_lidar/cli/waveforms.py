@@ -35,7 +35,9 @@ def waveforms(
     threshold: Annotated[
         float, typer.Option(help="Standard deviations of the noise above which a signal counts, greater than 0.")
     ] = 5.0,
-    contrast: Annotated[float, typer.Option(help="Share of the signal that an echo in the water must add.")] = 0.05,
+    contrast: Annotated[
+        float, typer.Option(help="Share of the signal that an echo in the water must add, at least 0 and below 1.")
+    ] = 0.05,
     layers: Annotated[int, typer.Option(help="Number of changes in the column to test for, 0 to 8.")] = 0,
     mean_surface: Annotated[
         bool, typer.Option("--mean-surface", help="Depths from the mean surface, not from each pixel's surface echo.")
@@ -49,7 +51,8 @@ def waveforms(
         ),
     ] = None,
     wind_speed: Annotated[
-        float | None, typer.Option(help="Wind speed of the corrections [m/s]; that of the scene by default.")
+        float | None,
+        typer.Option(help="Wind speed of the corrections [m/s], at least 0; that of the scene by default."),
     ] = None,
 ) -> None:
     """Measure the echoes in the waveforms of a result.

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from mitransient_lidar.campaigns.store import Store
+from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
 from mitransient_lidar.campaigns.sweep import complete
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import integer
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
@@ -52,8 +53,8 @@ def fly(
     workers, scheduler
         As for `campaigns.sweep.sweep`.
     shard_size
-        Pulses of a shard, which one process renders and writes, by default an eighth of them, but 512 to 1024. The bits
-        depend on it.
+        Pulses of a shard, which one process renders and writes, 1 to 10^6; by default an eighth of them, but 512 to
+        1024. The bits depend on it.
     progress
         Called with a `rendering.passes.Progress` about every second.
 
@@ -69,6 +70,8 @@ def fly(
     KeyboardInterrupt
         After Ctrl-C; pulses that are written stay, and the same call goes on.
     """
+    if shard_size is not None:
+        shard_size = integer("shard_size", shard_size, 1, LARGEST_SHARD)
     if isinstance(flight, Mapping):
         plan = FlightPlan.of(flight)
     else:

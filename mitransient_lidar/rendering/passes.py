@@ -152,7 +152,7 @@ def run_passes(
 ) -> PassLog:
     """Render independent passes until the goal is reached.
 
-    Warns when the passes or the time end before the requested error is reached.
+    Warns when the passes or the time end before the requested error is reached, or the time before the passes.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def run_passes(
     verify
         Called with the number of passes when there are 8, and at the end; raises UserError if the result is of no use.
     smallest
-        Number of passes from which a Ctrl-C keeps the result, at least 2; before, it is raised.
+        Number of passes that a result needs, at least 2: no goal ends the render before, and a Ctrl-C is raised.
     progress
         Called after every pass.
 
@@ -185,7 +185,9 @@ def run_passes(
     ends = [time.perf_counter()]
     try:
         with DeferredInterrupt() as interruption:
-            while not goal.reached(count, time.perf_counter() - ends[0], ends[-1] - ends[-2:][0], error):
+            while count < smallest or not goal.reached(
+                count, time.perf_counter() - ends[0], ends[-1] - ends[-2:][0], error
+            ):
                 lost += render_pass(count, pass_seed(seed, count))
                 count += 1
                 if errors is not None and count > 1:
@@ -195,11 +197,12 @@ def run_passes(
                 ends.append(time.perf_counter())
                 if progress is not None:
                     elapsed, pace, needed = ends[-1] - ends[0], _pace(ends), goal.needed_passes(count, error)
+                    left = goal.remaining(count, elapsed, pace, error)
                     state = Progress(
                         done=count,
                         planned=goal.passes,
                         elapsed_s=elapsed,
-                        remaining_s=goal.remaining(count, elapsed, pace, error),
+                        remaining_s=None if left is None else max(left, pace * (smallest - count)),
                         error_median=median,
                         error_p95=p95,
                         target_error=goal.target_error,
@@ -227,6 +230,8 @@ def run_passes(
     log = PassLog(count, time.perf_counter() - ends[0], interrupted, lost, goal, needed_s, *known)
     if error is not None and goal.target_error is not None and not accurate:
         logger.warning(_shortfall(log, errors_of, needed))
+    elif goal.target_error is None and goal.passes is not None and count < goal.passes and not interrupted:
+        logger.warning("max_time = %g s ended after %d of %d passes", goal.max_time, count, goal.passes)
     return log
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import logging
 import math
 import os
 import time
@@ -15,14 +16,17 @@ import xarray as xr
 
 from mitransient_lidar.analysis.information.fisher import fisher_information, priors
 from mitransient_lidar.analysis.jackknife import jackknife_error
-from mitransient_lidar.analysis.receiver import receiver_of
+from mitransient_lidar.analysis.receiver import DENSEST, receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
-from mitransient_lidar.core.validation import integer, non_negative, shown
+from mitransient_lidar.core.validation import in_range, integer, non_negative, positive, shown
 from mitransient_lidar.physics.receiver.receiver_files import Receiver
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
 from mitransient_lidar.rendering.session import open_scene
+
+_LOG = logging.getLogger(__name__)
 
 #: Most designs of a comparison.
 MOST_DESIGNS = 1000
@@ -43,6 +47,7 @@ def bounds(
     nuisances: Mapping[str, float] | None = None,
     renders: int = 4,
     passes: int = 16,
+    max_time: float | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -69,6 +74,9 @@ def bounds(
         spread gives standard errors.
     passes
         Passes of each render, 2 to 100 000.
+    max_time
+        Time after which no design is begun [s], above 0; the first one always is. The attribute ``designs_left_out``
+        has the number of the others that are left out, with a warning.
     seed
         Seed of the random numbers, at least 0; all designs have the same ones.
     progress
@@ -96,12 +104,20 @@ def bounds(
         raise UserError(f"free = {free!r} must be a list of different names of parameters")
     renders, passes = integer("renders", renders, 2, 1000), integer("passes", passes, 2, 100_000)
     seed, sky = integer("seed", seed, 0, 2**53), non_negative("background_power_w", background_power_w)
+    if gain not in (None, "auto"):
+        gain = positive("gain", gain)
+    if optical_density not in (None, "auto"):
+        optical_density = in_range("optical_density", optical_density, 0, DENSEST)
+    limit = RenderOptions(max_time=max_time).max_time or math.inf
     receivers = _receivers(receiver, gain)
     known, designs = priors(nuisances or {}), _designs(over or {})
     for design in designs:  # before the first render
         session = open_scene(scene, {**(params or {}), **design})
     began, found = time.perf_counter(), []
     for number, design in enumerate(designs):
+        if number and time.perf_counter() - began > limit:
+            _LOG.warning("max_time = %g s ended after %d of %d designs", limit, number, len(designs))
+            break
         results = []
         for i in range(renders):
             # Seeds of a render are signed.
@@ -125,9 +141,11 @@ def bounds(
         "renders": renders,
         "passes": passes,
         "seed": seed,
+        "designs_left_out": len(designs) - len(found) // len(receivers),
         "background_power_w": sky,
         **{f"scene.{name}": str(value) for name, value in (params or {}).items()},
     }
+    designs = designs[: len(found) // len(receivers)]
     if len(receivers) > 1:
         designs = [{**design, "receiver": name} for design in designs for name in receivers]
     return _compared(found, designs, attributes)

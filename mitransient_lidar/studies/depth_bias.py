@@ -19,6 +19,7 @@ from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import finite_array, integer
 from mitransient_lidar.loading.instruments import read_instrument
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.shot_series import render_shots
 
@@ -81,6 +82,7 @@ def depth_bias(
     records: int = 5,
     seed: int = 1,
     corrections: xr.Dataset | None = None,
+    max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Measure the errors of depths in an instrument's records, by angle, wind, water and depth.
@@ -113,6 +115,9 @@ def depth_bias(
         Seed of places, seas and noise, at least 0.
     corrections
         A former table, to correct the depths by.
+    max_time
+        Time after which no sea is rendered [s], above 0; the first one always is. All numbers of those that are left
+        out are NaN, and the attribute ``seas_left_out`` has their number.
     progress
         Called with a `passes.Progress` after every sea.
 
@@ -148,11 +153,17 @@ def depth_bias(
         raise UserError(f"depth = {axes['depth'].tolist()} must be numbers above 0 that ascend")
     shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
     seed = integer("seed", seed, 0, 2**31)
+    limit = RenderOptions(max_time=max_time).max_time or math.inf
     cells: dict[tuple[int, ...], dict[str, Any]] = {}
     began, total = time.perf_counter(), math.prod(values.size for values in axes.values())
     pixels: list[str] = []
+    left_out = 0
     geometry: dict[str, float] = {}
     for number, place in enumerate(np.ndindex(*(values.size for values in axes.values()))):
+        if cells and time.perf_counter() - began > limit:
+            left_out = total - number
+            _LOG.warning("max_time = %g s ended after %d of %d seas, the others are NaN", limit, number, total)
+            break
         angle, wind, water, depth = (values[index] for values, index in zip(axes.values(), place, strict=True))
         shallower = [cells[(*place[:3], index)] for index in range(place[3]) if (*place[:3], index) in cells]
         if not _is_lost(shallower):
@@ -196,9 +207,10 @@ def depth_bias(
         "shots": shots,
         "records": records,
         "seed": seed,
+        "seas_left_out": left_out,
         **geometry,
     }
-    return _labelled(axes, cells, pixels, list(estimators), attributes)
+    return _labelled(axes, cells, pixels, list(estimators), attributes, total - left_out)
 
 
 def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[str]:
@@ -211,6 +223,8 @@ def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[
     for place in np.ndindex(*(found.sizes[axis] for axis in AXES)):
         at = one.isel(dict(zip(AXES, place, strict=True)))
         label = f"{float(at['off_nadir_deg']):>6.1f}{float(at['wind_speed']):>6g} {at['water'].item():<6}"
+        if np.isnan(at["found"].values).all():  # left out
+            continue
         for pixel in found["pixel"].values:
             cell = at.sel(pixel=pixel)
             number = {name: float(cell[name]) for name in cell.data_vars if cell[name].ndim == 0}
@@ -266,8 +280,9 @@ def _labelled(
     pixels: Sequence[str],
     estimators: Sequence[str],
     attributes: Mapping[str, Any],
+    begun: int,
 ) -> xr.Dataset:
-    """Return the table of all seas."""
+    """Return the table of all seas, of which the first `begun` were rendered or need not be."""
     shape = tuple(values.size for values in axes.values())
 
     def table(name: str) -> Any:
@@ -275,6 +290,7 @@ def _labelled(
         values = np.full((*shape, *first.shape), 0.0 if name in ("found", "wrong") else np.nan)
         for place, cell in cells.items():
             values[place] = cell[name]
+        values.reshape(-1, *first.shape)[begun:] = np.nan
         return values
 
     data: dict[str, Any] = {}

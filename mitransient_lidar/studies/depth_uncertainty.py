@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,13 +13,17 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.depth_uncertainty import sounding_uncertainty
+from mitransient_lidar.analysis.waveforms.depth_correction import AXES
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import finite, finite_array
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.physics.lidar.sounding_errors import SURVEY_ORDERS, TrajectoryErrors
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.studies.depth_bias import depth_bias
+
+_LOG = logging.getLogger(__name__)
 
 #: Winds [m/s] and waters of the tables of uncertainty tools, and depths at which airborne lidars find the bottom.
 WINDS, WATERS, DEPTHS = (1.0, 3.0, 5.0, 7.0, 9.0), ("III", "1C", "3C", "5C", "7C", "9C"), (1.0, 1.5, 3.0, 6.0, 10.0)
@@ -40,6 +46,7 @@ def depth_uncertainty(
     records: int = 4,
     seed: int = 1,
     corrections: xr.Dataset | None = None,
+    max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Determine the uncertainties of an instrument's soundings by altitude, angle, wind, water and depth.
@@ -58,6 +65,9 @@ def depth_uncertainty(
         Errors of the survey's trajectory.
     estimator
         An estimator of `echo_table.extract`.
+    max_time
+        Time after which no sea is rendered [s], above 0. The uncertainties of seas that are left out are NaN; altitudes
+        of which none is rendered are left out. The attribute ``seas_left_out`` has the number of both.
     progress
         Called with a `passes.Progress` after every cell of the table.
 
@@ -79,9 +89,15 @@ def depth_uncertainty(
     heights = finite_array("altitudes", own if altitudes is None else altitudes)
     if heights.size == 0 or np.any(np.diff(heights, prepend=0.0) <= 0):
         raise UserError(f"altitudes = {heights.tolist()} must be numbers above 0 that ascend")
+    limit = RenderOptions(max_time=max_time).max_time
     angles = [float(usual["off_nadir_deg"])] if angles_deg is None else angles_deg
-    began, found = time.perf_counter(), []
+    began = time.perf_counter()
+    found: list[xr.Dataset] = []
     for number, height in enumerate(heights):
+        left = None if limit is None else limit - (time.perf_counter() - began)
+        if found and left is not None and left <= 0:
+            _LOG.warning("max_time = %g s ended after %d of %d altitudes", limit, number, heights.size)
+            break
 
         def report(state: Progress, number: int = number) -> None:
             if progress is not None and state.planned is not None:
@@ -104,11 +120,15 @@ def depth_uncertainty(
             records=records,
             seed=seed,
             corrections=corrections,
+            max_time=left,
             progress=report,
         )
         found.append(sounding_uncertainty(table, trajectory))
     joined = xr.concat(found, "altitude", combine_attrs="drop_conflicts")
-    return joined.assign_coords(altitude=("altitude", heights, {"units": "m"})).assign_attrs(estimator=estimator)
+    seas = math.prod(found[0].sizes[axis] for axis in AXES)
+    left_out = sum(one.attrs["seas_left_out"] for one in found) + (heights.size - len(found)) * seas
+    rendered = ("altitude", heights[: len(found)], {"units": "m"})
+    return joined.assign_coords(altitude=rendered).assign_attrs(estimator=estimator, seas_left_out=left_out)
 
 
 def describe_depth_uncertainty(found: xr.Dataset) -> list[str]:
@@ -130,4 +150,6 @@ def describe_depth_uncertainty(found: xr.Dataset) -> list[str]:
         residual = np.sqrt((cell["vertical_residual"] ** 2).mean())
         text += "".join(f"{100 * float(cell[f'vertical_{name}']):>{8 - number}.2f}" for number, name in enumerate("ab"))
         lines.append(f"{text}{100 * float(residual):>10.2f}")
+    if left_out := found.attrs.get("seas_left_out"):
+        lines.append(f"- also stands for {left_out} seas that were left out by max_time")
     return lines

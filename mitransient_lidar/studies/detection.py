@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
 from mitransient_lidar.results.geometry import LidarGeometry
@@ -41,6 +43,7 @@ def detect(
     target_id: str = "target",
     background_power_w: float = 0.0,
     passes: int = 16,
+    max_time: float | None = None,
     seed: int = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
@@ -68,6 +71,9 @@ def detect(
         Steady power on each pixel [W], at least 0.
     passes
         Passes of each render, 16 to 100 000.
+    max_time
+        Time after which no further depth is begun [s], above 0; all renders of the target as it is are made. The
+        attribute ``depths_left_out`` has those that are left out as text, and a warning names them.
     seed
         Seed of the random numbers, at least 0.
     progress
@@ -119,6 +125,7 @@ def detect(
         raise UserError(f"depths = {list(depths)} must be above 0 m and increase")
     if not isinstance(scene, (str, bytes)) and not hasattr(scene, "__fspath__") and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
+    limit = RenderOptions(max_time=max_time).max_time or math.inf
     session = open_scene(scene, params)
     for option, wanted, key in (("depths", depths, "target_depth"), ("clutter", clutter, "surface_seed")):
         if wanted and key not in session.parameters:
@@ -131,9 +138,15 @@ def detect(
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
     for depth in depths:  # before the first render
         find_target(open_scene(scene, {**(params or {}), "target_depth": depth}).scene, target_id)
+    began, left_out = time.perf_counter(), ""
     experiments: list[Experiment] = []
     first: list[xr.Dataset] = []
     for place in (None, *depths):
+        if experiments and time.perf_counter() - began > limit:
+            done = len(experiments) - 1
+            depths, left_out = depths[:done], ", ".join(f"{depth:g}" for depth in depths[done:])
+            _LOG.warning("max_time = %g s ended before the depths of %s m, which are left out", limit, left_out)
+            break
         moved = {**(params or {}), **({} if place is None else {"target_depth": place})}
         fixed = session.scene if place is None else open_scene(scene, moved).scene if clutter == 0 else None
         found: list[xr.Dataset] = []
@@ -148,7 +161,7 @@ def detect(
             found.append(
                 target_signal(
                     sea if clutter else fixed,
-                    seed=pass_seed(seed, i),
+                    seed=pass_seed(seed, i) >> 1,  # seeds of a render are signed
                     target_id=target_id,
                     passes=passes,
                     integrator=integrator,
@@ -189,6 +202,7 @@ def detect(
         seed=seed,
         background_power_w=sky,
         confidence=trials.CONFIDENCE,
+        depths_left_out=left_out,
         drawn_share=share,
         gain_pixels=experiments[0].gain(False),
         gain_single=experiments[0].gain(True),

@@ -20,7 +20,7 @@ from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.rendering.options import MOST_PASSES
+from mitransient_lidar.rendering.options import MOST_PASSES, RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.render import render
 
@@ -50,6 +50,7 @@ def fit(
     passes: int | None = None,
     seed: int | None = None,
     most_renders: int = 60,
+    max_time: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Fit parameters of a scene to waveforms by weighted nonlinear least squares.
@@ -86,6 +87,9 @@ def fit(
         Seed of all renders, so that they share their random numbers; by default 1, or for a result its own plus 1.
     most_renders
         Renders after which the fit ends without convergence, 2 to 10000.
+    max_time
+        Time after which no step is tried [s], above 0: the fit ends at the last step, without convergence and with a
+        warning. The start is always rendered.
     progress
         Called with a `rendering.passes.Progress` after every render.
 
@@ -101,6 +105,7 @@ def fit(
         If the waveforms, the scene, a parameter or an option is invalid; or the seed is that of the result, whose noise
         the model would repeat.
     """
+    limit, began = RenderOptions(max_time=max_time).max_time or math.inf, time.perf_counter()
     names = _names(free)
     if unknown := [name for name in start or {} if name not in (*names, SCALE, TIME_OFFSET)]:
         raise UserError(f"start of {unknown[0]}: it is not one of the free parameters {', '.join(names)}")
@@ -114,7 +119,7 @@ def fit(
         if missing := [name for name in names if name not in (start or {})]:
             raise UserError(f"start of {missing[0]} is missing: a model that is a function needs all starts")
         problem = WaveformFit(found, scene, dict(start or {}), bounds, **options)
-        return problem.run(most_renders=most_renders, scale_errors=scale_errors)
+        return _run(problem, began, limit, most_renders, scale_errors)
     given = None if passes is None else integer("passes", passes, 2, MOST_PASSES)
     attributes = source.attrs if isinstance(source, xr.Dataset) else {}
     model = _RenderedModel(
@@ -134,8 +139,16 @@ def fit(
             )
         model.passes = min(needed, _MOST_PASSES)
         problem.forget()
-    fitted = problem.run(most_renders=most_renders, scale_errors=scale_errors)
+    fitted = _run(problem, began, limit, most_renders, scale_errors)
     return fitted.assign_attrs({"scene": model.name, "passes": model.passes, "seed": model.seed})
+
+
+def _run(problem: WaveformFit, began: float, limit: float, most_renders: int, scale_errors: bool) -> xr.Dataset:
+    """Return the fit, which ends `limit` [s] after it `began`, with a warning if it has not converged then."""
+    fitted = problem.run(most_renders=most_renders, until=began + limit, scale_errors=scale_errors)
+    if not fitted.attrs["converged"] and time.perf_counter() - began >= limit:
+        logger.warning("max_time = %g s ended the fit after %d renders, before convergence", limit, problem.renders)
+    return fitted
 
 
 class _RenderedModel:

@@ -20,6 +20,7 @@ from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
 from mitransient_lidar.results.geometry import LidarGeometry
@@ -39,6 +40,7 @@ def fov_sweep(
     min_depth: float = 1.0,
     max_depth: float = 5.0,
     passes: int = 48,
+    max_time: float | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> xr.Dataset:
@@ -55,6 +57,9 @@ def fov_sweep(
         Limits of the fit as in `effective_attenuation` [m], in homogeneous water and far from bottom and targets.
     passes
         Independent passes for each field of view, 4 to 10 000.
+    max_time
+        Time after which no pass begins [s], above 0. The wider fields of view whose passes are not complete are left
+        out, with a warning; the narrowest one is always rendered.
     seed
         Seed of the random numbers, at least 0.
     progress
@@ -68,7 +73,8 @@ def fov_sweep(
         axis where that meets the mean surface, ``scaled_radius`` c R_s [1], ``system_attenuation`` [1/m] of the fit in
         `system_attenuation`. Over ``field_of_view`` and ``time`` [ns]: ``impulse_response`` [J per bin] and its
         standard error. Attributes: ``attenuation`` c, ``absorption`` a, ``a_plus_bb``, ``kd`` [1/m] of the water,
-        ``beam_radius`` R_b [m].
+        ``beam_radius`` R_b [m], and ``left_out_mrad``, as text the fields of view that `max_time` or Ctrl-C
+        has left out.
 
     Raises
     ------
@@ -96,6 +102,7 @@ def fov_sweep(
     which include the correlation of the bins.
     """
     passes, seed = integer("passes", passes, 4, 10_000), integer("seed", seed, 0, 2**53)
+    limit = RenderOptions(max_time=max_time).max_time
     fields = np.unique(finite_array("fov_mrad", fov_mrad))
     if fields.size == 0 or fields[0] <= 0:
         raise UserError(f"fov_mrad = {fields.tolist()} must hold at least one angle, each greater than 0")
@@ -107,7 +114,10 @@ def fov_sweep(
     column = ColumnBins.between(geometry, edge, lidar.axis, min_depth, max_depth)
     water = _water(lidar, float(min_depth), float(max_depth))
     _check_solids(lidar, geometry, edge, float(max_depth))
-    energy, log = _render(session, fields, passes, seed, progress)
+    energy, log = _render(session, fields, Goal(passes=passes, max_time=limit), seed, progress)
+    left_out = ", ".join(f"{field:g}" for field in fields[len(energy) :])
+    if left_out:
+        logger.warning("fields of view of %s mrad are left out: their passes are not complete", left_out)
     fields = fields[: len(energy)]
 
     mean, stderr = energy.mean(axis=1), energy.std(axis=1, ddof=1) / math.sqrt(passes)
@@ -145,6 +155,7 @@ def fov_sweep(
         a_plus_bb=water.absorption + water.backscattering,
         kd=water.kd,
         beam_radius=beam,
+        left_out_mrad=left_out,
     )
     return xr.Dataset(data, coords, attributes)
 
@@ -216,13 +227,17 @@ def _check_solids(lidar: LidarScene, geometry: LidarGeometry, edge: float, max_d
 
 
 def _render(
-    session: Session, fields: FloatArray, passes: int, seed: int, progress: ProgressCallback | None
+    session: Session, fields: FloatArray, of_field: Goal, seed: int, progress: ProgressCallback | None
 ) -> tuple[FloatArray, PassLog]:
-    """Return the energy [J] in circles of full angles [mrad], shape (fields, passes, bins), and the log."""
+    """Return the energy [J] in circles of full angles [mrad], shape (fields, passes, bins), and the log.
+
+    `of_field` has the passes of a field of view, and the time of all.
+    """
     from mitransient_lidar.transport.sensor.fov_shapes import Sector
     from mitransient_lidar.transport.sensor.pixels import ShapedPixels
 
-    chosen = choose_integrator(session.scene, None)
+    assert of_field.passes is not None
+    passes, chosen = of_field.passes, choose_integrator(session.scene, None)
     receiver: Receiver = session.sensor.receiver
     edges = np.append(0.0, 0.5e-3 * fields)
     rings: list[FloatArray] = []
@@ -238,7 +253,7 @@ def _render(
         rings.append(record.histogram.energy()[0])
         return float(record.edge_loss[0])
 
-    goal = Goal(passes=fields.size * passes)
+    goal = replace(of_field, passes=fields.size * passes)
     log = run_passes(render_pass, goal, seed=seed, smallest=passes, progress=progress)
     complete = log.count // passes
     energy = np.array(rings[: complete * passes]).reshape(complete, passes, -1)

@@ -38,12 +38,14 @@ def scattering_orders(
 
     Parameters
     ----------
-    scene, params, seed, integrator
+    scene, params, integrator
         As for `rendering.render.render`.
     orders
         Number of separate orders, 1 to 62: 0 to `orders` - 1, in addition to the sum of all higher ones.
     passes
         Number of passes, 2 to 100 000.
+    seed
+        Seed of the random numbers, 0 to 2^53.
     max_time
         Time after which no pass begins [s], above 0; at least two passes are made.
     progress
@@ -65,6 +67,7 @@ def scattering_orders(
     """
     orders = integer("orders", orders, 1, MOST_ORDERS)
     passes, options = integer("passes", passes, 2, 100_000), RenderOptions(max_time=max_time)
+    seed = integer("seed", seed, 0, 2**53)
     session = open_scene(scene, params)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor, classes=PathClasses(orders))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
+from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, Progress, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import choose_integrator, open_scene, pass_attributes, warn_of_edge_loss
 
@@ -31,6 +33,7 @@ def target_signal(
     *,
     target_id: str = "target",
     passes: int = 64,
+    max_time: float | None = None,
     seed: int = 0,
     integrator: Any = None,
     progress: ProgressCallback | None = None,
@@ -49,6 +52,8 @@ def target_signal(
         Id of the target's shape.
     passes
         Number of passes of each render, 16 to 100 000.
+    max_time
+        Time after which no pass begins [s], above 0; at least 16 passes are made.
     progress
         Called with a `passes.Progress` after every pass.
 
@@ -65,7 +70,7 @@ def target_signal(
     Raises
     ------
     UserError
-        If the scene or a parameter is invalid, `passes` is out of range, there is no such shape, or it is above the
+        If the scene or a parameter is invalid, a number is out of range, there is no such shape, or it is above the
         sea or below the bottom, or returns no light.
 
     Notes
@@ -75,7 +80,7 @@ def target_signal(
     sum(w E) / sqrt(sum(w^2 B)) [sqrt(J)], which is largest for w = E/B (matched filter): sqrt(sum(E^2/B)). Ratios of
     detectabilities are ratios of signal-to-noise ratios for every detector.
     """
-    passes = integer("passes", passes, _GROUPS, 100_000)
+    passes, options = integer("passes", passes, _GROUPS, 100_000), RenderOptions(max_time=max_time, seed=seed)
     session = open_scene(scene, params)
     bare = _without(session.scene, target_id)
     chosen = choose_integrator(session.scene, integrator)
@@ -93,7 +98,8 @@ def target_signal(
         pairs.append((records[0].histogram.energy(), records[1].histogram.energy()))
         return float(records[0].edge_loss[0])
 
-    log = run_passes(render_pass, Goal(passes=passes), seed=seed, smallest=_GROUPS, progress=progress)
+    goal = Goal(passes=passes, max_time=options.max_time)
+    log = run_passes(render_pass, goal, seed=seed, smallest=_GROUPS, progress=progress)
     result = _measure(np.array(pairs), axis, kernel, pulse.fwhm_ns)
     warn_of_edge_loss(log.edge_loss_share(float(np.sum(np.array(pairs)[:, 0]))))
     attributes = session.attributes(target=target_id, integrator=chosen, **pass_attributes(log, seed), **result.attrs)
@@ -106,6 +112,7 @@ def target_map(
     *,
     x: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
     y: Sequence[float] = (-2.0, -1.0, 0.0, 1.0, 2.0),
+    max_time: float | None = None,
     progress: ProgressCallback | None = None,
     **options: Any,
 ) -> xr.Dataset:
@@ -117,6 +124,8 @@ def target_map(
         An XML scene with the parameters ``target_x`` and ``target_y``.
     x, y
         Offsets from the target's place in the scene [m], at least one of each.
+    max_time
+        Time for all places [s], above 0, shared equally among those that are left; each has at least 16 passes.
     progress
         Called with a `passes.Progress` after every place.
     **options
@@ -125,7 +134,8 @@ def target_map(
     Returns
     -------
     xarray.Dataset
-        Quantities of `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m].
+        Quantities of `target_signal` without time, in addition over ``target_x`` and ``target_y`` [m]; and the number
+        of ``place_passes`` over these alone.
 
     Raises
     ------
@@ -138,9 +148,14 @@ def target_map(
             raise UserError(f"scene {scene!r} has no parameter {name}: the map moves the target by it")
     places = [float(known["target_x"]) + np.asarray(x, float), float(known["target_y"]) + np.asarray(y, float)]
     cells: list[xr.Dataset] = []
+    limit, began = RenderOptions(max_time=max_time).max_time, time.perf_counter()
     for place_x, place_y in itertools.product(*places):
         moved = {**(params or {}), "target_x": place_x, "target_y": place_y}
-        cells.append(target_signal(scene, moved, **options).drop_dims("time"))
+        if limit is not None:
+            left = max(limit - (time.perf_counter() - began), 1e-3)
+            options["max_time"] = left / (len(places[0]) * len(places[1]) - len(cells))
+        cell = target_signal(scene, moved, **options).drop_dims("time")
+        cells.append(cell.assign(place_passes=((), cell.attrs["passes"], {"units": "1", "long_name": "passes"})))
         if progress is not None:
             progress(Progress(len(cells), len(places[0]) * len(places[1]), "place"))
     rows = [cells[start : start + len(places[1])] for start in range(0, len(cells), len(places[1]))]

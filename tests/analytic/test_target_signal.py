@@ -85,6 +85,15 @@ def test_map_moves_the_target():
     assert len(describe_map(maps)) == 5
 
 
+@pytest.mark.long
+def test_the_time_leaves_each_place_the_passes_that_errors_need(caplog):
+    """A place has 16 passes of 64, for a time in which no pass is complete."""
+    maps = target_map("fig13_2x2", NEAR, x=(0.0,), y=(0.5,), passes=64, max_time=0.01, integrator=SMALL)
+    assert maps["place_passes"].values.tolist() == [[16]]
+    assert np.all(maps["echo_stderr"] > 0)
+    assert caplog.text.count("ended after 16 of 64 passes") == 1
+
+
 @pytest.mark.slow
 def test_table_lists_pixels_and_combinations(published):
     lines = describe_target(published)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -167,13 +168,13 @@ class WaveformFit:
         carrying = used & (noise > 0) & (np.abs(slopes).max(axis=0) > 0) & (mean**2 > noise)
         return float(np.median(by_model[carrying] / noise[carrying])) if carrying.any() else 0.0
 
-    def run(self, *, most_renders: int = 60, scale_errors: bool = False) -> xr.Dataset:
+    def run(self, *, most_renders: int = 60, until: float = math.inf, scale_errors: bool = False) -> xr.Dataset:
         """Fit and return the table of parameters and the fitted waveforms.
 
         Parameters
         ----------
-        most_renders
-            Number of renders after which the fit ends without convergence, 2 to 10000.
+        most_renders, until
+            Renders, 2 to 10000, and time of `time.perf_counter` [s] that end the fit without convergence.
         scale_errors
             Whether to multiply covariances by the reduced chi-squared, as is done where errors are unknown.
 
@@ -191,11 +192,11 @@ class WaveformFit:
         """
         from scipy.optimize import least_squares
 
-        self._limit = integer("most_renders", most_renders, 2, 10_000)
+        self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
         lower = np.array([free.internal(free.low) for free in self.free])
         upper = np.array([free.internal(free.high) for free in self.free])
         values, rounds, settled = dict(self.starts), 0, False
-        while not settled and rounds < _MOST_ROUNDS and self.renders < most_renders:
+        while not (settled or self._exhausted) and rounds < _MOST_ROUNDS and self.renders < most_renders:
             rounds += 1
             self._refusal = ""
             used = self._used(values)
@@ -323,7 +324,7 @@ class WaveformFit:
         values = self._named(x)
         unknown = np.full(np.count_nonzero(used), np.nan)
         if self._key(values) not in self._kept:
-            self._exhausted |= self.renders >= self._limit
+            self._exhausted |= self.renders >= self._limit or time.perf_counter() >= self._until
             if self._exhausted or (self._accepted is not None and self._step(x) < _SMALLEST_STEP):
                 return unknown
         try:

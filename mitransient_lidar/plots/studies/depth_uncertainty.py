@@ -43,7 +43,7 @@ def plot_uncertainty(found: xr.Dataset, path: drawing.FilePath | None = None) ->
         drawing.add_grid(ax)
     for ax in axes.flat[waters.size :]:
         ax.axis("off")
-    axes[0, 0].set_ylim(0, 1.15 * max(float(found["tvu"].max()), float(SURVEY_ORDERS[1].largest_tvu(0.0))))
+    axes[0, 0].set_ylim(0, 1.15 * max(float(found["tvu"].fillna(0).max()), float(SURVEY_ORDERS[1].largest_tvu(0.0))))
     for ax in axes[-1]:
         ax.set_xlabel("depth (m)")
     for ax in axes[:, 0]:
@@ -58,7 +58,7 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
     """Draw the strictest order of S-44 that is met by wind and water, one panel a depth.
 
     `found` is a result of `studies.depth_uncertainty` at one altitude and angle; corrected depths count where there
-    are any.
+    are any. Cells of seas that were left out are empty.
     """
     depths = found["depth"].values
     figure = drawing.new_figure(path, 2.3 * depths.size + 1.8, 3.4)
@@ -67,7 +67,8 @@ def plot_orders(found: xr.Dataset, path: drawing.FilePath | None = None) -> Figu
     norm = BoundaryNorm(np.arange(len(_ORDER_COLOURS) + 1) - 0.5, len(_ORDER_COLOURS))
     axes = figure.subplots(1, depths.size, sharey=True, squeeze=False)[0]
     orders = found["order"].isel(correction=-1).transpose("water", "wind_speed", "depth").values
-    shown = np.where(orders < 0, len(_ORDER_COLOURS) - 1, orders)
+    rendered = found["found"].transpose("water", "wind_speed", "depth").notnull().values
+    shown = np.where(rendered, np.where(orders < 0, len(_ORDER_COLOURS) - 1, orders), np.nan)
     for number, (ax, depth) in enumerate(zip(axes, depths, strict=True)):
         image = ax.imshow(shown[..., number], cmap=colours, norm=norm, origin="upper", aspect="auto")
         ax.set_xticks(range(found.sizes["wind_speed"]), [f"{wind:g}" for wind in found["wind_speed"].values])

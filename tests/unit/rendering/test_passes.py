@@ -38,6 +38,15 @@ def test_the_quantile_of_the_errors_ends_the_render(monkeypatch, quantile, expec
     assert log.needed_s == 0
 
 
+def test_the_time_ends_no_render_before_the_passes_that_it_needs(monkeypatch, caplog):
+    clock = Clock(monkeypatch, 1.0)
+    assert run_passes(clock.render_pass, Goal(passes=64, max_time=3.5), seed=0, smallest=16).count == 16
+    assert "max_time = 3.5 s ended after 16 of 64 passes" in caplog.text
+    caplog.clear()
+    assert run_passes(clock.render_pass, Goal(passes=16, max_time=100), seed=0, smallest=16).count == 16
+    assert not caplog.text
+
+
 def test_the_forecast_is_that_of_the_passes_that_follow(monkeypatch, caplog):
     """The first pass compiles the kernels and takes 20 s, the others 2 s: 100 passes take 218 s."""
     clock, reports = Clock(monkeypatch, 20.0, 2.0), []

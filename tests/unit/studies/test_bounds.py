@@ -88,6 +88,27 @@ def test_designs_are_rendered_on_the_same_random_numbers(compared):
     assert rendered[0]["params"]["attenuation"] == 0.3
 
 
+def test_designs_after_the_time_are_left_out_and_counted(monkeypatch, caplog):
+    """Renders take a second each: two designs of two renders begin within 3 s."""
+    now = [0.0]
+
+    def render(scene, **options):
+        now[0] += 1
+        return light(scene, **options)
+
+    monkeypatch.setattr(study, "render", render)
+    monkeypatch.setattr(study.time, "perf_counter", lambda: now[0])
+    energies = {"pulse_energy_mj": [5, 20, 1.25]}
+    options = {"free": ["attenuation"], "receiver": "ideal", "passes": 2, "renders": 2}
+    found = study.bounds("table1", SMALL, over=energies, max_time=3, **options)
+    assert found["design_pulse_energy_mj"].values.tolist() == ["5", "20"]
+    assert found.attrs["designs_left_out"] == 1
+    assert "max_time = 3 s ended after 2 of 3 designs" in caplog.text
+    whole = study.bounds("table1", SMALL, over=energies, **options)
+    np.testing.assert_array_equal(found["bound"], whole["bound"][:2])
+    assert whole.attrs["designs_left_out"] == 0
+
+
 @pytest.mark.slow
 def test_ratios_of_counts_go_with_the_root_of_the_energy(found):
     """Four times the photons halve the errors of counts, and pixels that share the light change nothing."""

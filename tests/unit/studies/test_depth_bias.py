@@ -10,15 +10,24 @@ from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
 
 
 @pytest.fixture
+def clock(monkeypatch):
+    """The time of the studies in a list [s], which renders advance by a second each."""
+    now = [0.0]
+    monkeypatch.setattr(study.time, "perf_counter", lambda: now[0])
+    return now
+
+
+@pytest.fixture
 def rendered(monkeypatch):
     """Depths that are rendered: waves uncover 0.1 m, the surface hides 0.2 m, and bottoms from 6 m on are lost."""
     depths = []
+    geometry = {"altitude": 150.0, "refractive_index": 1.34, "divergence_mrad": 1.0}
 
     def render(scene, given, **options):
         depths.append(given["bottom_depth"])
         if given["bottom_depth"] == 0.1:
             raise DryBottomError("shape 'bottom' up to z = -0.1 m rises through the sea surface")
-        return xr.Dataset(coords={"pixel": ["single"]}, attrs={"depth": given["bottom_depth"], "altitude": 150.0})
+        return xr.Dataset(coords={"pixel": ["single"]}, attrs={"depth": given["bottom_depth"], **geometry})
 
     def cell(recorded, estimators, corrections):
         found = float(0.2 < recorded.attrs["depth"] < 6)
@@ -64,6 +73,29 @@ def test_records_of_single_photons_are_refused(units, event, brightest, refused)
         study._check_counts(recorded)
 
 
+def test_seas_after_the_time_are_nan_and_named(rendered, clock, monkeypatch, caplog):
+    """Four of six seas in 3.5 s; a bottom below a lost one needs no render, and stays one that is not found."""
+    render = study.render_shots
+
+    def slow(*arguments, **options):
+        clock[0] += 1
+        return render(*arguments, **options)
+
+    monkeypatch.setattr(study, "render_shots", slow)
+    options = {"angles_deg": [20.0], "winds": [3.0], "estimators": ["gaussian"]}
+    table = study.depth_bias("riegl_vq840g", waters=["IB", "1C"], depths=[3, 6, 8], max_time=2.5, **options)
+    one = table.isel(off_nadir_deg=0, wind_speed=0, estimator=0, pixel=0)
+    np.testing.assert_array_equal(one["found"], [[1, 0, 0], [1, np.nan, np.nan]])
+    np.testing.assert_array_equal(one["wrong"], [[0, 0, 0], [0, np.nan, np.nan]])
+    np.testing.assert_array_equal(one["bias"], [[0.1, 0.1, np.nan], [0.1, np.nan, np.nan]])
+    assert table.attrs["seas_left_out"] == 2
+    assert "max_time = 2.5 s ended after 4 of 6 seas" in caplog.text
+    assert len(study.describe_depth_bias(table)) == 1 + 4
+    found = depth_uncertainty("riegl_vq840g", altitudes=[100, 200, 300], waters=["IB"], depths=[3], max_time=2.5)
+    assert found["altitude"].values.tolist() == [100]
+    assert found.attrs["seas_left_out"] == 3 * 5 - 3
+
+
 def test_a_table_needs_a_depth_below_the_waves(rendered):
     with pytest.raises(UserError, match=r"depth = \[0\.1\] must hold one below the waves of \[3\.0\] m/s"):
         study.depth_bias("riegl_vq840g", depths=[0.1], winds=[3.0], waters=["IB"])
@@ -103,7 +135,13 @@ def test_uncertainty_reports_the_cells_of_all_altitudes(monkeypatch):
         data["snr"] = (dims[:4] + dims[5:], np.ones(shape[:5]))
         data |= {name: (dims[:4], np.zeros(shape[:4])) for name in ("slope_along", "slope_across")}
         coords = {"off_nadir_deg": [0.0], "wind_speed": [0.0], "water": ["IB"], "depth": [1.0, 2.0, 4.0]}
-        attributes = {"instrument": instrument, "refractive_index": 1.34, "divergence_mrad": 1.0, **params}
+        attributes = {
+            "instrument": instrument,
+            "refractive_index": 1.34,
+            "divergence_mrad": 1.0,
+            "seas_left_out": 0,
+            **params,
+        }
         return xr.Dataset(data, {**coords, "estimator": ["gaussian"], "pixel": ["single"]}, attributes)
 
     monkeypatch.setattr("mitransient_lidar.studies.depth_uncertainty.depth_bias", table)

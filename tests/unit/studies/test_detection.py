@@ -275,8 +275,12 @@ def test_figure_without_depths_and_with_infinite_values(result):
 
 @pytest.mark.slow
 def test_seas_and_depths_are_asked_for(monkeypatch):
-    """Four other seas than the scene's, surface_seed 8, at its own depth of 8 m and at the one asked for."""
-    asked = []
+    """Four other seas than the scene's, surface_seed 8, at its own depth of 8 m and at those for which there is time.
+
+    Renders take a second each: of depths of 7 and 7.5 m only the first begins within 5 s.
+    """
+    asked: list[tuple[int, float, int]] = []
+    monkeypatch.setattr(detection.time, "perf_counter", lambda: float(len(asked)))
     random = np.random.default_rng(3)
 
     def signal(session, **options):
@@ -293,12 +297,18 @@ def test_seas_and_depths_are_asked_for(monkeypatch):
     coarse = {"surface_size": 60, "surface_cell_size": 0.5}
     count = {"clutter": 4, "shots": 200, "receiver": "ideal"}
     found = detection.detect(
-        "fig13_2x2", coarse, depths=(7,), progress=lambda state: done.append((state.done, state.planned)), **count
+        "fig13_2x2",
+        coarse,
+        depths=(7, 7.5),
+        max_time=5,
+        progress=lambda state: done.append((state.done, state.planned)),
+        **count,
     )
     assert [(seed, depth) for seed, depth, _ in asked] == [(9 + i, d) for d in (8, 7) for i in range(4)]
     # The same random numbers at each depth, others for each sea.
     assert len({seed for *_, seed in asked}) == 4
-    assert done == [(i + 1, 8) for i in range(8)]
+    assert done == [(i + 1, 12) for i in range(8)]
+    assert found.attrs["depths_left_out"] == "7.5"
     assert found["needed_at_depth"].sizes == {"combination": 4, "depth": 1}
     assert found.attrs["renders"] == found.attrs["clutter"] == 4
     assert found.attrs["scene.surface_seed"] == "8"

@@ -117,6 +117,24 @@ def test_scenes_that_are_unknown_are_refused():
         mitransient_lidar.fit(data, closed_form, NAMES, start={"attenuation": 0.2})
 
 
+def test_the_time_ends_a_fit_before_it_converges(monkeypatch, caplog):
+    """Renders take a second each: no step is tried from 2.5 s on, and the last values are the result."""
+    now = [0.0]
+
+    def model(values):
+        now[0] += 1
+        return closed_form(values)
+
+    monkeypatch.setattr(study.time, "perf_counter", lambda: now[0])
+    start = {name: 1.3 * value for name, value in TRUTH.items()}
+    fitted = mitransient_lidar.fit(closed_form(TRUTH), model, list(TRUTH), start=start, noise=0.01, max_time=2.5)
+    assert now[0] == 3
+    assert fitted.attrs["renders"] == 3
+    assert not fitted.attrs["converged"]
+    assert "max_time = 2.5 s ended the fit after 3 renders, before convergence" in caplog.text
+    assert np.all(np.isfinite(fitted["value"]) & np.isfinite(fitted["stderr"]))
+
+
 def test_a_function_is_a_model():
     fitted = mitransient_lidar.fit(closed_form(TRUTH), closed_form, list(TRUTH), start=TRUTH, noise=0.01)
     np.testing.assert_allclose(fitted["value"], list(TRUTH.values()))

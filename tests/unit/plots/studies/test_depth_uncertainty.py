@@ -21,7 +21,8 @@ def uncertainty():
     dims = ("correction", "wind_speed", "water", "depth")
     coords = {"correction": ["none", "table"], "wind_speed": WINDS, "water": WATERS, "depth": DEPTHS}
     scalars = {"altitude": 300.0, "off_nadir_deg": 20.0}
-    return xr.Dataset({"tvu": (dims, tvu), "order": (dims, order)}, {**coords, **scalars}, {"instrument": "made"})
+    data = {"tvu": (dims, tvu), "order": (dims, order), "found": (dims[1:], np.ones(shape[1:]))}
+    return xr.Dataset(data, {**coords, **scalars}, {"instrument": "made"})
 
 
 @pytest.mark.slow
@@ -37,6 +38,8 @@ def test_uncertainty_is_drawn_by_water_beside_the_orders(uncertainty):
             np.testing.assert_array_equal(lines[2 * number + 1].get_ydata(), drawn.sel(correction="none"))
         assert ax.lines[1].get_ydata()[0] == 0.25
     assert figure.legends[0].get_texts()[1].get_text() == "5 m/s"
+    uncertainty["tvu"][:] = np.nan
+    assert plot_uncertainty(uncertainty).axes[0].get_ylim()[1] > 0.25
 
 
 @pytest.mark.slow
@@ -46,6 +49,9 @@ def test_orders_are_drawn_by_depth_with_lost_bottoms_apart(uncertainty):
         image = figure.axes[number].images[0].get_array()
         expected = uncertainty["order"].sel(correction="table", depth=depth).transpose("water", "wind_speed").values
         np.testing.assert_array_equal(image, np.where(expected < 0, 5, expected))
+    uncertainty["found"][0, 0] = np.nan
+    left_out = np.ma.getmaskarray(plot_orders(uncertainty).axes[0].images[0].get_array())
+    np.testing.assert_array_equal(left_out, (np.arange(8) == 0).reshape(4, 2))
     labels = [text.get_text() for text in figure.axes[-1].get_yticklabels()]
     assert labels == ["exclusive", "special", "1a/1b", "2", "none", "no depth"]
 
