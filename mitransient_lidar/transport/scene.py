@@ -107,7 +107,7 @@ class WaterScene:
         return replace(self, parts=tuple(part.of(lanes) for part in self.parts), receiver_poses=poses)
 
     def with_parts_of(self: SceneT, shapes: Sequence[mi.Shape]) -> SceneT:
-        """Return a scene in parts without those parts that hold none of the shapes, or the same one if all do."""
+        """Return a scene in parts without the parts that hold none of the shapes; the same one if all hold none."""
         parts = [part for part in self.parts if any(one is shape for one in part.shapes.shapes() for shape in shapes)]
         return replace(self, parts=tuple(parts)) if parts else self
 
@@ -234,6 +234,7 @@ class WaterScene:
         turn = mi.Vector2f(1, 0)
         for part in self.parts:
             moved = part.ray(ray)
+            # What lies beyond a shape of another part does not matter.
             moved.maxt = dr.minimum(ray.maxt, nearest.t)
             found = part.shapes.ray_intersect_preliminary(moved, active=active)
             is_nearer = found.t < nearest.t
