@@ -22,7 +22,6 @@ from mitransient_lidar.flights.poses.mounting import PulsePoses
 from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.rendering.options import SMALLEST_SHARE
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import FARTHEST
 
@@ -161,10 +160,8 @@ class FlightRenderer:
         return self._stacked(inputs)[0]
 
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
-        """Return arrays of few paths, the coordinates of their dimensions, and the attributes of echoes."""
-        # So few paths may be brighter than the flight: their gain is their own.
-        inputs = {name: column for name, column in inputs.items() if not name.startswith(tuple(SETTINGS))}
-        arrays, echoes = self._stacked(inputs, few_paths=True)
+        """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
+        arrays, echoes = self._stacked(inputs)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
         found = {
             name: Array(tuple(map(str, echoes[name].dims)), echoes[name].values, _plain(echoes[name].attrs))
@@ -178,10 +175,9 @@ class FlightRenderer:
         stacked = {name: array._replace(values=array.values[0]) for name, array in arrays.items()}
         return stacked, found, {"echo_attributes": _plain(echoes.attrs)}
 
-    def _stacked(self, inputs: Mapping[str, Column], few_paths: bool = False) -> tuple[dict[str, Array], xr.Dataset]:
+    def _stacked(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], xr.Dataset]:
         """Return the arrays of pulses, stacked, and their echoes."""
-        passes = (2, SMALLEST_SHARE, None) if few_paths else self._passes(until_error=True)
-        series, later = self._render(inputs, passes)
+        series, later = self._render(inputs, self._passes(until_error=True))
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         recorded = record(series, self.plan, inputs)
         echoes = extract(recorded, self.plan.estimator)

@@ -24,6 +24,7 @@ from mitransient_lidar.transport.medium.bubble_plume import BubblePlume
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.scene import LidarScene
 
 #: Paths of all shots in a launch, and time bins of all their pixels.
 _PATHS, _BINS = 2**17, 2**24
@@ -148,7 +149,7 @@ class ShotBatches:
         lidar = self._renderer.scene
         surfaces = [*lidar.surfaces, *(sea.shape for sea in self._seas)]
 
-        def several(copies: int) -> PassRenderer:
+        def scene_of(copies: int) -> LidarScene:
             all_shots = shots.repeated(copies)
             moved = tuple(
                 all_shots.scene_part(
@@ -157,12 +158,12 @@ class ShotBatches:
                 for shapes, positions in parts
             )
             receiver, transmitter = all_shots.receiver, all_shots.transmitter
-            scene = replace(
+            return replace(
                 lidar, parts=moved, surfaces=surfaces, receiver_poses=receiver, transmitter_poses=transmitter
             )
-            return self._renderer.of_shots(scene, len(all_shots), copies)
 
-        return several
+        placed = self._renderer.of_shots(scene_of(1), len(shots))
+        return lambda copies: placed.repeated(scene_of(copies), copies)
 
     def set_time(self, time_s: float) -> None:
         """Set the time [s] at which shots meet the waves."""

@@ -119,11 +119,17 @@ class PassRenderer(ABC):
             perturbed.focusing = self.focusing.perturbed(perturbations)
         return perturbed
 
-    def of_shots(self, scene: LidarScene, shots: int, copies: int) -> PassRenderer:
-        """Return a renderer of a number of shots that meet a scene in parts, each `copies` of them at one place."""
+    def of_shots(self, scene: LidarScene, shots: int) -> PassRenderer:
+        """Return a renderer of a number of shots that meet a scene in parts."""
         moved = copy.copy(self)
         moved.scene = scene
         return moved
+
+    def repeated(self, scene: LidarScene, copies: int) -> PassRenderer:
+        """Return a renderer of each shot several times in turn, which meet a scene in parts."""
+        several = copy.copy(self)
+        several.scene = scene
+        return several
 
     def render_pass(
         self, seed: int | Sequence[int], *, paths: int | None = None, gates: GateWeights | None = None

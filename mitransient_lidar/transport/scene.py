@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -104,6 +105,11 @@ class WaterScene:
             return self
         poses = None if self.receiver_poses is None else self.receiver_poses.of(lanes)
         return replace(self, parts=tuple(part.of(lanes) for part in self.parts), receiver_poses=poses)
+
+    def with_parts_of(self: SceneT, shapes: Sequence[mi.Shape]) -> SceneT:
+        """Return a scene in parts without the parts that hold none of the shapes; the same one if all hold none."""
+        parts = [part for part in self.parts if any(one is shape for one in part.shapes.shapes() for shape in shapes)]
+        return replace(self, parts=tuple(parts)) if parts else self
 
     @property
     def receiver_pose(self) -> Pose:
@@ -227,7 +233,10 @@ class WaterScene:
         nearest.t = dr.inf
         turn = mi.Vector2f(1, 0)
         for part in self.parts:
-            found = part.shapes.ray_intersect_preliminary(part.ray(ray), active=active)
+            moved = part.ray(ray)
+            # What lies beyond a shape of another part does not matter.
+            moved.maxt = dr.minimum(ray.maxt, nearest.t)
+            found = part.shapes.ray_intersect_preliminary(moved, active=active)
             is_nearer = found.t < nearest.t
             nearest = dr.select(is_nearer, found, nearest)
             shift = dr.select(is_nearer, part.displacement, shift)

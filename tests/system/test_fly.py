@@ -90,8 +90,8 @@ def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed):
     away, across = np.sum(beside * ahead, axis=1), beside[:, 1] * ahead[:, 0] - beside[:, 0] * ahead[:, 1]
     for error in (*beside.T, away, across):
         assert_within(error, horizontal, bottom, points)
-    # One gain in all batches.
-    assert np.unique(flown.values("gain")).size == 1
+    # One gain in all batches, and in the attributes.
+    assert np.unique(flown.values("gain")).tolist() == [flown.attributes["gain"]]
     assert len(np.unique(np.floor(flown.values("time_s") / 0.05 + 1e-6))) >= 2
     # The bottom falls to -y and rises to +x: its height is that of the place that was found.
     x, y, z = (points[name].values[bottom] for name in "xyz")

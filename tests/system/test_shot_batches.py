@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from few_paths import few_paths
@@ -15,6 +17,7 @@ from mitransient_lidar.rendering.shot_batches import ShotBatches
 from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.rendering.shot_series import render_shots
 from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.rng import Lanes
 
 PLACES = np.array([[0.0, 0.0], [17.3, -42.1], [-250.4, 130.2]])
 RECORD = {"time_start_ns": 1380, "bin_count": 200}
@@ -108,6 +111,34 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator):
         edges = np.linspace(0, axis.bin_count, 14).astype(int)[:-1]
         pair = [np.add.reduceat(each, edges, axis=-1) for each in (found, energy)]
         assert_same(*pair, error=0.06, bias=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("depth", "slope"), [(6.0, 0.0), (1.5, 4.0)])
+def test_heights_of_shots_are_those_at_their_places(depth, slope):
+    """Of the sea, and of a bottom below all troughs or one that rises above the sea, in the last of several passes."""
+    params = {"wind_speed": 6, "bottom_depth": depth, "bottom_slope_deg": slope}
+    renderer = prepared("docs/guide/survey_lidar.xml", params, "lidar_merging")
+    places, copies, points = PLACES[:2], 3, 1000
+    batches = ShotBatches(renderer, (0.0, 0.0), copies, 0.01, None, [], lambda x, y: None)
+    heights, region = batches.at(ShotPoses(places))(copies).layout.grid.heights, renderer.layout.region
+    highest, lowest = renderer.scene.empty_heights
+    assert (highest < lowest) == (slope == 0)
+    x, y = (np.random.default_rng(1).uniform(region.low[axis], region.high[axis], points) for axis in (0, 1))
+    for number, place in enumerate(places):
+        aim = {"aim_x": place[0], "aim_y": place[1]}
+        alone = prepared("docs/guide/survey_lidar.xml", params | aim, "lidar_merging").scene
+        down = mi.Ray3f(mi.Point3f(mi.Float(x + place[0]), mi.Float(y + place[1]), 5.0), mi.Vector3f(0, 0, -1))
+        sea = alone.ray_intersect(down)
+        bed = alone.ray_intersect(alone.spawn_ray(sea, down.d))
+        assert np.all(alone.is_surface(sea.shape))
+        last_pass = Lanes(len(places) * copies, dr.full(mi.UInt32, copies * number + copies - 1, points), mi.UInt32(0))
+        found = heights.of(last_pass)
+        surface, _ = found.surface_at(mi.Float(x), mi.Float(y))
+        assert np.std(sea.p.z) > 0.03
+        # Cells of 14 cm.
+        np.testing.assert_allclose(surface, sea.p.z, atol=0.02)
+        np.testing.assert_allclose(found.bed_at(mi.Float(x), mi.Float(y)), bed.p.z, atol=0.01)
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,12 @@ class WaterGrid:
         grid.width, grid.bits = self.width * opaque(wider), bits
         return grid
 
+    def repeated(self, copies: int) -> WaterGrid:
+        """Return the grid of each shot several times in turn."""
+        grid = copy.copy(self)
+        grid.heights, grid.rings = self.heights.repeated(copies), self.rings.repeated(copies)
+        return grid
+
     @property
     def bits_ring(self) -> int:
         """Bits of the number of the ring in that of the bucket."""

@@ -72,19 +72,14 @@ class SolidPatch:
     faces: mi.Float
 
 
-def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1, copies: int = 1) -> list[mi.Shape]:
-    """Return solids with parts above each other in the region of any shot, found with vertical rays.
-
-    Each `copies` successive shots are at one place.
-    """
-    places = shots // copies
-    rays = PROBE_RAYS if places == 1 else _PROBE_RAYS_OF_SHOTS
-    lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * rays), places, rays)
-    lanes = Lanes(shots, lanes.shot * opaque_index(copies), lanes.number)
-    scene, (x, y) = scene.of(lanes), region.probe_points(lanes.number)
+def solids_of_several_levels(scene: LidarScene, region: Region, shots: int = 1) -> list[mi.Shape]:
+    """Return solids with parts above each other in the region of any shot, found with vertical rays."""
+    rays = PROBE_RAYS if shots == 1 else _PROBE_RAYS_OF_SHOTS
+    lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * rays), shots, rays)
+    scene, (x, y) = scene.with_parts_of(scene.solids).of(lanes), region.probe_points(lanes.number)
     top = max((float(shape.bbox().max.z) for shape in scene.mitsuba_scene.shapes()), default=0.0)
     ray = mi.Ray3f(mi.Point3f(x, y, opaque(top + 1.0)), mi.Vector3f(0, 0, -1))
-    looking = dr.full(mi.Bool, True, places * rays)
+    looking = dr.full(mi.Bool, True, shots * rays)
     met = [mi.UInt32(0) for _ in scene.solids]
     for _ in range(_MOST_LEVELS):
         si = scene.ray_intersect(ray, looking)

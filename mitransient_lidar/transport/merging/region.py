@@ -37,6 +37,9 @@ _HEIGHT_CELLS, _HEIGHT_CELLS_OF_SHOTS = 512, 64
 #: Largest number of times that a line through the mean sea level crosses the waves.
 _MOST_CROSSINGS = 4
 
+#: Largest distance below the sea at which vertical rays to solids start [m].
+_MARGIN_BELOW_SEA = 1.0
+
 #: Height of the bed of columns without a solid below [m].
 _NO_BED = -1e9
 
@@ -130,20 +133,19 @@ def meet_sea(scene: LidarScene, pose: Pose, angles: mi.Point2f) -> FloatArray:
     return np.where(np.array(direction.z)[:, None] < 0, np.array(point, np.float64).T, np.nan)
 
 
-def beam_entries(scene: LidarScene, shots: int = 1, copies: int = 1) -> FloatArray:
+def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
     """Return where the beam of each shot meets the sea, relative to where it meets its mean level [m].
 
-    Means over the beam, shape (shots, 3). Each `copies` successive shots are at one place.
+    Means over the beam, shape (shots, 3).
     """
-    places = shots // copies
-    lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * _ENTRY_RAYS), places, _ENTRY_RAYS)
-    moved = scene.of(Lanes(shots, lanes.shot * opaque_index(copies), lanes.number))
+    lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * _ENTRY_RAYS), shots, _ENTRY_RAYS)
+    moved = scene.of(lanes)
     pose = moved.transmitter_pose
     angles = mi.Point2f(scene.transmitter.sample_tangent(unit_points(_ENTRY_RAYS, lanes.number)))
     direction = np.array(pose.direction(*angles), np.float64).T
     height = meet_sea(moved, pose, angles)[:, 2]
     offset = np.where(np.isfinite(height), height / direction[:, 2], 0.0)[:, None] * direction
-    found: FloatArray = np.repeat(offset.reshape(places, -1, 3).mean(axis=1), copies, axis=0)
+    found: FloatArray = offset.reshape(shots, -1, 3).mean(axis=1)
     if scene.transmitter_poses is None:
         return found
     origin, axis = scene.transmitter_poses.origin, scene.transmitter_poses.axis
@@ -174,6 +176,12 @@ class _Grid:
     cells: int
     start: mi.UInt32
 
+    def repeated(self, copies: int) -> _Grid:
+        """Return the grid of each shot several times in turn."""
+        low = dr.repeat(self.low, copies)
+        dr.eval(low)
+        return replace(self, low=low)
+
     def of(self, lanes: Lanes, copies: mi.UInt32) -> _Grid:
         """Return the grid of each lane's shot, of which `copies` successive ones share one."""
         start = (lanes.shot // copies) * (self.cells * self.cells)
@@ -199,31 +207,44 @@ class SurfaceHeights:
         Largest depth of light [m]: solids are found beside the region, too, where light of that depth is.
     moves
         Displacements of the region (x, y) of each shot [m], shape (shots, 2).
-    copies
-        Number of successive shots at one place, which share a grid.
     """
 
-    def __init__(
-        self, scene: LidarScene, region: Region, depth: float, moves: FloatArray | None = None, copies: int = 1
-    ) -> None:
+    def __init__(self, scene: LidarScene, region: Region, depth: float, moves: FloatArray | None = None) -> None:
         moves = np.zeros((1, 2)) if moves is None else moves
-        self._copies = opaque_index(copies)
-        self._surface = self._look_down(scene, region, moves, copies, solids=False)
-        self._bed = self._look_down(scene, region.below(scene, depth), moves, copies, solids=True)
+        #: Number of successive shots that share a grid.
+        self._copies = opaque_index(1)
+        self._surface = self._look_down(scene, region, moves, solids=False)
+        self._bed = self._look_down(scene, region.below(scene, depth), moves, solids=True)
 
-    def _look_down(self, scene: LidarScene, region: Region, moves: FloatArray, copies: int, *, solids: bool) -> _Grid:
+    def repeated(self, copies: int) -> SurfaceHeights:
+        """Return the heights of each shot several times in turn, which share them."""
+        heights = copy.copy(self)
+        heights._copies = opaque_index(copies)
+        heights._surface, heights._bed = (grid.repeated(copies) for grid in (self._surface, self._bed))
+        return heights
+
+    def _look_down(self, scene: LidarScene, region: Region, moves: FloatArray, *, solids: bool) -> _Grid:
         """Return heights and slopes of the surface, or heights of solids under water, found with vertical rays."""
         shots = len(moves)
-        n, places = _HEIGHT_CELLS if shots == 1 else _HEIGHT_CELLS_OF_SHOTS, shots // copies
+        n = _HEIGHT_CELLS if shots == 1 else _HEIGHT_CELLS_OF_SHOTS
         corner = (moves + np.array(region.low)).astype(np.float32)
         low = mi.Point2f(*(aligned(mi.Float, column) for column in corner.T))
         per_metre = mi.Point2f(*(opaque(n / size) for size in region.size))
-        lanes = Lanes.of_paths(dr.arange(mi.UInt32, places * n * n), places, n * n)
-        index, lanes = lanes.number, Lanes(shots, lanes.shot * self._copies, lanes.number)
-        scene = scene.of(lanes)
+        lanes = Lanes.of_paths(dr.arange(mi.UInt32, shots * n * n), shots, n * n)
+        index, scene = lanes.number, scene.of(lanes)
         x = (mi.Float(index % n) + 0.5) / per_metre.x + lanes.pick(low.x)
         y = (mi.Float(index // n) + 0.5) / per_metre.y + lanes.pick(low.y)
-        top = opaque(max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0)
+        top = max(float(surface.bbox().max.z) for surface in scene.surfaces) + 1.0
+        under_water = False
+        if scene.parts:
+            highest_solid, lowest_sea = scene.empty_heights
+            under_water = solids and highest_solid < lowest_sea
+            if under_water:
+                # Between the solids and the sea, which these rays need not meet.
+                top = lowest_sea - min(0.5 * (lowest_sea - highest_solid), _MARGIN_BELOW_SEA)
+            if under_water or not solids:
+                scene = scene.with_parts_of(scene.solids if solids else scene.surfaces)
+        start = opaque(top)
 
         def look_down(
             ray: mi.Ray3f, found: mi.Vector4f, wet: mi.Bool, active: mi.Bool
@@ -237,12 +258,12 @@ class SurfaceHeights:
             wet |= active & at_sea
             return dr.select(active, si.spawn_ray(ray.d), ray), found, wet, active
 
-        count = places * n * n
+        count = shots * n * n
         found = dr.zeros(mi.Vector4f, count)
         found.x = _NO_BED if solids else 0.0
         state = (
-            mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1)),
-            *(found, dr.zeros(mi.Bool, count), dr.full(mi.Bool, True, count)),
+            mi.Ray3f(mi.Point3f(x, y, start), mi.Vector3f(0, 0, -1)),
+            *(found, dr.full(mi.Bool, under_water, count), dr.full(mi.Bool, True, count)),
         )
         _, found, _, _ = dr.while_loop(state, lambda *state: state[-1], look_down, label="heights")
         values = found.x if solids else dr.ravel(found)

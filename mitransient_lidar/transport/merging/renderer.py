@@ -148,26 +148,31 @@ class MergingLayout:
     side_bits: int = MOST_SIDE_BITS
     widens: bool = True
 
-    def of_shots(self, scene: LidarScene, shots: int, copies: int, photons: int) -> MergingLayout:
-        """Return the layout of shots that meet a scene in parts, with a number of photons each.
-
-        Each `copies` successive shots are at one place.
-        """
+    def of_shots(self, scene: LidarScene, shots: int, photons: int) -> MergingLayout:
+        """Return the layout of shots that meet a scene in parts, with a number of photons each."""
         bits = math.ceil(math.log2(photons))
         wider = min((_PHOTONS / photons) ** (1 / 3), _WIDEST) if self.widens else 1.0
         side_bits = min(MOST_SIDE_BITS, -(-(bits + _SIDE_BITS_OF_PATCHES) // 2))
         grid, rings = self.grid, self.rings
         if isinstance(grid, WaterGrid):
-            entries = beam_entries(scene, shots, copies)
-            heights = SurfaceHeights(scene, self.region, self.depth, entries[:, :2] - self.entry[:2], copies)
+            entries = beam_entries(scene, shots)
+            heights = SurfaceHeights(scene, self.region, self.depth, entries[:, :2] - self.entry[:2])
             buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, grid.bits_z + 2))
             axes = None if scene.transmitter_poses is None else scene.transmitter_poses.axis
             grid = grid.of_shots(heights, entries, axes, max(wider, 1.0), buckets)
             rings = grid.rings
         # A copy has capacities of its own.
-        uneven = solids_of_several_levels(scene, self.region, shots, copies)
+        uneven = solids_of_several_levels(scene, self.region, shots)
         patch_width = self.patch_width * max(wider, 1.0)
         return replace(self, grid=grid, rings=rings, uneven=uneven, side_bits=side_bits, patch_width=patch_width)
+
+    def repeated(self, copies: int) -> MergingLayout:
+        """Return the layout of each shot several times in turn."""
+        grid, rings = self.grid, self.rings
+        if isinstance(grid, WaterGrid):
+            grid = grid.repeated(copies)
+            rings = grid.rings
+        return replace(self, grid=grid, rings=rings)
 
     def of_scene_alike(self, scene: LidarScene) -> MergingLayout:
         """Return the same points and cells for a scene that differs a little, whose solids may be other objects."""
@@ -281,11 +286,17 @@ class MergingRenderer(PassRenderer):
         scaled.paths, scaled.photons = (max(round(share * count), 1) for count in (self.paths, self.photons))
         return scaled
 
-    def of_shots(self, scene: LidarScene, shots: int, copies: int) -> MergingRenderer:
-        """Return a renderer of shots that meet a scene in parts, of which each `copies` are at one place."""
+    def of_shots(self, scene: LidarScene, shots: int) -> MergingRenderer:
+        """Return a renderer of a number of shots that meet a scene in parts."""
         moved = copy.copy(self)
-        moved.scene, moved.layout = scene, self.layout.of_shots(scene, shots, copies, self.photons)
+        moved.scene, moved.layout = scene, self.layout.of_shots(scene, shots, self.photons)
         return moved
+
+    def repeated(self, scene: LidarScene, copies: int) -> MergingRenderer:
+        """Return a renderer of each shot several times in turn, which meet a scene in parts."""
+        several = copy.copy(self)
+        several.scene, several.layout = scene, self.layout.repeated(copies)
+        return several
 
     def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
         """Trace the paths of one pass into a record."""

@@ -102,6 +102,16 @@ class BeamRings:
             rings.shear, rings.slant = _columns(shear), _columns(np.where(is_steep[:, None], shear, 0.0))
         return rings
 
+    def repeated(self, copies: int) -> BeamRings:
+        """Return the rings of each shot several times in turn."""
+        rings = copy.copy(self)
+        rings._entry = dr.repeat(self._entry, copies)
+        if any(dr.width(each) > 1 for each in self.shear):
+            sides = self.shear, self.slant
+            rings.shear, rings.slant = ([dr.repeat(each, copies) for each in pair] for pair in sides)
+        dr.eval(rings._entry, rings.shear, rings.slant)
+        return rings
+
     def of(self, lanes: Lanes) -> BeamRings:
         """Return the rings of each lane's shot."""
         if lanes.shots == 1:
