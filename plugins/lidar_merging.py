@@ -45,7 +45,7 @@ class LidarMerging(LidarIntegrator):
     equal widths in arsinh(*r*/*q*): cells are small where the light is concentrated, and grow with the distance from a
     narrow beam. They are half as thick as the distance of the points, at most 0.3 attenuation lengths, and thinner near
     the surface where a narrow beam spreads fast, where facets are small, and in turbid water. Patches of solids that
-    look up or down are such sectors, too.
+    look up or down are such sectors, too; on the axis they grow with depth at most twice as much as unscattered light.
 
     Within a cell, light is counted where it meets a common plane, at a random depth in each pass. The receiver's paths
     look it up where the light at their points would meet that plane: along the beam as the facet above refracts it, at

@@ -86,14 +86,20 @@ class RefractedProfile:
         # scale of `BeamRings.offset`.
         shifts = turn / cosine**2 * down, turn / cosine
         ripples = 0.5 * max((sum(sea.ripple_variance) for sea in scene.seas), default=0.0)
+        self._own = [(spread, shift * math.sqrt(ripples)) for spread, shift in zip(spreads, shifts, strict=True)]
         self._spreads, self._shifts = ([opaque(value) for value in values] for values in (spreads, shifts))
-        self._growths = [opaque(shift * math.sqrt(ripples)) for shift in shifts]
+        self._growths = [opaque(growth) for _, growth in self._own]
         #: Depth at which the sea's slopes double the variance [m].
         slopes = max(math.sqrt(0.5 * scene.slope_variance), _LEAST_SLOPE)
         self.depth = min(spread / (shift * slopes) for spread, shift in zip(spreads, shifts, strict=True))
         #: Displacement for each metre of depth by the slopes of facets.
         of_facets = max(0.5 * scene.slope_variance - ripples, 0.0)
         self.shift_by_facets = max(max(shifts) * math.sqrt(of_facets), _LEAST_SLOPE)
+
+    def growth(self, depth: FloatArray, most: float) -> FloatArray:
+        """Return by how much ripples widen light down to depths [m], of the beam or, if less, of a deviation `most`."""
+        factors = [np.hypot(1, growth * depth / min(spread, most)) for spread, growth in self._own]
+        return np.asarray(np.minimum(*factors))
 
     def _axes(
         self, offset: tuple[mi.Float, mi.Float], depth: mi.Float, slopes: tuple[mi.Float, mi.Float]

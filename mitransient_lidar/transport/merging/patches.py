@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
@@ -34,6 +35,10 @@ _MOST_LEVELS = 8
 
 #: Margin of the probes beyond a level, and of their steps beyond a surface, over the height of the level.
 _PROBE_MARGIN = 1e-3
+
+#: Largest growth of the patches with depth, over that of unscattered light below ripples: in wider ones, narrow beams
+#: and views blur.
+_MOST_GROWTH = 2.0
 
 #: Largest number of coverage samples: rounding may hide a sliver of a patch from all of them.
 _MOST_COVERAGE_SAMPLES = 1000
@@ -113,6 +118,10 @@ class SolidPatches:
         Solids that `solids_of_several_levels` found.
     side_bits
         Logarithm to base 2 of the number of buckets of a shot along one side.
+    least
+        Least side of squares, and of sectors on the solids [m].
+    growth
+        Factors by which ripples widen unscattered light down to depths [m]; None for patches that grow as the rings.
     """
 
     def __init__(
@@ -125,17 +134,23 @@ class SolidPatches:
         shift: mi.Point2f,
         uneven: Sequence[mi.Shape] = (),
         side_bits: int = MOST_SIDE_BITS,
+        least: float = 0.0,
+        growth: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         self.scene, self._rings, self._side_bits = scene, rings, side_bits
         self._start = mi.UInt32(0)
-        self.width, self._depth = opaque(width), opaque(depth)
+        self.width, self._depth = opaque(max(width, least)), opaque(depth)
         # Sizes suit the light at the middle of a solid.
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(solid))[0]) for solid in scene.solids]
         depths = np.zeros(max(numbers, default=0) + 1)
         for number, solid in zip(numbers, scene.solids, strict=True):
             depths[number] = np.clip(-float(solid.bbox().center().z), 0, depth)
-        self._cores = rings.core(mi.Float(depths))
-        self._ring_width = self.width / rings.core(mi.Float(0))
+        core = rings.core(mi.Float(0))
+        self._ring_width = opaque(width) / core
+        cores = rings.core(mi.Float(depths))
+        if growth is not None:
+            cores = dr.minimum(cores, _MOST_GROWTH * core * mi.Float(growth(depths)))
+        self._cores = dr.maximum(cores, opaque(least) / self._ring_width)
         self._shift = shift
         self._bounded = [
             solid

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -58,8 +60,8 @@ _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 #: Width of the patches of solids, over the width of the cells at the surface.
 _PATCH_PER_CELL = 3.2
 
-#: Least width of the patches over the size of the largest solid, some ten times the rounding of positions on it.
-_PATCH_PER_SOLID = 2**-20
+#: Least width of the patches over the size of the largest solid, eight times the rounding of positions on it.
+_PATCH_PER_SOLID = 2**-22
 
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
@@ -123,8 +125,10 @@ class MergingLayout:
         Distance between points along a path [m].
     reach, depth
         Mean distance in the water along the axis to a solid or to the record's end, and its depth [m].
-    patch_width
-        Width of the patches of solids on the axis at the surface [m].
+    patch_width, least_patch
+        Width of the patches of solids on the axis at the surface, and the least one on the solids [m].
+    growth
+        Factors by which ripples widen unscattered light down to depths [m].
     light_segments, sensor_segments, hits
         Capacities for segments and hits of solids of each path; they grow when a pass needs more.
     side_bits
@@ -142,6 +146,8 @@ class MergingLayout:
     reach: float
     depth: float
     patch_width: float
+    least_patch: float
+    growth: Callable[[FloatArray], FloatArray] | None
     light_segments: float
     sensor_segments: float
     hits: float = 2.0
@@ -203,9 +209,9 @@ class MergingLayout:
             grid: WaterGrid | SphericalGrid = SphericalGrid(scene, thickness)
             rings = BeamRings(pose, scene.transmitter.angular_spread * nearest, 1.0, 0.0)
             depth = nearest * max(-float(pose.axis[2]), 0.0) - float(pose.origin[2])
-            patches = _patch_width(scene, width)
+            patches = _PATCH_PER_CELL * width, _least_patch(scene)
             return cls(
-                *(region, np.zeros(3), uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
+                *(region, np.zeros(3), uneven, grid, rings, spacing, reach, depth, *patches, None, segments, segments),
                 widens=not options.cell_size,
             )
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
@@ -232,17 +238,19 @@ class MergingLayout:
             max(_UPPERMOST_PER_ATTENUATION / max(float(column.attenuation[0]), _LEAST_ATTENUATION), footprint),
         )
         grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
-        patches = _patch_width(scene, width)
+        # The standard deviation of even light in the field of view is a quarter of its diameter.
+        patches = _PATCH_PER_CELL * width, _least_patch(scene)
+        by_ripples = functools.partial(profile.growth, most=0.25 * view)
         return cls(
-            *(region, entries[0], uneven, grid, rings, spacing, reach, depth, patches, segments, segments),
+            *(region, entries[0], uneven, grid, rings, spacing, reach, depth, *patches, by_ripples, segments, segments),
             widens=not options.cell_size,
         )
 
 
-def _patch_width(scene: LidarScene, cell: float) -> float:
-    """Return the width of the patches of solids for a width of the cells at the surface [m]."""
+def _least_patch(scene: LidarScene) -> float:
+    """Return the least width of the patches of solids [m]."""
     sizes = [np.max(np.array(solid.bbox().max) - np.array(solid.bbox().min)) for solid in scene.solids]
-    return float(max(_PATCH_PER_CELL * cell, _PATCH_PER_SOLID * max(sizes, default=0.0)))
+    return float(_PATCH_PER_SOLID * max(sizes, default=0.0))
 
 
 def paths_of_pass(options: MergingOptions, pixels: int) -> int:
@@ -317,6 +325,8 @@ class MergingRenderer(PassRenderer):
             mi.Point2f(shifts[4:]),
             layout.uneven,
             layout.side_bits,
+            layout.least_patch,
+            layout.growth,
         )
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
         rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)
