@@ -111,7 +111,8 @@ def compare(name, params, confirming=False):
                 continue
             # Welch (1947), as a standard normal number.
             freedom = (ea**2 + eb**2) ** 2 / (ea**4 / (len(a) - 1) + eb**4 / (len(b) - 1))
-            z = norm.isf(t.sf((a.mean() - b.mean()) / np.hypot(ea, eb), freedom))
+            score = (a.mean() - b.mean()) / np.hypot(ea, eb)
+            z = np.copysign(norm.isf(t.sf(abs(score), freedom)), score)
             gate = -1 if (first, end) == (0, len(light)) else gate
             rows.append((origin, gate, a.mean() / b.mean() - 1, np.hypot(ea, eb) / b.mean(), float(z)))
     return rows

@@ -138,9 +138,8 @@ def extract(
 
     Surface echoes are held against beam and geometry; see `surface_times.surface_times`. A pixel without direct light
     has the flag ``no_surface_light``, ``surface_time_ns`` from the other pixels of its shot, and echoes with the flag
-    ``scattered_light``. Echoes no higher than single events of the detector have the flag ``few_events``. The estimator
-    ``gaussian`` flags a surface echo of less than 3 standard errors as ``no_echo``; its time is that of the column's
-    onset. A target or bottom of less has the flag ``poor_fit``.
+    ``scattered_light``. Echoes no higher than single events of the detector are ``few_events``. ``gaussian`` flags
+    targets and bottoms below 3 standard errors as ``poor_fit``, surfaces as ``no_echo``, timed by the column's onset.
 
     ``depth_m_stderr`` is the error by noise and by the jitter of the record's trigger and clocks, which cancels where
     the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for ``gaussian``

@@ -9,7 +9,6 @@ from command_line import assert_refused, run
 from scipy.stats import exponnorm, norm
 from significance import largest_count, largest_z
 
-import mitransient_lidar
 from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import csv_tables, echo_table
@@ -487,27 +486,3 @@ def test_invalid_input(dataset, options, sentence):
     with pytest.raises(UserError, match=sentence) as refused:
         echo_table.extract(dataset, **options)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.long
-def test_published_biases_of_depth_appear_in_rendered_results():
-    """Turbid water: depths too large at nadir, too small far off it, by undercutting (Guenther and Thomas 1984)."""
-    depths = {}
-    for off_nadir in (5.0, 50.0):
-        for scattering, backscattering in ((0.02, 0.0005), (0.8, 0.008)):
-            params = {"off_nadir_deg": off_nadir, "spectrum": "flat", "slope_variance": 0.01}
-            params |= {"attenuation": scattering + 0.1, "scattering": scattering, "backscattering": backscattering}
-            params |= {"divergence_mrad": 2, "pulse_fwhm_ns": 4, "field_of_view_mrad": 60, "bottom_reflectance": 0.5}
-            first = round(2e9 * 200 / np.cos(np.radians(off_nadir)) / 299792458 - 60)
-            params |= {"time_start_ns": first, "bin_width_ns": 1, "bin_count": 200}
-            shot = mitransient_lidar.render("fig09_1x1", params=params, passes=6, seed=1)
-            table = echo_table.extract(shot, ["leading_edge", "peak"], depth_from="mean")
-            bottom = table.sel(echo="bottom").isel(pixel=0)
-            depths[off_nadir, scattering] = bottom["depth_m"]
-    clear, turbid = (depths[5.0, scattering].sel(estimator="peak") for scattering in (0.02, 0.8))
-    assert float(clear) == pytest.approx(8.0, abs=0.05)
-    assert 0.05 < float(turbid - clear) < 0.3
-    clear, turbid = (depths[50.0, scattering].sel(estimator="leading_edge") for scattering in (0.02, 0.8))
-    assert -0.6 < float(turbid - clear) < -0.1
-    # The beam's footprint alone makes a leading edge early there; the peak is where the axis meets the bottom.
-    assert float(depths[50.0, 0.02].sel(estimator="peak")) == pytest.approx(8.0, abs=0.06)
