@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
-from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, is_one_of, opaque, opaque_index
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.scene import LidarScene
 
@@ -147,9 +147,9 @@ class SolidPatches:
             depths[number] = np.clip(-float(solid.bbox().center().z), 0, depth)
         core = rings.core(mi.Float(0))
         self._ring_width = opaque(width) / core
-        cores = rings.core(mi.Float(depths))
+        cores = rings.core(aligned(mi.Float, depths))
         if growth is not None:
-            cores = dr.minimum(cores, _MOST_GROWTH * core * mi.Float(growth(depths)))
+            cores = dr.minimum(cores, _MOST_GROWTH * core * aligned(mi.Float, growth(depths)))
         self._cores = dr.maximum(cores, opaque(least) / self._ring_width)
         self._shift = shift
         self._bounded = [
