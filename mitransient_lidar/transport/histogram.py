@@ -12,7 +12,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain, ResponseTable
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.opaque import opaque, opaque_index
+from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
 from mitransient_lidar.transport.perturbations import Perturbations, Sums
 
 #: Largest number of sums: more do not fit the memory of a laptop.
@@ -41,7 +41,7 @@ class GateWeights:
         # Zero at both ends, so that linear interpolation never leaves the table.
         values = np.append(table.values[first:last], 0.0)
         values[0] = 0.0
-        self._values = mi.Float(values)
+        self._values = aligned(mi.Float, values)
         self._last = values.size - 2
         self._start = opaque((table.start_ns + first * table.step_ns) * 1e-9 * C0 - reference_length)
         self._per_metre = opaque(1 / (table.step_ns * 1e-9 * C0))

@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.laser.beam_sampler import BeamSampler
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.random_walk import RandomWalk, RandomWalkPath
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
@@ -114,7 +114,7 @@ class Crossings:
         self.capacity = capacity
         self._water = water
         self._longest = opaque(longest)
-        self._depths = mi.Float(np.append(depths, np.inf))
+        self._depths = aligned(mi.Float, np.append(depths, np.inf))
         self._planes = len(depths)
         self._stored = dr.zeros(mi.UInt32, 1)
         self._first = dr.empty(mi.UInt32, 4 * capacity)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import positive
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.sensor.image_sampling import ImageSampler
 from mitransient_lidar.transport.sensor.outlines import Outline, enclosed_area
 
@@ -175,7 +175,7 @@ class ImageBeam(BeamProfile):
         self._cell = positive("side of the beam image", side) / self._columns
         self.reach = 0.5 * self._cell * float(np.hypot(self._rows, self._columns))
         self._sampler = ImageSampler(self._share)
-        self._density = mi.Float((self._share / self._cell**2).ravel())
+        self._density = aligned(mi.Float, self._share / self._cell**2)
         self._measure()
 
     def _measure(self) -> None:

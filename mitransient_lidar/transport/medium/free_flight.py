@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.layers import WaterColumn
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import aligned, opaque
 
 #: Least optical depth left in the last layer of a flight: in clear water even this is never crossed.
 _SMALLEST_OPTICAL_DEPTH = 1e-30
@@ -45,7 +45,7 @@ class LayeredFlight:
         return self._look_up(self._albedo, layer)
 
     def _table(self, values: FloatArray) -> mi.Float:
-        return opaque(values[0]) if self.count == 1 else mi.Float(values)
+        return opaque(values[0]) if self.count == 1 else aligned(mi.Float, values)
 
     def _look_up(self, table: mi.Float, layer: mi.UInt32) -> mi.Float:
         return table if self.count == 1 else dr.gather(mi.Float, table, layer)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.opaque import opaque
+from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape, Rectangle, Sector
 from mitransient_lidar.transport.sensor.pixel_lookup import FovLookup
@@ -187,7 +187,8 @@ class ShapedPixels(PixelArray):
         areas = np.array([field.area for field in fields])
         self.area = float(areas.sum())
         ends = np.cumsum(areas) / self.area
-        self._starts, self._per_share = mi.Float(np.append(0, ends[:-1])), mi.Float(1 / np.diff(ends, prepend=0))
+        self._starts = aligned(mi.Float, np.append(0, ends[:-1]))
+        self._per_share = aligned(mi.Float, 1 / np.diff(ends, prepend=0))
         self.field_of_view = 2 * float(np.abs([field.bounds() for field in fields]).max())
         self.field_of_view_shape = "nested"
         self._lookup = FovLookup(fields)
