@@ -44,6 +44,10 @@ def find_shots(
     output: Annotated[Path, typer.Option("-o", "--output", help="PNG, PDF or SVG file to write.")] = OUTPUT
     / "find_shots.png",
     waveforms: Annotated[bool, typer.Option("--waveforms/--no-waveforms", help="Also render the shots.")] = True,
+    max_time: Annotated[
+        float | None,
+        typer.Option(help="Stop before this many seconds, with fewer passes or waveforms (greater than 0)."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Find places of the sea where the beam meets given slopes.
@@ -56,12 +60,13 @@ def find_shots(
     from mitransient_lidar.plots.studies.find_shots import plot_found_shots
     from mitransient_lidar.studies import find_shots as study
 
-    with reporting(quiet):
+    with reporting(quiet) as progress:
         if places:
             found = study.shots_at(scene, places, params)
         else:
             found = study.find_shots(scene, params, slope_sigmas=slope_sigmas, count=count)
-        rendered = study.render_found_shots(scene, found, params, waveforms=waveforms)
+        options: dict[str, Any] = {"waveforms": waveforms, "max_time": max_time, "progress": progress}
+        rendered = study.render_found_shots(scene, found, params, **options)
     typer.echo(f"{'kind':<10}{'aim_x':>10}{'aim_y':>10}{'along (deg)':>13}{'across (deg)':>14}")
     for shot in found:
         along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
@@ -69,6 +74,8 @@ def find_shots(
     output.parent.mkdir(parents=True, exist_ok=True)
     plot_found_shots(rendered, output)
     typer.echo(output)
+    for result in rendered.results[:1]:
+        exit_if_interrupted(result)
 
 
 @render_options(

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import render_shots
@@ -89,7 +90,13 @@ def shots_at(scene: Any, places: Sequence[tuple[float, float]], params: Mapping[
 
 
 def render_found_shots(
-    scene: Any, shots: Sequence[Shot], params: Mapping[str, Any] | None = None, *, waveforms: bool = True
+    scene: Any,
+    shots: Sequence[Shot],
+    params: Mapping[str, Any] | None = None,
+    *,
+    waveforms: bool = True,
+    max_time: float | None = None,
+    progress: ProgressCallback | None = None,
 ) -> RenderedShots:
     """Render shots, and map the sea and the footprints of beam and pixels.
 
@@ -101,19 +108,22 @@ def render_found_shots(
         Places.
     waveforms
         Whether to render the shots.
+    max_time, progress
+        As for `rendering.shot_series.render_shots`: `results` may hold the first shots alone.
 
     Raises
     ------
     UserError
-        If the scene is invalid, has no waves or no parameters ``aim_x`` and ``aim_y``.
+        If the scene is invalid, has no waves or no parameters ``aim_x`` and ``aim_y``, or `max_time` is out of range.
     """
     session = open_scene(scene, params)
     loaded = session.scene
     sea = SeaMap.of_scene(loaded)
     results: list[xr.Dataset] = []
     if waveforms:
-        series = render_shots(scene, params, positions=[(shot.x, shot.y) for shot in shots], passes=_PASSES)
-        results = [series.isel(shot=number) for number in range(len(shots))]
+        places = [(shot.x, shot.y) for shot in shots]
+        series = render_shots(scene, params, positions=places, passes=_PASSES, max_time=max_time, progress=progress)
+        results = [series.isel(shot=number) for number in range(series.sizes["shot"])]
     azimuth, along, across = footprint(transmitter_of(loaded))
     lines, pixel_map = _pixel_map(loaded)
     count = loaded.sensors()[0].receiver.pixels.count

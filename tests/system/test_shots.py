@@ -92,6 +92,24 @@ def test_found_shots_are_drawn_on_their_sea(tmp_path):
 
 
 @pytest.mark.slow
+def test_an_interrupted_search_draws_the_shots_that_were_rendered(tmp_path, monkeypatch):
+    render_shots, seen = shots.render_shots, {}
+
+    def interrupted(*args, positions, **options):
+        seen.update(options)
+        return render_shots(*args, positions=positions[:2], **options).assign_attrs(interrupted=1)
+
+    monkeypatch.setattr(shots, "render_shots", interrupted)
+    scene, picture = few_paths("fig09_2x2", tmp_path), tmp_path / "sea.png"
+    places = [part for x in (0, 3, 6) for part in ("--at", f"{x},1")]
+    done = run("find-shots", scene, *places, "--max-time", "500", "-o", picture)
+    assert done.exit_code == 130, done.stderr
+    assert picture.is_file()
+    assert seen["max_time"] == 500
+    assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["shot"] * 3
+
+
+@pytest.mark.slow
 def test_depth_bias_is_that_of_a_ray_through_the_slope():
     """A ray traced with vectors through a tilted plane that meets it at the mean level, down to the bottom."""
     for slope in (-0.12, 0.0, 0.05):
