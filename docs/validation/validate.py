@@ -31,6 +31,7 @@ import test_beam_spread as beams  # noqa: E402
 import test_half_space as half_space  # noqa: E402
 import test_passive as daylight_scenes  # noqa: E402
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin  # noqa: E402
+from oracles.half_space import banded_reflectance, phase_moments, water_leaving_reflectance  # noqa: E402
 
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem  # noqa: E402
 from mitransient_lidar.physics.lidar.refraction import fresnel  # noqa: E402
@@ -40,6 +41,8 @@ from mitransient_lidar.physics.water.layers import WaterColumn  # noqa: E402
 from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters  # noqa: E402
 from mitransient_lidar.transport.path_classes import PathClasses  # noqa: E402
 
+#: Number of random scenes in the table.
+RANDOM_SCENES = 6
 INTEGRATORS = "lidar_merging", "lidar_volpath"
 COLUMNS = "case", "quantity", "unit", "ours", "error", "theirs", "ratio", "z", "source"
 BEGIN, END = "<!-- table by validate.py -->", "<!-- end of the table -->"
@@ -157,10 +160,10 @@ def moments() -> list[Row]:
 
 
 def scenes() -> list[Row]:
-    """Light by origin of both integrators in two random scenes, as in tests/random_scenes.py."""
+    """Light by origin of both integrators in random scenes, with the passes of a confirmation."""
     found = []
-    for number in (0, 1):
-        for origin, gate, difference, error, _ in random_scenes.compare(*random_scenes.draw(number)):
+    for number in range(RANDOM_SCENES):
+        for origin, gate, difference, error, _ in random_scenes.compare(*random_scenes.draw(number), confirming=True):
             if gate == -1:
                 quantity = f"random scene {number}, {origin}: lidar_merging over lidar_volpath"
                 found.append(Row(quantity, "1", 1 + difference, error, 1.0, "lidar_volpath"))
@@ -190,23 +193,31 @@ REFLECTANCES = {
     **{0.9: 8.1159e-3, 0.8: 3.2858e-3, 0.7: 1.8294e-3, 0.6: 1.1462e-3},
     **{0.5: 7.5220e-4, 0.3: 3.1669e-4, 0.1: 8.1317e-5},
 }
+#: Edges of the bands of directions of its radiances [deg].
+HYDROLIGHT_BANDS = (0, *range(5, 90, 10), 90)
 #: The same by a backward Monte Carlo.
 MONTE_CARLO = {0.9: 8.049e-3, 0.6: 1.1533e-3}
 
 
 def daylight() -> list[Row]:
     """Water-leaving radiance at the nadir over the irradiance above a level sea."""
+    parameters = fournier_forand_parameters(0.0183)
+    moments = phase_moments(lambda angle: fournier_forand(angle, *parameters), 1501)
     found = []
-    for albedo, expected in REFLECTANCES.items():
+    for albedo, hydrolight in REFLECTANCES.items():
         scene = daylight_scenes.build(
             sky={"irradiance": 1.0},
             water={"attenuation": 1.0, "scattering": albedo, "backscattering": 0.0183 * albedo},
             integrator={"paths_per_pass": 2**18},
         )
         # The sky's mirror image is not random.
-        leaving = daylight_scenes.passes(scene, 12)[:, 0] - float(fresnel(0.0, daylight_scenes.N)[0]) / np.pi
+        leaving = daylight_scenes.passes(scene, 48)[:, 0] - float(fresnel(0.0, daylight_scenes.N)[0]) / np.pi
         quantity = f"reflectance of deep water, albedo {albedo:g}"
-        found.append(row(quantity, "1/sr", leaving, expected, "HydroLight 4.2"))
+        exact = float(water_leaving_reflectance(albedo, moments[:193], daylight_scenes.N))
+        banded = banded_reflectance(albedo, moments, daylight_scenes.N, HYDROLIGHT_BANDS)
+        found.append(row(quantity, "1/sr", leaving, exact, "discrete ordinates"))
+        found.append(row(quantity, "1/sr", leaving, hydrolight, "HydroLight 4.2"))
+        found.append(Row(f"{quantity}, in bands of 10°", "1/sr", banded, 0.0, hydrolight, "HydroLight 4.2"))
         if albedo in MONTE_CARLO:
             found.append(row(quantity, "1/sr", leaving, MONTE_CARLO[albedo], "backward Monte Carlo"))
     return found
@@ -280,12 +291,12 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     known = [row for row in rows if row["error"]]
-    figure, ax = plt.subplots(figsize=(8, 1 + 0.22 * len(known)), layout="constrained")
+    figure, ax = plt.subplots(figsize=(10, 1 + 0.22 * len(known)), layout="constrained")
     ratio = np.array([float(row["ratio"]) for row in known])
     error = np.array([float(row["error"]) / abs(float(row["theirs"])) for row in known])
     ax.axvline(1, color="0.5", lw=1)
     ax.errorbar(ratio, np.arange(len(known)), xerr=error, fmt=".", capsize=2)
-    ax.set_yticks(range(len(known)), [row["quantity"] for row in known], fontsize=7)
+    ax.set_yticks(range(len(known)), [f"{row['quantity']} ({row['source']})" for row in known], fontsize=7)
     ax.set_xlabel("ours over theirs, with one standard error of ours")
     ax.invert_yaxis()
     figure.savefig(path / "ratios.png", dpi=100)

@@ -1,8 +1,14 @@
-"""H function against an independent discrete-ordinate table, Chandrasekhar's own numbers and its integral equation."""
+"""H function against an independent discrete-ordinate table, Chandrasekhar's own numbers and its integral equation;
+discrete ordinates against the H function, and where nothing absorbs.
+"""
 
 import numpy as np
 import pytest
-from oracles.half_space import chandrasekhar_h
+from oracles.half_space import banded_reflectance, chandrasekhar_h, phase_moments, water_leaving_reflectance
+from scipy.integrate import quad
+
+from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 
 DEGREES = [0, 20, 40, 60]
 
@@ -60,3 +66,32 @@ def test_no_scattering_and_grazing():
 def test_rejections(mu, albedo, message):
     with pytest.raises(ValueError, match=message):
         chandrasekhar_h(mu, albedo)
+
+
+@pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("zenith", [0.0, 1.0])
+def test_discrete_ordinates_of_isotropic_scattering(albedo, zenith):
+    """Below an even sky of radiance 1/pi: omega/(2 pi) H(m) times the integral over u of u H(u)/(u + m)."""
+    mu = np.cos(zenith)
+    integral = quad(lambda u: u * chandrasekhar_h(u, albedo) / (u + mu), 0, 1)[0]
+    expected = albedo / (2 * np.pi) * chandrasekhar_h(mu, albedo) * integral
+    found = water_leaving_reflectance(albedo, np.eye(1, 65)[0], 1 + 1e-9, zenith)
+    assert found == pytest.approx(expected, rel=1e-7)
+
+
+def test_discrete_ordinates_below_a_surface():
+    """Where nothing absorbs, what leaves and what the surface reflects are as bright as the sky."""
+    zenith = [0.0, 0.8, 1.4]
+    found = water_leaving_reflectance(1 - 1e-10, np.eye(1, 65)[0], 1.34, zenith)
+    assert np.pi * found == pytest.approx(fresnel(zenith, 1.34)[1], rel=1e-4)
+
+
+def test_discrete_ordinates_converge_for_forward_scattering():
+    parameters = fournier_forand_parameters(0.0183)
+    moments = phase_moments(lambda angle: fournier_forand(angle, *parameters), 401)
+    coarse, fine = (water_leaving_reflectance(0.9, moments[: 2 * half + 1], 1.34) for half in (32, 64))
+    assert coarse == pytest.approx(fine, rel=3e-4)
+    # Within bands of 10 degrees, light that is scattered forwards comes closer to the direction of any other light.
+    wide, narrow = (banded_reflectance(0.9, moments, 1.34, np.linspace(0, 90, n)) for n in (10, 91))
+    assert narrow == pytest.approx(fine, rel=1e-3)
+    assert 1.01 < wide / fine < 1.1
