@@ -32,6 +32,7 @@ def rendered(monkeypatch):
     def cell(recorded, estimators, corrections):
         found = float(0.2 < recorded.attrs["depth"] < 6)
         numbers = {name: np.full((1, 1), 0.1) for name in ("bias", "spread", "error", "z")}
+        numbers |= dict.fromkeys(("flagged", "bright_found", "hidden"), np.zeros((1, 1)))
         numbers |= {"found": np.full((1, 1), found), "wrong": np.zeros((1, 1)), "snr": np.full(1, 9.0)}
         return {**numbers, "attenuation": 0.2, "slope_along": 0.05, "slope_across": 0.04}
 
