@@ -22,6 +22,7 @@ _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
 _EVENT = 0.8  # height of a single event after the detection filter
 _BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
+_GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
 GAUSSIAN_AREA = float(np.sqrt(np.pi / np.log(16)))  # area of a Gaussian of unit height and unit width at half maximum
 
@@ -179,9 +180,10 @@ def find_echoes(
     """Find surface, target and bottom.
 
     The surface echo is the first peak above the noise. Behind it, a peak exceeds the water column if the smoothed
-    signal w exceeds both w(t-d)^2/w(t-2d), extrapolated from the column before it, and w(t-d)^0.6 v^0.4, interpolated
-    to v, the mean of w from t+d to t+2d. An exponential exceeds neither: neither the column nor a step down in it is a
-    peak. Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
+    signal w exceeds both w(t-d)^2/w(t-2d), extrapolated from the column before it, and sqrt(w(t-d) w(t+d)),
+    interpolated between both sides; or where w(t+2d) is below 0.8 w(t-d), as behind a bottom, w(t-d)^0.6 v^0.4 with
+    the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
+    Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
     strongest before it a target; peaks below a fiftieth of the strongest are ignored.
 
     Parameters
@@ -272,10 +274,13 @@ def _above_column(power: FloatArray, reach: int) -> FloatArray:
     padded = np.pad(power, ((0, 0), (2 * reach, 2 * reach)), mode="edge")
     size = power.shape[1]
     earlier, before = padded[:, :size], padded[:, reach : reach + size]
-    # Light of a bottom that was scattered in the water follows its echo, and is gone further behind.
-    after = np.lib.stride_tricks.sliding_window_view(padded[:, 3 * reach :], reach + 1, axis=1).mean(axis=-1)
+    after, far = padded[:, 3 * reach : 3 * reach + size], padded[:, 4 * reach :]
     falls_by = np.divide(before, earlier, out=np.ones_like(before), where=earlier > before)
-    return np.asarray(power - np.maximum(before * falls_by, before**_BEFORE * after ** (1 - _BEFORE)))
+    # Light of a bottom that was scattered in the water follows its echo, and is gone further behind, as is the column.
+    mean = np.lib.stride_tricks.sliding_window_view(padded[:, 3 * reach :], reach + 1, axis=1).mean(axis=-1)
+    behind = before**_BEFORE * mean ** (1 - _BEFORE)
+    between = np.where(far < _GONE * before, behind, np.sqrt(before * after))
+    return np.asarray(power - np.maximum(before * falls_by, between))
 
 
 def _hides_bottom(records: Records, power: FloatArray, width: float, surface: IntArray) -> BoolArray:
