@@ -224,17 +224,17 @@ def find_echoes(
 
     reach = max(round(_REACH * width / records.bin_ns), 1)
     behind = bins > origin[:, np.newaxis]
-    stands_out = _above_column(np.maximum(power, 0), reach)
+    rises, stands_out = _above_column(np.maximum(power, 0), reach)
     # Near the surface there is no column to extrapolate from: the excess is the rise after a dip.
     lowest = np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
     apart = width / records.bin_ns
     near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart) & (surface >= 0)[:, np.newaxis]
-    stands_out = np.where(near, power - lowest, stands_out)
+    rises, stands_out = (np.where(near, power - lowest, one) for one in (rises, stands_out))
     dip = np.minimum.accumulate(np.where(behind, np.maximum(stands_out, 0), np.inf), axis=1)
     excess = np.where(behind & ((surface >= 0) | late)[:, np.newaxis], stands_out, -np.inf)
     excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
     peaks = np.zeros(power.shape, dtype=bool)
-    peaks[:, 1:-1] = (stands_out[:, 1:-1] > stands_out[:, :-2]) & (stands_out[:, 1:-1] >= stands_out[:, 2:])
+    peaks[:, 1:-1] = (rises[:, 1:-1] > rises[:, :-2]) & (rises[:, 1:-1] >= rises[:, 2:])
     # The factor accounts for the noise of the samples of the column.
     peaks &= (excess > 1.5 * threshold * noise) & (excess > contrast * power)
     # Much weaker peaks are in the tail of a strong echo.
@@ -269,8 +269,11 @@ def _first_peak(power: FloatArray, noise: FloatArray, threshold: float, allowed:
     return np.where(above.any(axis=1), np.argmax(falls, axis=1), -1)
 
 
-def _above_column(power: FloatArray, reach: int) -> FloatArray:
-    """Return the excess of a signal, shape (n, time), over the column around it."""
+def _above_column(power: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
+    """Return the excess of a signal, shape (n, time), over the column around it: whose peaks count, and their heights.
+
+    Both are the same but for the last echo, whose scattered light lowers the first.
+    """
     padded = np.pad(power, ((0, 0), (2 * reach, 2 * reach)), mode="edge")
     size = power.shape[1]
     earlier, before = padded[:, :size], padded[:, reach : reach + size]
@@ -279,8 +282,9 @@ def _above_column(power: FloatArray, reach: int) -> FloatArray:
     # Light of a bottom that was scattered in the water follows its echo, and is gone further behind, as is the column.
     mean = np.lib.stride_tricks.sliding_window_view(padded[:, 3 * reach :], reach + 1, axis=1).mean(axis=-1)
     behind = before**_BEFORE * mean ** (1 - _BEFORE)
-    between = np.where(far < _GONE * before, behind, np.sqrt(before * after))
-    return np.asarray(power - np.maximum(before * falls_by, between))
+    beside, extrapolated = np.sqrt(before * after), before * falls_by
+    between = np.where(far < _GONE * before, behind, beside)
+    return power - np.maximum(extrapolated, beside), power - np.maximum(extrapolated, between)
 
 
 def _hides_bottom(records: Records, power: FloatArray, width: float, surface: IntArray) -> BoolArray:
