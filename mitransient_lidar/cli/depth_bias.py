@@ -17,6 +17,7 @@ SeaTime = Annotated[
     float | None,
     typer.Option(help="Render no sea after this many seconds; those left out are NaN in the table (greater than 0)."),
 ]
+Places = Annotated[int, typer.Option(help="Random places of a sea with waves, or renders of a level sea, 2 to 10 000.")]
 SeaSeed = Annotated[int, typer.Option(help="Seed of the random numbers, 0 to 2^31.")]
 
 
@@ -36,8 +37,11 @@ def depth_bias(
     ] = "3,6,10",
     scene: Annotated[str, typer.Option(help="Scene whose sea, water and bottom count.")] = "table1",
     receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's.")] = None,
-    shots: Annotated[int, typer.Option(help="Random places of a sea with waves, 2 to 10 000.")] = 12,
+    shots: Places = 12,
     records: Annotated[int, typer.Option(help="Records with noise of each place, 1 to 10 000.")] = 5,
+    target_error: Annotated[
+        float, typer.Option(help="Relative standard error of a render over waves; 0.3 of it of a level sea.")
+    ] = 0.1,
     corrections: Annotated[
         str | None,
         typer.Option(
@@ -85,6 +89,7 @@ def depth_bias(
             receiver=receiver,
             shots=shots,
             records=records,
+            target_error=target_error,
             max_time=max_time,
             seed=seed,
             corrections=former,
@@ -122,7 +127,7 @@ def tpu(
     scene: Annotated[str, typer.Option(help="Scene whose sea, water and bottom count.")] = "table1",
     receiver: Annotated[str | None, typer.Option(help=f"{RECEIVERS} By default the instrument's.")] = None,
     estimator: Annotated[str, typer.Option(help="Estimator of depths, as of waveforms.")] = "gaussian",
-    shots: Annotated[int, typer.Option(help="Random places of a sea with waves, 2 to 10 000.")] = 12,
+    shots: Places = 12,
     records: Annotated[int, typer.Option(help="Records with noise of each place, 1 to 10 000.")] = 4,
     corrections: Annotated[
         str,

@@ -10,14 +10,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar._version import __version__
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_depths, summarize_depths
+from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
-from mitransient_lidar.core.validation import finite_array, integer
+from mitransient_lidar.core.validation import FloatArray, finite_array, integer, positive
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -31,8 +33,8 @@ WATERS = ("IB", "1C", "5C")
 #: Wavelength of their tables [nm].
 _WAVELENGTH = 532.0
 
-#: Relative standard error of renders, over a level sea and over waves.
-_ERRORS = (0.02, 0.1)
+#: Relative standard error of renders of a level sea over that of waves, which differ more between places.
+_LEVEL = 0.3
 
 #: Speed of the wind whose ripples a level sea has [m/s].
 _RIPPLES = 5.0
@@ -42,6 +44,9 @@ _FURTHER, _GRAZING = 5.0, 60.0
 
 #: Distance from the bottom within which its signal is the largest [m].
 _NEAR = 0.5
+
+#: Signal-to-noise ratio of bright bottoms, and largest error of their depths [m].
+_BRIGHT, _RIGHT = 10.0, 2.0
 
 #: Attributes of renders that do not depend on angle, wind, water and depth.
 _GEOMETRY = ("altitude", "divergence_mrad", "refractive_index")
@@ -54,11 +59,18 @@ _NUMBERS = {
     "error": ("m", "median of the stated error"),
     "z": ("1", "root mean square of error over stated error"),
     "wrong": ("1", "share of shots with an error above 0.5 m and no flag"),
+    "flagged": ("1", "share of shots with a depth and a flag"),
+    "bright": ("1", "share of shots whose largest signal-to-noise ratio within 0.5 m of the bottom is above 10"),
+    "bright_found": ("1", "share of shots with a depth among the bright ones"),
+    "hidden": ("1", "share of shots that are bright and have a depth only where errors of the render are no noise"),
     "corrected_bias": ("m", "bias after correction"),
     "corrected_spread": ("m", "standard deviation after correction"),
     "corrected_z": ("1", "root mean square of error over stated error after correction"),
     "snr": ("1", "median over shots of the largest signal-to-noise ratio within 0.5 m of the bottom"),
 }
+
+#: Numbers of bottoms that are not found.
+_ZERO = ("found", "flagged", "wrong")
 
 #: Root mean squares of slopes, in the names of the truth of shots.
 _SLOPES = {
@@ -80,6 +92,7 @@ def depth_bias(
     receiver: str | None = None,
     shots: int = 12,
     records: int = 5,
+    target_error: float = 0.1,
     seed: int = 1,
     corrections: xr.Dataset | None = None,
     max_time: float | None = None,
@@ -103,14 +116,18 @@ def depth_bias(
         Jerlov types, from clear to turbid, of light of 532 nm, whatever the instrument has.
     depths
         Depths of the bottom [m], above 0, ascending. Not rendered are bottoms that waves uncover, and those below one
-        that no channel finds though it found a shallower one: ``found`` and ``wrong`` are 0, other numbers NaN.
+        that no channel finds though it found a shallower one: ``found``, ``flagged`` and ``wrong`` are 0, other numbers
+        NaN.
     estimators
         Estimators of `echo_table.extract`.
     receiver
         A receiver as of `receiver_files.receiver`; by default that of the instrument.
     shots, records
-        Random places of a sea with waves, 2 to 10 000, and records with noise of each, 1 to 10 000; a level sea has as
-        many records in all.
+        Random places of a sea with waves, or independent renders of a level sea, 2 to 10 000, and records with noise of
+        each, 1 to 10 000.
+    target_error
+        Relative standard error of the render of each place, above 0; of a level sea 0.3 of it. Bottoms of faint pixels
+        have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
     seed
         Seed of places, seas and noise, at least 0.
     corrections
@@ -126,10 +143,12 @@ def depth_bias(
     xarray.Dataset
         Over ``off_nadir_deg``, ``wind_speed``, ``water``, ``depth``, ``estimator`` and ``pixel``: ``bias``, ``spread``,
         ``found``, ``noise_error``, ``error``, ``z`` and ``wrong`` of `summarize_depths`; with `corrections` also
-        ``corrected_bias``, ``corrected_spread`` and ``corrected_z``. Without estimator: ``snr``; without estimator and
-        pixel: ``slope_along`` and ``slope_across``, root mean squares of the mean slopes in the beam; and over
-        ``off_nadir_deg``, ``wind_speed`` and ``water``, the ``attenuation`` [1/m] that is measured. The truth is the
-        depth of the bottom below the mean surface in the beam.
+        ``corrected_bias``, ``corrected_spread`` and ``corrected_z``; and the shares of shots ``flagged`` with a depth,
+        ``bright`` with a signal-to-noise ratio above 10 at the bottom, ``bright_found`` with a depth among these, and
+        ``hidden``, bright ones without a depth that have one where errors of the render do not count as noise. Without
+        estimator: ``snr``; without estimator and pixel: ``slope_along`` and ``slope_across``, root mean squares of the
+        mean slopes in the beam; and over ``off_nadir_deg``, ``wind_speed`` and ``water``, the ``attenuation`` [1/m]
+        that is measured. The truth is the depth of the bottom below the mean surface in the beam.
 
     Raises
     ------
@@ -153,6 +172,7 @@ def depth_bias(
         raise UserError(f"depth = {axes['depth'].tolist()} must be numbers above 0 that ascend")
     shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
     seed = integer("seed", seed, 0, 2**31)
+    target_error = positive("target_error", target_error)
     limit = RenderOptions(max_time=max_time).max_time or math.inf
     cells: dict[tuple[int, ...], dict[str, Any]] = {}
     began, total = time.perf_counter(), math.prod(values.size for values in axes.values())
@@ -177,8 +197,8 @@ def depth_bias(
                 "surface_seed": seed + number,
                 **({} if wind else {"spectrum": "flat"}),
             }
-            options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)]}
-            error = _ERRORS[bool(wind)]
+            options: dict[str, Any] = {"count": shots} if wind else {"positions": [(0.0, 0.0)] * shots}
+            error = target_error * (1 if wind else _LEVEL)
             try:
                 rendered = render_shots(
                     scene, given, instrument=instrument, target_error=error, seed=seed, first_seed=seed, **options
@@ -186,7 +206,7 @@ def depth_bias(
             except DryBottomError:
                 _LOG.warning("no bottom at %g m: it rises through the waves of %g m/s", depth, wind)
             else:
-                recorded = detect_waveforms(rendered, receiver or instrument, records * (1 if wind else shots), seed)
+                recorded = detect_waveforms(rendered, receiver or instrument, records, seed)
                 _check_counts(recorded)
                 cells[place] = _cell(recorded, estimators, corrections)
                 pixels = [str(name) for name in recorded["pixel"].values]
@@ -206,6 +226,8 @@ def depth_bias(
         "parameters": json.dumps({name: str(value) for name, value in (params or {}).items()}),
         "shots": shots,
         "records": records,
+        "target_error": target_error,
+        "level_renders": shots,
         "seed": seed,
         "seas_left_out": left_out,
         **geometry,
@@ -217,7 +239,7 @@ def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[
     """Return the lines of a table of a result of `depth_bias`, in centimetres, of one estimator."""
     corrected = "corrected_bias" in found
     head = f"{'angle':>6}{'wind':>6} {'water':<6}{'depth':>6} {'channel':<10}{'SNR':>7}{'found':>7}"
-    head += f"{'bias':>8}{'spread':>8}"
+    head += f"{'>10':>7}{'hidden':>8}{'flagged':>9}{'bias':>8}{'spread':>8}"
     lines = [head + f"{'error':>8}{'z':>6}{'wrong':>7}" + (f"{'bias':>10}{'spread':>8}{'z':>6}" if corrected else "")]
     one = found.sel(estimator=estimator)
     for place in np.ndindex(*(found.sizes[axis] for axis in AXES)):
@@ -229,6 +251,9 @@ def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[
             cell = at.sel(pixel=pixel)
             number = {name: float(cell[name]) for name in cell.data_vars if cell[name].ndim == 0}
             text = f"{label}{float(at['depth']):>6g} {pixel!s:<10}{number['snr']:>7.1f}{100 * number['found']:>5.0f} %"
+            text += (
+                f"{_percent(number['bright_found']):>7}{_percent(number['hidden']):>8}{_percent(number['flagged']):>9}"
+            )
             text += "".join(f"{100 * number[name]:>8.1f}" for name in ("bias", "spread", "error"))
             text += f"{number['z']:>6.2f}{100 * number['wrong']:>5.1f} %"
             if corrected:
@@ -236,6 +261,11 @@ def describe_depth_bias(found: xr.Dataset, estimator: str = "gaussian") -> list[
                 text += f"{number['corrected_z']:>6.2f}"
             lines.append(text)
     return lines
+
+
+def _percent(share: float) -> str:
+    """Return a share as text, `-` without one."""
+    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
 
 
 def _is_lost(shallower: Sequence[Mapping[str, Any]]) -> bool:
@@ -269,9 +299,34 @@ def _cell(recorded: xr.Dataset, estimators: Sequence[str], corrections: xr.Datas
         numbers[name] = float(np.sqrt(np.mean(recorded[f"true_{name}"].values ** 2)))
     depth = (recorded["time"] - recorded["surface_time"]) * recorded["depth_per_ns"]
     near = np.abs(depth - float(np.mean(truth))) < _NEAR
-    largest = recorded["snr"].where(near).max("time")
-    numbers["snr"] = largest.median("shot").transpose("pixel").values
-    return numbers
+    largest = recorded["snr"].where(near).max("time").transpose("shot", "pixel")
+    numbers["snr"] = largest.median("shot").values
+    return numbers | _shares(recorded, found, truth, largest.values > _BRIGHT)
+
+
+def _shares(recorded: xr.Dataset, found: xr.Dataset, truth: FloatArray, bright: BoolArray) -> dict[str, FloatArray]:
+    """Return the shares of shots whose bottom is flagged, bright, bright and found, and hidden by errors of the render.
+
+    Bright shots and pixels are of the shape (shots, pixels); shares are over estimator and pixel.
+    """
+
+    def with_depth(echoes: xr.Dataset) -> tuple[FloatArray, npt.NDArray[np.intp]]:
+        bottom = echoes.sel(echo="bottom").transpose("shot", "pixel", "estimator")
+        flags = bottom["flags"].values
+        return np.where(has_echo(flags), bottom["depth_m"].values, np.nan), flags
+
+    wanted = bright[..., np.newaxis]
+    depth, flags = with_depth(found)
+    known = np.isfinite(depth)
+    hidden = np.zeros(known.shape, dtype=bool)
+    if "signal_mean_stderr" in recorded and (wanted & ~known).any():
+        exact, _ = with_depth(extract(recorded.drop_vars("signal_mean_stderr"), found["estimator"].values.tolist()))
+        hidden = wanted & ~known & (np.abs(exact - truth[:, np.newaxis, np.newaxis]) < _RIGHT)
+    share = np.broadcast_to(wanted, known.shape).mean(axis=0)
+    of_bright = np.divide((wanted & known).mean(axis=0), share, out=np.full(share.shape, np.nan), where=share > 0)
+    flagged = known & (flags != 0)
+    means = {"flagged": flagged.mean(axis=0), "bright": share, "bright_found": of_bright, "hidden": hidden.mean(axis=0)}
+    return {name: values.T for name, values in means.items()}
 
 
 def _labelled(
@@ -287,7 +342,7 @@ def _labelled(
 
     def table(name: str) -> Any:
         first = np.asarray(next(iter(cells.values()))[name])
-        values = np.full((*shape, *first.shape), 0.0 if name in ("found", "wrong") else np.nan)
+        values = np.full((*shape, *first.shape), 0.0 if name in _ZERO else np.nan)
         for place, cell in cells.items():
             values[place] = cell[name]
         values.reshape(-1, *first.shape)[begun:] = np.nan

@@ -94,7 +94,7 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
 
         - the spread in the table beyond the error by noise there, of waves with the mean over the waters; where the
           error by noise exceeds the spread, ``depth_m_stderr`` is reduced to the spread;
-        - the error of the mean bias over the places of a sea with waves, spread/sqrt(n);
+        - the error of the mean bias over n places of a sea with waves, or n renders of a level sea, spread/sqrt(n);
         - the error of biases between nodes, and beyond the ends of the table, as of random walks: see Notes;
         - the rounding of the surface's time to a bin of the render, the largest of the pixels; see
           `depth_errors.rounding_ns`.
@@ -188,8 +188,10 @@ def _learnt(table: xr.Dataset) -> xr.Dataset:
     table = table.assign({name: table[name].where(counts) for name in ("bias", "spread", "noise_error")})
     records = float(table.attrs.get("records", 1))
     shots = table["found"] * float(table.attrs.get("shots", np.inf))
-    number = shots.where(waves, records * shots).clip(min=_FEWEST)
-    uncertain = (table["spread"] ** 2 / number).where(waves, 0.0).fillna(0)
+    # Records of a single render of a level sea differ by noise alone.
+    independent = waves | (table.attrs.get("level_renders", 1) > 1)
+    number = shots.where(independent, records * shots).clip(min=_FEWEST)
+    uncertain = (table["spread"] ** 2 / number).where(independent, 0.0).fillna(0)
     certain = table["bias"] ** 2 / (table["bias"] ** 2 + uncertain).where(lambda total: total > 0, 1.0)
     left = table["spread"] ** 2 / (1 - 1 / number)
     noise = table["noise_error"] ** 2

@@ -21,6 +21,8 @@ _SMOOTHING = 0.5  # width of the detection filter in echo widths
 _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
 _EVENT = 0.8  # height of a single event after the detection filter
+_BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
+_GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
 _REACH = 1.5  # distance from an echo to the signal around it, in echo widths
 GAUSSIAN_AREA = float(np.sqrt(np.pi / np.log(16)))  # area of a Gaussian of unit height and unit width at half maximum
 
@@ -179,8 +181,9 @@ def find_echoes(
 
     The surface echo is the first peak above the noise. Behind it, a peak exceeds the water column if the smoothed
     signal w exceeds both w(t-d)^2/w(t-2d), extrapolated from the column before it, and sqrt(w(t-d) w(t+d)),
-    interpolated between both sides. Both are exact for an exponential: neither the column nor a step down in it is a
-    peak. Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
+    interpolated between both sides; or where w(t+2d) is below 0.8 w(t-d), as behind a bottom, w(t-d)^0.6 v^0.4 with
+    the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
+    Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
     strongest before it a target; peaks below a fiftieth of the strongest are ignored.
 
     Parameters
@@ -221,17 +224,17 @@ def find_echoes(
 
     reach = max(round(_REACH * width / records.bin_ns), 1)
     behind = bins > origin[:, np.newaxis]
-    stands_out = _above_column(np.maximum(power, 0), reach)
+    rises, stands_out = _above_column(np.maximum(power, 0), reach)
     # Near the surface there is no column to extrapolate from: the excess is the rise after a dip.
     lowest = np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
     apart = width / records.bin_ns
     near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart) & (surface >= 0)[:, np.newaxis]
-    stands_out = np.where(near, power - lowest, stands_out)
+    rises, stands_out = (np.where(near, power - lowest, one) for one in (rises, stands_out))
     dip = np.minimum.accumulate(np.where(behind, np.maximum(stands_out, 0), np.inf), axis=1)
     excess = np.where(behind & ((surface >= 0) | late)[:, np.newaxis], stands_out, -np.inf)
     excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
     peaks = np.zeros(power.shape, dtype=bool)
-    peaks[:, 1:-1] = (stands_out[:, 1:-1] > stands_out[:, :-2]) & (stands_out[:, 1:-1] >= stands_out[:, 2:])
+    peaks[:, 1:-1] = (rises[:, 1:-1] > rises[:, :-2]) & (rises[:, 1:-1] >= rises[:, 2:])
     # The factor accounts for the noise of the samples of the column.
     peaks &= (excess > 1.5 * threshold * noise) & (excess > contrast * power)
     # Much weaker peaks are in the tail of a strong echo.
@@ -266,13 +269,22 @@ def _first_peak(power: FloatArray, noise: FloatArray, threshold: float, allowed:
     return np.where(above.any(axis=1), np.argmax(falls, axis=1), -1)
 
 
-def _above_column(power: FloatArray, reach: int) -> FloatArray:
-    """Return the excess of a signal, shape (n, time), over the column around it."""
-    padded = np.pad(power, ((0, 0), (2 * reach, reach)), mode="edge")
+def _above_column(power: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
+    """Return the excess of a signal, shape (n, time), over the column around it: whose peaks count, and their heights.
+
+    Both are the same but for the last echo, whose scattered light lowers the first.
+    """
+    padded = np.pad(power, ((0, 0), (2 * reach, 2 * reach)), mode="edge")
     size = power.shape[1]
-    earlier, before, after = padded[:, :size], padded[:, reach : reach + size], padded[:, 3 * reach : 3 * reach + size]
+    earlier, before = padded[:, :size], padded[:, reach : reach + size]
+    after, far = padded[:, 3 * reach : 3 * reach + size], padded[:, 4 * reach :]
     falls_by = np.divide(before, earlier, out=np.ones_like(before), where=earlier > before)
-    return np.asarray(power - np.maximum(before * falls_by, np.sqrt(before * after)))
+    # Light of a bottom that was scattered in the water follows its echo, and is gone further behind, as is the column.
+    mean = np.lib.stride_tricks.sliding_window_view(padded[:, 3 * reach :], reach + 1, axis=1).mean(axis=-1)
+    behind = before**_BEFORE * mean ** (1 - _BEFORE)
+    beside, extrapolated = np.sqrt(before * after), before * falls_by
+    between = np.where(far < _GONE * before, behind, beside)
+    return power - np.maximum(extrapolated, beside), power - np.maximum(extrapolated, between)
 
 
 def _hides_bottom(records: Records, power: FloatArray, width: float, surface: IntArray) -> BoolArray:

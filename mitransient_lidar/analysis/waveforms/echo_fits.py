@@ -25,6 +25,7 @@ _FAINT = 0.1  # first guess of the height of a surface whose column is brighter,
 _RISE = 0.5  # level of the column that its rise crosses
 _BRIGHT = 10.0  # levels of the column beyond which a peak is that of the surface
 _WEAK = 0.3  # first guess of the height of a surface without such a peak, in levels of the column
+_CLOSE = 0.5  # least distance from the earliest time of a surface that a fit may find, in echo widths
 _HEIGHTS = np.array([0.0, 0.05, 0.12, 0.25, 0.45])  # tested heights of a surface that is not distinct, over the peak
 
 
@@ -50,7 +51,8 @@ def gaussian_surface(
     A surface echo that is weak relative to the column is fitted nearly as well without A, one or two nanoseconds
     earlier. Where A lowers the squared residuals by less than 9, the result is the mean over fits with fixed A, 0 to
     0.45 of the peak, weighted with their likelihood and a prior probability of one half for A = 0; the errors include
-    the spread of these fits.
+    the spread of these fits. Over waves, where it is within half an echo width of the earliest time that the samples
+    about the peak allow, the peak is too deep in the column for the surface, which is not found.
 
     Parameters
     ----------
@@ -72,6 +74,8 @@ def gaussian_surface(
     early = begin.brightest_ns
     data = _Data.of(records, bins, width, decay, (-2 - 2 * early / width, 2), shape)
     data = replace(data, earliest=-1.2 * width - 2 * early)
+    # A column over waves that begins at the earliest time that a fit may find began before it.
+    limit = data.earliest + _CLOSE * width if early > 0 else -np.inf
     if level is not None:
         data = replace(data, known=(3, *level))
     peak = data.peak()
@@ -123,11 +127,11 @@ def gaussian_surface(
             weak = exists & tried[0].good & (tried[0].cost <= fit.cost + _SIGNIFICANT)
             continue
         if not weak.any():
-            return _echoes(records, bins, fit, flags, shape)
+            return _echoes(records, bins, fit.later(limit), flags, shape)
         tried.append(_fit(model, faint, data, peak, weak, np.where(weak, share * peak, np.nan)))
         faint = np.where(tried[-1].good[:, np.newaxis], tried[-1].values, faint)
         weak &= ~some | (tried[0].cost <= fit.cost + _SIGNIFICANT)
-    return _echoes(records, bins, fit.replaced(weak, _mean(tried)), flags, shape)
+    return _echoes(records, bins, fit.replaced(weak, _mean(tried)).later(limit), flags, shape)
 
 
 def gaussian_echo(
@@ -246,6 +250,10 @@ class _Fit:
     covariance: FloatArray
     cost: FloatArray
     good: BoolArray
+
+    def later(self, limit: float) -> _Fit:
+        """Return the fits, of which only those count that are later than a time from the peak."""
+        return replace(self, good=self.good & (self.values[:, 0] > limit))
 
     def replaced(self, where: BoolArray, fit: _Fit) -> _Fit:
         """Return this fit with another one in some rows."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.studies import depth_bias as study
 from mitransient_lidar.studies.depth_uncertainty import depth_uncertainty
@@ -32,6 +33,7 @@ def rendered(monkeypatch):
     def cell(recorded, estimators, corrections):
         found = float(0.2 < recorded.attrs["depth"] < 6)
         numbers = {name: np.full((1, 1), 0.1) for name in ("bias", "spread", "error", "z")}
+        numbers |= dict.fromkeys(("flagged", "bright_found", "hidden"), np.zeros((1, 1)))
         numbers |= {"found": np.full((1, 1), found), "wrong": np.zeros((1, 1)), "snr": np.full(1, 9.0)}
         return {**numbers, "attenuation": 0.2, "slope_along": 0.05, "slope_across": 0.04}
 
@@ -55,6 +57,41 @@ def test_bottoms_below_a_lost_one_are_not_rendered(rendered):
     assert [state.done for state in states] == list(range(1, 13))
     assert table["attenuation"].item(0) == pytest.approx(0.2)
     assert table.attrs["altitude"] == 150
+
+
+def test_level_seas_are_rendered_as_often_as_waves_have_places(rendered, monkeypatch):
+    """A single render has an error that its records share."""
+    options = []
+    render = study.render_shots
+    monkeypatch.setattr(study, "render_shots", lambda *given, **rest: options.append(rest) or render(*given, **rest))
+    seas = {"angles_deg": [20.0], "winds": [0.0, 3.0], "waters": ["IB"], "estimators": ["gaussian"], "depths": [3.0]}
+    table = study.depth_bias("riegl_vq840g", shots=4, target_error=0.05, **seas)
+    assert [one["target_error"] for one in options] == pytest.approx([0.015, 0.05])
+    assert options[0]["positions"] == 4 * [(0.0, 0.0)]
+    assert options[1]["count"] == 4
+    assert table.attrs["level_renders"] == 4
+    with pytest.raises(UserError, match="target_error = 0 must be greater than 0"):
+        study.depth_bias("riegl_vq840g", target_error=0.0, **seas)
+
+
+def test_bottoms_that_errors_of_the_render_hide_are_counted(monkeypatch):
+    """Of four shots of one pixel one is faint, one found, one flagged, and one is found without the render's error."""
+
+    def echoes(recorded, estimators):
+        assert estimators == ["gaussian"]
+        depth = np.array([np.nan, 5.1, 5.2, np.nan if "signal_mean_stderr" in recorded else 5.3])
+        flags = np.where(np.isnan(depth), int(EchoFlag.NO_ECHO), [0, 0, int(EchoFlag.SCATTERED_LIGHT), 0])
+        dims = ("shot", "pixel", "estimator", "echo")
+        data = {"depth_m": (dims, depth.reshape(4, 1, 1, 1)), "flags": (dims, flags.reshape(4, 1, 1, 1))}
+        return xr.Dataset(data, {"echo": ["bottom"], "pixel": ["single"], "estimator": ["gaussian"]})
+
+    monkeypatch.setattr(study, "extract", echoes)
+    recorded = xr.Dataset({"signal_mean_stderr": ("time", np.zeros(3))})
+    bright = np.array([[False], [True], [True], [True]])
+    shares = study._shares(recorded, echoes(recorded, ["gaussian"]), np.full(4, 5.0), bright)
+    assert {name: values.item() for name, values in shares.items()} == pytest.approx(
+        {"flagged": 1 / 4, "bright": 3 / 4, "bright_found": 2 / 3, "hidden": 1 / 4}
+    )
 
 
 @pytest.mark.parametrize(

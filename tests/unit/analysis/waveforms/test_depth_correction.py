@@ -112,9 +112,14 @@ def test_noise_in_the_table_counts_once():
 def test_a_bias_within_its_error_counts_little():
     made = table().assign_attrs(shots=4)
     made["bias"][:], made["spread"][:] = 0.02, 0.08
-    for wind, share in ((6.0, 0.2), (0.0, 1.0)):  # a level sea has one place
-        corrected = correct_depths(echoes([6.0]), made, wind).sel(echo="bottom")
+    # A level sea has one place, of which several renders differ as places of waves do.
+    for wind, renders, share in ((6.0, 1, 0.2), (0.0, 1, 1.0), (0.0, 4, 0.2)):
+        given = made.assign_attrs(level_renders=renders)
+        corrected = correct_depths(echoes([6.0]), given, wind).sel(echo="bottom")
         np.testing.assert_allclose(corrected["depth_correction_m"], 0.02 * share)
+        # The variance of four places, and that of their mean where they are independent.
+        variance = 0.08**2 / (1 - 1 / 4) + (0.08**2 / 4 if share < 1 else 0)
+        np.testing.assert_allclose(corrected["depth_m_method_error"], np.sqrt(variance))
 
 
 def stated(seed, realisations=20):

@@ -174,6 +174,26 @@ def test_a_weak_bottom_is_found_as_often_as_its_signal_allows_and_noise_hardly_e
     assert (dark.flags[0][dark.surface < 0] == EchoFlag.NO_ECHO).all()
 
 
+def test_light_scattered_behind_a_bottom_does_not_hide_it():
+    """A bottom with a tail of 20 ns: interpolated to the signal 1.5 widths behind it, a third would be found."""
+    noise, count, decay = 0.04, 1000, 0.012
+    fine = np.arange(-40, 160, 0.05)
+    blur = np.exp(-0.5 * (np.arange(-10, 10, 0.05) / SIGMA) ** 2)
+    tail = np.convolve(np.where(fine > 0, np.exp(-np.maximum(fine, 0) / 20), 0), blur / blur.sum(), "same")
+    bottom = 0.5 * np.interp(TIME - 120, fine, tail)
+    surface = echoes(20.0, 3.0)[0]
+    rng = np.random.default_rng(8)
+    shares = []
+    for signal in (column(20.0, 120.0, decay=decay) + surface + bottom, column(20.0, decay=decay) + surface):
+        found = find_echoes(Records.of(signal + noise * rng.normal(size=(count, TIME.size)), TIME, noise), FWHM)
+        exists = found.bins[2] >= 0
+        near = exists & (np.abs(TIME[found.bins[2]] - 122) < 6)
+        assert np.mean(exists & ~near) < 0.004
+        shares.append(near.mean())
+    assert shares[0] > 0.5
+    assert shares[1] < 0.004
+
+
 def test_echoes_nearer_than_a_pulse_are_flagged_as_merged():
     resolved = echoes(60, 1.0)[0] + echoes(60 + 1.3 * FWHM, 1.0)[0]
     near = echoes(60, 1.0)[0] + echoes(60 + 1.1 * FWHM, 1.0)[0]

@@ -172,6 +172,24 @@ def test_the_focusing_of_single_shots_does_not_move_the_surface():
     assert np.mean(np.abs(late) < 1) > 0.9
 
 
+def test_a_peak_deep_in_the_column_is_not_that_of_the_surface():
+    """A focus 14 ns below the surface, further than samples about it reach; peaks at 3 ns give the surface."""
+    focusing = Focusing(np.array([0.0, 0.5, 1.0, 2.0, 30.0]), np.array([1.0, 3.0, 2.1, 1.5, 1.0]))
+    begin = ColumnOnset.of(focusing, 0.106, SHAPE.sigma_of(3 * WIDTH))
+    sigma, count = 0.8, 60
+    short = EchoShape.gaussian(2.3548 * sigma)
+    value, _, _ = begin.at(TIME - SURFACE, np.full(TIME.shape, sigma))
+    signal = value * np.exp(-DECAY * np.maximum(TIME - SURFACE, 0))
+    records = noisy(signal, 0.03, count)
+    level, flags = (np.ones(count), np.full(count, 0.2)), np.zeros(count, int)
+    for delay, share in ((3.0, 1.0), (14.0, 0.0)):
+        bins = np.full(count, int(np.searchsorted(TIME, SURFACE + delay)))
+        found = gaussian_surface(records, bins, short.fwhm_ns, DECAY, flags, short, begin, level)
+        right = np.abs(found.time_ns - SURFACE) < 1
+        assert right.mean() == share
+        assert (right | (np.isnan(found.time_ns) & (found.flags == EchoFlag.POOR_FIT))).all()
+
+
 def test_missing_echoes_are_nan_and_poor_fits_are_flagged():
     flags = np.array([int(EchoFlag.NO_ECHO), 0])
     records = Records.of(np.stack([gauss(60, 1.0), np.full(TIME.size, -1.0)]), TIME, 0.1)
