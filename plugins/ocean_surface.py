@@ -59,6 +59,8 @@ class OceanSurface(mi.Mesh):
     wake_bearing_deg          float    Heading of the ship, from +x to +y [deg]. Default: 0
     wake_length               float    Length of the ship [m], 1 to 500. Default: 20
     wake_x, wake_y            float    Centre of the ship [m]. Default: 0
+    slope_x_deg, slope_y_deg  float    Mean slope under the lidar, -15 to 15 [deg]: positive where the sea rises towards
+                                       +x, +y, as on a wave far longer than the patch. Default: 0
     refined_size              float    Side of the finely resolved patch [m], or ``auto``. Default: ``auto``
     cell_size                 float    Side of its cells [m], or ``auto``. Default: ``auto``
     shortest_wave             float    Length of the shortest waves of the mesh [m], at least two cells, or ``auto``;
@@ -130,6 +132,9 @@ class OceanSurface(mi.Mesh):
     With more than 1024 of the shortest waves (or of pairs of cells) per period the waves are a sum of bands. The
     longest waves are the same as in coarse cells; each band of shorter ones repeats after an odd fraction (1/3 to 1/31)
     of the last one's period.
+
+    A mean slope turns the sea about the centre of the patch, or about the place of each shot of a series. It is as wide
+    as the patch; beyond it the sea is level. It adds to the slopes of the waves, and not to ``slope_variance``.
 
     Outside the patch the facets are longer and resolve fewer slopes, with the ripples of the patch, for light that has
     scattered far. Light beyond ``size`` is lost and reported after rendering.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import ErrorInflation, ErrorWindow, PassStatistics
 from mitransient_lidar.rendering.reweighting import Case, check_share, effective_share
-from mitransient_lidar.results.gate_stack import build_gates, check_train
+from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -137,6 +138,9 @@ class WaveformAccumulator(PassAccumulator):
         self._parts = PassStatistics(), PassStatistics()
         self._batches: list[FloatArray] = [np.zeros(())] * batches  # sums of the power of every batch
         self._weights = None if train is None else _weights(scene, train)
+        self._gate_slopes = PassStatistics()
+        if differences is not None and train is not None:
+            differences.cut(train)
 
     @property
     def received(self) -> float:
@@ -162,6 +166,8 @@ class WaveformAccumulator(PassAccumulator):
             perturbed = perturbed.reshape(shape).sum(axis=2)
             self._perturbed[0].add(perturbed)
             self._perturbed[1].add(waveform(perturbed, self.scene.axis.bin_width_ns, self._kernel))
+            if self._weights is not None:
+                self._gate_slopes.add(perturbed[: self._scores] @ self._weights)
         energy = energy.reshape(self.scene.receiver.pixels.count, -1)
         power = waveform(energy, self.scene.axis.bin_width_ns, self._kernel)
         self._energy.add(energy)
@@ -221,6 +227,8 @@ class WaveformAccumulator(PassAccumulator):
         if self.train is None:
             return built
         stack = self._gate_stack(built.coords, dict(built.attrs))
+        if self._parameters:
+            stack = add_gate_derivatives(stack, *self._gate_derivatives())
         return built.merge(stack, combine_attrs="override").assign_attrs(stack.attrs)
 
     def _perturbations(self, chosen: slice) -> list[FloatArray]:
@@ -230,16 +238,23 @@ class WaveformAccumulator(PassAccumulator):
     def _derivatives(self) -> list[FloatArray]:
         """Return derivatives of energy and power and their standard errors, in the order of the parameters."""
         of_paths = self._perturbations(slice(0, self._scores)) if self._scores else []
-        if self._differences is None:
-            return of_paths
         one = self._differences
-        others = one.impulse_response, one.impulse_response_stderr, one.waveform, one.waveform_stderr
+        others = [] if one is None else [one.impulse_response, one.impulse_response_stderr]
+        others += [] if one is None else [one.waveform, one.waveform_stderr]
+        return self._joined(of_paths, others)
+
+    def _gate_derivatives(self) -> list[FloatArray]:
+        """Return derivatives of the energy in gates and their standard errors, in the order of the parameters."""
+        of_paths = [self._gate_slopes.mean, self._gate_slopes.stderr] if self._scores else []
+        one = self._differences
+        return self._joined(of_paths, [] if one is None else [one.gates, one.gates_stderr])
+
+    def _joined(self, of_paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return arrays of the parameters with scores and of the others in the order of the parameters."""
         last = [parameter.perturbation is None for parameter in self._parameters]
         order = np.argsort(np.argsort(last, kind="stable"))
-        return [
-            np.concatenate([*([of_paths[number]] if of_paths else []), values])[order]
-            for number, values in enumerate(others)
-        ]
+        pairs = itertools.zip_longest(of_paths, others)
+        return [np.concatenate([part for part in pair if part is not None])[order] for pair in pairs]
 
 
 class GateAccumulator(PassAccumulator):
@@ -363,10 +378,5 @@ def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -
 
 
 def _weights(scene: LidarScene, train: GateTrain) -> FloatArray:
-    """Return the weight of light that arrives in each bin in each gate, pulses included, shape (bin, gate)."""
-    table = train.response_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns)
-    times = table.start_ns + table.step_ns * np.arange(table.values.size)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (table.values[1:] + table.values[:-1]) * table.step_ns)])
-    shifts = train.step_ns * np.arange(train.count)
-    within = np.interp(scene.axis.edges_ns[:, None] - shifts, times, integral)
-    return np.asarray(np.diff(within, axis=0) * (train.pulses / scene.axis.bin_width_ns))
+    """Return the weights of the bins of a scene in gates, shape (bin, gate)."""
+    return train.bin_weights(scene.transmitter.pulse, scene.receiver.optics.response_time_ns, scene.axis)

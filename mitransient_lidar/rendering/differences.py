@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
@@ -31,8 +32,8 @@ _LENGTH_STEP = 0.05
 #: Steps of beams and views, and of all others, over the value; and steps where that is 0.
 _VIEW_STEP, _RELATIVE_STEP, _STEP_FROM_ZERO = 0.1, 0.01, 0.01
 
-#: Longest step of angles [degree].
-_ANGLE_STEP_DEG = 0.5
+#: Longest step of angles, and step of the mean slope of the sea, by which surface echoes change fast [degree].
+_ANGLE_STEP_DEG, _SEA_STEP_DEG = 0.5, 0.2
 
 #: Parameters that choose bins, gates and random numbers instead of what is measured.
 _NO_QUANTITIES = ("time_start_ns", "bin_width_ns", "bin_count", "pulses")
@@ -41,17 +42,25 @@ _NO_QUANTITY_STARTS, _NO_QUANTITY_ENDS = ("gate_",), ("_seed", "_count")
 
 @dataclass(frozen=True)
 class _Side:
-    """A scene with a parameter beside its value: its renderer, and the kernel of pulse and response."""
+    """A scene with a parameter beside its value: renderer, kernel of pulse and response, weights of bins in gates."""
 
     renderer: PassRenderer
     kernel: tuple[int, FloatArray]
+    weights: FloatArray | None = None
 
-    def render(self, seed: int, share: float) -> tuple[FloatArray, FloatArray]:
-        """Return energy [J] and power [W] of one pass, shape (pixel, time)."""
+    def with_gates(self, train: GateTrain) -> _Side:
+        """Return the scene with the weights of its bins in gates."""
+        scene = self.renderer.scene
+        pulse, response = scene.transmitter.pulse, scene.receiver.optics.response_time_ns
+        return replace(self, weights=train.bin_weights(pulse, response, scene.axis))
+
+    def render(self, seed: int, share: float) -> list[FloatArray]:
+        """Return energy [J] and power [W] of one pass, shape (pixel, time), and that in gates [J], (pixel, gate)."""
         scene = self.renderer.scene
         fitted = self.renderer if share == 1 else self.renderer.scaled(share)
         energy = fitted.render_pass(seed).histogram.energy().reshape(scene.receiver.pixels.count, -1)
-        return energy, waveform(energy, scene.axis.bin_width_ns, self.kernel)
+        found = [energy, waveform(energy, scene.axis.bin_width_ns, self.kernel)]
+        return found if self.weights is None else [*found, energy @ self.weights]
 
 
 class Differences:
@@ -124,7 +133,11 @@ class Differences:
             (self._side(name, value, step), self._side(name, value, -step))
             for name, value, step in zip(self.names, self.values.tolist(), self.steps.tolist(), strict=True)
         ]
-        self._energy, self._power = PassStatistics(), PassStatistics()
+        self._energy, self._power, self._gates = PassStatistics(), PassStatistics(), PassStatistics()
+
+    def cut(self, train: GateTrain) -> None:
+        """Differentiate the energy in gates, too, before the first pass; the gates stay at their times."""
+        self._pairs = [(above.with_gates(train), below.with_gates(train)) for above, below in self._pairs]
 
     def _side(self, name: str, value: float, step: float) -> _Side:
         """Return the scene with a parameter beside its value."""
@@ -145,9 +158,10 @@ class Differences:
         """Render and add one pass of every parameter, with a share of the paths of a full one."""
         slopes = []
         for (above, below), step in zip(self._pairs, self.steps, strict=True):
-            sides = zip(above.render(seed, share), below.render(seed, share), strict=True)
+            sides = zip(*(side.render(seed, share) for side in (above, below)), strict=True)
             slopes.append([(high - low) / (2 * step) for high, low in sides])
-        for statistics, one in zip((self._energy, self._power), zip(*slopes, strict=True), strict=True):
+        kept = [self._energy, self._power, self._gates][: len(slopes[0])]
+        for statistics, one in zip(kept, zip(*slopes, strict=True), strict=True):
             statistics.add(np.array(one))
 
     @property
@@ -174,6 +188,16 @@ class Differences:
     def waveform_stderr(self) -> FloatArray:
         """Their standard errors, without the bias by the step; NaN before the second pass."""
         return self._power.stderr
+
+    @property
+    def gates(self) -> FloatArray:
+        """Derivatives of the energy in gates [J per unit of the parameter], shape (parameter, pixel, gate)."""
+        return self._gates.mean
+
+    @property
+    def gates_stderr(self) -> FloatArray:
+        """Their standard errors, without the bias by the step; NaN before the second pass."""
+        return self._gates.stderr
 
 
 def differences(
@@ -204,7 +228,8 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
     The noise of the derivative falls with the square root of the step or faster, and the bias grows with its square.
     Depths, the altitude and the angle off nadir shift echoes by a twentieth of the pulse's width at half maximum, which
     changes derivatives by 0.5 % of the largest one. Other lengths have steps of 5 cm, beams and views of 10 % of their
-    width, other angles of 0.5 degrees, and all others of 1 %.
+    width, other angles of 0.5 degrees, and all others of 1 %. Steps of the mean slope of the sea are 0.2 degrees: at 3
+    m/s and 20 degrees off nadir they change the surface echo of Gaussian slopes by 15 %, and derivatives by 0.4 %.
     """
     known, scene = parameter_of(name), renderer.scene
     unit = unit_of(known)
@@ -217,6 +242,8 @@ def default_step(name: str, value: float, renderer: PassRenderer) -> float:
         return float(shift)
     if "depth" in known or known == "layer_tops":
         return float(shift / scene.group_index) * (_LAYER_FACTOR if known == "layer_tops" else 1.0)
+    if known.startswith("surface_slope_"):
+        return _SEA_STEP_DEG
     fixed = {"m": _LENGTH_STEP, "degree": _ANGLE_STEP_DEG}.get(unit or "")
     relative = _VIEW_STEP if unit == "mrad" else _RELATIVE_STEP
     return fixed or relative * abs(value) or _STEP_FROM_ZERO

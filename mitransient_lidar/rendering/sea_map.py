@@ -63,7 +63,7 @@ class SeaMap:
         from mitransient_lidar.transport.scene_parts import seas_of
 
         sea = next((found.sea for found in seas_of(scene)), None)
-        if sea is None or not math.isfinite(sea.cell_size):
+        if sea is None or (sea.waves is None and sea.wake is None):
             raise UserError("the scene has no ocean_surface with waves: every shot on a flat sea is the same")
         transmitter = transmitter_of(scene)
         transmitter.pose.require_above_sea()

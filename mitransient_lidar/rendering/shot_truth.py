@@ -151,7 +151,7 @@ def footprint_means(
     lines_x, lines_y = (
         np.asarray((round(place / sea.cell_size) + steps) * sea.cell_size, dtype=np.float64) for place in (x, y)
     )
-    heights = sea.heights(lines_x, lines_y)
+    heights = sea.heights_about((x, y), lines_x, lines_y)
     up, right = np.gradient(heights, sea.cell_size)
     cos, sin = math.cos(azimuth), math.sin(azimuth)
     dx, dy = np.meshgrid(lines_x - x, lines_y - y)

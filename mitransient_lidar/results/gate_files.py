@@ -31,14 +31,15 @@ from mitransient_lidar.results.schema import check_attributes, check_coordinates
 _LOG = logging.getLogger(__name__)
 
 _CHANNELS = {"gate_energy": "Y", "gate_energy_stderr": "Y.stderr"}
-_OF_BINS = ("time", "origin", "parameter", "case", "batch")  # dimensions of results with time bins alone
+_OF_BINS = ("time", "origin", "case", "batch")  # dimensions of results with time bins alone
+_SLOPES = "gate_energy_derivative"
 _HEADER = {"gate_start": "gateStartNs", "gate_width": "gateWidthNs", "gate_depth": "gateDepthM"}
 _IDENTITY = "gateStackId"  # header attribute, equal in all files of a sequence and different between sequences
 _NUMBERED = re.compile(r"(.+)_gate(\d{3,})\.exr", re.IGNORECASE | re.DOTALL)
 
 
 def check_stack(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the gates of a dataset without its time bins, the dimension ``gate`` last.
+    """Return the gates of a dataset, with their derivatives if it has any, without its time bins; ``gate`` is last.
 
     Raises
     ------
@@ -60,13 +61,14 @@ def check_stack(dataset: xr.Dataset) -> xr.Dataset:
             raise UserError(f"the dataset is no gate stack: it has no coordinate {name} over ({', '.join(dims)}).")
     check_attributes("the gate stack", dataset.attrs)
     check_coordinates("the gate stack", dataset, "gate_energy")
-    return dataset.drop_dims(_OF_BINS, errors="ignore").transpose(*pixels, "gate", ...)
+    stack = dataset.drop_dims(_OF_BINS, errors="ignore")
+    return (stack if _SLOPES in stack else _without_slopes(stack)).transpose(..., *pixels, "gate")
 
 
 def save_stack(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a gate stack to an EXR (``.exr``) or NetCDF file (``.nc``) atomically; an existing file is replaced.
 
-    Time bins are not written; use `results.save` for them.
+    Time bins are not written, nor derivatives to EXR files; use `results.save` for both.
 
     Raises
     ------
@@ -91,7 +93,7 @@ def save_sequence(dataset: xr.Dataset, folder: str | os.PathLike[str], stem: str
     Parameters
     ----------
     dataset : xarray.Dataset
-        A gate stack. Time bins are not written.
+        A gate stack. Time bins and derivatives are not written.
     folder : path
         Output folder, created if missing. Existing files of the same names are replaced.
     stem : str
@@ -152,9 +154,16 @@ def _writable(dataset: xr.Dataset, path: Path, *, exr_file: bool) -> xr.Dataset:
         stack = check_stack(dataset)
     except UserError as error:
         raise UserError(f"cannot write {path}: {error}") from error
+    if exr_file:
+        stack = _without_slopes(stack)
     if exr_file and (extra := [str(name) for name in stack.data_vars if name not in _CHANNELS]):
         raise UserError(f"cannot write {path}: an EXR file cannot store the variable {extra[0]}; use a .nc file.")
     return stack.assign_attrs({name: attribute(name, value) for name, value in stack.attrs.items()})
+
+
+def _without_slopes(stack: xr.Dataset) -> xr.Dataset:
+    """Return a stack without derivatives and their parameters."""
+    return stack.drop_dims("parameter", errors="ignore")
 
 
 def _parts(stack: xr.Dataset, *, is_sequence: bool) -> list[exr.Part]:

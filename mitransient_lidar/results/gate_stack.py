@@ -175,6 +175,30 @@ def build_gates(
     return stack
 
 
+def add_gate_derivatives(stack: xr.Dataset, slopes: npt.ArrayLike, stderr: npt.ArrayLike) -> xr.Dataset:
+    """Return a gate stack of `build_gates` with the derivatives of its energies by parameters.
+
+    Parameters
+    ----------
+    stack : xarray.Dataset
+        The gate stack.
+    slopes, stderr : array-like of shape (parameter, pixel, gate)
+        Derivative of the energy in each gate, in J per unit of the parameter, and its standard error.
+    """
+    energy = stack["gate_energy"]
+    texts = {"": "derivative of the energy collected while the gate is open", "_stderr": "standard error of it"}
+    arrays = {
+        f"gate_energy_derivative{end}": (
+            ("parameter", *energy.dims),
+            np.reshape(values, (-1, *energy.shape)),
+            {"units": "J per unit of the parameter", "long_name": text},
+        )
+        for (end, text), values in zip(texts.items(), (slopes, stderr), strict=True)
+    }
+    arrays["gate_energy_derivative"][2]["ancillary_variables"] = "gate_energy_derivative_stderr"
+    return stack.assign(arrays)
+
+
 def check_train(train: GateTrain, attributes: Mapping[str, Any], time: TimeAxis) -> None:
     """Raise `UserError` if a gate train ends before the surface echo or is not within the record."""
     spans = train.spans_ns

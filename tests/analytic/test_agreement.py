@@ -15,6 +15,7 @@ from mitransient_lidar.transport.path_classes import PathClasses
 INTEGRATORS = ["lidar_merging", "lidar_volpath"]
 WAVES = {"spectrum": "elfouhaily", "wind_speed": 3.0, "slope_variance": "cox_munk"}
 ROUGH = {"slope_variance": "0.01"}
+INCLINED = {**ROUGH, "slope_x_deg": 6.0, "slope_y_deg": -4.0}
 LAYERS = {"layer_tops": "0, 3", "attenuation": "0.9, 0.5", "scattering": "0.7, 0.35", "backscattering": "0.014, 0.007"}
 LAYERS |= {"phase_function": "hg", "phase_g": 0.6}
 BUBBLES = {"plume_scattering": 1.5, "plume_width": 3.0, "plume_depth": 2.0, "plume_bearing_deg": 60.0, "plume_x": 1.0}
@@ -87,7 +88,13 @@ CASES = {
         *(FROM_200_M, 5, 0.03, None),
     ),
     "turbid, by order": ({"sea": ROUGH, "water": TURBID, "bottom": 4.0}, FROM_200_M, 5, 0.03, 4),
-    "solids on sand": ({"sea": ROUGH, "bottom": None, "extra": SOLIDS}, FROM_200_M, 5, 0.02, None),
+    "solids below an inclined sea": (
+        {"sea": INCLINED, "bottom": None, "extra": SOLIDS},
+        FROM_200_M,
+        5,
+        0.02,
+        None,
+    ),
     "materials": ({"sea": ROUGH, "extra": MATERIALS}, FROM_200_M, 5, 0.03, None),
     "mirror and sphere in strata": (
         {
@@ -262,7 +269,12 @@ MIXED = "mirror and sphere in strata"
 LONG = {"patches on a slope", "50 m aside over waves", "150 m aside", "elliptic beam", "a diver looks up"}
 LONG |= {"narrow view at 75 degrees", "mast, 1 m aside over waves", "from orbit over waves"}
 LONG |= {"strata of other indices, by order", "view as narrow as the beam", "narrow beam in turbid, smooth water"}
-LONG |= {"sand below bubbles of a windy sea", "solids on sand", "mast at 60 degrees", "below a boat, at a target"}
+LONG |= {
+    "sand below bubbles of a windy sea",
+    "solids below an inclined sea",
+    "mast at 60 degrees",
+    "below a boat, at a target",
+}
 
 
 def tier_of(name):

@@ -48,13 +48,21 @@ def test_gates_are_the_waveform_behind_a_shutter(lidar_scene):
 
 @pytest.mark.slow
 def test_recut_gates_are_those_of_the_render(lidar_scene):
-    result = render(gated(lidar_scene, "lidar_volpath"), passes=16)
+    """Energies, and their derivatives with the light."""
+    names = ["attenuation", "bottom_reflectance"]
+    result = render(gated(lidar_scene, "lidar_volpath"), passes=16, derivatives=names)
     options = {"start_ns": 1425.0, "width_ns": 8.0, "step_ns": 5.0, "count": 20, "rise_ns": 2.0}
     cut = gating.cut_gates(result, gate_stack.train_from_options(result.attrs, **options))
     np.testing.assert_allclose(cut["gate_energy"], result["gate_energy"], rtol=0.01)
+    assert result["gate_energy_derivative"].dims == ("parameter", "pixel", "gate")
+    largest = abs(result["gate_energy_derivative"]).max("gate")
+    difference = cut["gate_energy_derivative"] - result["gate_energy_derivative"]
+    assert float((abs(difference) / largest).max()) < 0.01
     # The error is that of the passes within the inflation of sums over bins, which is one for the whole record.
-    ratio = cut["gate_energy_stderr"] / result["gate_energy_stderr"]
-    assert 0.7 < float(ratio.median()) < 1.4
+    for name in ("gate_energy", "gate_energy_derivative"):
+        lit = result[f"{name}_stderr"] > 0
+        ratio = (cut[f"{name}_stderr"] / result[f"{name}_stderr"]).where(lit)
+        assert 0.7 < float(ratio.median()) < 1.4, name
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,10 @@ a wide view, which are their exchange (reciprocity is tested on its own): no lig
 import numpy as np
 import pytest
 from oracles.half_space import chandrasekhar_h
-from significance import largest_error, largest_z
+from significance import assert_equal, largest_error, largest_z
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.rendering.derivatives import path_parameters
 
 HEIGHT = 2e4
 ENERGY = 5e-3 * 0.81 * 0.9 * 0.025  # J m^2
@@ -41,14 +42,14 @@ def orders_of_scattering(mu, count):
     return np.array([sum(h[j][-1] * h[n - j][-1] for j in range(n + 1)) for n in range(count)])
 
 
-def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator):
-    """Return the energy [J] of `count` passes, for a view and a beam of these radii [m] at the surface."""
+def half_space(lidar_scene, degrees, albedo, view, beam, integrator):
+    """Return the scene of a half-space, for a view and a beam of these radii [m] at the surface."""
     slant = HEIGHT / np.cos(np.radians(degrees))
     pose = {"altitude": HEIGHT, "off_nadir_deg": degrees}
     # Light that comes later has been absorbed, but for exp(-8) of the little that stays in the water so long. The far
     # edge of a slanted view is seen later than its middle.
     longest = 8 / (1 - albedo) + 2 * view * np.tan(np.radians(degrees))
-    scene = lidar_scene(
+    return lidar_scene(
         integrator=integrator,
         tx={**pose, "beam_profile": "top_hat", "divergence_mrad": 2e3 * beam / slant},
         rx={**pose, "field_of_view_mrad": 2e3 * view / slant, "layout": "1x1"},
@@ -61,6 +62,11 @@ def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator
         },
         bottom=None,
     )
+
+
+def returned(lidar_scene, passes, count, degrees, albedo, view, beam, integrator):
+    """Return the energy [J] of `count` passes of a half-space."""
+    scene = half_space(lidar_scene, degrees, albedo, view, beam, integrator)
     # Energies go with the solid angle that is seen.
     return passes(scene, count)[:, 0, 0] * (beam / view) ** 2
 
@@ -136,3 +142,38 @@ def test_orders_of_scattering_sum_to_h_squared(degrees):
     series = orders_of_scattering(mu, 40)
     assert series[1] == pytest.approx(mu * np.log((1 + mu) / mu), rel=1e-8)
     assert np.sum(0.5 ** np.arange(40) * series) == pytest.approx(chandrasekhar_h(mu, 0.5) ** 2, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "albedo", "degrees", "view", "beam"),
+    [
+        pytest.param("lidar_volpath", 0.5, 0.0, 0.1, 20.0, marks=pytest.mark.slow),
+        pytest.param("lidar_volpath", 0.9, 60.0, 0.1, 40.0, marks=pytest.mark.long),
+        pytest.param("lidar_merging", 0.5, 0.0, 4.0, 14.0, marks=pytest.mark.slow),
+        pytest.param("lidar_merging", 0.9, 60.0, 5.0, 22.0, marks=pytest.mark.long),
+    ],
+)
+def test_derivatives_by_absorption_and_scattering(lidar_scene, integrator, albedo, degrees, view, beam):
+    """The energy is a function of the albedo w = b / (a + b) alone, w H(mu, w)^2, since lengths do not matter.
+
+    With a + b = 1 the derivatives are -w dE/dw by a at fixed b, and (1 - w) dE/dw by b at fixed a. H is differentiated
+    numerically. Biases are those of the energy, by the index and by the blur of cells.
+    """
+    count, mu, step = 16, np.cos(np.radians(degrees)), 1e-4
+    options = {"type": integrator, "paths_per_pass": 2**14}
+    if integrator == "lidar_volpath":
+        options |= {"guiding_probability": 0.0, "roulette_threshold": 0.5}
+    else:
+        options |= {"photons_per_pass": 2**14, "cell_size": 0.2, "point_spacing": 0.3 * mu}
+    scene = half_space(lidar_scene, degrees, albedo, view, beam, options)
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0])
+    parameters = path_parameters(renderer, ["attenuation", "scattering"])
+    renderer = renderer.perturbed([one.perturbation for one in parameters])
+    by_c, by_b = np.array([renderer.render_pass(seed).histogram.perturbed()[:, 0, 0] for seed in range(count)]).T
+    received = [omega * chandrasekhar_h(mu, omega) ** 2 for omega in (albedo - step, albedo + step)]
+    slope = single_scattering(degrees, 1.0) * (received[1] - received[0]) / (2 * step)
+    # By a with b fixed, all that is added to c; by b with a fixed, as much is added to c and to b.
+    found = np.stack([-by_c, by_c + by_b]) * (beam / view) ** 2
+    bias = NOT_MATCHED + (4e-3 if integrator == "lidar_merging" else 0.0)
+    for samples, wanted in zip(found, (albedo * slope, (1 - albedo) * slope), strict=True):
+        assert_equal(samples[:, None], [wanted], error=0.012, bias=bias)

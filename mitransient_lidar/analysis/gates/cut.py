@@ -14,7 +14,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
-from mitransient_lidar.results.gate_stack import build_gates, check_train
+from mitransient_lidar.results.gate_stack import add_gate_derivatives, build_gates, check_train
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,7 +36,8 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
     over as many bins, estimated from the passes of the render (attributes ``error_inflation_bins`` and
     ``error_inflation``; linear in the logarithm of the number of bins, and beyond the last one proportional to the
     square root). A gate with weights w is equivalent to (sum w)^2 / sum w^2 bins. The upper bound is the sum of the
-    errors, which is used if the inflation is unknown.
+    errors, which is used if the inflation is unknown. Derivatives of a result are cut in the same way, with the
+    inflation of the waveform: ``gate_energy_derivative`` and its standard error, over ``parameter`` too.
     """
     if missing := [name for name in ("waveform", "waveform_stderr") if name not in dataset]:
         raise UserError(
@@ -48,7 +49,25 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
     inflation = _inflation(dataset.attrs)
     if inflation is None:
         _LOG.info("the result has no error_inflation: the errors of the gates are upper bounds")
-    power, error = dataset["waveform"].values, dataset["waveform_stderr"].transpose(*dims).values
+    energy, stderr = _cut(dataset, "waveform", dims, train, inflation)
+    # Gates of the result itself are replaced.
+    coords = {name: one for name, one in dataset.coords.items() if "gate" not in one.dims}
+    stack = build_gates(energy, stderr, train, coords=coords, attributes=dataset.attrs)
+    if "waveform_derivative" not in dataset:
+        return stack
+    return add_gate_derivatives(stack, *_cut(dataset, "waveform_derivative", ("parameter", *dims), train, inflation))
+
+
+def _cut(
+    dataset: xr.Dataset,
+    name: str,
+    dims: tuple[str, ...],
+    train: GateTrain,
+    inflation: tuple[FloatArray, FloatArray] | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return energies in gates [J] of a power, or its derivatives, and their standard errors, with gates last."""
+    time = results.time_axis(dataset)
+    power, deviation = (dataset[one].transpose(*dims).values for one in (name, f"{name}_stderr"))
     energy = np.zeros((*power.shape[:-1], train.count))
     stderr = np.zeros_like(energy)
     for gate in range(train.count):
@@ -56,17 +75,15 @@ def cut_gates(dataset: xr.Dataset, train: GateTrain) -> xr.Dataset:
         # Only the bins of the gate: a NaN in another bin must not spread to it.
         inside = slice(first, first + weights.size)
         energy[..., gate] = power[..., inside] @ weights
-        bound = error[..., inside] @ weights
+        bound = deviation[..., inside] @ weights
         if inflation is None:
             stderr[..., gate] = bound
         else:
             equivalent = float(weights.sum() ** 2 / np.sum(weights**2))
-            quadrature = np.sqrt(error[..., inside] ** 2 @ weights**2)
+            quadrature = np.sqrt(deviation[..., inside] ** 2 @ weights**2)
             stderr[..., gate] = np.minimum(quadrature * _inflation_at(inflation, equivalent), bound)
     joules = train.pulses * time.bin_width_ns * 1e-9
-    # Gates of the result itself are replaced.
-    coords = {name: one for name, one in dataset.coords.items() if "gate" not in one.dims}
-    return build_gates(joules * energy, joules * stderr, train, coords=coords, attributes=dataset.attrs)
+    return joules * energy, joules * stderr
 
 
 def _inflation(attributes: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:

@@ -12,6 +12,11 @@ from mitransient_lidar.core.validation import BoolArray, FloatArray
 
 _DEGENERATE = 0.999  # correlation of two parameters above which only one combination of them is known
 _SMOOTHED = 9  # samples over which variances are smoothed
+#: Said where errors are too small, because nothing tells how those of far samples agree.
+NO_BATCHES = (
+    "stated errors are too small: errors of a render agree over its whole record, and neither the waveforms nor the "
+    "model have batches of passes, which show this"
+)
 _SMALLEST = 1e-14  # eigenvalue of the scaled normal matrix, below which a combination of parameters is unknown
 
 
@@ -100,6 +105,7 @@ def estimate_errors(
     scaled: bool,
     known_noise: bool = True,
     batches: Sequence[FloatArray | None] = (None, None),
+    borrows: bool = False,
 ) -> Errors:
     """Return the errors of the solution of a weighted least-squares problem.
 
@@ -122,6 +128,9 @@ def estimate_errors(
     batches
         Deviations of the batches of passes of waveforms and model, in standard deviations, shape (batch, pixel, time),
         whose outer products add up to the covariance of the errors; None where there are none.
+    borrows
+        Whether waveforms without batches are of a render, whose errors agree over its samples as those of the model do:
+        the batches of the model, scaled to the variances of the waveforms, are theirs, too.
 
     Notes
     -----
@@ -138,6 +147,9 @@ def estimate_errors(
     the covariance is from batches, f is divided by s^2, as Satterthwaite does. Fewer than P + 3 batches are not used,
     nor are any for the chi-squared.
     """
+    own, by_render = batches
+    if borrows := borrows and own is None and by_render is not None:
+        own = _with_variance(by_render, noise[0] ** 2)
     influence = np.sqrt(np.sum(derivatives**2, axis=(1, 2)))
     known = (influence > 0) & ~held
     count = int(known.sum())
@@ -148,11 +160,11 @@ def estimate_errors(
     # Residuals, from which unknown errors are taken, hold those of the model, too.
     kinds = [noise, model] if known_noise else [noise]
     parts = [
-        inverse @ _projected(scaled_derivatives, errors, own) @ inverse
-        for errors, own in zip((noise, model), batches, strict=True)
+        inverse @ _projected(scaled_derivatives, errors, deviations) @ inverse
+        for errors, deviations in ((noise, own), (model, by_render))
     ]
     known_parts = sum(parts[: len(kinds)], np.zeros_like(inverse))
-    widening = _widening(known_parts, [*zip(parts, batches, strict=True)][: len(kinds)])
+    widening = _widening(known_parts, [*zip(parts, (own, by_render), strict=True)][: len(kinds)], borrows)
     # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
     kept = eigenvalues > _SMALLEST * count
     basis = ((vectors[:, kept] / np.sqrt(eigenvalues[kept])).T @ flat).reshape(-1, *residuals.shape)
@@ -181,6 +193,16 @@ def smoothed_variance(variance: FloatArray) -> FloatArray:
     return np.where(positive, np.exp(sums / np.where(positive, counts, 1.0)), 0.0)
 
 
+def _with_variance(batches: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return deviations of batches, shape (batch, pixel, time), scaled to other variances, shape (pixel, time).
+
+    Both variances are smoothed: bins of few passes whose variance is low by chance would count too little.
+    """
+    own = smoothed_variance(np.sum(batches**2, axis=0))
+    ratio = np.divide(smoothed_variance(variance), own, out=np.zeros_like(own), where=own > 0)
+    return np.asarray(batches * np.sqrt(ratio))
+
+
 def _projected(
     derivatives: FloatArray, errors: tuple[FloatArray, FloatArray], batches: FloatArray | None
 ) -> FloatArray:
@@ -193,11 +215,14 @@ def _projected(
     return np.asarray(across @ across.T)
 
 
-def _widening(covariance: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray | None]]) -> float:
+def _widening(covariance: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray | None]], borrowed: bool) -> float:
     """Return the factor of a covariance whose parts are partly estimated from batches; see `estimate_errors`."""
     count = len(covariance)
     known = [(part, len(own) - 1) for part, own in parts if own is not None and len(own) >= count + 3]
     shares = [(float(np.trace(np.linalg.pinv(covariance) @ part)) / max(count, 1), freedom) for part, freedom in known]
+    if borrowed and shares:
+        # The same batches: their errors add up.
+        shares = [(sum(share for share, _ in shares), shares[0][1])]
     return 1 / (1 - (count + 1) * sum(share**2 / freedom for share, freedom in shares))
 
 

@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.errors import Errors, estimate_errors, smoothed_variance
+from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
 from mitransient_lidar.analysis.information.measured import Measured, Prediction, best_offset, predict
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import limits, unit_of
@@ -389,10 +389,9 @@ class WaveformFit:
         step, own_step = (float(np.median(np.diff(times))) for times in (self.found.time_ns, model.time_ns))
         distance = np.arange(0, model.correlation.size * own_step, step) / own_step
         lags = np.interp(distance, np.arange(model.correlation.size), model.correlation, right=0.0)
-        batches = self.found.batches, model.batches
-        if model.batches is not None:
-            scale = values.get(SCALE, 1.0)
-            batches = self.found.batches, scale * self._resampled(values, model.batches)
+        by_render = model.batches
+        if by_render is not None:
+            by_render = values.get(SCALE, 1.0) * self._resampled(values, by_render)
         return estimate_errors(
             weights * (np.nan_to_num(self.found.values) - mean),
             weights * derivative,
@@ -401,7 +400,8 @@ class WaveformFit:
             np.array([free.is_bound(values[free.name]) for free in self.free]),
             scale_errors,
             known_noise=noise is not None,
-            batches=[None if one is None else weights * one for one in batches],
+            batches=[None if one is None else weights * one for one in (self.found.batches, by_render)],
+            borrows=self.found.estimated,
         )
 
     def _dataset(
@@ -437,13 +437,15 @@ class WaveformFit:
             "at_bound": errors.held.astype(np.int8),
         }
         matrices = {"covariance": errors.covariance, "correlation": errors.correlation}
-        units = [self.units.get(name) or _unit(name) for name in names]
+        units = [self.units.get(name) or unit_of(re.sub(r"\[\d+\]$", "", name)) or "1" for name in names]
         messages = [] if converged else [f"the fit has not converged in {self.renders} renders"]
         messages += errors.messages(names, np.array(list(values.values())))
         if self._refusal:
             messages.append(f"steps were refused, at which the fit may have ended: {self._refusal}")
         if noise is None:
             messages.append("the errors of the waveforms are unknown: they are taken from the residuals")
+        if found.estimated and found.batches is None and self._prediction(values).batches is None:
+            messages.append(NO_BATCHES)
         return xr.Dataset(
             {
                 **{name: ("parameter", vector) for name, vector in vectors.items()},
@@ -462,11 +464,6 @@ class WaveformFit:
                 "messages": messages,
             },
         )
-
-
-def _unit(name: str) -> str:
-    """Return the unit of a parameter by its name."""
-    return unit_of(re.sub(r"\[\d+\]$", "", name)) or "1"
 
 
 def _interpolated(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:

@@ -25,6 +25,7 @@ from mitransient_lidar.core.validation import (
 )
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA, Pulse
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 #: Points of a table of weights per shortest time scale, and largest number of points.
 _POINTS, _LONGEST_TABLE = 128, 2**18
@@ -202,6 +203,18 @@ class GateTrain:
         values[0] = values[-1] = 0
         start = self.start_ns + opens - step - step * (lag + kernel.size - 1)
         return ResponseTable(start, step, values)
+
+    def bin_weights(self, pulse: Pulse, response_time_ns: float, axis: TimeAxis) -> FloatArray:
+        """Return the weight in each gate of light that arrives in each bin, of all pulses together, shape (bin, gate).
+
+        Light is spread evenly over its bin; pulse and response time [ns] are as for `response_weights`.
+        """
+        table = self.response_weights(pulse, response_time_ns)
+        times = table.start_ns + table.step_ns * np.arange(table.values.size)
+        integral = np.concatenate([[0.0], np.cumsum(0.5 * (table.values[1:] + table.values[:-1]) * table.step_ns)])
+        shifts = self.step_ns * np.arange(self.count)
+        within = np.interp(axis.edges_ns[:, None] - shifts, times, integral)
+        return np.asarray(np.diff(within, axis=0) * (self.pulses / axis.bin_width_ns))
 
 
 def time_of_depth(depth_m: npt.ArrayLike, surface_time_ns: float, group_index: float, cos_water: float) -> FloatArray:

@@ -45,6 +45,9 @@ _PERIOD_STEP, _PERIOD_WAVELENGTHS, _LONGEST_PERIOD = 32.0, 3.0, 512.0
 #: Water depth [m] from which no wave notices the bottom.
 DEEP = 1e4
 
+#: Steepest mean slope of the sea along x and y [degree].
+_STEEPEST_DEG = 15.0
+
 #: Wind speed [m/s] below which there are no waves.
 _CALM = 1e-6
 
@@ -81,6 +84,7 @@ class SeaSurface:
     focusing_spectrum: SeaState | None = None
     #: Elevations of the same waves at a time [s]; None for waves that do not move.
     waves_at: Callable[[float], PeriodicHeights | NestedHeights] | None = None
+    slope: tuple[float, float] = (0.0, 0.0)  #: Mean slopes along x and y within the patch [1].
 
     @classmethod
     def read(cls, get: Get, footprints: Sequence[Footprint] = (), is_placeholder: bool = False) -> SeaSurface:
@@ -110,6 +114,7 @@ class SeaSurface:
         slope_variance = get("slope_variance", "cox_munk")
         seed = integer("surface_seed", get("surface_seed", 1), 0, 2**53)
         wake = _read_wake(get)
+        slope = _read_slope(get, "slope_x_deg"), _read_slope(get, "slope_y_deg")
         resolution = Resolution.read(get, footprints)
         period = read_length(get, "period")
         time = finite("time", get("time", 0.0))
@@ -127,7 +132,7 @@ class SeaSurface:
         resolved = (0.0, 0.0)
         centre, cell, refined_size = resolution.centre, resolution.cell_size, resolution.refined_size
         if is_placeholder:
-            cell, wake = math.inf, None
+            cell, wake, slope = math.inf, None, (0.0, 0.0)
         elif state is not None:
             period = period or _period(state)
             if cell <= period / _FEWEST_CELLS or get("cell_size", "auto") != "auto":
@@ -138,7 +143,7 @@ class SeaSurface:
                 axis_and_shortest = wind_direction, resolution.shortest_wave
                 waves, cell, resolved = realise_heights(*given, motion, *axis_and_shortest)
                 waves_at = partial(_waves_at, given, motion, axis_and_shortest)
-            elif wake is None:
+            elif wake is None and not any(slope):
                 cell = math.inf
         elif spectrum == "height_map":
             waves = terrain = read_height_map(_required(path, spectrum), map_size)
@@ -149,7 +154,7 @@ class SeaSurface:
             centre = (middle[0] if is_free[0] else centre[0], middle[1] if is_free[1] else centre[1])
             _check_number_of_cells(refined_size, cell)
             resolved = _facet_variance(terrain, wind_direction)
-        elif wake is None:
+        elif wake is None and not any(slope):
             cell = math.inf
         else:
             _check_number_of_cells(refined_size, cell)
@@ -174,6 +179,7 @@ class SeaSurface:
             *(kind, wind_speed, wind_direction, waves, cell, centre, patch, size),
             *(resolved, ripples, wake, shortest, beam_wave, series, state if focuses and is_whole else None),
             waves_at,
+            slope,
         )
 
     def at(self, time: float) -> SeaSurface:
@@ -196,7 +202,7 @@ class SeaSurface:
         # Integer cells: the sea does not depend on the position of the patch.
         first = [round(centre / self.cell_size) for centre in self.centre]
         x, y = (np.asarray((indices + start) * self.cell_size, dtype=np.float64) for start in first)
-        return triangulate(self.heights(x, y), x, y, self.wind_direction)
+        return triangulate(self.heights_about(self.centre, x, y), x, y, self.wind_direction)
 
     def patches(self, places: FloatArray, refined_size: float) -> tuple[SeaMesh, FloatArray]:
         """Return the mesh of fine patches about places, and the position of each place in it.
@@ -230,13 +236,25 @@ class SeaSurface:
             # On the cells of the sea, as in `mesh`.
             x, y = ((indices + round(centre / self.cell_size)) * self.cell_size for centre in place)
             lines = (x - place[0] + position[0], y - place[1] + position[1])
-            meshes.append(triangulate(self.heights(x, y), *lines, self.wind_direction))
+            meshes.append(triangulate(self.heights_about(place, x, y), *lines, self.wind_direction))
         return joined(meshes), positions
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return elevations [m] on grid lines x and y [m], integer multiples of the cells, shape (len(y), len(x))."""
         heights = np.zeros((len(y), len(x))) if self.waves is None else self.waves.sample(x, y)
         return heights if self.wake is None else heights + self.wake(x, y)
+
+    def heights_about(self, place: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return `heights` under a lidar that is aimed at a place (x, y) [m], inclined by the mean slope.
+
+        The plane of the mean slope turns about the place and is as wide as the patch; beyond it the sea is level.
+        """
+        heights = self.heights(x, y)
+        if not any(self.slope):
+            return heights
+        reach = 0.5 * self.refined_size
+        dx, dy = (np.clip(lines - middle, -reach, reach) for lines, middle in zip((x, y), place, strict=True))
+        return np.asarray(heights + self.slope[0] * dx + self.slope[1] * dy[:, None])
 
 
 def _read_waves(get: Get, spectrum: str, wind_speed: float, wind_direction: float) -> SeaState | None:
@@ -380,6 +398,11 @@ def _read_switch(get: Get, name: str) -> bool:
 def _read_angle(get: Get, name: str) -> float:
     """Return an angle of a parameter in degrees [rad], 0 by default."""
     return math.radians(finite(name, get(name, 0.0)))
+
+
+def _read_slope(get: Get, name: str) -> float:
+    """Return a mean slope of a parameter in degrees [1], 0 by default."""
+    return math.tan(math.radians(in_range(name, get(name, 0.0), -_STEEPEST_DEG, _STEEPEST_DEG)))
 
 
 def _read_table(path: str) -> TabulatedSpectrum:

@@ -19,7 +19,7 @@ TABLE = {
     **{"time_start_ns": "auto", "bin_width_ns": "1", "bin_count": "auto"},
     **{"wind_speed": "3", "wind_direction_deg": "0", "spectrum": "elfouhaily", "slope_variance": "cox_munk"},
     **{"slope_distribution": "gaussian", "ripple_focusing": "true"},
-    **{"surface_seed": "1", "surface_time": "0"},
+    **{"surface_seed": "1", "surface_time": "0", "surface_slope_x_deg": "0", "surface_slope_y_deg": "0"},
     **{"surface_refined_size": "auto", "surface_cell_size": "auto"},
     **{"surface_shortest_wave": "auto", "surface_size": "auto"},
     **{"refractive_index": "1.34", "group_index": "1.364", "layer_tops": "0"},

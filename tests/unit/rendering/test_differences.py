@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.rendering.differences import Differences, default_step, differences
 from mitransient_lidar.rendering.session import choose_integrator, open_scene
 
@@ -35,6 +36,8 @@ def test_a_pass_is_the_difference_of_two_renders(level):
     """The energy of a pulse multiplies all light, so that its derivative is the record over the energy."""
     session, integrator = level
     found = Differences(session, integrator, ["pulse_energy_mj", "pulse_fwhm_ns"], steps={"pulse_energy_mj": 1.0})
+    train = GateTrain(1430.0, 8.0, 5.0, 6)
+    found.cut(train)
     found.add_pass(3)
     energy = integrator.prepare(session.scene, session.sensor).render_pass(3).histogram.energy()
     quantum = np.abs(energy).max() * 1e-6
@@ -43,6 +46,13 @@ def test_a_pass_is_the_difference_of_two_renders(level):
     assert not found.impulse_response[1].any()
     assert found.waveform[1].sum() == pytest.approx(0, abs=1e-3 * np.abs(found.waveform[1]).sum())
     assert np.isnan(found.waveform_stderr).all()
+    # Gates collect the power, also where a longer pulse moves it.
+    axis = session.sensor.film().axis
+    for gate in range(train.count):
+        first, weights = train.gate_bins(gate, axis.start_ns, axis.bin_width_ns, axis.bin_count)
+        collected = 1e-9 * axis.bin_width_ns * found.waveform[..., first : first + weights.size] @ weights
+        largest = np.abs(found.gates).max(axis=(1, 2))[:, None]
+        assert np.all(np.abs(found.gates[..., gate] - collected) < 0.01 * largest)
     found.add_pass(4, share=0.5)
     assert np.isfinite(found.waveform_stderr).all()
 

@@ -30,6 +30,9 @@ TRUTH = (
 )
 
 
+MEAN_SLOPE = 0.02, -0.03
+
+
 class Wave:
     """A plane wave, with the interface of a sea."""
 
@@ -40,6 +43,10 @@ class Wave:
 
     def heights(self, x, y):
         return 0.3 * np.cos(self.k[0] * x + self.k[1] * y[:, np.newaxis] + 0.4)
+
+    def heights_about(self, place, x, y):
+        """The mean slope, about the place, adds to the wave's."""
+        return self.heights(x, y) + MEAN_SLOPE[0] * (x - place[0]) + MEAN_SLOPE[1] * (y[:, np.newaxis] - place[1])
 
 
 class Beam:
@@ -64,7 +71,10 @@ def test_truth_is_the_mean_of_a_wave_over_an_elliptic_gaussian(k_x, k_y, azimuth
     k_across = k_y * math.cos(azimuth) - k_x * math.sin(azimuth)
     damped = 0.3 * math.exp(-0.5 * ((k_along * along) ** 2 + (k_across * across) ** 2))
     phase = k_x * x + k_y * y + 0.4
-    expected = [-k_along * damped * math.sin(phase), -k_across * damped * math.sin(phase), damped * math.cos(phase)]
+    cos, sin = math.cos(azimuth), math.sin(azimuth)
+    mean = cos * MEAN_SLOPE[0] + sin * MEAN_SLOPE[1], cos * MEAN_SLOPE[1] - sin * MEAN_SLOPE[0]
+    slopes = (part - k * damped * math.sin(phase) for part, k in zip(mean, (k_along, k_across), strict=True))
+    expected = [*slopes, damped * math.cos(phase)]
     # Central differences of the wave's heights are flatter by up to (k h)^2/6 = 0.8 %.
     found = shot_truth.footprint_means(Wave(k_x, k_y), Beam(azimuth), x, y)
     np.testing.assert_allclose(found, expected, rtol=0.01, atol=1e-4)

@@ -12,6 +12,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_files
+from mitransient_lidar.results.gate_stack import add_gate_derivatives
 
 ATTRIBUTES = {
     "scene": "mine field",
@@ -163,6 +164,16 @@ def test_parts_and_derivatives_of_waveforms_are_left_out(dim, tmp_path):
     with_more = make().assign(more).assign_coords({f"{dim}_names": (dim, ["a", "b"])})
     gate_files.save_stack(with_more, tmp_path / "gates.exr")
     xr.testing.assert_identical(gate_files.open_stack(tmp_path / "gates.exr"), make())
+
+
+def test_derivatives_of_gates_need_netcdf(tmp_path):
+    stack = make()
+    slopes, errors = np.random.default_rng(3).normal(size=(2, 2, 4, 5, 3))
+    more = add_gate_derivatives(stack, slopes, errors).assign_coords(parameter=["attenuation", "bottom_depth"])
+    for name, kept in (("a.nc", more), ("a.exr", stack)):
+        gate_files.save_stack(more.assign(waveform=(("row", "column", "time"), np.ones((4, 5, 7)))), tmp_path / name)
+        xr.testing.assert_identical(gate_files.open_stack(tmp_path / name), kept)
+    assert more["gate_energy_derivative"].dims == ("parameter", "row", "column", "gate")
 
 
 def test_histogram_is_left_out_and_other_variables_need_netcdf(tmp_path):

@@ -177,6 +177,31 @@ def test_standard_errors_from_few_passes_widen_the_covariance():
     assert abs(mean - len(TRUTH)) < largest_z(len(distances)) * error, mean
 
 
+@pytest.mark.slow
+def test_errors_of_a_result_without_batches_agree_as_those_of_the_model():
+    """Data of 16 passes whose errors are a common factor for the larger part, which the batches of the model tell.
+
+    With errors of the data that are independent from bin to bin, the mean squared distance was 5.5.
+    """
+    random = np.random.default_rng(11)
+    distances = []
+    for _ in range(150):
+        data = rendered(TRUTH, *of_passes(random, 16, 0.1)).drop_vars(["waveform_batch", "waveform_derivative"])
+        own = of_passes(random, 64, 0.1)
+        fitted = fit(data, TRUTH, model=lambda values, own=own: rendered(values, *own))
+        distances.append(distance(fitted))
+    mean, error = np.mean(distances), np.std(distances, ddof=1) / np.sqrt(len(distances))
+    assert abs(mean - len(TRUTH)) < largest_z(len(distances)) * error, mean
+    assert not any("stated errors are too small" in text for text in fitted.attrs["messages"])
+
+
+def test_errors_of_a_render_that_are_too_small_are_named():
+    """Neither the data nor the model have batches."""
+    exact = closed_form(TRUTH)
+    fitted = fit(exact[["waveform"]].assign(waveform_stderr=xr.full_like(exact["waveform"], 0.002)), TRUTH)
+    assert any("stated errors are too small" in text for text in fitted.attrs["messages"])
+
+
 def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
     """Steps of less than 0.02 standard errors are not rendered."""
     fitted = fit(closed_form(TRUTH), noise=0.001)

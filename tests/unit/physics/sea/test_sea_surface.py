@@ -8,6 +8,7 @@ from oracles.two_scale import two_scale_ratio
 from scipy.ndimage import gaussian_filter
 from significance import assert_equal
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.cox_munk import cox_munk
 from mitransient_lidar.physics.sea.periodic_heights import Motion, NestedHeights, realise_heights
 from mitransient_lidar.physics.sea.sea_state import MatchedSpectrum
@@ -138,3 +139,35 @@ def under_beams(echo, cells_per_wave):
     step = len(echo) // 8
     padded = gaussian_filter(echo, cells_per_wave, mode="wrap")
     return 0.25 * sum(np.roll(padded, (i, j), (0, 1)) for i in (0, 1) for j in (0, 1))[::step, ::step]
+
+
+def test_a_mean_slope_turns_the_sea_about_its_centre_and_each_place():
+    """The plane is added to the waves, ends at the patch, and leaves the variance of slopes as it is."""
+    options = {
+        "wind_speed": 6.0,
+        "refined_size": 8.0,
+        "cell_size": 0.25,
+        "centre_x": 5.0,
+        "centre_y": -3.0,
+        "size": 50.0,
+    }
+    level, inclined = read(**options), read(**options, slope_x_deg=2.0, slope_y_deg=-1.0)
+    added = inclined.mesh().vertices - level.mesh().vertices
+    slopes = np.tan(np.radians([2.0, -1.0]))
+    offsets = np.clip(level.mesh().vertices[:, :2] - inclined.centre, -4.0, 4.0)
+    np.testing.assert_allclose(added, np.stack([0 * added[:, 0], 0 * added[:, 0], offsets @ slopes], axis=1), atol=1e-9)
+    assert inclined.slope_variance == level.slope_variance
+    places = np.array([[10.0, 0.0], [-20.0, 7.0]])
+    (mesh, positions), (plain, _) = (sea.patches(places, 8.0) for sea in (inclined, level))
+    for half, position in zip(np.split(np.arange(len(mesh.vertices)), 2), positions, strict=True):
+        offsets = np.clip(plain.vertices[half, :2] - position, -4.0, 4.0)
+        np.testing.assert_allclose((mesh.vertices - plain.vertices)[half, 2], offsets @ slopes, atol=1e-9)
+
+
+def test_a_flat_sea_with_a_mean_slope_is_a_plane_and_slopes_are_limited():
+    mesh = read(spectrum="flat", slope_x_deg=3.0, refined_size=6.0, cell_size=0.5, size=20.0).mesh()
+    inside = np.abs(mesh.vertices[:, 0]) <= 3.0
+    np.testing.assert_allclose(mesh.vertices[inside, 2], np.tan(np.radians(3.0)) * mesh.vertices[inside, 0], atol=1e-12)
+    assert len(read(spectrum="flat", size=20.0).mesh().faces) == 2
+    with pytest.raises(UserError, match="slope_y_deg = 16 must lie between -15 and 15"):
+        read(slope_y_deg=16.0)
