@@ -18,6 +18,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.las import write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
+from mitransient_lidar.flights.poses.mounting import pixel_turns
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
 from mitransient_lidar.physics.lidar.refraction import snell
 
@@ -99,19 +100,22 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
             if name.endswith("time_ns"):
                 values = values + later.reshape(-1, *[1] * (values.ndim - 1))
             data[name.removeprefix("echo_")] = (("shot", *dims[1:]), values, dict(array.attrs))
+    angles = {name: ("pixel", flown.coordinate(name)) for name in ("angle_x", "angle_y")}
     echoes = xr.Dataset(
         data,
-        {"shot": flown.values("pulse"), "pixel": flown.coordinate("pixel"), "echo": flown.coordinate("echo")},
+        {"shot": flown.values("pulse"), "pixel": flown.coordinate("pixel"), "echo": flown.coordinate("echo"), **angles},
         attributes,
     )
-    group, angle = flown.values("group"), flown.values("group_angle_deg")
+    angle = flown.values("group_angle_deg")
+    turns = pixel_turns(flown.vectors("axis"), flown.vectors("far"))
+    kinds, kind = np.unique(np.stack([flown.values("group"), turns]), axis=1, return_inverse=True)
     table = None if corrections == "none" else corrections_for(str(attributes.get("instrument", "")), corrections)
     if table is not None:
         parts, places = [], []
-        for one in np.unique(group):
-            place = np.flatnonzero(group == one)
+        for number, turn in enumerate(kinds[1].tolist()):
+            place = np.flatnonzero(kind.reshape(-1) == number)
             part = echoes.isel(shot=place).assign_attrs(off_nadir_deg=float(angle[place[0]]))
-            parts.append(correct_depths(part, table))
+            parts.append(correct_depths(part, table, turn_deg=turn))
             places.append(place)
         order = np.argsort(np.concatenate(places))
         echoes = xr.concat(parts, "shot", combine_attrs="override").isel(shot=order)

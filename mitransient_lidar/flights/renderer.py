@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,12 +18,13 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.poses.mounting import PulsePoses
+from mitransient_lidar.flights.poses.mounting import PulsePoses, pixel_turns
 from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import FARTHEST
+from mitransient_lidar.results.geometry import LinesOfSight
 
 if TYPE_CHECKING:
     from mitransient_lidar.rendering.shot_batches import ShotBatches
@@ -33,10 +34,6 @@ if TYPE_CHECKING:
 
 #: Largest range of angles from nadir [deg], and ratio of heights and of ranges, of the pulses that share a lidar.
 _ANGLES, _HEIGHTS = 2.0, 1.1
-
-#: Largest angle by which pixels may be turned about their line of sight [deg]: their lines of sight and the corrections
-#: of their depths are those of pixels at the far and the near side of the beam, as in the lidar of the group.
-_LARGEST_TURN = 15.0
 
 #: Most shots that are rendered together, and longest time between them in which waves stand still [s].
 _BATCH, _STILL_S = 64, 0.05
@@ -161,7 +158,7 @@ class FlightRenderer:
 
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
         """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
-        arrays, echoes = self._stacked(inputs)
+        arrays, echoes = self._stacked(inputs, turned=False)
         names = [name for name in ("pixel", "angle_x", "angle_y", "sight_x", "sight_y") if name in echoes.coords]
         found = {
             name: Array(tuple(map(str, echoes[name].dims)), echoes[name].values, _plain(echoes[name].attrs))
@@ -175,12 +172,12 @@ class FlightRenderer:
         stacked = {name: array._replace(values=array.values[0]) for name, array in arrays.items()}
         return stacked, found, {"echo_attributes": _plain(echoes.attrs)}
 
-    def _stacked(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], xr.Dataset]:
-        """Return the arrays of pulses, stacked, and their echoes."""
+    def _stacked(self, inputs: Mapping[str, Column], *, turned: bool = True) -> tuple[dict[str, Array], xr.Dataset]:
+        """Return the arrays of pulses, stacked, and their echoes, whose pixels may be turned about the axis."""
         series, later = self._render(inputs, self._passes(until_error=True))
         series["waveform_stderr"] = pooled_errors(series["waveform"], series["waveform_stderr"])
         recorded = record(series, self.plan, inputs)
-        echoes = extract(recorded, self.plan.estimator)
+        echoes = extract(self._with_turned_pixels(recorded, inputs) if turned else recorded, self.plan.estimator)
         pixels = recorded.sizes["pixel"]
         start = float(recorded.attrs["time_start_ns"]) + later
         about = {"units": "ns", "long_name": "time of the start of the first sample after the pulse"}
@@ -217,19 +214,35 @@ class FlightRenderer:
                     {name: column[part] for name, column in columns.items()}, self._passes(until_error=False)
                 )[0]
 
+    def _scene_of(self, inputs: Mapping[str, Column]) -> ShotScene:
+        """Return the loaded scene of the lidar of pulses of one group."""
+        return _shot_scene(self, *self._lidar_and_record(inputs))
+
+    def _lidar_and_record(self, inputs: Mapping[str, Column]) -> tuple[float, float, float, float, TimeAxis]:
+        """Return the lidar of pulses of one group, as of `_lidar_of`, and its time bins."""
+        assert self.axis is not None
+        return *_lidar_of(inputs), replace(self.axis, start_ns=float(inputs["record_start_ns"][0]))
+
+    def _with_turned_pixels(self, recorded: xr.Dataset, inputs: Mapping[str, Column]) -> xr.Dataset:
+        """Return the record of pulses of one group with the lines of sight of pixels that are turned about the axis."""
+        turns = pixel_turns(*(_vectors(inputs, name) for name in ("axis", "far")))
+        if not turns.any():
+            return recorded
+        lines = [_turned_lines(self, *self._lidar_and_record(inputs), turn) for turn in turns.tolist()]
+        arrays = {name: np.stack([vars(one)[name] for one in lines]) for name in vars(lines[0])}
+        return recorded.assign_coords(LinesOfSight(**arrays).coordinates(("shot", "pixel"), arrays["off_nadir"].shape))
+
     def _render(
         self, inputs: Mapping[str, Column], passes: tuple[int, float, float | None]
     ) -> tuple[xr.Dataset, FloatArray]:
         """Return the waveforms of pulses as those of a series, and how much later than its times each shot is [ns]."""
         from mitransient_lidar.rendering.shot_truth import sea_of, truth_coordinates
 
-        plan, axis = self.plan, self.axis
-        assert axis is not None
-        start = float(inputs["record_start_ns"][0])
-        scene = _shot_scene(self, *_lidar_of(inputs), TimeAxis(start, axis.bin_width_ns, axis.bin_count))
+        plan = self.plan
+        scene = self._scene_of(inputs)
         poses = _shot_poses(scene.lidar, inputs)
         # Records start at whole bins after the pulse, as the clock of a digitizer that the pulse starts.
-        further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * axis.bin_width_ns
+        further, width = poses.extra_range(scene.lidar), C0 * 1e-9 * scene.lidar.axis.bin_width_ns
         poses = poses.delayed(further % width)
         batches = _batches(scene, *passes)
         if plan.max_time is not None:
@@ -280,6 +293,16 @@ def _shot_scene(
     return ShotScene(renderer.scene, params, None, None, np.array([[x, y]]), axis, False, check=False)
 
 
+@functools.lru_cache(maxsize=256)
+def _turned_lines(
+    renderer: FlightRenderer, angle_deg: float, height: float, x: float, y: float, axis: TimeAxis, turn_deg: float
+) -> LinesOfSight:
+    """Return the lines of sight of the lidar of a group whose pixels are turned about the receiver's axis [deg]."""
+    from mitransient_lidar.rendering.echo_window import lines_of_sight
+
+    return lines_of_sight(_shot_scene(renderer, angle_deg, height, x, y, axis).lidar, turn_deg)
+
+
 @functools.lru_cache(maxsize=2)
 def _batches(scene: ShotScene, passes: int, share: float, error: float | None) -> ShotBatches:
     """Return the shots of a scene in batches, whose solids and buffers serve all of them."""
@@ -298,21 +321,12 @@ def _vectors(inputs: Mapping[str, Column], name: str) -> FloatArray:
 
 
 def _shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
-    """Return the poses of pulses of one group; raise `UserError` for pixels that are turned too far."""
+    """Return the poses of pulses of one group."""
     from mitransient_lidar.rendering.shot_poses import ShotPoses
     from mitransient_lidar.transport.pose import Pose
 
     origin, axis, far, left = (_vectors(inputs, name) for name in ("origin", "axis", "far", "left"))
-    poses = ShotPoses.of_receiver(lidar, Pose(origin, axis, far, left))
-    assert poses.receiver is not None
-    cosine = poses.receiver.far @ lidar.receiver.pose.far
-    turn = float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
-    if turn > _LARGEST_TURN:
-        raise UserError(
-            f"the pixels are turned about their line of sight by up to {turn:.3g} degrees: at most {_LARGEST_TURN:g} "
-            "may be; let them turn with the scan, pixels = 'scan'"
-        )
-    return poses
+    return ShotPoses.of_receiver(lidar, Pose(origin, axis, far, left))
 
 
 def _columns(poses: PulsePoses) -> dict[str, Column]:

@@ -182,8 +182,11 @@ def error_window(lidar: LidarScene, probe: EchoProbe) -> ErrorWindow:
     return ErrorWindow(start, np.where(np.isnan(end), time_ns[-1], end), time_ns)
 
 
-def lines_of_sight(scene: LidarScene) -> LinesOfSight:
+def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
     """Return the lines of sight of the pixels over a level sea at z = 0, weighted with the beam.
+
+    The lidar may be turned about the receiver's axis, from far to left [deg]; angles are those of the lidar that is
+    not.
 
     Under water they are straight, and ``surface_time`` is where depths on their scale are 0, before the pulse is
     emitted if the lidar looks down.
@@ -193,18 +196,34 @@ def lines_of_sight(scene: LidarScene) -> LinesOfSight:
     """
     pixels = scene.receiver.pixels
     depths = _depths_of_scale(scene)
-    surface, below = (_mean_sight(scene, at) for at in depths)
+    poses = _turned(scene, turn_deg)
+    surface, below = (_mean_sight(scene, poses, at) for at in depths)
     centres = pixels.centres()
     lit = (surface.share > 0) & (below.share > 0)
-    x, y = (np.where(lit, seen, centre) for seen, centre in zip(surface.angles.T, centres.T, strict=True))
+    seen = np.where(lit[:, np.newaxis], surface.angles, centres)
     time, deep = (
-        np.where(lit, sight.time, _by_receiver(scene, centres, at)[0])
+        np.where(lit, sight.time, _two_way(scene, *poses, centres, at)[0])
         for sight, at in zip((surface, below), depths, strict=True)
     )
-    off_nadir = np.arccos(np.clip(-_directions(scene.receiver.pose, np.stack([x, y], axis=1))[:, 2], -1, 1))
+    directions = _directions(poses[0], seen)
+    off_nadir = np.arccos(np.clip(-directions[:, 2], -1, 1))
+    x, y = seen.T if turn_deg == 0 else _tangent(scene.receiver.pose, directions).T
     spread, share = (np.where(lit, values, 0.0) for values in (surface.spread, surface.share))
     depth_per_ns = (depths[1] - depths[0]) / (deep - time)
     return LinesOfSight(x, y, off_nadir, time - depths[0] / depth_per_ns, spread, depth_per_ns, share)
+
+
+def _turned(scene: LidarScene, turn_deg: float) -> tuple[Pose, Pose]:
+    """Return the poses of receiver and transmitter, turned about the receiver's axis from far to left [deg]."""
+    own, other = scene.receiver.pose, scene.transmitter.pose
+    if turn_deg == 0:
+        return own, other
+    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    before = np.stack([own.axis, own.far, own.left])
+    after = np.stack([own.axis, cos * own.far + sin * own.left, cos * own.left - sin * own.far])
+    rotation = after.T @ before
+    shift = own.origin - rotation @ own.origin
+    return own.moved(rotation, shift), other.moved(rotation, shift)
 
 
 def _depths_of_scale(scene: LidarScene) -> tuple[float, float]:
@@ -228,13 +247,13 @@ class _Sight:
     points: FloatArray  #: Effective number of points.
 
 
-def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
-    """Return the means over the light of the beam that pixels see at a depth [m]."""
+def _mean_sight(scene: LidarScene, poses: tuple[Pose, Pose], depth: float) -> _Sight:
+    """Return the means over the light of the beam that pixels see at a depth [m], for poses of receiver and laser."""
     pixels, transmitter = scene.receiver.pixels, scene.transmitter
 
     # Points of the beam, of equal energy. One of several pixels at a point stands for all of them.
     angle_x, angle_y = transmitter.sample_tangent(_lattice(_POINTS))
-    time, angles = _by_transmitter(scene, np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
+    time, angles = _two_way(scene, *poses[::-1], np.stack([np.array(angle_x), np.array(angle_y)], axis=1), depth)
     seen_x, seen_y = (aligned(mi.Float, axis) for axis in angles.T)
     pixel, inside = pixels.pixel_at(seen_x, seen_y, _choices(_POINTS))
     share = np.where(np.isfinite(time), np.array(inside, dtype=np.float64) / _POINTS, 0.0)
@@ -245,7 +264,7 @@ def _mean_sight(scene: LidarScene, depth: float) -> _Sight:
     angle_x, angle_y = pixels.sample(_lattice(count))
     pixel, inside = pixels.pixel_at(angle_x, angle_y, _choices(count))
     angles = np.stack([np.array(angle_x), np.array(angle_y)], axis=1).astype(np.float64)
-    time, at_laser = _by_receiver(scene, angles, depth)
+    time, at_laser = _two_way(scene, *poses, angles, depth)
     density = np.array(transmitter.tangent_density(*(aligned(mi.Float, axis) for axis in at_laser.T)), dtype=np.float64)
     weight = np.where((np.array(inside) > 0) & np.isfinite(time), density, 0) * (pixels.area / count)
     by_pixel = _means(time, angles, np.array(pixel), weight, pixels.count)
@@ -288,16 +307,6 @@ def _choices(count: int) -> mi.Float:
 def _at_one_place(scene: LidarScene) -> bool:
     """Return whether transmitter and receiver are at one place."""
     return bool(np.all(scene.transmitter.pose.origin == scene.receiver.pose.origin))
-
-
-def _by_receiver(scene: LidarScene, angles: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
-    """Return two-way times [ns] to a depth at angles of the receiver [rad], and the angles there of the laser."""
-    return _two_way(scene, scene.receiver.pose, scene.transmitter.pose, angles, depth)
-
-
-def _by_transmitter(scene: LidarScene, angles: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
-    """Return two-way times [ns] to a depth at angles of the laser [rad], and the angles there of the receiver."""
-    return _two_way(scene, scene.transmitter.pose, scene.receiver.pose, angles, depth)
 
 
 def _two_way(

@@ -29,6 +29,8 @@ _USUAL, _FEWEST = 0.5, 4.0
 #: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
 #: and waters, over a level sea, of the first six shipped tables.
 _OF_TWO = 0.57
+_SAME_RING = 0.05  # largest difference of the radii of pixels on a ring, over the largest radius
+_ANGLE_DIGITS = 6  # of angles between pixels [deg]
 _NEAR = 2.0  # largest error of a depth that counts [m]
 
 
@@ -70,7 +72,9 @@ def corrections_for(instrument: str, given: str | os.PathLike[str]) -> xr.Datase
     return read_corrections(path)
 
 
-def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | None = None) -> xr.Dataset:
+def correct_depths(
+    found: xr.Dataset, table: xr.Dataset, wind_speed: float | None = None, turn_deg: float = 0.0
+) -> xr.Dataset:
     """Subtract the mean errors of a table from the depths of bottoms and targets.
 
     Parameters
@@ -81,6 +85,8 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
         From `read_corrections` or `studies.depth_bias.depth_bias`.
     wind_speed : float, optional
         Wind speed [m/s], at least 0; by default that of the result's scene, 0 over a level sea.
+    turn_deg : float
+        Angle by which the pixels are turned about the receiver's axis, from far to left [deg]; see `turned_pixels`.
 
     Returns
     -------
@@ -128,6 +134,8 @@ def correct_depths(found: xr.Dataset, table: xr.Dataset, wind_speed: float | Non
     several = "estimator" in found.dims
     names = found["estimator"].values if several else found.attrs["estimators"]
     learnt = _learnt(table.sel(pixel=found["pixel"].values, estimator=list(names)))
+    if turn_deg != 0:
+        learnt = turned_pixels(learnt, found["angle_x"].values, found["angle_y"].values, turn_deg)
     wind = _wind(found) if wind_speed is None else non_negative("wind_speed", wind_speed)
     angle = required_number(found.attrs, "off_nadir_deg")
     cell, rates = learnt, _walks(learnt)
@@ -202,6 +210,41 @@ def _learnt(table: xr.Dataset) -> xr.Dataset:
         variance=beyond + uncertain,
         noise_share=np.sqrt((left / noise).where(noise > 0, 1.0).clip(max=1)),
     )
+
+
+def turned_pixels(learnt: xr.Dataset, angle_x: FloatArray, angle_y: FloatArray, turn_deg: float) -> xr.Dataset:
+    """Return a table for pixels that are turned about the receiver's axis.
+
+    A bias depends on the angle between a pixel's place and the plane of incidence. That of a turned pixel is linear in
+    this angle between the two pixels of the table on its ring which are beside it, with weights 1 - w and w, and has
+    the variance w (1 - w) (b_2 - b_1)^2 of their biases b_1 and b_2 besides theirs.
+
+    Parameters
+    ----------
+    learnt
+        Table over ``pixel``, with the variables ``bias`` and ``variance`` [m^2].
+    angle_x, angle_y
+        Centres of the pixels, away from nadir and to the left, in any unit, shape (pixels,).
+    turn_deg
+        Angle from far to left [deg].
+    """
+    place = np.asarray(angle_x) + 1j * np.asarray(angle_y)
+    radius = np.abs(place)
+    same = np.abs(radius[:, np.newaxis] - radius) <= _SAME_RING * radius.max()
+    azimuth = np.degrees(np.angle(place))
+    ahead = np.round(azimuth - azimuth[:, np.newaxis] - turn_deg, _ANGLE_DIGITS) % 360
+    ahead, behind = (np.where(same, angle, np.inf) for angle in (ahead, -ahead % 360))
+    ways = np.stack([behind.min(axis=1), ahead.min(axis=1)])
+    in_middle = radius <= _SAME_RING * radius.max()
+    before, after = (np.where(in_middle, np.arange(radius.size), angle.argmin(axis=1)) for angle in (behind, ahead))
+    share = np.where(in_middle, 0.0, ways[0] / np.maximum(ways.sum(axis=0), 10.0**-_ANGLE_DIGITS))
+    first, second = (learnt.isel(pixel=one).assign_coords(pixel=learnt["pixel"]) for one in (before, after))
+    w = xr.DataArray(share, dims="pixel", coords={"pixel": learnt["pixel"]})
+    mixed = first.where(w < 1, 0) * (1 - w) + second.where(w > 0, 0) * w
+    apart = (second["bias"] - first["bias"]).where((w > 0) & (w < 1), 0)
+    mixed["variance"] = mixed["variance"] + apart**2 * w * (1 - w)
+    whole = [name for name in learnt.data_vars if "pixel" not in learnt[name].dims]
+    return mixed.assign({name: learnt[name] for name in whole})
 
 
 def _walks(learnt: xr.Dataset) -> dict[str, xr.DataArray]:

@@ -20,6 +20,7 @@ _NOISE_FLOOR = 1e-6  # smallest noise, relative to the largest sample of a recor
 _SMOOTHING = 0.5  # width of the detection filter in echo widths
 _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
+_FOCUSED = 1.0  # smallest target below waves, relative to the column
 _EVENT = 0.8  # height of a single event after the detection filter
 _BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
 _GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
@@ -176,6 +177,7 @@ def find_echoes(
     earliest_ns: float = -np.inf,
     latest_ns: npt.ArrayLike = np.inf,
     event_height: npt.ArrayLike = 0.0,
+    waves: bool = False,
 ) -> DetectedEchoes:
     """Find surface, target and bottom.
 
@@ -184,7 +186,9 @@ def find_echoes(
     interpolated between both sides; or where w(t+2d) is below 0.8 w(t-d), as behind a bottom, w(t-d)^0.6 v^0.4 with
     the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
     Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
-    strongest before it a target; peaks below a fiftieth of the strongest are ignored.
+    strongest before it a target; peaks below a fiftieth of the strongest are ignored. Waves focus the light of a shot,
+    so that its column has peaks: below them, targets are at least as high as the column, near the surface also as the
+    one behind them.
 
     Parameters
     ----------
@@ -203,6 +207,8 @@ def find_echoes(
         the bottom.
     event_height : array_like, shape () or (n,)
         Height that single events of the detector reach. Lower peaks count only where there is no higher one.
+    waves : bool
+        Whether the light has passed waves.
 
     Raises
     ------
@@ -224,19 +230,23 @@ def find_echoes(
 
     reach = max(round(_REACH * width / records.bin_ns), 1)
     behind = bins > origin[:, np.newaxis]
-    rises, stands_out = _above_column(np.maximum(power, 0), reach)
+    rises, by_column, column = _above_column(np.maximum(power, 0), reach)
     # Near the surface there is no column to extrapolate from: the excess is the rise after a dip.
-    lowest = np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
+    rise = power - np.minimum.accumulate(np.where(behind, power, np.inf), axis=1)
     apart = width / records.bin_ns
-    near = behind & (bins <= surface[:, np.newaxis] + 2 * reach + apart) & (surface >= 0)[:, np.newaxis]
-    rises, stands_out = (np.where(near, power - lowest, one) for one in (rises, stands_out))
+    near_until = np.where(surface >= 0, surface + 2 * reach + apart, -np.inf)[:, np.newaxis]
+    stands_out = np.where(behind & (bins <= near_until), rise, by_column)
     dip = np.minimum.accumulate(np.where(behind, np.maximum(stands_out, 0), np.inf), axis=1)
-    excess = np.where(behind & ((surface >= 0) | late)[:, np.newaxis], stands_out, -np.inf)
-    excess = np.minimum(excess, excess - np.where(np.isfinite(dip), dip, 0))
-    peaks = np.zeros(power.shape, dtype=bool)
-    peaks[:, 1:-1] = (rises[:, 1:-1] > rises[:, :-2]) & (rises[:, 1:-1] >= rises[:, 2:])
-    # The factor accounts for the noise of the samples of the column.
-    peaks &= (excess > 1.5 * threshold * noise) & (excess > contrast * power)
+    dip = np.where(np.isfinite(dip), dip, 0)
+    found = behind & ((surface >= 0) | late)[:, np.newaxis]
+    # An echo on the border has its peak in one of both: the rise has its own a little farther.
+    beyond, within = bins > near_until, bins <= near_until + 0.5 * apart
+    peaks, excess = np.zeros(power.shape, dtype=bool), np.full(power.shape, -np.inf)
+    for shape, above, where in ((rises, by_column, beyond), (rise, rise, within)):
+        own = np.where(found & where & _is_peak(shape), above - dip, -np.inf)
+        # The factor accounts for the noise of the samples of the column.
+        own[(own <= 1.5 * threshold * noise) | (own <= contrast * power)] = -np.inf
+        peaks, excess = peaks | np.isfinite(own), np.maximum(excess, own)
     # Much weaker peaks are in the tail of a strong echo.
     peaks &= excess > _FAINT * np.max(np.where(peaks, excess, 0), axis=1, keepdims=True)
 
@@ -246,6 +256,10 @@ def find_echoes(
     peaks = np.where(strong.any(axis=1, keepdims=True), strong, peaks)
     bottom = np.where(peaks.any(axis=1), count - 1 - np.argmax(peaks[:, ::-1], axis=1), -1)
     before = peaks & (bins < (bottom - apart)[:, np.newaxis])
+    if waves:
+        around = np.maximum(power - rise, _column_behind(power, noise, reach))
+        level = np.where(bins <= near_until, around, column)
+        before &= power - level > _FOCUSED * level
     target = np.where(before.any(axis=1), np.argmax(np.where(before, excess, -np.inf), axis=1), -1)
     places = np.stack([surface, target, bottom])
     flags = np.where(places < 0, int(EchoFlag.NO_ECHO), 0)
@@ -269,10 +283,18 @@ def _first_peak(power: FloatArray, noise: FloatArray, threshold: float, allowed:
     return np.where(above.any(axis=1), np.argmax(falls, axis=1), -1)
 
 
-def _above_column(power: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
-    """Return the excess of a signal, shape (n, time), over the column around it: whose peaks count, and their heights.
+def _is_peak(values: FloatArray) -> BoolArray:
+    """Return where values, shape (n, time), are larger than those before and not smaller than those after them."""
+    peaks = np.zeros(values.shape, dtype=bool)
+    peaks[:, 1:-1] = (values[:, 1:-1] > values[:, :-2]) & (values[:, 1:-1] >= values[:, 2:])
+    return peaks
 
-    Both are the same but for the last echo, whose scattered light lowers the first.
+
+def _above_column(power: FloatArray, reach: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the excess of a signal, shape (n, time), over the column around it, and the column before it.
+
+    The first excess is that whose peaks count, the second one their heights: both are the same but for the last echo,
+    whose scattered light lowers the first.
     """
     padded = np.pad(power, ((0, 0), (2 * reach, 2 * reach)), mode="edge")
     size = power.shape[1]
@@ -282,9 +304,24 @@ def _above_column(power: FloatArray, reach: int) -> tuple[FloatArray, FloatArray
     # Light of a bottom that was scattered in the water follows its echo, and is gone further behind, as is the column.
     mean = np.lib.stride_tricks.sliding_window_view(padded[:, 3 * reach :], reach + 1, axis=1).mean(axis=-1)
     behind = before**_BEFORE * mean ** (1 - _BEFORE)
-    beside, extrapolated = np.sqrt(before * after), before * falls_by
+    beside, column = np.sqrt(before * after), before * falls_by
     between = np.where(far < _GONE * before, behind, beside)
-    return power - np.maximum(extrapolated, beside), power - np.maximum(extrapolated, between)
+    return power - np.maximum(column, beside), power - np.maximum(column, between), column
+
+
+def _column_behind(power: FloatArray, noise: FloatArray, reach: int) -> FloatArray:
+    """Return the column behind each sample, extrapolated to it from the lowest signals within one and two reaches.
+
+    It is at most the mean of the logarithms of the sample and of the lowest signal, so that the end of the column, or
+    of the record, is no steep decay.
+    """
+    from scipy.ndimage import minimum_filter1d
+
+    size = reach + 1
+    ahead = minimum_filter1d(power, size, axis=1, origin=-(size // 2), mode="nearest")
+    first = np.maximum(ahead, noise)
+    later = np.maximum(np.pad(ahead, ((0, 0), (0, reach)), mode="edge")[:, reach:], noise)
+    return np.asarray(np.minimum(first * np.maximum(first / later, 1), np.sqrt(first * np.maximum(power, first))))
 
 
 def _hides_bottom(records: Records, power: FloatArray, width: float, surface: IntArray) -> BoolArray:

@@ -228,6 +228,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         earliest_ns=waveforms.quiet_until_ns,
         latest_ns=waveforms.latest_surface(rows),
         event_height=waveforms.events(rows),
+        waves=waveforms.focusing is not None,
     )
     time = records.time_ns
     surface, target, bottom = found.bins
@@ -251,8 +252,7 @@ def _measure(waveforms: Waveforms, rows: slice, settings: _Settings) -> dict[str
         echoes = _estimate(estimator, waveforms, records, found, column, sharp, settings)
         # The detected peak replaces a surface time that the estimator cannot determine.
         surface_ns = np.where(np.isfinite(echoes[0].time_ns), echoes[0].time_ns, reference)
-        body = _column(records, column, start, end, surface_ns - reference)
-        quantities.append([echoes[0], body, *echoes[1:]])
+        quantities.append([echoes[0], _column(records, column, start, end, surface_ns - reference), *echoes[1:]])
     table = {
         name: np.stack([np.stack([getattr(one, name) for one in echoes], axis=1) for echoes in quantities], axis=1)
         for name in vars(quantities[0][0])

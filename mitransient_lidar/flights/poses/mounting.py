@@ -16,6 +16,9 @@ from mitransient_lidar.flights.poses.attitude import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
 
+#: Step of the angles of pixels about their axis [deg], and sine of the angle from nadir below which they have none.
+_TURN_DEG, _LEVEL = 10.0, 1e-6
+
 
 @dataclass(frozen=True)
 class Mounting:
@@ -116,3 +119,22 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
         scan_angle_deg=np.degrees(np.arctan2(right, -axis[:, 2])),
         line=platform.line,
     )
+
+
+def pixel_turns(axis: FloatArray, far: FloatArray) -> FloatArray:
+    """Return the angles [deg] by which pixels are turned about their axis, from far to left, shape (shots,).
+
+    They are those to the plane of incidence, rounded to multiples of 10 degrees, -170 to 180; 0 of an axis that is
+    vertical.
+
+    Parameters
+    ----------
+    axis, far
+        Unit directions of the pulses and of +angle_x, shape (shots, 3).
+    """
+    # Left of the plane of incidence is level.
+    left = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
+    outwards = np.cross(axis, left)
+    turn = np.degrees(np.arctan2(np.sum(far * left, axis=1), np.sum(far * outwards, axis=1)))
+    steps = np.round(turn / _TURN_DEG) * _TURN_DEG
+    return np.where(np.hypot(axis[:, 0], axis[:, 1]) > _LEVEL, np.where(steps == -180, 180.0, steps + 0.0), 0.0)

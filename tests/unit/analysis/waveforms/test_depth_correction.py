@@ -11,6 +11,7 @@ from mitransient_lidar.analysis.waveforms.depth_correction import (
     corrections_for,
     read_corrections,
     summarize_depths,
+    turned_pixels,
 )
 from mitransient_lidar.analysis.waveforms.echo_detection import EchoFlag
 from mitransient_lidar.core.errors import UserError
@@ -245,3 +246,36 @@ def test_files_without_corrections_are_refused(tmp_path):
         read_corrections(tmp_path / "mixed.nc")
     table().to_netcdf(tmp_path / "good.nc")
     xr.testing.assert_allclose(read_corrections(tmp_path / "good.nc")["bias"], table()["bias"])
+
+
+@pytest.mark.parametrize(
+    ("turn", "first", "second", "share"),
+    [
+        (0, [0, 1, 2, 3, 4], None, 0),
+        (90, [1, 2, 3, 0, 4], None, 0),
+        (-90, [3, 0, 1, 2, 4], None, 0),
+        (45, [0, 1, 2, 3, 4], [1, 2, 3, 0, 4], 0.5),
+        (-60, [0, 1, 2, 3, 4], [3, 0, 1, 2, 4], 2 / 3),
+    ],
+)
+def test_turned_pixels_have_the_biases_of_their_places(turn, first, second, share):
+    """Four pixels from far left by near left and near right to far right, and one in the middle."""
+    bias = np.array([0.1, 0.2, 0.5, 0.4, 0.9])
+    given = xr.Dataset({"bias": ("pixel", bias), "variance": ("pixel", bias**2)}, {"pixel": list("abcde")})
+    given["attenuation"] = ("water", [0.1, 0.2])
+    found = turned_pixels(given, np.array([1.0, -1, -1, 1, 0]), np.array([1.0, 1, -1, -1, 0]), turn)
+    beside = bias[first] if second is None else bias[second]
+    np.testing.assert_allclose(found["bias"], (1 - share) * bias[first] + share * beside, atol=1e-12)
+    # The second moment of the two biases, whose mean is the bias.
+    square = (1 - share) * 2 * bias[first] ** 2 + share * 2 * beside**2
+    np.testing.assert_allclose(found["variance"] + found["bias"] ** 2, square, atol=1e-12)
+    np.testing.assert_array_equal(found["attenuation"], given["attenuation"])
+    np.testing.assert_array_equal(found["pixel"], given["pixel"])
+
+
+def test_depths_of_turned_pixels_are_corrected_by_the_pixel_at_their_place():
+    found = echoes([5.0]).assign_coords(angle_x=("pixel", [1.0, -1.0]), angle_y=("pixel", [0.0, 0.0]))
+    straight, turned = (correct_depths(found, table(), turn_deg=turn) for turn in (0.0, 180.0))
+    for name in ("depth_m", "depth_m_method_error"):
+        np.testing.assert_allclose(turned[name], straight[name].values[:, ::-1], atol=1e-12)
+    assert np.all(np.ptp(straight["depth_m"].sel(echo="bottom").values, axis=1) > 0.5)

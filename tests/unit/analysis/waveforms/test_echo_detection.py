@@ -161,6 +161,36 @@ def test_a_column_is_no_echo_nor_is_a_step_down_in_it():
     assert found.flags[2].tolist() == [EchoFlag.NO_ECHO] * 2
 
 
+def test_a_bottom_at_any_distance_from_the_surface_is_one_echo():
+    """Near the surface another criterion holds, whose border cuts through some of the echoes."""
+    arrivals = np.arange(55, 90, 0.25)
+    signal = [column(40, at) + echoes(40, 0.3)[0] + echoes(at, 2.0)[0] for at in arrivals]
+    found = find_echoes(Records.of(np.stack(signal), TIME), FWHM)
+    assert found.bins[1].tolist() == [-1] * arrivals.size
+    # The end of the column shifts the peak.
+    np.testing.assert_allclose(TIME[found.bins[2]], arrivals, atol=1.5 * DT)
+
+
+@pytest.mark.parametrize(
+    ("decay", "focused", "height", "delay"),
+    [(0.02, 0.5, 2.5, 12), (0.02, 0.5, 2.5, 20), (0.02, 0.5, 2.5, 30), (0.1, 2, 5, 12), (0.1, 2, 5, 20)],
+)
+def test_waves_make_no_targets_and_do_not_hide_one(decay, focused, height, delay):
+    """A depth at which waves focus the light of a shot; a target there, and one that is two pulses above the bottom."""
+    bottom = 80 + delay
+    smooth = column(40, bottom, decay=decay) + echoes(40, 0.6)[0]
+    bright = smooth * (1 + focused * np.exp(-0.5 * ((TIME - 40 - delay) / 3) ** 2)) + echoes(bottom, 2.0)[0]
+    target = smooth + echoes(40 + delay, height * np.exp(-decay * delay))[0] + echoes(bottom, 2.0)[0]
+    cube = smooth + echoes([bottom - 2 * FWHM, bottom], 1.0).sum(axis=0)
+    records = Records.of(np.stack([bright, target, cube]), TIME)
+    level, waves = (find_echoes(records, FWHM, waves=waves) for waves in (False, True))
+    assert level.bins[1][0] >= 0
+    assert waves.bins[1][0] == -1
+    for found in (level, waves):
+        np.testing.assert_allclose(TIME[found.bins[1][1:]], [40 + delay, bottom - 2 * FWHM], atol=0.5 * FWHM)
+        np.testing.assert_allclose(TIME[found.bins[2]], bottom, atol=0.5 * FWHM)
+
+
 def test_a_weak_bottom_is_found_as_often_as_its_signal_allows_and_noise_hardly_ever():
     rng = np.random.default_rng(3)
     noise = 0.02
