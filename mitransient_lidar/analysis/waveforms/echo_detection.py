@@ -20,7 +20,7 @@ _NOISE_FLOOR = 1e-6  # smallest noise, relative to the largest sample of a recor
 _SMOOTHING = 0.5  # width of the detection filter in echo widths
 _SURFACE_LEVEL = 1e-3  # smallest surface echo, relative to the largest value of a record
 _FAINT = 0.02  # smallest echo behind the surface, relative to the strongest one there
-_FOCUSED = 1.0  # smallest target below waves, relative to the column
+_FOCUSED = 0.5  # smallest target below waves above the column, relative to it
 _EVENT = 0.8  # height of a single event after the detection filter
 _BEFORE = 0.6  # weight of the signal one reach before an echo beside the mean from one to two reaches behind it
 _GONE = 0.8  # signal two reaches behind the last echo, relative to the column before it
@@ -187,8 +187,8 @@ def find_echoes(
     the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
     Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
     strongest before it a target; peaks below a fiftieth of the strongest are ignored. Waves focus the light of a shot,
-    so that its column has peaks: below them, targets are at least as high as the column, near the surface also as the
-    one behind them.
+    so that its column has peaks: below them, targets rise above the column by at least half of it, near the surface also
+    of the column behind them.
 
     Parameters
     ----------

@@ -95,5 +95,5 @@ def test_what_takes_an_error_takes_a_time():
     commands = {name: {one.name for one in command.params} for name, command in COMMANDS.items()}
     with_error = {name for name, options in commands.items() if "target_error" in options}
     assert with_error <= {name for name, options in commands.items() if "max_time" in options}
-    assert with_error == {"render", "passive", "shots", "bench", "figures"}
+    assert with_error == {"render", "passive", "shots", "bench", "figures", "depth-bias"}
     assert {"target_error", "max_time"} <= {one.name for one in fields(Campaign)}
