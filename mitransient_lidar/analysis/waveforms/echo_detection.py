@@ -187,8 +187,8 @@ def find_echoes(
     the mean v of w from t+d to t+2d. An exponential exceeds none: neither the column nor a step down in it is a peak.
     Where t-2d is in the surface echo, the signal must rise again after a dip. The last peak is the bottom, the
     strongest before it a target; peaks below a fiftieth of the strongest are ignored. Waves focus the light of a shot,
-    so that its column has peaks: below them, targets rise above the column by at least half of it, near the surface also
-    of the column behind them.
+    so that its column has peaks: below them, targets rise above the column by at least half of it, and near the surface
+    also of the column behind them.
 
     Parameters
     ----------
