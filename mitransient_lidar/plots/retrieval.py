@@ -56,7 +56,7 @@ def plot_slopes(receivers: Mapping[str, xr.Dataset], path: drawing.FilePath | No
         ax.set_xlabel("true mean slope over the footprint (deg)")
         ax.set_aspect("equal")
         drawing.add_grid(ax)
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize="small", handletextpad=0.2)
+        ax.legend(loc="upper left", framealpha=0.9, fontsize="small", handletextpad=0.2)
     axes[0].set_ylabel("slope retrieved from one shot (deg)")
     return drawing.save(figure, path)
 
