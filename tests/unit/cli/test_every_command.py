@@ -123,11 +123,12 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     assert_refused(again, "--output")
     options = [*few, "--depths", 5, "--seed", 2, "--corrections", made, "-o", tmp_path / "again.nc", "-q"]
     lines = run("depth-bias", "riegl_vq840g", *options).stdout.splitlines()
-    # Angle, wind, water, depth, channel, SNR, found %, bias, spread, error, z, wrong %, and after correction.
-    cells = lines[-1].split()
+    # Angle, wind, water, depth, channel, SNR, four shares, bias, spread, error, z, wrong, and bias after correction.
+    names, cells = lines[0].split(), lines[-1].replace(" %", "").split()
     assert cells[:5] == ["20.0", "0", "IB", "5", "single"]
-    assert float(cells[6]) == 100
-    before, after = float(cells[8]), float(cells[14])
+    assert float(cells[names.index("found")]) == float(cells[names.index(">10")]) == 100
+    first = names.index("bias")
+    before, after = float(cells[first]), float(cells[names.index("bias", first + 1)])
     assert abs(before) < 4
     assert abs(after) < min(abs(before), 1)
     scene = ["-D", "jerlov=IB", "-D", "spectrum=flat", "-D", "wind_speed=5", "-D", "bottom_depth=5"]
