@@ -124,7 +124,7 @@ def test_corrected_depths_of_an_instrument_from_end_to_end(tmp_path):
     options = [*few, "--depths", 5, "--seed", 2, "--corrections", made, "-o", tmp_path / "again.nc", "-q"]
     lines = run("depth-bias", "riegl_vq840g", *options).stdout.splitlines()
     # Angle, wind, water, depth, channel, SNR, four shares, bias, spread, error, z, wrong, and bias after correction.
-    names, cells = lines[0].split(), lines[-1].replace(" %", "").split()
+    names, cells = lines[-2].split(), lines[-1].replace(" %", "").split()
     assert cells[:5] == ["20.0", "0", "IB", "5", "single"]
     assert float(cells[names.index("found")]) == float(cells[names.index(">10")]) == 100
     first = names.index("bias")
