@@ -95,8 +95,9 @@ def _draw_sample(ax: Axes, dataset: xr.Dataset, runs: npt.NDArray[np.intp]) -> N
     # Records of other heights side by side: each relative to its own peak.
     peaks = values.max(axis=1, keepdims=True)
     values = values / np.where(peaks > 0, peaks, 1)
-    # A logarithmic axis has no values below 0, and lower ones would be drawn as a level.
-    values[values < 1 / _DYNAMIC_RANGE[name]] = np.nan
+    # A logarithmic axis has no values below 0, and lower ones would be drawn as a level, as would be that of the dark
+    # before the first light: behind a converter it is the code next to 0.
+    values[(values < 1 / _DYNAMIC_RANGE[name]) | (values <= values[:, :1])] = np.nan
     ax.set_yscale("log")
     ax.set_ylim(1 / _DYNAMIC_RANGE[name], 2)
     for run, line, colour in zip(runs, values, drawing.pixel_colours(len(runs) + 11)[::-1], strict=False):

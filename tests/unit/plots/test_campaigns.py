@@ -59,10 +59,14 @@ def test_what_is_below_the_range_is_not_drawn(campaign):
     """Not as a level, at which it would look like a signal."""
     waveform = campaign["waveform"].copy()
     waveform[..., 10:20] = 0
+    # The code next to 0 of a converter, before the first light and at the end.
+    waveform[..., :5] = waveform[..., 45:] = 1e-4
+    waveform[..., 20:45] += 0.1
     ax = plot_campaign(campaign.assign(waveform=waveform)).axes[0]
     for line in ax.lines:
         assert np.isnan(line.get_ydata()[10:20]).all()
-        assert np.isfinite(line.get_ydata()[20:]).all()
+        assert np.isfinite(line.get_ydata()[20:45]).all()
+        assert np.isnan(line.get_ydata()[[0, 4, 45, 49]]).all()
     assert ax.get_ylim() == (1e-6, 2)
 
 
