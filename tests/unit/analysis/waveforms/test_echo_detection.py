@@ -173,7 +173,10 @@ def test_a_bottom_at_any_distance_from_the_surface_is_one_echo():
 
 @pytest.mark.parametrize(
     ("decay", "focused", "height", "delay"),
-    [(0.02, 0.5, 2.5, 12), (0.02, 0.5, 2.5, 20), (0.02, 0.5, 2.5, 30), (0.1, 2, 5, 12), (0.1, 2, 5, 20)],
+    [
+        *[(0.02, 0.5, 2.5, 12), (0.02, 0.5, 2.5, 20), (0.02, 0.5, 2.5, 30), (0.1, 2, 5, 12), (0.1, 2, 5, 20)],
+        *[(0.02, 0.4, 0.9, 20), (0.02, 0.4, 0.9, 30)],  # as high as the column
+    ],
 )
 def test_waves_make_no_targets_and_do_not_hide_one(decay, focused, height, delay):
     """A depth at which waves focus the light of a shot; a target there, and one that is two pulses above the bottom."""
