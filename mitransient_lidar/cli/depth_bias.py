@@ -41,8 +41,8 @@ def depth_bias(
     records: Annotated[int, typer.Option(help="Records with noise of each place, 1 to 10 000.")] = 5,
     target_error: Annotated[
         float,
-        typer.Option(help="Relative standard error of a render over waves; of a level sea 0.3 of it (greater than 0)."),
-    ] = 0.1,
+        typer.Option(help="Relative standard error of a render over waves; of a level sea 0.6 of it (greater than 0)."),
+    ] = 0.05,
     corrections: Annotated[
         str | None,
         typer.Option(

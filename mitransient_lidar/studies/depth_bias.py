@@ -34,7 +34,7 @@ WATERS = ("IB", "1C", "5C")
 _WAVELENGTH = 532.0
 
 #: Relative standard error of renders of a level sea over that of waves, which differ more between places.
-_LEVEL = 0.3
+_LEVEL = 0.6
 
 #: Speed of the wind whose ripples a level sea has [m/s].
 _RIPPLES = 5.0
@@ -92,7 +92,7 @@ def depth_bias(
     receiver: str | None = None,
     shots: int = 12,
     records: int = 5,
-    target_error: float = 0.1,
+    target_error: float = 0.05,
     seed: int = 1,
     corrections: xr.Dataset | None = None,
     max_time: float | None = None,
@@ -126,7 +126,7 @@ def depth_bias(
         Random places of a sea with waves, or independent renders of a level sea, 2 to 10 000, and records with noise of
         each, 1 to 10 000.
     target_error
-        Relative standard error of the render of each place, above 0; of a level sea 0.3 of it. Bottoms of faint pixels
+        Relative standard error of the render of each place, above 0; of a level sea 0.6 of it. Bottoms of faint pixels
         have larger errors than the median, and are not found where these could be mistaken for echoes: see ``hidden``.
     seed
         Seed of places, seas and noise, at least 0.
