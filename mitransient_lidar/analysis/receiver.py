@@ -75,7 +75,8 @@ def detect_waveforms(
         (`ReceiverChain.fitting_gain`). Where channels differ, attributes of the chain are
         ``receiver.channels.NAME.*``, and the others lists over the pixels. ``event_height`` over the pixels is that of
         `ReceiverChain.event_height`. ``receiver_response`` over ``lag`` [ns] is
-        the weight of the light of a bin in later samples.
+        the weight of the light of a bin in later samples. Of a converter that stores blocks, samples outside them are
+        NaN, and ``dark_level`` and ``block_level`` over the pixels are the levels without light, and of the threshold.
 
     Raises
     ------
@@ -220,6 +221,11 @@ def _record_channel(
     power, background = 10**-density * light, np.broadcast_to(10**-density * sky, light.shape[:-1])
     signal, saturated = receiver.apply(power, width, shots, seeds[1], background, series=series, common_seed=seeds[0])
     number = len(signal)
+    dark = None
+    if receiver.digitiser is not None and receiver.digitiser.block_threshold_v is not None:
+        dark = receiver.expected(np.zeros((*background.shape, 1)), width, background).mean
+        stored = receiver.digitiser.stored(signal, dark)
+        signal, saturated = np.where(stored, signal, np.float32(np.nan)), saturated & stored
     expected = receiver.expected(power, width, background)
     snr = receiver.snr(power, width, background, expected)
     stride = receiver.stride(width)
@@ -256,6 +262,11 @@ def _record_channel(
             {**share, "long_name": "share of saturated samples"},
         ),
     }
+    if dark is not None and receiver.digitiser is not None:
+        level = (dark[0] if series else dark)[..., 0]
+        values["dark_level"] = (pixels, level, {**sampled, "long_name": "mean signal without light of the pulse"})
+        least = level + float(receiver.digitiser.block_threshold_v or 0)
+        values["block_level"] = (pixels, least, {**sampled, "long_name": "signal above which samples are stored"})
     first, weights = receiver.low_pass(width).by_bin()
     lag = ("lag", (first + np.arange(weights.size)) * width, {"units": "ns", "long_name": "delay of the sample"})
     values["receiver_response"] = (
@@ -317,6 +328,8 @@ def describe_recording(recorded: xr.Dataset) -> list[str]:
         f"{recorded.sizes['shot']} shots, receiver {attributes.get('receiver', 'custom')}, {used}",
         saturation_advice(recorded),
     ]
+    if "block_level" in recorded:
+        lines.append(f"{_percent(float(recorded['signal'].notnull().mean()))} of the samples are stored in blocks")
     shots, samples = recorded["saturated_shots"], recorded["saturated_samples"]
     if not shots.any():
         return lines

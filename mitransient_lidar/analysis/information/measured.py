@@ -276,7 +276,9 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
     results.record_dims(dataset, "signal", shots=True)
     if "signal_mean" in dataset and "shot" in dataset["signal_mean"].dims:
         raise UserError("the signals are those of a series of shots: select one shot with isel(shot=...)")
-    values = dataset["signal"].mean("shot", keep_attrs=True) if "shot" in dataset["signal"].dims else dataset["signal"]
+    values = dataset["signal"]
+    if "shot" in values.dims:  # samples that some shots have not stored are missing: the others are the high ones
+        values = values.mean("shot", keep_attrs=True, skipna=False)
     dims = tuple(str(dim) for dim in values.dims)
     pixels = [str(name) for name in dataset["pixel"].values] if "pixel" in dims else []
     count = math.prod(dataset.sizes[dim] for dim in dims[:-1])

@@ -30,6 +30,7 @@ _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouri
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
 _LATEST = 3.0  # widths of an echo by which the surface may be late
 _LOWEST = -3.0  # point of a sea without the attribute surface_heights_m [m]
+_UNKNOWN = 10.0  # noise of samples that are not stored, over the threshold of blocks
 _LONGEST_ECHO = 4.0  # largest expected width of an echo, in pulse widths
 
 
@@ -136,7 +137,8 @@ class Waveforms:
             saturation_level = None if saturation_level is None else float(logarithm.expand(saturation_level))
         time = np.asarray(dataset["time"].values, dtype=np.float64)
         samples = dataset[name].values.reshape(-1, time.size)
-        if not np.isfinite(samples).all():
+        in_blocks = name == "signal" and {"dark_level", "block_level"} <= set(dataset)
+        if not np.isfinite(samples).all() and not in_blocks:
             raise UserError(f"{name} holds values that are not finite: render or record it again")
         geometry = LidarGeometry.from_attributes(dataset.attrs)
         shape = pulse or _pulse(dataset.attrs)
@@ -160,12 +162,17 @@ class Waveforms:
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))
         quiet = time < quiet_until
         baseline = np.zeros(pixels)
-        if name == "signal":
+        if in_blocks:
+            baseline = dataset["dark_level"].values.reshape(-1).astype(np.float64)
+        elif name == "signal":
             if np.count_nonzero(quiet) < _FEWEST_QUIET:
                 raise UserError(
                     f"the record must hold at least {_FEWEST_QUIET} bins before {quiet_until:.1f} ns for its baseline"
                 )
             baseline = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)).mean(axis=(0, 2))
+        deviation = _noise(dataset, name, samples, baseline, quiet, noise, max(int(template.fwhm_ns / step), 1))
+        if in_blocks:
+            samples, deviation = _without_gaps(dataset, samples, deviation)
         return cls(
             dims,
             dataset[name].shape,
@@ -173,7 +180,7 @@ class Waveforms:
             samples,
             time,
             baseline,
-            _noise(dataset, name, samples, baseline, quiet, noise, max(int(template.fwhm_ns / step), 1)),
+            deviation,
             dataset["saturated"].values.reshape(-1, time.size).astype(bool) if "saturated" in dataset else None,
             math.inf if saturation_level is None else float(saturation_level),
             kernel,
@@ -278,6 +285,8 @@ def _expanded(dataset: xr.Dataset, logarithm: LogAmplifier) -> xr.Dataset:
     replaced = {"signal": signal.copy(data=logarithm.expand(signal.values))}
     if "event_height" in dataset:
         replaced["event_height"] = dataset["event_height"].copy(data=logarithm.expand(dataset["event_height"].values))
+    for name in {"signal_mean", "dark_level", "block_level"} & set(dataset):
+        replaced[name] = dataset[name].copy(data=logarithm.expand(dataset[name].values))
     for name in ("signal_deviation", "signal_mean_stderr"):
         if name in dataset:
             error = dataset[name]
@@ -331,6 +340,13 @@ def _receiver_noise(
 ) -> FloatArray:
     """Return the noise of the receiver's signal for means of `run` samples."""
     pixels, count = baseline.size, samples.shape[1]
+    if "block_level" in dataset:  # noise alone is hardly stored
+        stated, mean = (dataset[key].values.reshape(-1, count) for key in ("signal_deviation", "signal_mean"))
+        shots = samples[: _MOST_SHOTS * pixels].reshape(-1, pixels, count)
+        own = slice(0, len(shots) * pixels)
+        floored = np.where(stated > 0, stated, 1.0)
+        known = (shots - mean[own].reshape(-1, pixels, count)) / floored[own].reshape(-1, pixels, count)
+        return np.asarray(stated * _inflation(known, run))
     if np.count_nonzero(quiet) < _FEWEST_QUIET:
         raise UserError(f"noise must be given: the record has less than {_FEWEST_QUIET} bins before the surface echo")
     rest = samples[:, quiet].reshape(-1, pixels, np.count_nonzero(quiet)) - baseline[:, np.newaxis]
@@ -351,10 +367,28 @@ def _receiver_noise(
     return np.asarray(deviation.reshape(-1, count) * _inflation((shots - mean) / floored, run))
 
 
+def _without_gaps(
+    dataset: xr.Dataset, samples: npt.NDArray[Any], noise: FloatArray
+) -> tuple[npt.NDArray[Any], FloatArray]:
+    """Return samples and noise, shape (count, time), with the dark level where no sample is stored.
+
+    Signals there may lie anywhere up to the threshold of blocks: they hardly count.
+    """
+    dark, level = (dataset[name].values.reshape(-1, 1).astype(np.float64) for name in ("dark_level", "block_level"))
+    missing, pixel = np.isnan(samples), np.arange(len(samples)) % len(dark)
+    own = np.broadcast_to(noise if len(noise) == len(samples) else noise[pixel], samples.shape)
+    unknown = np.maximum(own, (_UNKNOWN * (level - dark))[pixel])
+    return np.where(missing, dark[pixel], samples), np.where(missing, unknown, own)
+
+
 def _inflation(rest: FloatArray, run: int) -> float:
-    """Return the standard deviation of means of `run` neighbouring samples over that of independent samples."""
+    """Return the standard deviation of means of `run` neighbouring samples over that of independent samples.
+
+    NaN are missing samples.
+    """
     run = min(run, rest.shape[-1])
     blocks = rest.shape[-1] // run
     means = rest[..., : blocks * run].reshape(*rest.shape[:-1], blocks, run).mean(axis=-1)
-    variance = float(np.mean(rest**2))
-    return math.sqrt(max(run * float(np.mean(means**2)) / variance, 1.0)) if variance > 0 else 1.0
+    known = means[np.isfinite(means)]
+    variance = float(np.mean(rest[np.isfinite(rest)] ** 2)) if known.size else 0.0
+    return math.sqrt(max(run * float(np.mean(known**2)) / variance, 1.0)) if variance > 0 else 1.0

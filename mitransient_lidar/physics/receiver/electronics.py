@@ -253,6 +253,11 @@ class Digitiser:
     sampling_ghz : float or None
         Samples per ns, positive. The time between them must be an integer number of the record's bins; None for one
         sample per bin.
+    block_threshold_v : float or None
+        Samples above the level without light by this voltage, positive, start a block that is stored; None to store
+        all samples.
+    block_before, block_after : int
+        Samples that are stored before and after those above the threshold, 0 to 100 000.
 
     Notes
     -----
@@ -264,6 +269,9 @@ class Digitiser:
     full_scale_v: float
     low_v: float = 0.0
     sampling_ghz: float | None = None
+    block_threshold_v: float | None = None
+    block_before: int = 0
+    block_after: int = 0
 
     def __post_init__(self) -> None:
         integer("bits", self.bits, 1, 24)
@@ -271,6 +279,12 @@ class Digitiser:
         finite("low_v", self.low_v)
         if self.sampling_ghz is not None:
             positive("sampling_ghz", self.sampling_ghz)
+        if self.block_threshold_v is not None:
+            positive("block_threshold_v", self.block_threshold_v)
+        for name in ("block_before", "block_after"):
+            number = integer(name, getattr(self, name), 0, 100_000)
+            if number and self.block_threshold_v is None:
+                raise UserError(f"{name} = {number} needs block_threshold_v, above which blocks are stored")
 
     @property
     def step_v(self) -> float:
@@ -293,6 +307,18 @@ class Digitiser:
                 f"between samples, not {bins:.6g}"
             )
         return round(bins)
+
+    def stored(self, samples: npt.NDArray[np.floating], dark: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which samples [V], shape (..., sample), are stored, for levels without light [V] that broadcast."""
+        if self.block_threshold_v is None:
+            return np.ones(np.shape(samples), np.bool_)
+        above = samples > dark + self.block_threshold_v
+        count = above.shape[-1]
+        passed = np.zeros((*above.shape[:-1], count + 1), np.int32)
+        np.cumsum(above, axis=-1, out=passed[..., 1:])
+        place = np.arange(count)
+        first, last = np.maximum(place - self.block_after, 0), np.minimum(place + self.block_before, count - 1)
+        return np.asarray(passed[..., last + 1] > passed[..., first])
 
 
 @dataclass(frozen=True)

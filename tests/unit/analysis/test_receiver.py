@@ -431,3 +431,25 @@ def test_codes_in_a_file_are_volts_by_their_attributes(tmp_path):
     np.testing.assert_allclose(volts, recorded["signal"].values, atol=1e-6)
     np.testing.assert_allclose(open_waveforms(path)["signal"].values, recorded["signal"].values, atol=1e-6)
     assert encoding(detect_waveforms(make(), "ideal")) == {}
+
+
+def test_blocks_above_a_threshold_are_stored(tmp_path):
+    """Two samples before and four after each one above 20 mV are those of the whole record, the others are missing."""
+    blocks = replace(CHAIN, digitiser=replace(CHAIN.digitiser, block_threshold_v=0.02, block_before=2, block_after=4))
+    light = {"shots": 30, "seed": 3, "background_power": 2e-8}
+    whole, recorded = (detect_waveforms(make(), chain, **light) for chain in (CHAIN, blocks))
+    dark = whole["signal_mean"].isel(time=slice(0, 3)).mean("time").values
+    np.testing.assert_allclose(recorded["dark_level"], dark, atol=1e-4)
+    for shot, pixel in np.ndindex(30, 4):
+        samples = whole["signal"].values[shot, pixel]
+        wanted = np.full(samples.size, np.nan)
+        for place in np.flatnonzero(samples > recorded["block_level"].values[pixel]):
+            own = slice(max(place - 2, 0), place + 5)
+            wanted[own] = samples[own]
+        np.testing.assert_array_equal(recorded["signal"].values[shot, pixel], wanted)
+    stored = recorded["signal"].notnull()
+    assert 0.2 < float(stored.mean()) < 0.8
+    assert not recorded["saturated"].where(~stored, False).any()
+    assert "of the samples are stored in blocks" in "\n".join(describe_recording(recorded))
+    dump(recorded, tmp_path / "blocks.nc", encoding(recorded))
+    np.testing.assert_allclose(open_waveforms(tmp_path / "blocks.nc")["signal"], recorded["signal"], atol=1e-6)

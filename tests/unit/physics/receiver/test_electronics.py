@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import norm
 from significance import largest_z
 
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser, LogAmplifier, Readout, filtered
 
 
@@ -166,6 +167,15 @@ def test_samples_fall_on_bins():
         Digitiser(8, 1.0, sampling_ghz=1.0).stride(0.3)
     with pytest.raises(ValueError, match="sampling_ghz = 2"):
         Digitiser(8, 1.0, sampling_ghz=2.0).stride(1.0)
+
+
+def test_blocks_need_a_threshold():
+    with pytest.raises(UserError, match="block_threshold_v = 0 must be greater than 0"):
+        Digitiser(8, 1.0, block_threshold_v=0.0)
+    with pytest.raises(UserError, match="block_after = 5 needs block_threshold_v"):
+        Digitiser(8, 1.0, block_after=5)
+    with pytest.raises(UserError, match="block_before = -1 must lie between 0 and 100000"):
+        Digitiser(8, 1.0, block_threshold_v=0.1, block_before=-1)
 
 
 @pytest.mark.parametrize(
