@@ -138,7 +138,7 @@ class Waveforms:
         time = np.asarray(dataset["time"].values, dtype=np.float64)
         samples = dataset[name].values.reshape(-1, time.size)
         in_blocks = name == "signal" and {"dark_level", "block_level"} <= set(dataset)
-        if not np.isfinite(samples).all() and not in_blocks:
+        if not np.isfinite(samples).all() and (not in_blocks or np.isinf(samples).any()):
             raise UserError(f"{name} holds values that are not finite: render or record it again")
         geometry = LidarGeometry.from_attributes(dataset.attrs)
         shape = pulse or _pulse(dataset.attrs)
@@ -163,7 +163,7 @@ class Waveforms:
         quiet = time < quiet_until
         baseline = np.zeros(pixels)
         if in_blocks:
-            baseline = dataset["dark_level"].values.reshape(-1).astype(np.float64)
+            baseline, _ = _block_levels(dataset, pixels)
         elif name == "signal":
             if np.count_nonzero(quiet) < _FEWEST_QUIET:
                 raise UserError(
@@ -374,11 +374,19 @@ def _without_gaps(
 
     Signals there may lie anywhere up to the threshold of blocks: they hardly count.
     """
-    dark, level = (dataset[name].values.reshape(-1, 1).astype(np.float64) for name in ("dark_level", "block_level"))
-    missing, pixel = np.isnan(samples), np.arange(len(samples)) % len(dark)
+    dark, level = _block_levels(dataset, dataset["dark_level"].size)
+    missing, pixel = np.isnan(samples), np.arange(len(samples)) % dark.size
     own = np.broadcast_to(noise if len(noise) == len(samples) else noise[pixel], samples.shape)
-    unknown = np.maximum(own, (_UNKNOWN * (level - dark))[pixel])
-    return np.where(missing, dark[pixel], samples), np.where(missing, unknown, own)
+    unknown = np.maximum(own, _UNKNOWN * (level - dark)[pixel, np.newaxis])
+    return np.where(missing, dark[pixel, np.newaxis], samples), np.where(missing, unknown, own)
+
+
+def _block_levels(dataset: xr.Dataset, pixels: int) -> tuple[FloatArray, FloatArray]:
+    """Return the level without light, and that above which samples are stored, shape (pixels,)."""
+    dark, level = (dataset[name].values.ravel().astype(np.float64) for name in ("dark_level", "block_level"))
+    if dark.size != pixels or level.size != pixels or not np.all(level > dark) or not np.isfinite(level - dark).all():
+        raise UserError("dark_level and block_level must have a finite number for each pixel, and the second be larger")
+    return dark, level
 
 
 def _inflation(rest: FloatArray, run: int) -> float:

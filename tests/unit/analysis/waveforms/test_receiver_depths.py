@@ -11,6 +11,7 @@ from significance import largest_z
 from mitransient_lidar import results
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.analysis.waveforms import echo_table
+from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
@@ -92,3 +93,5 @@ def test_blocks_and_series_have_the_errors_of_whole_records(name, density, share
     for echoes in found.values():
         spread = echoes["depth_m"].std("shot").values / echoes["depth_m_stderr"].median("shot").values
         assert spread == pytest.approx(1, abs=largest_z(400) / np.sqrt(2 * 400) + 0.1)
+    with pytest.raises(UserError, match="dark_level and block_level must have a finite number for each pixel"):
+        echo_table.extract(blocks.assign(block_level=blocks["dark_level"]))
