@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,11 @@ from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
 from mitransient_lidar.physics.lidar.refraction import snell
+
+_LOG = logging.getLogger(__name__)
+
+#: Distance of a group's angle from those of a table of corrections that needs no warning [deg]: half of a group.
+_BESIDE = 1.0
 
 #: Pulses of a chunk of a file.
 _CHUNK = 4096
@@ -111,6 +117,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     kinds, kind = np.unique(np.stack([flown.values("group"), turns]), axis=1, return_inverse=True)
     table = None if corrections == "none" else corrections_for(str(attributes.get("instrument", "")), corrections)
     if table is not None:
+        warn_of_angles(angle, table)
         parts, places = [], []
         for number, turn in enumerate(kinds[1].tolist()):
             place = np.flatnonzero(kind.reshape(-1) == number)
@@ -126,6 +133,17 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
     for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"):
         echoes[name] = echoes[name] * xr.DataArray(ratio, dims="shot")
     return echoes
+
+
+def warn_of_angles(angle_deg: FloatArray, table: xr.Dataset) -> None:
+    """Warn of pulses outside the angles from nadir of a table of corrections."""
+    low, high = (float(table["off_nadir_deg"][end]) for end in (0, -1))
+    outside = np.count_nonzero((angle_deg < low - _BESIDE) | (angle_deg > high + _BESIDE))
+    if outside:
+        _LOG.warning(
+            f"{outside} of {angle_deg.size} pulses have corrections beyond the angles of their table, {low:g} to "
+            f"{high:g} degrees from nadir: set corrections to none, or to a table of depth-bias with these angles"
+        )
 
 
 def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:

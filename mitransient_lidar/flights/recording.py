@@ -13,7 +13,7 @@ from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.physics.receiver.receiver_files import Receiver
 
-#: Bins whose relative standard errors are pooled, and whose mean power they are relative to.
+#: Bins whose variances are pooled, and bins of a mean power.
 _POOLED_BINS, _MEAN_BINS = 21, 5
 
 #: Names of the inputs of pulses that hold a setting of a channel, which end in its number.
@@ -70,18 +70,22 @@ def has_automatic_settings(plan: FlightPlan, instrument: str | None) -> bool:
 
 
 def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
-    """Return standard errors that are at least those which neighbouring bins have, relative to the waveforms.
+    """Return standard errors that are at least those which neighbouring bins have.
 
-    A standard error of a few passes is itself uncertain by a third: where it is too small by chance, what a render left
-    of its noise would count as an echo. The mean square of the relative error of 21 bins has enough degrees of freedom.
+    A standard error of a few passes is itself uncertain by a third, and too small where none of the rare bright paths
+    came: such noise of a render would count as an echo. The variance of a sum of paths of like weights is in proportion
+    to its mean: the pooled variance of a bin is its power times the ratio of variance to power of 21 bins. Relative
+    errors rise behind an echo: pooled, they would raise that of its peak. Of 64 pulses of ``semi_arc`` and ``palmer``,
+    8 and 11 passes against renders to 2 %, the root mean square of error over pooled error is 1.26 and 0.98; with
+    pooled relative errors it would be 1.69 and 1.26.
     """
     power, error = (values.transpose("shot", "pixel", "time").values for values in (waveform, stderr))
     # A mean over bins, since one that is low by chance is so in both.
     level = uniform_filter1d(np.abs(power), _MEAN_BINS, axis=-1, mode="nearest")
-    square = np.divide(error, level, out=np.zeros_like(error), where=level > 0) ** 2
+    of_all, variance = (uniform_filter1d(one, _POOLED_BINS, axis=-1, mode="nearest") for one in (level, error**2))
+    ratio = np.divide(variance, of_all, out=np.zeros_like(error), where=of_all > 0)
     # Running sums leave rounding errors below 0.
-    mean = np.maximum(uniform_filter1d(square, _POOLED_BINS, axis=-1, mode="nearest"), 0)
-    pooled = level * np.sqrt(mean)
+    pooled = np.sqrt(np.maximum(level * ratio, 0))
     return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
 
 

@@ -40,7 +40,7 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
     The first one has the places of the pulses, all points in a side view by class, and maps of the heights of the
     bottom and of their errors. The second one has the waveforms and points of a strip, through a target if points lie
-    on one.
+    on one. Side view and strip are along x or y, over which the points extend farther.
 
     Parameters
     ----------
@@ -70,10 +70,8 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
         (errors, error, "error of the height (m)", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
     ):
         drawn = ax.scatter(wet["x"].values, wet["y"].values, c=values, s=3, linewidths=0, **style)
-        ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+        _set_map(ax, "Bottom" if ax is heights else "Errors of heights")
         figure.colorbar(drawn, ax=ax, label=label)
-    heights.set_title("Bottom")
-    errors.set_title("Errors against the true height there")
     drawing.save(figure, paths[0])
     figure = drawing.new_figure(paths[1], 10, 5)
     _draw_profile(figure.subplots(), flown, points)
@@ -89,33 +87,46 @@ def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     ax.plot(*origin[:, :2].T, color="black", linewidth=1.5, label="scanner")
     if np.any(chosen := points["true_target"].values.astype(bool)):
         ax.plot(points["x"].values[chosen], points["y"].values[chosen], ".", color="#d62728", label="above a target")
-    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"{len(origin)} pulses")
-    ax.legend(loc="best", fontsize="small")
+    _set_map(ax, f"{len(origin)} pulses")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), fontsize="small")
+
+
+def _set_map(ax: Axes, title: str) -> None:
+    """Set the axes of a map, which may be narrow."""
+    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=title)
+    ax.locator_params("x", nbins=3)
+
+
+def _sides(points: xr.Dataset) -> tuple[str, str]:
+    """Return the horizontal coordinate over which points extend farther, and the other one."""
+    return ("x", "y") if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else ("y", "x")
 
 
 def _draw_side(ax: Axes, points: xr.Dataset) -> None:
     """Draw all points from the side, by class."""
+    along = _sides(points)[0]
     for kind, (colour, name) in _CLASSES.items():
         chosen = points["kind"].values == kind
         if np.any(chosen):
             label = f"{name} ({np.count_nonzero(chosen)})"
-            ax.plot(points["x"].values[chosen], points["z"].values[chosen], ".", color=colour, ms=1.5, label=label)
-    ax.set(xlabel="x (m)", ylabel="z (m)", title="Points by class, from the side")
+            ax.plot(points[along].values[chosen], points["z"].values[chosen], ".", color=colour, ms=1.5, label=label)
+    ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title="Points by class, from the side")
     drawing.add_grid(ax)
     ax.legend(loc="best", fontsize="small", markerscale=5)
 
 
 def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
-    """Draw the waveforms and points of a strip along x, about the points above targets or the middle."""
+    """Draw the waveforms and points of a strip along x or y, about the points above targets or the middle."""
     target = points["true_target"].values.astype(bool)
-    y = points["y"].values
-    middle = float(np.median(y[target])) if np.any(target) else float(np.median(y))
-    strip = points.isel(point=np.abs(y - middle) < _STRIP)
+    along, across = _sides(points)
+    side = points[across].values
+    middle = float(np.median(side[target])) if np.any(target) else float(np.median(side))
+    strip = points.isel(point=np.abs(side - middle) < _STRIP)
     wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
     surface = strip["kind"].values == PointClass.SURFACE
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
     seen = np.unique(strip["shot"].values)
-    first, last = np.quantile(strip["x"].values, [0.0, 1.0])
+    first, last = np.quantile(strip[along].values, [0.0, 1.0])
     width = float(flown.store.attributes["bin_width_ns"])
     group, index = (float(flown.attributes[name]) for name in ("group_index", "refractive_index"))
     # Cells with a few pulses and samples each, so that they fill the picture.
@@ -134,7 +145,7 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
         place = origin[shot] + np.minimum(way, to_sea)[:, None] * axis[shot] + wet_way[:, None] * down
         values = np.abs(signal[shot]).mean(axis=0)
         for grid, weight in ((total, values), (number, np.ones_like(values))):
-            grid += np.histogram2d(place[:, 0], place[:, 2], bins=edges, weights=weight)[0]
+            grid += np.histogram2d(place[:, "xy".index(along)], place[:, 2], bins=edges, weights=weight)[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         image = np.log10(total / number).T
     highest = float(np.nanmax(image[np.isfinite(image)], initial=-np.inf))
@@ -142,11 +153,11 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     drawn = ax.pcolormesh(*edges, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
     ax.figure.colorbar(drawn, ax=ax, label="log10 of the mean signal")
     for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "bottom or object")):
-        ax.plot(strip["x"].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
-    order = np.argsort(strip["x"].values[wet])
-    ax.plot(
-        *(strip[name].values[wet][order] for name in ("x", "true_z")), "-", color="white", linewidth=1.2, label="truth"
-    )
+        ax.plot(strip[along].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
+    order = np.argsort(strip[along].values[wet])
+    truth = (strip[name].values[wet][order] for name in (along, "true_z"))
+    ax.plot(*truth, "-", color="white", linewidth=1.2, label="truth")
     ax.set_facecolor("black")
-    ax.set(xlabel="x (m)", ylabel="z (m)", title=f"Waveforms and points within {_STRIP:g} m of y = {middle:.1f} m")
+    title = f"Waveforms and points within {_STRIP:g} m of {across} = {middle:.1f} m"
+    ax.set(xlabel=f"{along} (m)", ylabel="z (m)", title=title)
     ax.legend(loc="lower right", fontsize="small", facecolor="#555555", labelcolor="white")

@@ -66,6 +66,27 @@ def test_settings_that_are_given_are_kept(receiver, instrument, automatic):
     assert bool(settings) is automatic
 
 
+def test_pooled_errors_are_those_of_counted_paths():
+    """An echo over a dim column and its tail, as means of 8 passes with Poisson numbers of paths of equal weights.
+
+    The root mean square of true error over pooled error is 1 less what the larger of two errors adds; with pooled
+    relative errors, which rise behind the echo, that of the peak would be 1.8 times the true one.
+    """
+    rng = np.random.default_rng(5 + significance.seed_shift)
+    time = np.arange(120)
+    paths = 4 + 400 * np.exp(-0.5 * ((time - 60) / 4) ** 2)
+    passes = rng.poisson(paths, (8, 400, 2, 120)) / paths.max()
+    waveform, stderr = (
+        xr.DataArray(values, dims=("shot", "pixel", "time"))
+        for values in (passes.mean(axis=0), passes.std(axis=0, ddof=1) / np.sqrt(8))
+    )
+    found = pooled_errors(waveform, stderr).values
+    true = np.sqrt(paths / 8) / paths.max()
+    ratio = np.sqrt(np.mean(((waveform.values - paths / paths.max()) / found) ** 2, axis=(0, 1)))
+    assert np.all((ratio[20:100] > 0.75) & (ratio[20:100] < 1.02))
+    assert found[..., 60].mean() < 1.25 * true[60]
+
+
 def test_pooled_errors_keep_noise_of_few_passes_from_being_echoes():
     """Means of 6 passes about a column: 5 of their own standard errors are exceeded by one bin in 240 (Student's t)."""
     rng = np.random.default_rng(4 + significance.seed_shift)
