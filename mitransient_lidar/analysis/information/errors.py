@@ -106,6 +106,7 @@ def estimate_errors(
     known_noise: bool = True,
     batches: Sequence[FloatArray | None] = (None, None),
     borrows: bool = False,
+    recorded: FloatArray | None = None,
 ) -> Errors:
     """Return the errors of the solution of a weighted least-squares problem.
 
@@ -131,6 +132,9 @@ def estimate_errors(
     borrows
         Whether waveforms without batches are of a render, whose errors agree over its samples as those of the model do:
         the batches of the model, scaled to the variances of the waveforms, are theirs, too.
+    recorded
+        Standard deviations of the render that waveforms are a record of, in those of the difference, shape
+        (pixel, time): errors beside `noise`, with the correlations and batches of the model.
 
     Notes
     -----
@@ -158,13 +162,16 @@ def estimate_errors(
     eigenvalues, vectors = np.linalg.eigh(flat @ flat.T)
     inverse = (vectors / np.maximum(eigenvalues, _SMALLEST)) @ vectors.T
     # Residuals, from which unknown errors are taken, hold those of the model, too.
-    kinds = [noise, model] if known_noise else [noise]
-    parts = [
-        inverse @ _projected(scaled_derivatives, errors, deviations) @ inverse
-        for errors, deviations in ((noise, own), (model, by_render))
-    ]
+    kinds, deviations = [noise, model], [own, by_render]
+    if recorded is not None:
+        kinds.append((recorded, model[1]))
+        deviations.append(None if by_render is None else _with_variance(by_render, recorded**2))
+        borrows |= by_render is not None
+    parts = [inverse @ _projected(scaled_derivatives, *both) @ inverse for both in zip(kinds, deviations, strict=True)]
+    if not known_noise:
+        kinds = kinds[:1]
     known_parts = sum(parts[: len(kinds)], np.zeros_like(inverse))
-    widening = _widening(known_parts, [*zip(parts, (own, by_render), strict=True)][: len(kinds)], borrows)
+    widening = _widening(known_parts, [*zip(parts, deviations, strict=True)][: len(kinds)], borrows)
     # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
     kept = eigenvalues > _SMALLEST * count
     basis = ((vectors[:, kept] / np.sqrt(eigenvalues[kept])).T @ flat).reshape(-1, *residuals.shape)

@@ -285,8 +285,8 @@ class WaveformFit:
         derivative = np.array([rows[name] for name in values])
         if self.found.stderr is not None:
             noise = np.nan_to_num(self.found.stderr) ** 2
-        elif noise is not None:
-            noise = noise / self.found.shots
+        elif noise is not None and self.found.render_variance is not None:
+            noise = noise + self.found.render_variance
         return scale * mean, derivative, scale**2 * by_model, noise
 
     def _model_times(self, values: Mapping[str, float]) -> FloatArray:
@@ -414,6 +414,9 @@ class WaveformFit:
         by_render = model.batches
         if by_render is not None:
             by_render = values.get(SCALE, 1.0) * self._resampled(values, by_render)
+        recorded = self.found.render_variance
+        if noise is not None and recorded is not None:
+            noise = noise - recorded
         return estimate_errors(
             weights * (np.nan_to_num(self.found.values) - mean),
             weights * derivative,
@@ -424,6 +427,7 @@ class WaveformFit:
             known_noise=noise is not None,
             batches=[None if one is None else weights * one for one in (self.found.batches, by_render)],
             borrows=self.found.estimated,
+            recorded=None if recorded is None else weights * np.sqrt(recorded),
         )
 
     def _dataset(

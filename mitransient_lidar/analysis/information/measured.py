@@ -14,14 +14,17 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar import results
+from mitransient_lidar.analysis.information.errors import smoothed_variance
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, positive, shown
+from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 
 _TIME, _STDERR = "time_ns", "_stderr"  # column of the times, and end of the names of columns of errors
 _STEP = 1e-4  # of the differences that give derivatives behind a receiver, relative to the largest power
+_TERMS = 20  # of the series of errors by rounding
 _SATURATED = 1e-3  # probability of saturation above which a sample is left out
 
 
@@ -54,6 +57,9 @@ class Measured:
         Whether values and times are those of a model, so that neither scale nor offset are unknown.
     receiver, shots
         Receiver of a signal, None for waveforms, and number of records whose mean it is.
+    render_variance
+        Variance of the render that a signal is a record of, which `stderr` and the receiver's noise leave out, shape
+        (pixel, time); None without one.
     estimated
         Whether `stderr` is from the spread of a few passes.
     batches
@@ -70,6 +76,7 @@ class Measured:
     shots: int = 1
     estimated: bool = False
     batches: FloatArray | None = None
+    render_variance: FloatArray | None = None
 
     @property
     def pixel_dims(self) -> tuple[str, ...]:
@@ -90,7 +97,7 @@ class Prediction(NamedTuple):
     mean: FloatArray  #: In the unit of the waveforms before any scale, shape (pixel, time).
     derivative: FloatArray  #: Per unit of each parameter, shape (parameter, pixel, time).
     model_variance: FloatArray  #: Of the model's Monte Carlo, shape (pixel, time).
-    noise_variance: FloatArray | None  #: Of a record of the receiver, shape (pixel, time); None without one.
+    noise_variance: FloatArray | None  #: Of the mean of the receiver's records, shape (pixel, time); None without one.
     valid: npt.NDArray[np.bool_]  #: Samples that are not saturated, shape (pixel, time).
     correlation: FloatArray  #: Of the Monte Carlo errors by the distance in samples, shape (lags,).
     batches: FloatArray | None  #: Deviations by batches of passes, shape (batch, pixel, time); see `batch_deviations`.
@@ -179,11 +186,12 @@ def predict(found: Measured, dataset: xr.Dataset, parameters: list[str]) -> Pred
     if found.receiver is None:
         return Prediction(times, light, slopes, error**2, None, np.ones(light.shape, dtype=bool), lags, batches)
     width = results.time_axis(dataset).bin_width_ns
-    return _recorded(found.receiver, light, slopes, error, times, width, lags, batches)
+    return _recorded(found.receiver, found.shots, light, slopes, error, times, width, lags, batches)
 
 
 def _recorded(
     receiver: ReceiverSettings,
+    shots: int,
     light: FloatArray,
     slopes: FloatArray,
     error: FloatArray,
@@ -212,7 +220,8 @@ def _recorded(
         count = len(steps)
         rise = expected.mean[2 : 2 + count] - expected.mean[2 + count : 2 + 2 * count]
         slope = np.divide(rise, 2 * reach[:, pixel], out=np.zeros_like(rise), where=reach[:, pixel] > 0)
-        one = expected.mean[0], slope, (expected.mean[1] - expected.mean[0]) ** 2, expected.variance[0]
+        noise = _noise_of_mean(expected.variance[0], chain.digitiser, shots)
+        one = expected.mean[0], slope, (expected.mean[1] - expected.mean[0]) ** 2, noise
         moved = expected.mean[2 + 2 * count :] - expected.mean[0]
         parts.append((*one, expected.saturation[0] < _SATURATED, moved))
     mean, slope, by_model, variance, valid, moved = zip(*parts, strict=True)
@@ -227,6 +236,23 @@ def _recorded(
         lags[::stride],
         None if batches is None else np.stack(moved, axis=1),
     )
+
+
+def _noise_of_mean(variance: FloatArray, digitiser: Digitiser | None, shots: int) -> FloatArray:
+    """Return the variance of the mean of records from that of one record.
+
+    Rounding errs alike in all records where the noise before it is less than half a step. The mean square of this
+    error, over voltages within a step q with noise of the variance s^2, is q^2 / (2 pi^2) times the sum over k = 1, 2,
+    ... of exp(-(2 pi k s / q)^2) / k^2 (B. Widrow and I. Kollar, Quantization Noise, Cambridge 2008, ch. 5,
+    doi:10.1017/CBO9780511754661), which is q^2/12 without noise.
+    """
+    if digitiser is None or shots == 1:
+        return variance / shots
+    step = digitiser.step_v**2
+    exponent = 4 * np.pi**2 * np.maximum(variance / step - 1 / 12, 0)
+    terms = np.arange(1, _TERMS + 1)
+    alike = np.exp(-np.multiply.outer(exponent, terms**2)) @ (1 / terms**2)
+    return np.asarray(np.maximum(variance / shots, step / (2 * np.pi**2) * alike))
 
 
 def best_offset(times: FloatArray, values: npt.ArrayLike, model: Prediction) -> float:
@@ -297,6 +323,11 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
     settings = ReceiverSettings(chains, lists["optical_density"], lists["background_power_w"])
     step = results.time_axis(dataset).bin_width_ns
     shots = int(dataset.sizes.get("shot", 1)) if "shot" in dataset["signal"].dims else 1
+    of_render = None
+    if "signal_mean_stderr" in dataset:
+        error = dataset["signal_mean_stderr"].transpose(*dims)
+        # Few passes know their errors badly, and bins whose variance is low by chance would count too much.
+        of_render = smoothed_variance(_by_pixel(error, dims) ** 2)
     return Measured(
         _by_pixel(values, dims),
         None,
@@ -305,6 +336,7 @@ def _of_signal(dataset: xr.Dataset, given: Any) -> Measured:
         values,
         receiver=settings,
         shots=shots,
+        render_variance=of_render,
     )
 
 

@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 import xarray as xr
 from closed_form_waveform import TIME, TRUTH, closed_form, noisy
+from scipy.special import ndtr
 from significance import largest_z
 
 from mitransient_lidar import results
-from mitransient_lidar.analysis.information.measured import batch_deviations, correlation, measured, predict
+from mitransient_lidar.analysis.information.measured import (
+    _noise_of_mean,
+    batch_deviations,
+    correlation,
+    measured,
+    predict,
+)
 from mitransient_lidar.analysis.receiver import detect_waveforms
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.results.netcdf import dump
 
 TABLE = "time_ns,a,a_stderr,b,b_stderr\n1.0,2,0.1,4,0.2\n1.5,3,0.1,,0.2\n2.5,5,0.1,6,0.2\n"
@@ -93,6 +101,19 @@ def test_predictions_behind_a_receiver_are_its_closed_form(receiver):
         ]  # fmt: skip
         slope = (means[0] - means[1]) / (0.002 * TRUTH[name])
         np.testing.assert_allclose(one.derivative[number], slope, atol=2e-3 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15, 0.3, 0.6])
+def test_noise_of_the_mean_of_many_records_holds_rounding(noise):
+    """Mean square over voltages of the error of a mean of 10^6 records behind a converter, in steps of it."""
+    converter = Digitiser(8, 256.0, -128.0)
+    volts = (np.arange(100) + 0.5) / 100
+    codes = np.arange(-6, 8)
+    upper, lower = (ndtr((codes + edge - volts[:, np.newaxis]) / max(noise, 1e-9)) for edge in (0.5, -0.5))
+    wanted = np.mean(((upper - lower) @ codes - volts) ** 2)
+    variance = np.array([noise**2 + 1 / 12])
+    assert _noise_of_mean(variance, converter, 10**6)[0] == pytest.approx(max(wanted, variance[0] / 1e6), rel=0.05)
+    assert _noise_of_mean(variance, converter, 1) == variance
 
 
 def in_batches(dataset, deviations, passes):
