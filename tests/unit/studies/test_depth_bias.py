@@ -66,7 +66,7 @@ def test_level_seas_are_rendered_as_often_as_waves_have_places(rendered, monkeyp
     monkeypatch.setattr(study, "render_shots", lambda *given, **rest: options.append(rest) or render(*given, **rest))
     seas = {"angles_deg": [20.0], "winds": [0.0, 3.0], "waters": ["IB"], "estimators": ["gaussian"], "depths": [3.0]}
     table = study.depth_bias("riegl_vq840g", shots=4, target_error=0.05, **seas)
-    assert [one["target_error"] for one in options] == pytest.approx([0.015, 0.05])
+    assert [one["target_error"] for one in options] == pytest.approx([0.03, 0.05])
     assert options[0]["positions"] == 4 * [(0.0, 0.0)]
     assert options[1]["count"] == 4
     assert table.attrs["level_renders"] == 4
