@@ -38,6 +38,8 @@ def gaussian_surface(
     shape: EchoShape,
     column: ColumnOnset | None = None,
     level: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    reflects: bool = True,
 ) -> Echoes:
     """Fit a surface echo together with the water column that begins at it.
 
@@ -68,6 +70,8 @@ def gaussian_surface(
         Blurred form of F; by default that of F = 1.
     level : (ndarray, ndarray), shape (n,) each, optional
         C from the column behind the echo, and its standard error; NaN where it is not known.
+    reflects : bool
+        Whether the surface may send light back; otherwise A is 0, and the time that of the onset of the column.
     """
     begin = column or ColumnOnset()
     # The brightest depth may be the peak, later than the surface; that of a single shot may be twice as deep.
@@ -109,6 +113,9 @@ def gaussian_surface(
         return height * jacobian[2] + level * jacobian[3], jacobian.transpose(1, 0, 2)
 
     exists = has_echo(flags)
+    if not reflects:
+        only = _fit(model, faint, data, peak, exists, np.where(exists, 0.0, np.nan))
+        return _echoes(records, bins, only.later(limit), flags, shape)
     fit = _fit(model, start, data, peak, exists)
     tried: list[_Fit] = []
     if early > 0:

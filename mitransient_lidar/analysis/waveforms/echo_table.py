@@ -22,7 +22,7 @@ from mitransient_lidar.analysis.waveforms.echo_detection import (
     find_echoes,
 )
 from mitransient_lidar.analysis.waveforms.records import Waveforms
-from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE, surface_times
+from mitransient_lidar.analysis.waveforms.surface_times import GRAZING, LEAST_SHARE, surface_times
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.pulse import Pulse
@@ -139,7 +139,8 @@ def extract(
     Surface echoes are held against beam and geometry; see `surface_times.surface_times`. A pixel without direct light
     has the flag ``no_surface_light``, ``surface_time_ns`` from the other pixels of its shot, and echoes with the flag
     ``scattered_light``. Echoes no higher than single events of the detector are ``few_events``. ``gaussian`` flags
-    targets and bottoms below 3 standard errors as ``poor_fit``, surfaces as ``no_echo``, timed by the column's onset.
+    targets and bottoms below 3 standard errors as ``poor_fit``, surfaces as ``no_echo``, timed by the column's onset,
+    as are all beyond 60 degrees from nadir.
 
     ``depth_m_stderr`` is the error by noise and by the jitter of the record's trigger and clocks, which cancels where
     the pixel's own surface echo counts. The method errs by more: ``depth_m_method_error`` states for ``gaussian``
@@ -478,10 +479,9 @@ def _estimate(
     if estimator == "gaussian":
         shape = waveforms.echo_shape
         level = column.level, np.hypot(column.level_stderr, _LEVEL * column.level)
-        surface = echo_fits.gaussian_surface(
-            records, found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
-        )
-        fits = [surface]
+        surface = found.surface, width, decay, found.flags[0], shape, waveforms.onset, level
+        reflects = waveforms.geometry.off_nadir < GRAZING
+        fits = [echo_fits.gaussian_surface(records, *surface, reflects=reflects)]
         for place, flag in places[1:]:
             fits.append(echo_fits.gaussian_echo(records, place, width, decay, flag, shape, after=found.surface))
         return fits

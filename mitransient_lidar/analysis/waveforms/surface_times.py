@@ -13,6 +13,8 @@ from mitransient_lidar.results.geometry import LinesOfSight
 
 #: Least share of the beam in a pixel with direct light, relative to the brightest pixel.
 LEAST_SHARE = 1e-3
+#: Angle from nadir [rad] beyond which no facet sends light back: a slope of 7 deviations at 20 m/s (Cox and Munk).
+GRAZING = np.radians(60.0)
 _LIMIT = 4.0  # standard deviations by which an echo may deviate from the other pixels' surface
 _LEVEL = 0.15  # error of the mean sea level [m]
 _SHAPE = 0.1  # error of an echo's time by its unknown shape, in echo widths

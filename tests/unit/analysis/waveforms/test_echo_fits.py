@@ -172,6 +172,29 @@ def test_the_focusing_of_single_shots_does_not_move_the_surface():
     assert np.mean(np.abs(late) < 1) > 0.9
 
 
+def test_a_surface_that_sends_no_light_back_is_timed_by_the_onset():
+    """Columns that waves focus to 2.5 to 6 times their level at 0.3 to 1 m, above the mean, look like a late echo."""
+    fine = np.arange(-40, 120, 0.01)
+    mean = Focusing(np.array([0.0, 0.5, 1.0, 2.0, 30.0]), np.array([1.0, 1.6, 1.4, 1.2, 1.0]))
+    begin = ColumnOnset.of(mean, 0.106, SHAPE.sigma_of(3 * WIDTH))
+    blur = np.exp(-0.5 * (np.arange(-20, 20, 0.01) / SIGMA) ** 2)
+    rng = np.random.default_rng(4)
+    signals = []
+    for depth, height in zip(rng.uniform(0.3, 1.0, 100), rng.uniform(2.5, 6, 100), strict=True):
+        own = Focusing(np.array([0.0, 0.5 * depth, depth, 1.4 * depth, 30.0]), np.array([1.0, 1.5, height, 1.3, 1.0]))
+        column = np.where(fine >= 0, own.at(0.106 * fine) * np.exp(-DECAY * fine), 0)
+        signals.append(np.interp(TIME, fine + SURFACE, np.convolve(column, blur / blur.sum(), "same")))
+    signal = np.stack(signals)
+    records = Records.of(signal + 0.02 * rng.standard_normal(signal.shape), TIME, 0.02)
+    level, peaks = (np.ones(100), np.full(100, 0.15)), (np.argmax(signal, axis=1), WIDTH, DECAY, np.zeros(100, int))
+    with_echo, without = (
+        gaussian_surface(records, *peaks, SHAPE, begin, level, reflects=reflects) for reflects in (True, False)
+    )
+    assert np.median(with_echo.time_ns - SURFACE) > 3
+    assert np.median(np.abs(without.time_ns - SURFACE)) < 0.6
+    assert not (without.amplitude > 3 * without.amplitude_stderr).any()
+
+
 def test_a_peak_deep_in_the_column_is_not_that_of_the_surface():
     """A focus 14 ns below the surface, further than samples about it reach; peaks at 3 ns give the surface."""
     focusing = Focusing(np.array([0.0, 0.5, 1.0, 2.0, 30.0]), np.array([1.0, 3.0, 2.1, 1.5, 1.0]))
