@@ -13,6 +13,7 @@ from mitransient_lidar.campaigns.store import LARGEST_SHARD, Store
 from mitransient_lidar.campaigns.sweep import complete
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import integer
+from mitransient_lidar.flights.las_header import coordinate_system_wkt
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.products import Flown, points_of, write_files
 from mitransient_lidar.flights.renderer import FlightRenderer, scene_of
@@ -66,7 +67,8 @@ def fly(
     Raises
     ------
     UserError
-        If the flight is invalid, its bottom does not cover it, or the folder holds another one or cannot be written.
+        If the flight is invalid, its coordinate system or corrections are unknown, its bottom does not cover it, or
+        the folder holds another one or cannot be written.
     KeyboardInterrupt
         After Ctrl-C; pulses that are written stay, and the same call goes on.
     """
@@ -77,6 +79,7 @@ def fly(
     else:
         plan = flight if isinstance(flight, FlightPlan) else FlightPlan.read(flight)
     folder = Path(folder)
+    coordinate_system_wkt(plan.crs)
     store = complete(lambda: _prepare(plan, folder / STORE, shard_size), workers, scheduler, False, progress)
     flown = Flown.of(store)
     points = points_of(flown, plan)

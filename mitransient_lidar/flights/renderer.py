@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.waveforms.depth_correction import corrections_for
 from mitransient_lidar.analysis.waveforms.echo_table import ECHOES, extract
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.campaigns.runs import Array
@@ -110,10 +111,13 @@ class FlightRenderer:
         Raises
         ------
         UserError
-            If the flight or its scene is invalid, the bottom does not cover it, or its echo is outside the record.
+            If the flight, its scene or its corrections are invalid, the bottom does not cover it, or its echo is
+            outside the record.
         """
         poses = plan.poses()
         scene = scene_of(plan)
+        if plan.corrections != "none":
+            corrections_for(scene.instrument or "", plan.corrections)
         columns = _columns(poses)
         longest, start = None, np.empty(len(poses.time_s))
         for group in np.unique(columns["group"]):

@@ -218,6 +218,7 @@ def test_killed_and_resumed_it_has_the_bits_of_an_uninterrupted_one(tmp_path):
         ({"parameters": {**FLIGHT["parameters"], "bottom_size": 60}}, "the bottom does not cover the flight"),
         ({"parameters": {"bottom_dept": 3}}, "has no parameter bottom_dept"),
         ({"instrument": None, "parameters": {"layout": "8x8"}}, "has an imager"),
+        ({"instrument": "published_mast", "corrections": "auto"}, "no shipped corrections of the instrument"),
         (
             {"parameters": {**FLIGHT["parameters"], "time_start_ns": 1380, "bin_count": 60}},
             "no bottom within the record",
@@ -231,6 +232,10 @@ def test_flights_that_cannot_be_rendered(change, message):
 
 def test_command_refuses_bad_flights(tmp_path):
     path = tmp_path / "flight.toml"
-    path.write_text(TOML.replace("rate_hz = 320.0", "rate_hz = -1"))
-    assert_refused(run("fly", path, "-o", tmp_path / "out"), "rate_hz = -1")
-    assert not (tmp_path / "out").exists()
+    for wrong, message in (
+        (TOML.replace("rate_hz = 320.0", "rate_hz = -1"), "rate_hz = -1"),
+        ('crs = "EPSG:999999"' + TOML, "crs = 'EPSG:999999'"),
+    ):
+        path.write_text(wrong)
+        assert_refused(run("fly", path, "-o", tmp_path / "out"), message)
+        assert not (tmp_path / "out").exists()
