@@ -117,8 +117,8 @@ def correct_depths(
     geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
     mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
     interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared
-    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0. Cells in which fewer of
-    the shots have a depth count only where no other ones do. Without any bias of an estimator in a pixel, depths and
+    difference over the distance, the mean ratio of both rates in eight tables; one node gives 0. Cells in which fewer
+    of the shots have a depth count only where no other ones do. Without any bias of an estimator in a pixel, depths and
     errors stay as they are.
     """
     instrument = found.attrs.get("instrument", "")
