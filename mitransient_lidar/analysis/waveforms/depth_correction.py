@@ -93,8 +93,8 @@ def correct_depths(
     xarray.Dataset
         The echoes with ``depth_m`` less the bias and ``depth_correction_m``, what was subtracted. Biases are
         interpolated linearly in the angle from nadir, the wind, the attenuation of the column (the median over the
-        waveforms), and the depth; outside the table they are those of its ends. A bias counts with the share
-        bias^2/(bias^2 + spread^2/n), for n places of a sea.
+        waveforms), and the depth, as are spreads; outside the table they are those of its ends. A bias counts with the
+        share bias^2/(bias^2 + spread^2/n), for n places of a sea.
 
         ``depth_m_method_error`` is the root of the sum of the squares of
 
@@ -136,6 +136,9 @@ def correct_depths(
     learnt = _learnt(table.sel(pixel=found["pixel"].values, estimator=list(names)))
     if turn_deg != 0:
         learnt = turned_pixels(learnt, found["angle_x"].values, found["angle_y"].values, turn_deg)
+    # Linear are spreads, not their squares: where surface echoes fade with the angle, errors of 22 degrees would be
+    # mostly those of 25.
+    learnt["deviation"] = learnt["variance"] ** 0.5
     wind = _wind(found) if wind_speed is None else non_negative("wind_speed", wind_speed)
     angle = required_number(found.attrs, "off_nadir_deg")
     cell, rates = learnt, _walks(learnt)
@@ -151,17 +154,17 @@ def correct_depths(
     by_water = _walked(attenuation, opacity)
     depth = found["depth_m"] if several else found["depth_m"].expand_dims(estimator=list(names))
     arranged = depth.transpose("estimator", "pixel", ..., "echo")
-    amount, variance, share = (np.zeros(arranged.shape) for _ in range(3))
+    amount, deviation, variance, share = (np.zeros(arranged.shape) for _ in range(4))
     for e, p in np.ndindex(arranged.shape[:2]):
         at = arranged.values[e, p]
         one = cell.isel(estimator=e, pixel=p)
         rate = {axis: of.isel(estimator=e, pixel=p).values for axis, of in rates.items()}
-        for name, target in (("bias", amount), ("variance", variance), ("noise_share", share)):
+        for name, target in (("bias", amount), ("deviation", deviation), ("noise_share", share)):
             values = one[name].transpose("water", "depth").values
             target[e, p] = _interpolated(values, water, _place_of(depths, at))
         by_depth = _at_row(rate["depth"], water) * _walked(depths, at)
         between = _at_row(rate["off_nadir_deg"], water) * by_angle + float(rate["water"]) * by_water
-        variance[e, p] += by_depth + between if one["bias"].notnull().any() else np.nan
+        variance[e, p] = deviation[e, p] ** 2 + (by_depth + between if one["bias"].notnull().any() else np.nan)
     amount[..., :2] = 0.0
 
     def of_echoes(values: FloatArray) -> xr.DataArray:

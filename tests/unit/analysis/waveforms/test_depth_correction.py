@@ -72,7 +72,7 @@ def test_the_bias_of_the_place_between_nodes_is_subtracted():
             # The bias is linear in depth; of two nodes, the walk's variance in the middle is 0.47 of a quarter of the
             # squared difference. The nodes' spreads are 2, 6 and 10 cm.
             between = 0.47 * 0.25 * factor**2 * (0.1**2 + 0.12**2)
-            left = np.sqrt(0.5 * np.array([0.02**2 + 0.06**2, 0.06**2 + 0.1**2]) + between)
+            left = np.sqrt(np.array([0.04, 0.08]) ** 2 + between)
             np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], left)
     assert np.isnan(bottom["depth_m"].values[2]).all()
     surface = corrected.sel(echo="surface")
