@@ -40,7 +40,7 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
     The first one has the places of the pulses, all points in a side view by class, and maps of the heights of the
     bottom and of their errors. The second one has the waveforms and points of a strip, through a target if points lie
-    on one. Side view and strip are along x or y, over which the points extend farther.
+    on one, else through most points. Side view and strip are along x or y, over which the points extend farther.
 
     Parameters
     ----------
@@ -116,11 +116,12 @@ def _draw_side(ax: Axes, points: xr.Dataset) -> None:
 
 
 def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
-    """Draw the waveforms and points of a strip along x or y, about the points above targets or the middle."""
+    """Draw the waveforms and points of a strip along x or y, through points above targets or else most points."""
     target = points["true_target"].values.astype(bool)
     along, across = _sides(points)
     side = points[across].values
-    middle = float(np.median(side[target])) if np.any(target) else float(np.median(side))
+    number, edges = np.histogram(side, np.arange(side.min(), side.max() + 4 * _STRIP, 2 * _STRIP))
+    middle = float(np.median(side[target])) if np.any(target) else float(edges[np.argmax(number)] + _STRIP)
     strip = points.isel(point=np.abs(side - middle) < _STRIP)
     wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
     surface = strip["kind"].values == PointClass.SURFACE
@@ -132,7 +133,7 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     # Cells with a few pulses and samples each, so that they fill the picture.
     rows = (depth + _ABOVE) / (2 * _PER_NS * width / group)
     shape = int(np.clip(len(seen) / 3, 10, _COLUMNS)), max(int(rows), 10)
-    edges = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
+    cells = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
     total, number = np.zeros(shape), np.zeros(shape)
     signal, start = flown.values("signal"), flown.values("sample_start_ns")
     origin, axis = flown.vectors("origin"), flown.vectors("axis")
@@ -145,12 +146,12 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
         place = origin[shot] + np.minimum(way, to_sea)[:, None] * axis[shot] + wet_way[:, None] * down
         values = np.abs(signal[shot]).mean(axis=0)
         for grid, weight in ((total, values), (number, np.ones_like(values))):
-            grid += np.histogram2d(place[:, "xy".index(along)], place[:, 2], bins=edges, weights=weight)[0]
+            grid += np.histogram2d(place[:, "xy".index(along)], place[:, 2], bins=cells, weights=weight)[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         image = np.log10(total / number).T
     highest = float(np.nanmax(image[np.isfinite(image)], initial=-np.inf))
     shown = np.where(np.isfinite(image), image, np.nan)
-    drawn = ax.pcolormesh(*edges, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
+    drawn = ax.pcolormesh(*cells, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
     ax.figure.colorbar(drawn, ax=ax, label="log10 of the mean signal")
     for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "bottom or object")):
         ax.plot(strip[along].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
