@@ -40,7 +40,8 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
     The first one has the places of the pulses, all points in a side view by class, and maps of the heights of the
     bottom and of their errors. The second one has the waveforms and points of a strip, through a target if points lie
-    on one, else through most points. Side view and strip are along x or y, over which the points extend farther.
+    on one. The side view is along x or y, over which points extend farther, the strip along x or y and through most
+    points.
 
     Parameters
     ----------
@@ -97,14 +98,20 @@ def _set_map(ax: Axes, title: str) -> None:
     ax.locator_params("x", nbins=3)
 
 
-def _sides(points: xr.Dataset) -> tuple[str, str]:
-    """Return the horizontal coordinate over which points extend farther, and the other one."""
-    return ("x", "y") if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else ("y", "x")
+def _fullest_strip(points: xr.Dataset) -> tuple[str, str, float]:
+    """Return the coordinates along and across the strip with most points, through targets if any, and its middle."""
+    target, found = points["true_target"].values.astype(bool), []
+    for along, across in (("x", "y"), ("y", "x")):
+        side = points[across].values
+        number, edges = np.histogram(side, np.arange(side.min(), side.max() + 4 * _STRIP, 2 * _STRIP))
+        middle = float(np.median(side[target])) if np.any(target) else float(edges[np.argmax(number)] + _STRIP)
+        found.append((np.count_nonzero(np.abs(side - middle) < _STRIP), along, across, middle))
+    return max(found)[1:]
 
 
 def _draw_side(ax: Axes, points: xr.Dataset) -> None:
     """Draw all points from the side, by class."""
-    along = _sides(points)[0]
+    along = "x" if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else "y"
     for kind, (colour, name) in _CLASSES.items():
         chosen = points["kind"].values == kind
         if np.any(chosen):
@@ -117,12 +124,8 @@ def _draw_side(ax: Axes, points: xr.Dataset) -> None:
 
 def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     """Draw the waveforms and points of a strip along x or y, through points above targets or else most points."""
-    target = points["true_target"].values.astype(bool)
-    along, across = _sides(points)
-    side = points[across].values
-    number, edges = np.histogram(side, np.arange(side.min(), side.max() + 4 * _STRIP, 2 * _STRIP))
-    middle = float(np.median(side[target])) if np.any(target) else float(edges[np.argmax(number)] + _STRIP)
-    strip = points.isel(point=np.abs(side - middle) < _STRIP)
+    along, across, middle = _fullest_strip(points)
+    strip = points.isel(point=np.abs(points[across].values - middle) < _STRIP)
     wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
     surface = strip["kind"].values == PointClass.SURFACE
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
