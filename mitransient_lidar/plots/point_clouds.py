@@ -40,7 +40,8 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
     The first one has the places of the pulses, all points in a side view by class, and maps of the heights of the
     bottom and of their errors. The second one has the waveforms and points of a strip, through a target if points lie
-    on one. Side view and strip are along x or y, over which the points extend farther.
+    on one. The side view is along x or y, over which points extend farther, the strip along x or y and through most
+    points.
 
     Parameters
     ----------
@@ -97,14 +98,20 @@ def _set_map(ax: Axes, title: str) -> None:
     ax.locator_params("x", nbins=3)
 
 
-def _sides(points: xr.Dataset) -> tuple[str, str]:
-    """Return the horizontal coordinate over which points extend farther, and the other one."""
-    return ("x", "y") if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else ("y", "x")
+def _fullest_strip(points: xr.Dataset) -> tuple[str, str, float]:
+    """Return the coordinates along and across the strip with most points, through targets if any, and its middle."""
+    target, found = points["true_target"].values.astype(bool), []
+    for along, across in (("x", "y"), ("y", "x")):
+        side = points[across].values
+        number, edges = np.histogram(side, np.arange(side.min(), side.max() + 4 * _STRIP, 2 * _STRIP))
+        middle = float(np.median(side[target])) if np.any(target) else float(edges[np.argmax(number)] + _STRIP)
+        found.append((np.count_nonzero(np.abs(side - middle) < _STRIP), along, across, middle))
+    return max(found)[1:]
 
 
 def _draw_side(ax: Axes, points: xr.Dataset) -> None:
     """Draw all points from the side, by class."""
-    along = _sides(points)[0]
+    along = "x" if np.ptp(points["x"].values) >= np.ptp(points["y"].values) else "y"
     for kind, (colour, name) in _CLASSES.items():
         chosen = points["kind"].values == kind
         if np.any(chosen):
@@ -116,12 +123,9 @@ def _draw_side(ax: Axes, points: xr.Dataset) -> None:
 
 
 def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
-    """Draw the waveforms and points of a strip along x or y, about the points above targets or the middle."""
-    target = points["true_target"].values.astype(bool)
-    along, across = _sides(points)
-    side = points[across].values
-    middle = float(np.median(side[target])) if np.any(target) else float(np.median(side))
-    strip = points.isel(point=np.abs(side - middle) < _STRIP)
+    """Draw the waveforms and points of a strip along x or y, through points above targets or else most points."""
+    along, across, middle = _fullest_strip(points)
+    strip = points.isel(point=np.abs(points[across].values - middle) < _STRIP)
     wet = np.isin(strip["kind"].values, (PointClass.BOTTOM, PointClass.OBJECT))
     surface = strip["kind"].values == PointClass.SURFACE
     depth = float(np.max(-strip["z"].values[wet], initial=1.0)) + _BELOW
@@ -132,7 +136,7 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     # Cells with a few pulses and samples each, so that they fill the picture.
     rows = (depth + _ABOVE) / (2 * _PER_NS * width / group)
     shape = int(np.clip(len(seen) / 3, 10, _COLUMNS)), max(int(rows), 10)
-    edges = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
+    cells = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
     total, number = np.zeros(shape), np.zeros(shape)
     signal, start = flown.values("signal"), flown.values("sample_start_ns")
     origin, axis = flown.vectors("origin"), flown.vectors("axis")
@@ -145,12 +149,12 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
         place = origin[shot] + np.minimum(way, to_sea)[:, None] * axis[shot] + wet_way[:, None] * down
         values = np.abs(signal[shot]).mean(axis=0)
         for grid, weight in ((total, values), (number, np.ones_like(values))):
-            grid += np.histogram2d(place[:, "xy".index(along)], place[:, 2], bins=edges, weights=weight)[0]
+            grid += np.histogram2d(place[:, "xy".index(along)], place[:, 2], bins=cells, weights=weight)[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         image = np.log10(total / number).T
     highest = float(np.nanmax(image[np.isfinite(image)], initial=-np.inf))
     shown = np.where(np.isfinite(image), image, np.nan)
-    drawn = ax.pcolormesh(*edges, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
+    drawn = ax.pcolormesh(*cells, shown, cmap="magma", vmin=highest - _DECADES, vmax=highest)
     ax.figure.colorbar(drawn, ax=ax, label="log10 of the mean signal")
     for chosen, colour, label in ((surface, "#4fc3f7", "water surface"), (wet, "#b2ff59", "bottom or object")):
         ax.plot(strip[along].values[chosen], strip["z"].values[chosen], ".", color=colour, ms=4, label=label)
