@@ -77,7 +77,6 @@ def fit(
     names = [name.strip() for name in free.split(",")]
     starts = {name: finite(f"--start {name}", value) for name, value in _pairs("--start", start).items()}
     limits = {name: _limits(name, text) for name, text in _pairs("--bounds", bounds).items()}
-    from mitransient_lidar.analysis.information.fits import describe_fit, table_rows
     from mitransient_lidar.plots.studies.fit import plot_fit
     from mitransient_lidar.studies import fit as study
 
@@ -101,13 +100,13 @@ def fit(
             progress=progress,
         )
     output.mkdir(parents=True, exist_ok=True)
-    heading, rows = table_rows(fitted)
+    heading, rows = study.table_rows(fitted)
     with announced():
         write_netcdf(fitted, targets[0])
         with replacing(targets[1]) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
             csv.writer(stream).writerows([heading, *rows])
         plot_fit(fitted, targets[2])
-    typer.echo("\n".join(describe_fit(fitted)))
+    typer.echo("\n".join(study.describe_fit(fitted)))
 
 
 def _pairs(option: str, given: list[str] | None) -> dict[str, str]:

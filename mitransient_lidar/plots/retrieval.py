@@ -150,8 +150,8 @@ def slope_statistics(truth: FloatArray, retrieved: FloatArray) -> dict[str, floa
     Returns
     -------
     dict
-        ``correlation`` with the ends ``low`` and ``high`` of its 95 % interval (Fisher's z), ``bias_deg``, ``rms_deg``
-        and ``median_deg`` of the errors [degree], and ``shots``.
+        ``correlation`` with the ends ``low`` and ``high`` of its 95 % interval (Fisher's z), NaN if all slopes of one
+        kind are equal, ``bias_deg``, ``rms_deg`` and ``median_deg`` of the errors [degree], and ``shots``.
 
     Raises
     ------
@@ -162,8 +162,10 @@ def slope_statistics(truth: FloatArray, retrieved: FloatArray) -> dict[str, floa
     count = int(np.count_nonzero(known))
     if count < 4:
         raise UserError(f"slopes of {count} shots are known and must be at least 4 to be compared")
-    correlation = float(np.corrcoef(truth[known], retrieved[known])[0, 1])
-    z, width = math.atanh(correlation), 1.96 / math.sqrt(count - 3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # The interval of a correlation of 1 or -1 is this point; that of equal slopes is not known.
+        correlation = float(np.corrcoef(truth[known], retrieved[known])[0, 1])
+        z, width = float(np.arctanh(correlation)), 1.96 / math.sqrt(count - 3)
     error = np.degrees(np.arctan(retrieved[known]) - np.arctan(truth[known]))
     return {
         "correlation": correlation,

@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
-from mitransient_lidar.analysis.information.fits import SCALE, TIME_OFFSET, WaveformFit
+from mitransient_lidar.analysis.information.fits import WaveformFit
+from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET
 from mitransient_lidar.analysis.information.measured import measured
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import integer, shown
@@ -26,7 +28,8 @@ from mitransient_lidar.rendering.render import render
 
 logger = logging.getLogger(__name__)
 
-_PILOT_PASSES, _MOST_PASSES = 16, 256  # of the first render, and most that are chosen
+_COARSE_PASSES = 4  # of renders that approach the solution
+_FEWEST_PASSES, _MOST_PASSES = 16, 256  # that are chosen
 #: Batches of passes that give the errors by the Monte Carlo of the model, besides those for each parameter: enough for
 #: their own noise to matter little, and few because each is kept.
 _BATCHES, _BATCHES_PER_PARAMETER, _MOST_BATCHES = 20, 4, 256
@@ -119,28 +122,36 @@ def fit(
         if missing := [name for name in names if name not in (start or {})]:
             raise UserError(f"start of {missing[0]} is missing: a model that is a function needs all starts")
         problem = WaveformFit(found, scene, dict(start or {}), bounds, **options)
+        problem.approach(most_renders=most_renders, until=began + limit)
         return _run(problem, began, limit, most_renders, scale_errors)
     given = None if passes is None else integer("passes", passes, 2, MOST_PASSES)
     attributes = source.attrs if isinstance(source, xr.Dataset) else {}
+    coarse = min(given or _FEWEST_PASSES, _COARSE_PASSES)
     model = _RenderedModel(
-        _scene(scene, attributes), params, instrument, names, given or _PILOT_PASSES, _seed(seed, attributes), progress
+        _scene(scene, attributes), params, instrument, names, coarse, _seed(seed, attributes), progress
     )
     starts = {**model.starts(start or {}), **(start or {})}
     problem = WaveformFit(found, model, starts, bounds, **options)
-    if given is None and (ratio := problem.noise_ratio()) > _LARGEST_RATIO:
-        needed = math.ceil(_PILOT_PASSES * ratio / _LARGEST_RATIO)
-        if needed > _MOST_PASSES:
-            logger.warning(
-                "a Monte Carlo error small against that of the waveforms takes %d passes, %d are rendered: passes = %d "
-                "would give smaller errors",
-                needed,
-                _MOST_PASSES,
-                needed,
-            )
-        model.passes = min(needed, _MOST_PASSES)
+    problem.approach(most_renders=most_renders, until=began + limit)
+    if time.perf_counter() - began < limit:
+        model.passes = given or _passes(problem.noise_ratio())
         problem.forget()
     fitted = _run(problem, began, limit, most_renders, scale_errors)
     return fitted.assign_attrs({"scene": model.name, "passes": model.passes, "seed": model.seed})
+
+
+def _passes(ratio: float) -> int:
+    """Return the passes of a render for the variance by Monte Carlo of coarse ones over that of the waveforms."""
+    needed = math.ceil(_COARSE_PASSES * ratio / _LARGEST_RATIO)
+    if needed > _MOST_PASSES:
+        logger.warning(
+            "a Monte Carlo error small against that of the waveforms takes %d passes, %d are rendered: passes = %d "
+            "would give smaller errors",
+            needed,
+            _MOST_PASSES,
+            needed,
+        )
+    return min(max(needed, _FEWEST_PASSES), _MOST_PASSES)
 
 
 def _run(problem: WaveformFit, began: float, limit: float, most_renders: int, scale_errors: bool) -> xr.Dataset:
@@ -228,3 +239,29 @@ def _seed(seed: int | None, attributes: Mapping[str, Any]) -> int:
     if own is not None and seed == own:
         raise UserError(f"seed = {seed} is that of the result: the model would repeat its noise, choose another seed")
     return seed
+
+
+def describe_fit(fitted: xr.Dataset) -> list[str]:
+    """Return the lines of a table of a fit: value, standard error and start of each parameter, and its quality."""
+    lines = [f"{'parameter':<24}{'value':>13}{'error':>11}{'start':>13}  unit"]
+    for name in fitted["parameter"].values:
+        one = fitted.sel(parameter=name)
+        error = f"{float(one['stderr']):>11.3g}" if np.isfinite(one["stderr"]) else f"{'unknown':>11}"
+        text = f"{name:<24}{float(one['value']):>13.6g}{error}{float(one['start']):>13.6g}  "
+        text += one["parameter_units"].item()
+        lines.append(text + (" (at its bound)" if int(one["at_bound"]) else ""))
+    chi = fitted.attrs
+    text = f"chi-squared {chi['chi_squared']:.4g}, expected {chi['expected']:.4g}"
+    if np.isfinite(chi["probability"]):
+        text += f"; a larger one has the probability {chi['probability']:.3g}"
+    return [*lines, text, f"{chi['renders']} renders", *chi["messages"]]
+
+
+def table_rows(fitted: xr.Dataset) -> tuple[Sequence[str], list[list[object]]]:
+    """Return the columns and rows of a table of the parameters of a fit, as for a CSV file."""
+    columns = ("value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
+    rows: list[list[object]] = []
+    for name in fitted["parameter"].values:
+        one = fitted.sel(parameter=name)
+        rows.append([str(name), one["parameter_units"].item(), *(one[column].item() for column in columns)])
+    return ("parameter", "unit", *columns), rows

@@ -2,8 +2,7 @@
 
 Scale and time offset of uncalibrated waveforms are parameters like the others, not projected out, so that bounds,
 weights and the covariance treat all parameters alike. They start at the time of the largest correlation with the model
-and at the scale of linear least squares. Positive parameters are fitted as logarithms: from starts of half and of 1.5
-times the truth of an exponential column and a bottom echo, that takes 6 renders each, with plain values 6 and 7.
+and at the scale of linear least squares. Positive parameters are fitted as logarithms.
 """
 
 from __future__ import annotations
@@ -11,86 +10,59 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
+from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET, free_parameters
 from mitransient_lidar.analysis.information.measured import Measured, Prediction, best_offset, predict
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.ranges import limits, unit_of
-from mitransient_lidar.core.validation import BoolArray, FloatArray, finite, integer
+from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
 
 #: A function that returns a render, with derivatives, of values of the free parameters.
 Model = Callable[[Mapping[str, float]], xr.Dataset]
 
-SCALE, TIME_OFFSET = "scale", "time_offset_ns"
-
 _WINDOW = 10.0  # model bins by which the time offset may change before samples in use are chosen anew
 _MOST_ROUNDS = 8  # of weights that follow the model
 _SETTLED = 0.05  # standard errors by which parameters may still change in the last round
-_SMALLEST_STEP = 0.02  # standard errors; smaller steps are not rendered
-_TOLERANCE = 1e-3  # relative change of the sum of squares that ends a round
+_LINEAR = 0.2  # standard errors from a render within which the model is taken as linear, and not rendered again
+_TOLERANCE, _COARSE_TOLERANCE = 1e-3, 0.03  # relative change of the sum of squares that ends a round, and an approach
+_RELATIVE_ERROR = 0.1  # of every sample while a fit approaches the solution
+_UNKNOWN_ERROR = 0.01  # standard deviation in place of unknown ones then, over the largest sample
+_DIGITS = 12  # of values that are rendered: logarithms and back change the last ones
 
 
-@dataclass(frozen=True)
-class Free:
-    """Free parameter: start, and lowest and highest value; fitted as its logarithm where it is positive."""
+class _Differences(NamedTuple):
+    """Differences of model and waveforms, of which the squares are added up: 0 for samples of weight 0.
 
-    name: str
-    start: float
-    low: float
-    high: float
-
-    @property
-    def is_logarithm(self) -> bool:
-        """Whether the parameter is positive, so that its logarithm is fitted and steps are relative."""
-        return self.low >= 0 and self.start > 0
-
-    def internal(self, value: float) -> float:
-        """Return what is fitted instead of a value."""
-        if not self.is_logarithm:
-            return value
-        return math.log(value) if value > 0 else -math.inf
-
-    def is_bound(self, value: float) -> bool:
-        """Return whether a value is one of the bounds within the accuracy of a fit."""
-        return any(abs(value - end) <= max(1e-3 * abs(end), 1e-6 * abs(self.start)) for end in self._finite_ends)
-
-    @property
-    def _finite_ends(self) -> list[float]:
-        return [end for end in (self.low, self.high) if math.isfinite(end)]
-
-    def value(self, internal: float) -> float:
-        """Return the value of what is fitted."""
-        return math.exp(internal) if self.is_logarithm else internal
-
-
-def free_parameters(starts: Mapping[str, float], bounds: Mapping[str, tuple[float, float]] | None = None) -> list[Free]:
-    """Return free parameters with their bounds, by default the range of their names, or 0 to 1 for reflectances.
-
-    Raises
-    ------
-    UserError
-        If bounds are those of no free parameter or do not increase, or a start is not between them.
+    Of values, or with `softening` of the logarithms of samples above it: asinh(value/softening).
     """
-    given = dict(bounds or {})
-    found = []
-    for name, start in starts.items():
-        base = re.sub(r"\[\d+\]$", "", name)
-        usual = (0.0, 1.0) if base.endswith("_reflectance") else limits(base) or (-math.inf, math.inf)
-        low, high = given.pop(name, (0.0, math.inf) if name == SCALE else usual)
-        if not low < high:
-            raise UserError(f"bounds of {name} = {low:g}, {high:g} must increase")
-        if not low <= finite(f"start of {name}", start) <= high:
-            raise UserError(f"start of {name} = {start:g} must lie between {low:g} and {high:g}")
-        found.append(Free(name, float(start), float(low), float(high)))
-    if given:
-        raise UserError(f"bounds of {next(iter(given))}: it is not one of the free parameters {', '.join(starts)}")
-    return found
+
+    weights: FloatArray  #: 1 over the standard deviation, shape (pixel, time).
+    softening: FloatArray | None = None  #: In the unit of the waveforms, above 0, shape (pixel, time).
+
+    def of(self, mean: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the differences, shape (pixel, time)."""
+        if self.softening is None:
+            return self.weights * (mean - values)
+        return np.asarray(self.weights * (np.arcsinh(mean / self.softening) - np.arcsinh(values / self.softening)))
+
+    def slope(self, mean: FloatArray) -> FloatArray:
+        """Return the change of the differences with the mean, shape (pixel, time)."""
+        return self.weights if self.softening is None else self.weights / np.hypot(mean, self.softening)
+
+
+class _Rendered(NamedTuple):
+    """Values of all free parameters whose model was rendered, and the change of the differences by each of them."""
+
+    values: dict[str, float]
+    slopes: FloatArray  #: In standard deviations, shape (sample, parameter).
+    prediction: Prediction
 
 
 class WaveformFit:
@@ -144,23 +116,52 @@ class WaveformFit:
         self.renders = 0
         self._kept: dict[tuple[float, ...], Prediction] = {}
         self.units: dict[str, str] = {}
-        # Values and Jacobian [standard deviations] of the last accepted step, and why others were not tried.
-        self._accepted: tuple[FloatArray, FloatArray] | None = None
+        # The last accepted step that was rendered, and why others were not tried.
+        self._rendered: _Rendered | None = None
         self._refusal, self._exhausted = "", False
         aligned = self._align({name: float(value) for name, value in starts.items()})
         self.free = free_parameters(aligned, bounds)
-        self.starts = aligned
+        self.values = aligned
 
     def forget(self) -> None:
         """Forget the renders so far, after a change of the model."""
         self._kept.clear()
+        self._rendered = None
+
+    def approach(self, *, most_renders: int = 60, until: float = math.inf) -> None:
+        """Move `values` from the starts towards the solution, which `run` begins from, by a model that may be coarse.
+
+        Light falls exponentially with coefficients of water, so that logarithms of samples are nearly linear in them
+        where values are not. Least squares of logarithms, of samples with a relative error of a tenth besides their
+        own, come close to the solution from starts from which those of values take many steps, or end elsewhere.
+
+        Parameters
+        ----------
+        most_renders, until
+            As for `run`, which has one render left at least.
+        """
+        self._limit, self._until = integer("most_renders", most_renders, 2, 10_000) - 1, until
+        used = self._used(self.values)
+        mean, _, by_model, noise = self._at(self.values)
+        largest = float(np.abs(self.found.values[used]).max())
+        variance = np.full_like(mean, (_UNKNOWN_ERROR * largest) ** 2) if noise is None else noise
+        known = used & (variance > 0)
+        softening = np.sqrt(np.where(known, variance, 1.0))
+        # Samples that are in the noise on one side alone say little: their logarithms are far from linear.
+        darker = np.minimum(np.abs(np.nan_to_num(self.found.values)), np.abs(mean))
+        relative = (variance + smoothed_variance(by_model)) / (darker**2 + softening**2)
+        weights = np.where(known, 1 / np.sqrt(relative + _RELATIVE_ERROR**2), 0.0)
+        found = self._solution(self.values, _Differences(weights, softening), used, _COARSE_TOLERANCE)
+        # Without time for another render, the last one is what is left.
+        self.values = self._rendered.values if self._is_over and self._rendered is not None else found
+        self._rendered, self._exhausted = None, False
 
     def noise_ratio(self) -> float:
-        """Return the variance of the model's Monte Carlo over that of the waveforms, at the starts.
+        """Return the variance of the model's Monte Carlo over that of the waveforms, at `values`.
 
         The median over the samples that carry information, 0 where the errors of the waveforms are unknown.
         """
-        values = self.starts
+        values = self.values
         used = self._used(values)
         mean, slopes, by_model, noise = self._at(values)
         if noise is None:
@@ -190,54 +191,79 @@ class WaveformFit:
             one, ``renders``, ``rounds``, ``converged``, and ``messages``, sentences on what the waveforms do not
             determine.
         """
-        from scipy.optimize import least_squares
-
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
-        lower = np.array([free.internal(free.low) for free in self.free])
-        upper = np.array([free.internal(free.high) for free in self.free])
-        values, rounds, settled = dict(self.starts), 0, False
-        while not (settled or self._exhausted) and rounds < _MOST_ROUNDS and self.renders < most_renders:
+        values, rounds, settled = dict(self.values), 0, False
+        while (
+            not (settled or self._exhausted) and rounds < _MOST_ROUNDS and (rounds == 0 or self.renders < self._limit)
+        ):
             rounds += 1
-            self._refusal = ""
             used = self._used(values)
-            weights = self._weights(values, used)
-            ends = lower.copy(), upper.copy()
-            self._narrow(ends, values)
-            start = np.array([free.internal(values[free.name]) for free in self.free])
-            solution = least_squares(
-                partial(self._residuals, weights=weights, used=used),
-                np.clip(start, *ends),
-                jac=partial(self._jacobian, weights=weights, used=used),
-                bounds=ends,
-                method="trf",
-                x_scale="jac",
-                ftol=_TOLERANCE,
-                xtol=1e-12,
-                gtol=1e-12,
-                max_nfev=most_renders,
-            )
-            former, values = values, self._named(solution.x)
+            former, values = values, self._solution(values, _Differences(self._weights(values, used)), used)
             errors = self._errors(values, used, scale_errors)
             change = np.array([values[name] - former[name] for name in values])
             settled = bool(np.all(np.abs(change) <= _SETTLED * np.nan_to_num(errors.stderr, nan=np.inf)))
         return self._dataset(values, used, errors, rounds, settled and not self._exhausted)
 
+    def _solution(
+        self, values: Mapping[str, float], differences: _Differences, used: BoolArray, tolerance: float = _TOLERANCE
+    ) -> dict[str, float]:
+        """Return the values of the smallest sum of the squares of differences, from others."""
+        from scipy.optimize import least_squares
+
+        self._refusal = ""
+        ends = (
+            np.array([free.internal(free.low) for free in self.free]),
+            np.array([free.internal(free.high) for free in self.free]),
+        )
+        self._narrow(ends, values)
+        solution = least_squares(
+            partial(self._residuals, differences=differences, used=used),
+            np.clip([free.internal(values[free.name]) for free in self.free], *ends),
+            jac=partial(self._jacobian, differences=differences, used=used),
+            bounds=ends,
+            method="dogbox",  # The other one takes small steps beside finite bounds, even if these are far.
+            x_scale="jac",
+            ftol=tolerance,
+            xtol=1e-12,
+            gtol=1e-12,
+            max_nfev=self._limit,
+        )
+        return self._named(solution.x)
+
     def _prediction(self, values: Mapping[str, float]) -> Prediction:
-        """Return the samples of the model, from one of the last renders if its values are the same."""
+        """Return the samples of the model, rendered unless one of the last renders has these values or near ones."""
         key = self._key(values)
-        if key not in self._kept:
-            dataset = self.model(dict(zip(self.names, key, strict=True)))
-            self.renders += 1
-            # A step that is refused leads back to the values before it.
-            self._kept = dict([*self._kept.items()][-1:]) | {key: predict(self.found, dataset, self.names)}
-            if "parameter_units" in dataset.coords:
-                units = dict(zip(dataset["parameter"].values.tolist(), dataset["parameter_units"].values, strict=True))
-                self.units = {str(name): str(unit) for name, unit in units.items()}
+        if key in self._kept:
+            return self._kept[key]
+        if self._is_near(values):
+            assert self._rendered is not None
+            near = self._rendered.prediction
+            steps = [values[name] - self._rendered.values[name] for name in self.names]
+            return near._replace(mean=near.mean + np.tensordot(steps, near.derivative, 1))
+        dataset = self.model(dict(zip(self.names, key, strict=True)))
+        self.renders += 1
+        # A step that is refused leads back to the values before it.
+        self._kept = dict([*self._kept.items()][-1:]) | {key: predict(self.found, dataset, self.names)}
+        if "parameter_units" in dataset.coords:
+            units = dict(zip(dataset["parameter"].values.tolist(), dataset["parameter_units"].values, strict=True))
+            self.units = {str(name): str(unit) for name, unit in units.items()}
         return self._kept[key]
 
+    def _is_near(self, values: Mapping[str, float]) -> bool:
+        """Return whether the model of values follows from the last accepted render and its derivatives."""
+        if self._rendered is None:
+            return False
+        change = [values[name] - self._rendered.values[name] for name in values]
+        return float(np.linalg.norm(self._rendered.slopes @ change)) < _LINEAR
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether there is neither time nor a number left for another render."""
+        return self.renders >= self._limit or time.perf_counter() >= self._until
+
     def _key(self, values: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the values of the parameters of the model."""
-        return tuple(values[name] for name in self.names)
+        """Return the values of the parameters of the model that are rendered."""
+        return tuple(float(f"{values[name]:.{_DIGITS}g}") for name in self.names)
 
     def _at(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray | None]:
         """Return what is expected at the times of the waveforms.
@@ -315,40 +341,36 @@ class WaveformFit:
         weighted = used & (variance > 0)
         return np.where(weighted, 1 / np.sqrt(np.where(weighted, variance, 1.0)), 0.0)
 
-    def _residuals(self, x: FloatArray, weights: FloatArray, used: BoolArray) -> FloatArray:
-        """Return the weighted differences, or NaN, after which the optimiser takes a smaller step.
+    def _residuals(self, x: FloatArray, differences: _Differences, used: BoolArray) -> FloatArray:
+        """Return the differences, or NaN, after which the optimiser takes a smaller step.
 
-        That is where the scene is impossible, too many renders were made, or the step is too small to matter: the last
-        steps are within the noise that common random numbers leave, and would cost a render each.
+        That is where the scene is impossible, or too many renders were made. Beside impossible scenes, near values
+        are taken for impossible, too.
         """
         values = self._named(x)
         unknown = np.full(np.count_nonzero(used), np.nan)
         if self._key(values) not in self._kept:
-            self._exhausted |= self.renders >= self._limit or time.perf_counter() >= self._until
-            if self._exhausted or (self._accepted is not None and self._step(x) < _SMALLEST_STEP):
+            near = self._is_near(values)
+            self._exhausted |= not near and self._is_over
+            if self._exhausted or (near and self._refusal):
                 return unknown
         try:
             mean = self._at(values)[0]
         except UserError as error:
             self._refusal = str(error)
             return unknown
-        return np.asarray((weights * (mean - np.nan_to_num(self.found.values)))[used])
+        return np.asarray(differences.of(mean, np.nan_to_num(self.found.values))[used])
 
-    def _step(self, x: FloatArray) -> float:
-        """Return the change of the model by a step in standard deviations, which is its length in standard errors."""
-        assert self._accepted is not None
-        start, jacobian = self._accepted
-        return float(np.linalg.norm(jacobian @ (x - start)))
-
-    def _jacobian(self, x: FloatArray, weights: FloatArray, used: BoolArray) -> FloatArray:
+    def _jacobian(self, x: FloatArray, differences: _Differences, used: BoolArray) -> FloatArray:
         values = self._named(x)
-        inner = [values[free.name] if free.is_logarithm else 1.0 for free in self.free]
         mean, derivative, _, noise = self._at(values)
-        jacobian = np.asarray(((weights * derivative)[:, used] * np.array(inner)[:, None]).T)
-        # Unknown errors are those of the residuals.
-        spread = 1.0 if noise is not None else float(np.std((self.found.values - mean)[used])) or 1.0
-        self._accepted = x.copy(), jacobian / spread
-        return jacobian
+        slopes = np.asarray((differences.slope(mean) * derivative)[:, used].T)
+        if (rendered := self._kept.get(self._key(values))) is not None:
+            # Unknown errors are those of the residuals.
+            unknown = noise is None and differences.softening is None
+            spread = float(np.std((self.found.values - mean)[used])) or 1.0 if unknown else 1.0
+            self._rendered = _Rendered(values, slopes / spread, rendered)
+        return slopes * [values[free.name] if free.is_logarithm else 1.0 for free in self.free]
 
     def _named(self, x: FloatArray) -> dict[str, float]:
         return {free.name: free.value(float(one)) for free, one in zip(self.free, x, strict=True)}
@@ -469,29 +491,3 @@ class WaveformFit:
 def _interpolated(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
     """Return rows of values at other times, linear between the known ones, and 0 outside."""
     return np.array([np.interp(times, known, row, left=0.0, right=0.0) for row in values])
-
-
-def describe_fit(fitted: xr.Dataset) -> list[str]:
-    """Return the lines of a table of a fit: value, standard error and start of each parameter, and its quality."""
-    lines = [f"{'parameter':<24}{'value':>13}{'error':>11}{'start':>13}  unit"]
-    for name in fitted["parameter"].values:
-        one = fitted.sel(parameter=name)
-        error = f"{float(one['stderr']):>11.3g}" if np.isfinite(one["stderr"]) else f"{'unknown':>11}"
-        text = f"{name:<24}{float(one['value']):>13.6g}{error}{float(one['start']):>13.6g}  "
-        text += one["parameter_units"].item()
-        lines.append(text + (" (at its bound)" if int(one["at_bound"]) else ""))
-    chi = fitted.attrs
-    text = f"chi-squared {chi['chi_squared']:.4g}, expected {chi['expected']:.4g}"
-    if np.isfinite(chi["probability"]):
-        text += f"; a larger one has the probability {chi['probability']:.3g}"
-    return [*lines, text, f"{chi['renders']} renders", *chi["messages"]]
-
-
-def table_rows(fitted: xr.Dataset) -> tuple[Sequence[str], list[list[object]]]:
-    """Return the columns and rows of a table of the parameters of a fit, as for a CSV file."""
-    columns = ("value", "stderr", "stderr_by_model", "start", "low", "high", "at_bound")
-    rows: list[list[object]] = []
-    for name in fitted["parameter"].values:
-        one = fitted.sel(parameter=name)
-        rows.append([str(name), one["parameter_units"].item(), *(one[column].item() for column in columns)])
-    return ("parameter", "unit", *columns), rows

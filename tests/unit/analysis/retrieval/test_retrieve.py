@@ -365,6 +365,17 @@ def test_errors_of_the_drawing(tmp_path):
         retrieval.slope_statistics(truth[:2], truth[:2])
 
 
+def test_slopes_without_spread_have_an_interval_of_one_point_or_none():
+    """Fisher's z of a correlation of 1 is infinite, and slopes that are all equal have no correlation."""
+    truth = np.array([-0.1, 0.0, 0.1, 0.2])
+    for sign in (1, -1):
+        one = retrieval.slope_statistics(truth, sign * truth)
+        assert [one[name] for name in ("correlation", "low", "high")] == pytest.approx([sign] * 3)
+    level = retrieval.slope_statistics(np.zeros(4), truth)
+    assert np.isnan([level[name] for name in ("correlation", "low", "high")]).all()
+    assert level["bias_deg"] == pytest.approx(np.degrees(np.arctan(truth)).mean())
+
+
 def drop(name):
     shot = result()
     del shot.attrs[name]
