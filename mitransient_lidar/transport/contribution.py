@@ -13,7 +13,7 @@ from mitransient_lidar.transport.perturbations import Sums
 _SIGN, _MAGNITUDE = 1 << 31, (1 << 31) - 1
 
 
-@dataclass(frozen=True)
+@dataclass
 class Contribution:
     """What a part of a path carries, from the laser or from the receiver up to a point.
 

@@ -8,8 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
-from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.scene import WaterScene
 
@@ -18,8 +18,8 @@ NO_SURFACE = 1e9
 
 
 @dataclass
-class Path:
-    """A path from the receiver or from the laser, up to its last vertex.
+class Path(Contribution):
+    """A path from the receiver or from the laser, up to its last vertex, with what it carries.
 
     Attributes
     ----------
@@ -32,8 +32,6 @@ class Path:
     length
         Optical length so far [m]: distance times group index, summed over the segments, less the distance from the
         start to the scene's reference point (`RelativePose`).
-    throughput
-        Product of the path's factors so far.
     scatterings
         Number of scattering events in the water so far.
     reversals
@@ -49,8 +47,6 @@ class Path:
         Number of rays traced so far, for the benchmark.
     active
         Whether the path continues.
-    sums
-        Sums of the `Perturbations` of the path so far.
     """
 
     point: mi.Point3f
@@ -58,7 +54,6 @@ class Path:
     in_water: mi.Bool
     at_start: mi.Bool
     length: mi.Float
-    throughput: mi.Float
     scatterings: mi.UInt32
     reversals: mi.UInt32
     index_layer: mi.UInt32
@@ -66,7 +61,6 @@ class Path:
     before_first_solid: mi.Bool
     rays: mi.UInt32
     active: mi.Bool
-    sums: Sums
 
     @property
     def depth(self) -> mi.Float:
@@ -101,6 +95,7 @@ class Path:
             "at_start": mi.Bool(True),
             "length": length,
             "throughput": throughput,
+            "lost": mi.Bool(False),
             "scatterings": mi.UInt32(0),
             "reversals": mi.UInt32(0),
             "index_layer": mi.UInt32(0),

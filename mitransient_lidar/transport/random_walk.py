@@ -9,7 +9,6 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.path_step import PathStep, Vertex
@@ -32,8 +31,6 @@ class RandomWalkPath(Path):
         path. With the scattering coefficient b [1/m] and the phase function p [1/sr] of events, it is V / (b p) for a
         merge in cells of volume V, and d^2 / (T b p b' p') times a rate for a connection over the distance d with the
         transmittance T of scattering.
-    lost
-        Whether the path has entered the water outside the surface mesh, as in `Contribution`.
     lane, points
         Number of the path, and of its points in the water so far.
     inverse_scattering_density
@@ -46,13 +43,7 @@ class RandomWalkPath(Path):
     points: mi.UInt32
     mis_partial_sum: mi.Float
     inverse_scattering_density: mi.Float
-    lost: mi.Bool
     offset: mi.Float
-
-    @property
-    def contribution(self) -> Contribution:
-        """What the path carries up to its last vertex."""
-        return Contribution(self.throughput, self.lost, self.sums)
 
     @classmethod
     def start(
@@ -68,7 +59,6 @@ class RandomWalkPath(Path):
             points=mi.UInt32(0),
             mis_partial_sum=mi.Float(0),
             inverse_scattering_density=mi.Float(0),
-            lost=mi.Bool(False),
             offset=offset,
         )
 

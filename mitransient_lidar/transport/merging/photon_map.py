@@ -207,7 +207,7 @@ class PhotonBuffer:
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
         dr.scatter(self._lane, path.lane, slot, keep)
         dr.scatter(self._record, where, slot, keep)
-        carried = path.contribution.packed()
+        carried = path.packed()
         dr.scatter(self._carried, mi.Vector2f(carried, dr.select(connectable, mi.Float(1), 0)), slot, keep)
         dr.scatter(self._connectable, where, path.lane, connectable)
         dr.scatter(self._place, mi.Vector4f(carried, place.x, place.y, place.z), path.lane, connectable)

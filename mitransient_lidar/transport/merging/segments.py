@@ -95,13 +95,13 @@ class _SegmentStore:
 
     def write(self, path: RandomWalkPath, label: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
         """Store the next segment of each path."""
-        start, direction, carried = path.point, path.direction, path.contribution
-        factors = carried.packed(), path.mis_partial_sum, path.inverse_scattering_density, path.surface_length
+        start, direction = path.point, path.direction
+        factors = path.packed(), path.mis_partial_sum, path.inverse_scattering_density, path.surface_length
         dr.scatter(self._label, label, place, active)
         dr.scatter(self._start, mi.Vector4f(start.x, start.y, start.z, path.offset), place, active)
         dr.scatter(self._direction, mi.Vector4f(direction.x, direction.y, direction.z, path.length), place, active)
         dr.scatter(self._factors, mi.Vector4f(*factors), place, active)
-        self._sums.write(carried.sums, place, active)
+        self._sums.write(path.sums, place, active)
 
     def read(self, place: mi.UInt32) -> _Segment:
         """Return segments."""
