@@ -20,7 +20,7 @@ CASES = {
     "layers": (SMALL | LAYERS, {"attenuation[0]": 0.5, "attenuation[1]": 0.3, "bottom_reflectance": 0.1}),
 }
 #: Passes of the shot behind the records, and renders and passes of the bounds.
-SHOT_PASSES, BOUND_RENDERS, BOUND_PASSES = 256, 3, 16
+SHOT_PASSES, BOUND_RENDERS, BOUND_PASSES = 128, 3, 16
 #: Standard errors from the truth within which a fit has ended at the right place.
 RIGHT = 5
 
@@ -34,51 +34,64 @@ def true_params(case):
     return {**params, **{name: ", ".join(values) for name, values in joined.items()}}
 
 
+def fit_one(case, shot, receiver, number):
+    """Fit one record and return what was found."""
+    params, (_, truth) = true_params(case), CASES[case]
+    names, true = list(truth), np.array(list(truth.values()))
+    record = mitransient_lidar.record(shot, receiver, gain="auto", seed=number)
+    factors = np.random.default_rng(number).choice([0.5, 1.5], len(names))
+    start = dict(zip(names, (true * factors).tolist(), strict=True))
+    began, core = time.perf_counter(), time.process_time()
+    fitted = mitransient_lidar.fit(record, "table1", names, params=params, start=start, seed=number + 1)
+    seconds, core = time.perf_counter() - began, time.process_time() - core
+    error, stderr = fitted["value"].values - true, fitted["stderr"].values
+    print(
+        f"{number:4} from {factors} errors over stated {np.round(error / stderr, 2)}, "
+        f"{fitted.attrs['renders']} renders, passes {fitted.attrs['passes']}, {core:.1f} s of a core",
+        flush=True,
+    )
+    return {
+        "error": error / true,
+        "stated": stderr / true,
+        "model": fitted["stderr_by_model"].values / true,
+        "distance": error @ np.linalg.solve(fitted["covariance"].values, error),
+        "right": bool(fitted.attrs["converged"]) and bool(np.all(np.abs(error) < RIGHT * stderr)),
+        "renders": fitted.attrs["renders"],
+        "core": core,
+        "seconds": seconds,
+    }
+
+
 def run(case, count, receiver, first):
-    """Fit `count` records and print what was found, fit by fit and in a table."""
-    params, truth = true_params(case), CASES[case][1]
+    """Fit `count` records and print a table of what was found; a Ctrl-C ends the fits before."""
+    params, (_, truth) = true_params(case), CASES[case]
     names, true = list(truth), np.array(list(truth.values()))
     shot = mitransient_lidar.render("table1", params=params, passes=SHOT_PASSES, seed=10**6)
+    gain = mitransient_lidar.record(shot, receiver, gain="auto", seed=first).attrs["gain"]
+    options = {"receiver": receiver, "gain": gain, "renders": BOUND_RENDERS, "passes": BOUND_PASSES}
+    bound = mitransient_lidar.bounds("table1", params, free=names, **options)["bound"].values[0] / true
     rows = []
-    for number in range(first, first + count):
-        record = mitransient_lidar.record(shot, receiver, gain="auto", seed=number)
-        factors = np.random.default_rng(number).choice([0.5, 1.5], len(names))
-        start = dict(zip(names, (true * factors).tolist(), strict=True))
-        began, core = time.perf_counter(), time.process_time()
-        fitted = mitransient_lidar.fit(record, "table1", names, params=params, start=start, seed=number + 1)
-        taken = time.process_time() - core, time.perf_counter() - began
-        error = fitted["value"].values - true
-        distance = error @ np.linalg.solve(fitted["covariance"].values, error)
-        stderr, by_model = fitted["stderr"].values, fitted["stderr_by_model"].values
-        right = bool(fitted.attrs["converged"]) and bool(np.all(np.abs(error) < RIGHT * stderr))
-        rows.append((error, stderr, by_model, distance, right, fitted.attrs["renders"], *taken))
-        print(
-            f"{number:4} from {factors} z {np.round(error / stderr, 2)} distance {distance:5.2f} "
-            f"renders {fitted.attrs['renders']} passes {fitted.attrs['passes']} core {taken[0]:.1f} s",
-            flush=True,
-        )
-    errors, stderrs, by_models, distances, rights, renders, cores, seconds = (
-        np.array(one) for one in zip(*rows, strict=True)
-    )
-    gain = record.attrs["gain"]
-    known = mitransient_lidar.bounds(
-        "table1", params, free=names, receiver=receiver, gain=gain, renders=BOUND_RENDERS, passes=BOUND_PASSES
-    )
-    bound = known["bound"].values[0]
-    rms, stated = (np.sqrt(np.mean(one**2, axis=0)) for one in (errors, stderrs))
-    model = np.sqrt(np.mean(by_models**2, axis=0))
-    print(f"{case}, {receiver}: {rights.sum()} of {count} fits end within {RIGHT} standard errors of the truth")
+    try:
+        for number in range(first, first + count):
+            rows.append(fit_one(case, shot, receiver, number))
+    except KeyboardInterrupt:
+        print("interrupted")
+    found = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    print(f"{case}, {receiver}: {found['right'].sum()} of {len(rows)} end within {RIGHT} standard errors of the truth")
+    error, stated, model = (np.sqrt(np.mean(found[name] ** 2, axis=0)) for name in ("error", "stated", "model"))
+    shares = {
+        "bound": 100 * bound,
+        "stated by the record alone / bound": np.sqrt(stated**2 - model**2) / bound,
+        "stated / bound": stated / bound,
+        "error / bound": error / bound,
+        "error / stated": error / stated,
+    }
     for place, name in enumerate(names):
-        print(
-            f"  {name:20} bound {100 * bound[place] / true[place]:.3g} %, rms error over bound "
-            f"{rms[place] / bound[place]:.2f}, over stated error {rms[place] / stated[place]:.2f}, mean error over "
-            f"its own error {np.sqrt(count) * errors[:, place].mean() / errors[:, place].std(ddof=1):.2f}, stated over "
-            f"bound {stated[place] / bound[place]:.2f}, of the records alone "
-            f"{np.sqrt(stated[place] ** 2 - model[place] ** 2) / bound[place]:.2f}"
-        )
-    spread = distances.std(ddof=1) / np.sqrt(count)
-    print(f"  mean squared distance {distances.mean():.2f} +- {spread:.2f}, expected {len(names)}")
-    print(f"  medians: {np.median(renders):g} renders, {np.median(cores):.1f} s of a core, {np.median(seconds):.1f} s")
+        print(f"  {name:20} " + ", ".join(f"{label} {value[place]:.3g}" for label, value in shares.items()))
+    spread = found["distance"].std(ddof=1) / np.sqrt(len(rows))
+    print(f"  mean squared distance {found['distance'].mean():.2f} +- {spread:.2f}, expected {len(names)}")
+    medians = {name: np.median(found[name]) for name in ("renders", "core", "seconds")}
+    print("  medians: {renders:g} renders, {core:.1f} s of a core, {seconds:.1f} s".format(**medians))
 
 
 def main():

@@ -165,8 +165,10 @@ def estimate_errors(
     ]
     known_parts = sum(parts[: len(kinds)], np.zeros_like(inverse))
     widening = _widening(known_parts, [*zip(parts, (own, by_render), strict=True)][: len(kinds)], borrows)
-    # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
     kept = eigenvalues > _SMALLEST * count
+    # Rounding decides on the sign of what is left in directions without information.
+    known_parts += (vectors[:, ~kept] / _SMALLEST) @ vectors[:, ~kept].T
+    # The matrices of an orthonormal basis of the derivatives, for the traces of Q C and of Q C Q C.
     basis = ((vectors[:, kept] / np.sqrt(eigenvalues[kept])).T @ flat).reshape(-1, *residuals.shape)
     image = sum((_correlated(basis, *errors) for errors in kinds), np.zeros_like(basis))
     projected = image.reshape(len(basis), -1) @ basis.reshape(len(basis), -1).T

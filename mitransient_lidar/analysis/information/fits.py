@@ -19,7 +19,7 @@ import xarray as xr
 
 from mitransient_lidar.analysis.information.errors import NO_BATCHES, Errors, estimate_errors, smoothed_variance
 from mitransient_lidar.analysis.information.free_parameters import SCALE, TIME_OFFSET, free_parameters
-from mitransient_lidar.analysis.information.measured import Measured, Prediction, best_offset, predict
+from mitransient_lidar.analysis.information.measured import Measured, Misfit, Prediction, best_offset, predict
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import BoolArray, FloatArray, integer
@@ -32,37 +32,19 @@ _MOST_ROUNDS = 8  # of weights that follow the model
 _SETTLED = 0.05  # standard errors by which parameters may still change in the last round
 _LINEAR = 0.2  # standard errors from a render within which the model is taken as linear, and not rendered again
 _TOLERANCE, _COARSE_TOLERANCE = 1e-3, 0.03  # relative change of the sum of squares that ends a round, and an approach
+_CONDITION = 1e6  # of correlations of parameters, above which their inverse is not used
 _RELATIVE_ERROR = 0.1  # of every sample while a fit approaches the solution
 _UNKNOWN_ERROR = 0.01  # standard deviation in place of unknown ones then, over the largest sample
 _DIGITS = 12  # of values that are rendered: logarithms and back change the last ones
 
 
-class _Differences(NamedTuple):
-    """Differences of model and waveforms, of which the squares are added up: 0 for samples of weight 0.
-
-    Of values, or with `softening` of the logarithms of samples above it: asinh(value/softening).
-    """
-
-    weights: FloatArray  #: 1 over the standard deviation, shape (pixel, time).
-    softening: FloatArray | None = None  #: In the unit of the waveforms, above 0, shape (pixel, time).
-
-    def of(self, mean: FloatArray, values: FloatArray) -> FloatArray:
-        """Return the differences, shape (pixel, time)."""
-        if self.softening is None:
-            return self.weights * (mean - values)
-        return np.asarray(self.weights * (np.arcsinh(mean / self.softening) - np.arcsinh(values / self.softening)))
-
-    def slope(self, mean: FloatArray) -> FloatArray:
-        """Return the change of the differences with the mean, shape (pixel, time)."""
-        return self.weights if self.softening is None else self.weights / np.hypot(mean, self.softening)
-
-
 class _Rendered(NamedTuple):
-    """Values of all free parameters whose model was rendered, and the change of the differences by each of them."""
+    """Values of all free parameters whose model was rendered."""
 
     values: dict[str, float]
-    slopes: FloatArray  #: In standard deviations, shape (sample, parameter).
     prediction: Prediction
+    information: FloatArray  #: Inverse of the covariance of the parameters, shape (parameter, parameter).
+    influence: FloatArray  #: Change of the differences per unit of each parameter, shape (parameter,).
 
 
 class WaveformFit:
@@ -151,7 +133,7 @@ class WaveformFit:
         darker = np.minimum(np.abs(np.nan_to_num(self.found.values)), np.abs(mean))
         relative = (variance + smoothed_variance(by_model)) / (darker**2 + softening**2)
         weights = np.where(known, 1 / np.sqrt(relative + _RELATIVE_ERROR**2), 0.0)
-        found = self._solution(self.values, _Differences(weights, softening), used, _COARSE_TOLERANCE)
+        found = self._solution(self.values, Misfit(weights, softening), used, _COARSE_TOLERANCE)
         # Without time for another render, the last one is what is left.
         self.values = self._rendered.values if self._is_over and self._rendered is not None else found
         self._rendered, self._exhausted = None, False
@@ -198,14 +180,14 @@ class WaveformFit:
         ):
             rounds += 1
             used = self._used(values)
-            former, values = values, self._solution(values, _Differences(self._weights(values, used)), used)
+            former, values = values, self._solution(values, Misfit(self._weights(values, used)), used)
             errors = self._errors(values, used, scale_errors)
             change = np.array([values[name] - former[name] for name in values])
             settled = bool(np.all(np.abs(change) <= _SETTLED * np.nan_to_num(errors.stderr, nan=np.inf)))
         return self._dataset(values, used, errors, rounds, settled and not self._exhausted)
 
     def _solution(
-        self, values: Mapping[str, float], differences: _Differences, used: BoolArray, tolerance: float = _TOLERANCE
+        self, values: Mapping[str, float], misfit: Misfit, used: BoolArray, tolerance: float = _TOLERANCE
     ) -> dict[str, float]:
         """Return the values of the smallest sum of the squares of differences, from others."""
         from scipy.optimize import least_squares
@@ -217,9 +199,9 @@ class WaveformFit:
         )
         self._narrow(ends, values)
         solution = least_squares(
-            partial(self._residuals, differences=differences, used=used),
+            partial(self._residuals, misfit=misfit, used=used),
             np.clip([free.internal(values[free.name]) for free in self.free], *ends),
-            jac=partial(self._jacobian, differences=differences, used=used),
+            jac=partial(self._jacobian, misfit=misfit, used=used),
             bounds=ends,
             method="dogbox",  # The other one takes small steps beside finite bounds, even if these are far.
             x_scale="jac",
@@ -250,11 +232,20 @@ class WaveformFit:
         return self._kept[key]
 
     def _is_near(self, values: Mapping[str, float]) -> bool:
-        """Return whether the model of values follows from the last accepted render and its derivatives."""
-        if self._rendered is None:
+        """Return whether the model of values follows from the last accepted render and its derivatives.
+
+        Where they are near in standard errors, and a relative curvature of 1 by each positive parameter would matter
+        little, too, as it might for parameters that are hardly told apart.
+        """
+        if (last := self._rendered) is None:
             return False
-        change = [values[name] - self._rendered.values[name] for name in values]
-        return float(np.linalg.norm(self._rendered.slopes @ change)) < _LINEAR
+        change = np.array([values[name] - last.values[name] for name in values])
+        bent = sum(
+            influence * step**2 / values[free.name]
+            for free, influence, step in zip(self.free, last.influence, change, strict=True)
+            if free.is_logarithm
+        )
+        return bool(change @ last.information @ change < _LINEAR**2 and bent < _LINEAR)
 
     @property
     def _is_over(self) -> bool:
@@ -341,7 +332,7 @@ class WaveformFit:
         weighted = used & (variance > 0)
         return np.where(weighted, 1 / np.sqrt(np.where(weighted, variance, 1.0)), 0.0)
 
-    def _residuals(self, x: FloatArray, differences: _Differences, used: BoolArray) -> FloatArray:
+    def _residuals(self, x: FloatArray, misfit: Misfit, used: BoolArray) -> FloatArray:
         """Return the differences, or NaN, after which the optimiser takes a smaller step.
 
         That is where the scene is impossible, or too many renders were made. Beside impossible scenes, near values
@@ -359,17 +350,24 @@ class WaveformFit:
         except UserError as error:
             self._refusal = str(error)
             return unknown
-        return np.asarray(differences.of(mean, np.nan_to_num(self.found.values))[used])
+        return np.asarray(misfit.of(mean, np.nan_to_num(self.found.values))[used])
 
-    def _jacobian(self, x: FloatArray, differences: _Differences, used: BoolArray) -> FloatArray:
+    def _jacobian(self, x: FloatArray, misfit: Misfit, used: BoolArray) -> FloatArray:
         values = self._named(x)
         mean, derivative, _, noise = self._at(values)
-        slopes = np.asarray((differences.slope(mean) * derivative)[:, used].T)
+        slopes = np.asarray((misfit.slope(mean) * derivative)[:, used].T)
         if (rendered := self._kept.get(self._key(values))) is not None:
-            # Unknown errors are those of the residuals.
-            unknown = noise is None and differences.softening is None
-            spread = float(np.std((self.found.values - mean)[used])) or 1.0 if unknown else 1.0
-            self._rendered = _Rendered(values, slopes / spread, rendered)
+            scaled = slopes
+            if misfit.softening is None and noise is None:
+                # Unknown errors are those of the residuals.
+                scaled = slopes / (float(np.std((self.found.values - mean)[used])) or 1.0)
+            information = scaled.T @ scaled
+            if misfit.softening is None and noise is not None:
+                errors = self._errors(values, used, False)
+                # The inverse of parameters that are hardly told apart would be that of rounding.
+                if not np.isnan(errors.covariance).any() and np.linalg.cond(errors.correlation) < _CONDITION:
+                    information = np.linalg.inv(errors.correlation) / np.outer(errors.stderr, errors.stderr)
+            self._rendered = _Rendered(values, rendered, information, np.linalg.norm(scaled, axis=0))
         return slopes * [values[free.name] if free.is_logarithm else 1.0 for free in self.free]
 
     def _named(self, x: FloatArray) -> dict[str, float]:

@@ -96,6 +96,26 @@ class Prediction(NamedTuple):
     batches: FloatArray | None  #: Deviations by batches of passes, shape (batch, pixel, time); see `batch_deviations`.
 
 
+class Misfit(NamedTuple):
+    """Differences of model and waveforms, of which the squares are added up: 0 for samples of weight 0.
+
+    Of values, or with `softening` of the logarithms of samples above it: asinh(value/softening).
+    """
+
+    weights: FloatArray  #: 1 over the standard deviation, shape (pixel, time).
+    softening: FloatArray | None = None  #: In the unit of the waveforms, above 0, shape (pixel, time).
+
+    def of(self, mean: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the differences, shape (pixel, time)."""
+        if self.softening is None:
+            return self.weights * (mean - values)
+        return np.asarray(self.weights * (np.arcsinh(mean / self.softening) - np.arcsinh(values / self.softening)))
+
+    def slope(self, mean: FloatArray) -> FloatArray:
+        """Return the change of the differences with the mean, shape (pixel, time)."""
+        return self.weights if self.softening is None else self.weights / np.hypot(mean, self.softening)
+
+
 def measured(
     source: xr.Dataset | str | os.PathLike[str],
     *,

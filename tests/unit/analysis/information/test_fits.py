@@ -1,5 +1,7 @@
 """Fits of a waveform in closed form: values, stated errors and their distribution, nuisances, and invalid input."""
 
+import itertools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -204,7 +206,7 @@ def test_errors_of_a_render_that_are_too_small_are_named():
 
 
 def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
-    """Steps of less than 0.02 standard errors are not rendered."""
+    """Near a render the model is taken as linear: last steps are not rendered."""
     fitted = fit(closed_form(TRUTH), noise=0.001)
     assert distance(fitted) < 0.02**2
     assert fitted.attrs["renders"] < 10
@@ -219,6 +221,41 @@ def test_exact_waveforms_are_fitted_far_within_their_errors_with_few_renders():
     heading, rows = table_rows(fitted)
     assert heading[:3] == ("parameter", "unit", "value")
     assert [row[0] for row in rows] == list(TRUTH)
+
+
+@pytest.mark.parametrize("deviation", [0.02, 0.0002])
+def test_logarithms_lead_from_wrong_starts_to_the_solution_with_few_renders(deviation):
+    """Every combination of half and of one and a half times the truth, against the fit from the truth."""
+    found = measured(noisy(deviation, np.random.default_rng(12)))
+    wanted = WaveformFit(found, closed_form, TRUTH).run()
+    for factors in itertools.product((0.5, 1.5), repeat=len(TRUTH)):
+        starts = {name: value * factor for (name, value), factor in zip(TRUTH.items(), factors, strict=True)}
+        problem = WaveformFit(found, closed_form, starts)
+        problem.approach()
+        near = np.array([problem.values[name] for name in TRUTH])
+        assert np.all(np.abs(near - wanted["value"]) < 0.1 * wanted["value"] + 3 * wanted["stderr"])
+        assert problem.renders <= 6
+        fitted = problem.run()
+        assert fitted.attrs["converged"]
+        assert fitted.attrs["renders"] <= 7
+        np.testing.assert_array_equal(fitted["start"], list(starts.values()))
+        off = (fitted["value"] - wanted["value"]).values
+        assert off @ np.linalg.solve(wanted["covariance"].values, off) < 0.2**2
+
+
+def test_parameters_that_are_hardly_told_apart_are_not_extrapolated():
+    """A large error of both is no reason to take the model as linear over it: samples would be off by their errors."""
+
+    def model(values):
+        exact = closed_form({**TRUTH, "scattering": values["scattering"] * values["factor"]})
+        slope = exact["waveform_derivative"].sel(parameter="scattering")
+        slopes = np.stack([slope * values["factor"], slope * values["scattering"]])
+        data = {"waveform": exact["waveform"], "waveform_derivative": (("parameter", "pixel", "time"), slopes)}
+        return xr.Dataset(data, {"parameter": ["scattering", "factor"]}, exact.attrs)
+
+    fitted = fit(closed_form(TRUTH), {"scattering": 0.05, "factor": 1.0}, model=model, noise=1e-5)
+    assert float(fitted["value"].prod()) == pytest.approx(0.15, rel=1e-4)
+    assert abs(fitted["residual"]).max() < 0.2
 
 
 def test_covariance_is_the_inverse_of_the_information():
