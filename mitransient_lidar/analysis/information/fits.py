@@ -136,7 +136,6 @@ class WaveformFit:
         found = self._solution(self.values, Misfit(weights, softening), used, _COARSE_TOLERANCE)
         # Without time for another render, the last one is what is left.
         self.values = self._rendered.values if self._is_over and self._rendered is not None else found
-        self._rendered, self._exhausted = None, False
 
     def noise_ratio(self) -> float:
         """Return the variance of the model's Monte Carlo over that of the waveforms, at `values`.
@@ -174,6 +173,7 @@ class WaveformFit:
             determine.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
+        self._rendered, self._exhausted = None, False
         values, rounds, settled = dict(self.values), 0, False
         while (
             not (settled or self._exhausted) and rounds < _MOST_ROUNDS and (rounds == 0 or self.renders < self._limit)
