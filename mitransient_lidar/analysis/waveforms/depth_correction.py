@@ -28,7 +28,7 @@ _TABLE = ("bias", "spread", "found", "noise_error", "attenuation")
 _USUAL, _FEWEST = 0.5, 4.0
 #: Rate of a random walk from left-out nodes over that from differences, which a trend raises: the mean of the depths
 #: and waters, over a level sea, of the first six shipped tables.
-_OF_TWO = 0.47
+_OF_TWO = 0.46
 _SAME_RING = 0.05  # largest difference of the radii of pixels on a ring, over the largest radius
 _ANGLE_DIGITS = 6  # of angles between pixels [deg]
 _NEAR = 2.0  # largest error of a depth that counts [m]
@@ -116,7 +116,7 @@ def correct_depths(
     g h/(g + h), and beyond an end rate times g (kriging with a linear variogram; G. Matheron, Principles of
     geostatistics, Economic Geology 58 (1963), 1246, doi:10.2113/gsecongeo.58.8.1246). The rate along an axis is the
     mean over the cells of the lowest wind in which half of the shots have a depth: of the squared differences from the
-    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.47 of their squared
+    interpolation between the neighbours, each left out in turn, over g h/(g + h). Two nodes give 0.46 of their squared
     difference over the distance, the mean ratio of both rates in eight tables; one node gives 0. Cells in which fewer
     of the shots have a depth count only where no other ones do. Without any bias of an estimator in a pixel, depths and
     errors stay as they are.

@@ -69,9 +69,9 @@ def test_the_bias_of_the_place_between_nodes_is_subtracted():
             bias = factor * (0.15 + 0.06 + 0.09 + 0.005 * np.array([4.0, 8.0])) + p
             np.testing.assert_allclose(bottom["depth_m"].values[:2, p, e], np.array([4.0, 8.0]) - bias)
             np.testing.assert_allclose(bottom["depth_correction_m"].values[:2, p, e], bias)
-            # The bias is linear in depth; of two nodes, the walk's variance in the middle is 0.47 of a quarter of the
+            # The bias is linear in depth; of two nodes, the walk's variance in the middle is 0.46 of a quarter of the
             # squared difference. The nodes' spreads are 2, 6 and 10 cm.
-            between = 0.47 * 0.25 * factor**2 * (0.1**2 + 0.12**2)
+            between = 0.46 * 0.25 * factor**2 * (0.1**2 + 0.12**2)
             left = np.sqrt(np.array([0.04, 0.08]) ** 2 + between)
             np.testing.assert_allclose(bottom["depth_m_method_error"].values[:2, p, e], left)
     assert np.isnan(bottom["depth_m"].values[2]).all()
