@@ -77,6 +77,9 @@ def test_a_signal_is_the_mean_of_its_records(tmp_path):
     np.testing.assert_allclose(found.values, recorded["signal"].mean("shot"))
     assert found.shots == 5
     assert found.receiver.backgrounds.tolist() == [1e-9]
+    # A sample that one record has not stored is missing: the mean of the others would be that of the high ones.
+    gap = recorded["signal"].where((recorded["shot"] != 2) | (recorded["time"] != 20))
+    assert np.flatnonzero(np.isnan(measured(recorded.assign(signal=gap)).values[0])).tolist() == [20]
     with pytest.raises(UserError, match=r"noise = 0\.1 is that of the receiver"):
         measured(recorded, noise=0.1)
     del recorded.attrs["receiver"]
