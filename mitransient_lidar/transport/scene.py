@@ -127,6 +127,11 @@ class WaterScene:
         return [surface for surface in self.surfaces if isinstance(surface, SeaSurface)]
 
     @property
+    def mean_slope(self) -> tuple[float, float]:
+        """Mean slopes of the sea along x and y under the lidar, of the first sea [1]."""
+        return self.seas[0].sea.slope if self.seas else (0.0, 0.0)
+
+    @property
     def bottoms(self) -> list[mi.Shape]:
         """Solids that are the bottom, or a part of it; all others are targets.
 
