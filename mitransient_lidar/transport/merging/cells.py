@@ -175,14 +175,12 @@ class WaterGrid:
         self._uppermost = opaque(uppermost)
         self.bits_z = int(np.clip(math.ceil(math.log2(layers + depth / thickness + 1)), 2, 8))
 
-    def of_shots(
-        self, heights: SurfaceHeights, entries: FloatArray, axes: FloatArray | None, wider: float, bits: int
-    ) -> WaterGrid:
-        """Return the grid of shots with heights and axes of their own, see `BeamRings.of_entries`.
+    def of_shots(self, heights: SurfaceHeights, rings: BeamRings, wider: float, bits: int) -> WaterGrid:
+        """Return the grid of shots with heights and axes of their own.
 
         Cells are wider by a factor, and there are buckets for each shot.
         """
-        grid = self.moved(heights, self.rings.of_entries(entries, axes))
+        grid = self.moved(heights, rings)
         grid.width, grid.bits = self.width * opaque(wider), bits
         return grid
 
@@ -313,7 +311,7 @@ class WaterCells:
         moved = dr.fma(distance, descent, depth)
         along, across = rings.offset(x, y, moved)
         # Offsets are from the axis that the mean slope refracts.
-        slopes, start = rings.along_and_across(slope - rings.tilt), rings.offset(point.x, point.y, depth)
+        slopes, start = rings.along_and_across(slope - mi.Vector2f(*rings.tilt)), rings.offset(point.x, point.y, depth)
         if looks_up:
             more = grid.profile.spread(start, depth, moved, slopes)
             along, across = along + more[0], across + more[1]

@@ -174,8 +174,8 @@ class MergingLayout:
             heights = SurfaceHeights(scene, self.region, self.depth, entries[:, :2] - self.entry[:2])
             buckets = min(MOST_BUCKET_BITS, max(bits + _BITS_OF_CELLS, grid.bits_z + 2))
             axes = None if scene.transmitter_poses is None else scene.transmitter_poses.axis
-            grid = grid.of_shots(heights, entries, axes, max(wider, 1.0), buckets)
-            rings = grid.rings
+            rings = grid.rings.of_entries(entries, axes, scene.mean_slopes(shots))
+            grid = grid.of_shots(heights, rings, max(wider, 1.0), buckets)
         # A copy has capacities of its own.
         uneven = solids_of_several_levels(scene, self.region, shots)
         patch_width = self.patch_width * max(wider, 1.0)
@@ -204,7 +204,7 @@ class MergingLayout:
         uneven, grid = solids_of_several_levels(scene, self.region), self.grid
         if not isinstance(grid, WaterGrid):
             return replace(self, uneven=uneven)
-        rings = grid.rings.alike(scene.transmitter.pose, beam_entries(scene), scene.mean_slope)
+        rings = grid.rings.alike(scene.transmitter.pose, beam_entries(scene), scene.mean_slopes(1))
         heights = grid.heights.with_surface_of(scene, self.region)
         return replace(self, uneven=uneven, grid=grid.moved(heights, rings), rings=rings)
 
@@ -240,7 +240,7 @@ class MergingLayout:
             )
         footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
         entries = beam_entries(scene)
-        rings = BeamRings(pose, footprint, scene.refractive_index, tilt=scene.mean_slope).of_entries(entries)
+        rings = BeamRings(pose, footprint, scene.refractive_index, tilt=scene.mean_slopes(1)).of_entries(entries)
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         receiver = scene.receiver.pose

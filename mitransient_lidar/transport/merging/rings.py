@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -67,7 +68,7 @@ class BeamRings:
     growth
         Growth of the core radius with depth [m/m].
     tilt
-        Mean slopes of the sea along x and y, which refracts the axis [1].
+        Mean slopes of the sea along x and y, which refracts the axis [1], shape (1, 2); by default it is level.
 
     The axis begins where it meets the mean sea level, or where each shot's beam meets the sea (`of_entries`).
     """
@@ -78,15 +79,15 @@ class BeamRings:
         spread: float,
         index: float,
         growth: float = _CORE_PER_METRE,
-        tilt: tuple[float, float] = (0.0, 0.0),
+        tilt: FloatArray | None = None,
     ) -> None:
         self.spread, self._growth, self._index = opaque(spread), opaque(growth), index
         self._entry = mi.Vector3f(opaque(0.0))
         #: Ratio of the axes of the ellipses.
         self.cosine = opaque(max(-float(pose.axis[2]), _SMALLEST_COSINE))
-        self._aim(pose, tilt)
+        self._aim(pose, np.zeros((1, 2)) if tilt is None else tilt)
 
-    def _aim(self, pose: Pose, tilt: tuple[float, float]) -> None:
+    def _aim(self, pose: Pose, tilt: FloatArray) -> None:
         """Lay the axis through that of a pose."""
         horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
@@ -94,37 +95,36 @@ class BeamRings:
         azimuth = horizontal / sine if sine > 0 else pose.far[:2]
         self._spot = [opaque(x) for x in spot]
         self._azimuth = [opaque(x) for x in azimuth]
-        #: Mean slopes of the sea along x and y.
-        self.tilt = mi.Vector2f(*(opaque(slope) for slope in tilt))
-        self._tilt = tilt
-        self._set_axes(pose.axis[np.newaxis])
+        self._set_axes(pose.axis[np.newaxis], tilt)
 
-    def alike(self, pose: Pose, entries: FloatArray, tilt: tuple[float, float]) -> BeamRings:
+    def alike(self, pose: Pose, entries: FloatArray, tilt: FloatArray) -> BeamRings:
         """Return the same rings about the axis of another pose, below a sea of other mean slopes."""
         rings = copy.copy(self)
         rings._aim(pose, tilt)
         return rings.of_entries(entries)
 
-    def of_entries(self, entries: FloatArray, axes: FloatArray | None = None) -> BeamRings:
+    def of_entries(
+        self, entries: FloatArray, axes: FloatArray | None = None, tilts: FloatArray | None = None
+    ) -> BeamRings:
         """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3).
 
-        Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own.
+        Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own, below
+        seas of mean slopes `tilts`, shape (shots, 2).
         """
         rings = copy.copy(self)
         rings._entry = mi.Vector3f(*_columns(entries))
-        if axes is not None:
-            rings._set_axes(axes)
+        if axes is not None and tilts is not None:
+            rings._set_axes(axes, tilts)
         return rings
 
-    def _set_axes(self, axes: FloatArray) -> None:
-        """Refract axes, unit directions in air of one or more shots, shape (shots, 3)."""
+    def _set_axes(self, axes: FloatArray, tilts: FloatArray) -> None:
+        """Refract axes, unit directions in air of one or more shots, shape (shots, 3), by seas of mean slopes."""
         index, horizontal = self._index, axes[:, :2]
         sine = np.hypot(*horizontal.T)
         cosine = np.maximum(np.sqrt(np.maximum(1 - (sine / index) ** 2, 0)), _SMALLEST_COSINE)
         level = shear = horizontal / (index * cosine)[:, None]
-        if any(self._tilt):
-            normal = np.array([-self._tilt[0], -self._tilt[1], 1.0])
-            refracted = refract_at_facet(axes, normal, index)
+        if tilts.any():
+            refracted = refract_at_facet(axes, np.column_stack([-tilts, np.ones(len(tilts))]), index)
             shear = refracted[:, :2] / np.maximum(-refracted[:, 2:], _SMALLEST_COSINE)
         is_steep = sine < _LARGEST_SLANT * index * cosine
         #: Horizontal displacement of the axis for each metre of depth.
@@ -133,15 +133,16 @@ class BeamRings:
         self.slant = _columns(np.where(is_steep[:, None], shear, 0.0))
         #: Horizontal displacement of the axis below level facets for each metre of depth.
         self._level = _columns(level)
+        #: Mean slopes of the sea along x and y.
+        self.tilt = _columns(tilts)
 
     def repeated(self, copies: int) -> BeamRings:
         """Return the rings of each shot several times in turn."""
         rings = copy.copy(self)
         rings._entry = dr.repeat(self._entry, copies)
-        if any(dr.width(each) > 1 for each in self.shear):
-            sides = self.shear, self.slant, self._level
-            rings.shear, rings.slant, rings._level = ([dr.repeat(each, copies) for each in pair] for pair in sides)
-        dr.eval(rings._entry, rings.shear, rings.slant, rings._level)
+        if self._differ:
+            rings._of_shots(lambda each: dr.repeat(each, copies))
+        dr.eval(rings._entry, rings.shear, rings.slant, rings._level, rings.tilt)
         return rings
 
     def of(self, lanes: Lanes) -> BeamRings:
@@ -150,10 +151,19 @@ class BeamRings:
             return self
         rings = copy.copy(self)
         rings._entry = lanes.pick(self._entry)
-        if any(dr.width(each) > 1 for each in self.shear):
-            sides = self.shear, self.slant, self._level
-            rings.shear, rings.slant, rings._level = ([lanes.pick(each) for each in pair] for pair in sides)
+        if self._differ:
+            rings._of_shots(lanes.pick)
         return rings
+
+    @property
+    def _differ(self) -> bool:
+        """Whether axes differ between shots."""
+        return any(dr.width(each) > 1 for each in self.shear)
+
+    def _of_shots(self, change: Callable[[mi.Float], mi.Float]) -> None:
+        """Change the numbers that differ between shots."""
+        for name in ("shear", "slant", "_level", "tilt"):
+            setattr(self, name, [change(each) for each in getattr(self, name)])
 
     def depth_at(self, z: mi.Float) -> mi.Float:
         """Return the depth of a height [m] below the beginning of the axis [m]."""
