@@ -85,7 +85,8 @@ def positions(
         Echoes of `echo_table.extract` with one estimator and depths from the surface echo, corrected by
         `depth_correction.correct_depths` or not; over ``shot`` and ``pixel``, or ``row`` and ``column``.
     origin, axis, far, left
-        Poses of the pulses, as of `transport.pose.Pose`: positions [m] and orthonormal directions, shape (shots, 3).
+        Poses of the pulses, as of `physics.lidar.pose.Pose`: positions [m] and orthonormal directions, shape
+        (shots, 3).
     angle_x, angle_y
         Tangent-plane angles of the pixels' lines of sight [rad], +angle_y to the left; they broadcast to (shots,
         pixels). Those of results are ``sight_x`` and ``sight_y``.

@@ -327,10 +327,10 @@ def _vectors(inputs: Mapping[str, Column], name: str) -> FloatArray:
 def _shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
     """Return the poses of pulses of one group."""
     from mitransient_lidar.rendering.shot_poses import ShotPoses
-    from mitransient_lidar.transport.pose import Pose
+    from mitransient_lidar.transport.pose import KernelPose
 
     origin, axis, far, left = (_vectors(inputs, name) for name in ("origin", "axis", "far", "left"))
-    return ShotPoses.of_receiver(lidar, Pose(origin, axis, far, left))
+    return ShotPoses.of_receiver(lidar, KernelPose(origin, axis, far, left))
 
 
 def _columns(poses: PulsePoses) -> dict[str, Column]:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.plugin_types import Transmitter
-    from mitransient_lidar.transport.pose import Pose
 
 #: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
 SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
@@ -132,8 +131,6 @@ def transmitter_of(scene: mi.Scene) -> Transmitter:
 
 def footprint(transmitter: Transmitter) -> tuple[float, float, float]:
     """Return the beam's azimuth [rad], and its spread on the mean sea level along and across it [m]."""
-    pose: Pose = transmitter.pose
-    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
-    cosine = max(-float(pose.axis[2]), 1e-3)
-    azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
-    return azimuth, across / cosine, across
+    pose = transmitter.pose
+    across = transmitter.widest_angular_spread * pose.ground_range
+    return float(pose.azimuth), across / max(-float(pose.axis[2]), 1e-3), across

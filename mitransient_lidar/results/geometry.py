@@ -21,6 +21,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
 from mitransient_lidar.physics.lidar import gate_train, refraction
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.pose import Pose
 
 Attributes = Mapping[str, Any]
 
@@ -221,13 +222,11 @@ class LinesOfSight:
         known = "angle_x" in dataset.coords and "angle_y" in dataset.coords
         count = math.prod(shape)
         x, y = (1e-3 * coordinate(name) if known else np.zeros(count) for name in ("angle_x", "angle_y"))
-        down = np.cos(axis.off_nadir) - np.sin(axis.off_nadir) * x
-        if "receiver_pose" in dataset.attrs:
-            _, (_, _, along), (_, _, far), (_, _, left) = np.reshape(dataset.attrs["receiver_pose"], (4, 3))
-            down = -(along + far * x + left * y)
+        pose = pose_of(dataset.attrs) or Pose.from_angles(axis.height, math.degrees(axis.off_nadir))
+        down = -pose.directions(np.stack([x, y], axis=1))[:, 2]
         if np.any(down <= 0):
             raise UserError("angle_x and angle_y must point below the horizon: the lines of sight must meet the sea")
-        off_nadir = np.arccos(np.minimum(down / np.sqrt(1 + x**2 + y**2), 1))
+        off_nadir = np.arccos(np.minimum(down, 1))
         time = refraction.surface_time_ns(axis.height, off_nadir)
         measured = optional_number(dataset.attrs, "surface_time_ns")
         if measured is not None:
@@ -287,6 +286,12 @@ class LinesOfSight:
         theta = self.off_nadir[:, np.newaxis]
         at, n = refraction.solid_angle_per_area, geometry.refractive_index
         return np.asarray(at(geometry.height, depth, theta, n) / at(geometry.height, 0.0, theta, n))
+
+
+def pose_of(attributes: Attributes, name: str = "receiver_pose") -> Pose | None:
+    """Return the pose of the receiver, or ``transmitter_pose``, of a result that has it among its attributes."""
+    given = attributes.get(name, ())
+    return Pose(*np.reshape(np.asarray(given, dtype=np.float64), (4, 3))) if len(given) == 12 else None
 
 
 def _require_height(height: float | None) -> None:

@@ -15,7 +15,7 @@ from mitransient_lidar.physics.sea import sea_surface
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
 
@@ -23,7 +23,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 class Transmitter(Protocol):
     """The emitter ``lidar_transmitter``: energies [J], rms angles of the beam [rad]."""
 
-    pose: Pose
+    pose: KernelPose
     parameters: dict[str, Any]
     wavelength_nm: float
     pulse_energy: float

@@ -154,7 +154,7 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     edge = transmitter.profile.reach
     moved = np.array([*shift, 0.0])
     view, beam = (
-        Cone(one.origin + moved, np.stack([one.axis, one.far, one.left]), angles, is_round)
+        Cone(replace(one, origin=one.origin + moved), angles, is_round)
         for one, angles, is_round in (
             (pose, half_angles, pixels.field_of_view_shape == "circle"),
             (transmitter.pose, (edge, edge), True),
@@ -163,7 +163,7 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     boxes = [shape.bbox() for shape in scene.mitsuba_scene.shapes()]
     corners = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 3)[:, :2]
     reach = max(
-        (float(np.hypot(*(np.abs(corners - one.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
+        (float(np.hypot(*(np.abs(corners - one.pose.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
         default=float(pose.origin[2]),
     )
     if scene.water is None:
@@ -172,8 +172,7 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     layers, column, plume = scene.water.index_layers, scene.water.column, scene.water.plume
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     kd = [InherentProperties(*map(float, row)).kd for row in rows]
-    slant_range = float(np.linalg.norm(pose.ground_point() - pose.origin))
-    spot = slant_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
+    spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
     attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
     n, group, boundaries = (
         tuple(map(float, each)) for each in (layers.refractive_index, layers.group_index, layers.boundaries)

@@ -19,7 +19,7 @@ from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
 from mitransient_lidar.transport.plugin_types import SeaSurface, Transmitter
-from mitransient_lidar.transport.pose import Pose, RelativePose
+from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
@@ -96,7 +96,7 @@ class WaterScene:
     surfaces: list[mi.Shape]
     slope_variance: float
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
-    receiver_poses: Pose | None = field(default=None, kw_only=True)
+    receiver_poses: KernelPose | None = field(default=None, kw_only=True)
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
 
     def of(self: SceneT, lanes: Lanes) -> SceneT:
@@ -112,7 +112,7 @@ class WaterScene:
         return replace(self, parts=tuple(parts)) if parts else self
 
     @property
-    def receiver_pose(self) -> Pose:
+    def receiver_pose(self) -> KernelPose:
         """Pose of the receiver for paths."""
         return self.receiver_poses or self.receiver.pose
 
@@ -207,11 +207,11 @@ class WaterScene:
             return LevelSea((1.0,))
         return LevelSea(tuple(map(float, layers.refractive_index)), tuple(map(float, layers.boundaries)))
 
-    def relative(self, pose: Pose) -> RelativePose:
+    def relative(self, pose: KernelPose) -> RelativePose:
         """Return a pose relative to the reference point of the scene, as lengths of paths are."""
         return RelativePose(pose, self.receiver.pose.nearby_point())
 
-    def first_points(self, pose: Pose, angles: mi.Point2f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Float]:
+    def first_points(self, pose: KernelPose, angles: mi.Point2f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Float]:
         """Return where paths from a pose start [m], at tangent-plane angles, and their relative lengths there [m].
 
         Paths from more than 10 km above the scene start 1 m above all shapes: traced from farther away in single
@@ -316,7 +316,7 @@ class LidarScene(WaterScene):
     transmitter: Transmitter
     axis: TimeAxis
     gates: GatePlan | None
-    transmitter_poses: Pose | None = field(default=None, kw_only=True)
+    transmitter_poses: KernelPose | None = field(default=None, kw_only=True)
 
     def of(self, lanes: Lanes) -> LidarScene:
         """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
@@ -325,7 +325,7 @@ class LidarScene(WaterScene):
         return moved if poses is None else replace(moved, transmitter_poses=poses.of(lanes))
 
     @property
-    def transmitter_pose(self) -> Pose:
+    def transmitter_pose(self) -> KernelPose:
         """Pose of the transmitter for paths."""
         return self.transmitter_poses or self.transmitter.pose
 

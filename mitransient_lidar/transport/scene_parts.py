@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.medium.water import Water
@@ -21,7 +22,6 @@ from mitransient_lidar.transport.plugin_types import (
     Transmitter,
     WaterMedium,
 )
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -196,8 +196,7 @@ def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
 
 def _check_cells(surfaces: list[mi.Shape], transmitter: Transmitter) -> None:
     """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
-    spot = transmitter.pose.ground_point()
-    footprint = 2 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    footprint = 2 * transmitter.angular_spread * transmitter.pose.ground_range
     for surface in surfaces:
         if isinstance(surface, SeaSurface) and footprint < surface.cell_size < np.inf:
             raise UserError(

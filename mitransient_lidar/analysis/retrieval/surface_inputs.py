@@ -15,7 +15,13 @@ from mitransient_lidar.core.validation import FloatArray, finite
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
-from mitransient_lidar.results.geometry import LidarGeometry, open_aperture, required_number, two_way_efficiency
+from mitransient_lidar.results.geometry import (
+    LidarGeometry,
+    open_aperture,
+    pose_of,
+    required_number,
+    two_way_efficiency,
+)
 
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
 
@@ -72,8 +78,8 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
             return None
         speed = known
     direction = attributes.get("scene.wind_direction_deg", 0) if direction_deg is None else direction_deg
-    axis = np.asarray(attributes.get("receiver_pose", [0.0, 0, 0, 1, 0]), dtype=np.float64)[3:5]
-    azimuth = math.atan2(axis[1], axis[0]) if np.hypot(*axis) > 1e-9 else 0.0
+    pose = pose_of(attributes)
+    azimuth = 0.0 if pose is None else float(pose.azimuth)
     return speed, math.radians(finite("wind_direction_deg", direction)) - azimuth
 
 

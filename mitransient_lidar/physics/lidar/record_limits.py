@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
@@ -46,18 +47,15 @@ class Cone:
 
     Parameters
     ----------
-    origin
-        Position [m], shape (3,), above the sea level.
-    frame
-        Unit vectors of the axis and of the tangent-plane angles, shape (3, 3).
+    pose
+        Position above the sea level, and axis.
     half_angles
         Half angles along the two tangent-plane angles [rad].
     is_round
         Whether the cross-section is an ellipse, or a rectangle.
     """
 
-    origin: FloatArray
-    frame: FloatArray
+    pose: Pose
     half_angles: tuple[float, float]
     is_round: bool = True
 
@@ -68,21 +66,19 @@ class Cone:
         if not self.is_round:
             edge = edge / np.abs(edge).max(axis=1, keepdims=True)
         angles = (np.linspace(0, 1, _CIRCLES + 1)[:, None, None] * edge).reshape(-1, 2) * self.half_angles
-        axis, far, left = self.frame
-        direction = axis + angles[:, :1] * far + angles[:, 1:] * left
+        direction = self.pose.rays(angles)
         sine, down = np.hypot(direction[:, 0], direction[:, 1]), -direction[:, 2]
         with np.errstate(divide="ignore"):
-            distance = np.where(down > 0, (self.origin[2] - z) * sine / np.maximum(down, 0), np.inf)
+            distance = np.where(down > 0, (self.pose.origin[2] - z) * sine / np.maximum(down, 0), np.inf)
         along = np.minimum(distance, reach) / np.where(sine > 0, sine, 1)
-        return np.asarray(self.origin[:2] + direction[:, :2] * along[:, None])
+        return np.asarray(self.pose.origin[:2] + direction[:, :2] * along[:, None])
 
     def holds(self, places: FloatArray, z: float) -> np.ndarray:
         """Return whether places x, y [m] at a height [m] are in the cone."""
-        offset = np.column_stack([places, np.full(len(places), z)]) - self.origin
-        axis, far, left = self.frame
-        ahead = offset @ axis
-        scale = 1 / np.where(ahead > 0, ahead, np.inf)
-        x, y = (np.abs(offset @ side) * scale / half for side, half in zip((far, left), self.half_angles, strict=True))
+        offset = np.column_stack([places, np.full(len(places), z)]) - self.pose.origin
+        ahead = offset @ self.pose.axis
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = np.abs(self.pose.angles_of(offset) / self.half_angles).T
         # The edge of an equal cone is inside, whatever the rounding.
         return np.asarray((ahead > 0) & ((np.hypot(x, y) if self.is_round else np.maximum(x, y)) <= 1 + 1e-9))
 
@@ -298,10 +294,10 @@ class LidarView:
         common = np.concatenate([of_view[self.beam.holds(of_view, z)], of_beam[self.view.holds(of_beam, z)]])
         meet = len(common) > 0
         laser, receiver = (common, common) if meet else (of_beam, of_view)
-        return Lines.between(self.beam.origin, laser, z), Lines.between(self.view.origin, receiver, z), meet
+        return Lines.between(self.beam.pose.origin, laser, z), Lines.between(self.view.pose.origin, receiver, z), meet
 
     def _below_instruments(self, z: float) -> float:
-        return float(min(z, _HIGHEST * min(self.view.origin[2], self.beam.origin[2])))
+        return float(min(z, _HIGHEST * min(self.view.pose.origin[2], self.beam.pose.origin[2])))
 
     def _earliest(self, z: float) -> float:
         """Return the time of the first light from a height in the air [ns]."""

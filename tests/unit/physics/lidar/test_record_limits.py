@@ -7,6 +7,7 @@ import pytest
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid, Water
 from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -19,9 +20,9 @@ def cone(off_nadir_deg=20.0, half_mrad=15.0, altitude=200.0, x=0.0, is_round=Tru
     """A cone towards +x whose axis meets the sea level at `aim`, moved by x."""
     angle = math.radians(off_nadir_deg)
     sin, cos = math.sin(angle), math.cos(angle)
-    frame = np.array([[sin, 0, -cos], [cos, 0, sin], [0, 1, 0]])
-    origin = np.array([aim - altitude * sin / cos + x, 0.0, altitude])
-    return Cone(origin, frame, (1e-3 * half_mrad, 1e-3 * half_mrad), is_round)
+    axes = np.array([[sin, 0, -cos], [cos, 0, sin], [0, 1, 0]])
+    pose = Pose(np.array([aim - altitude * sin / cos + x, 0.0, altitude]), *axes)
+    return Cone(pose, (1e-3 * half_mrad, 1e-3 * half_mrad), is_round)
 
 
 def water(attenuation=0.1, boundaries=(), indices=(N,), group=(GROUP,), tops=(0.0,)):
@@ -80,12 +81,13 @@ def test_a_receiver_beside_the_laser():
     found = lidar(view, beam).limits([plane(10.0)], direct=True)
     places = np.concatenate([one.places(-0.0, 1000.0) for one in (view, beam)])
     both = places[view.holds(places, 0.0) & beam.holds(places, 0.0)]
-    ranges = [np.linalg.norm(np.column_stack([both, np.zeros(len(both))]) - one.origin, axis=1) for one in (view, beam)]
+    points = np.column_stack([both, np.zeros(len(both))])
+    ranges = [np.linalg.norm(points - one.pose.origin, axis=1) for one in (view, beam)]
     assert found.surface_ns[0] == pytest.approx(NS * (ranges[0] + ranges[1]).min(), abs=0.05)
     far = both[np.argmax(both[:, 0])]
     lengths = []
     for one, height in ((view, 200.0), (beam, 150.0)):
-        theta, phi = refracted_path(float(np.hypot(*(far - one.origin[:2]))), height, 10.0, N)
+        theta, phi = refracted_path(float(np.hypot(*(far - one.pose.origin[:2]))), height, 10.0, N)
         lengths.append(float(height / np.cos(theta) + GROUP * 10.0 / np.cos(phi)))
     # That point lies above the bottom of the far edge; the record may be longer, not shorter.
     assert NS * sum(lengths) - 0.5 < found.last_ns < NS * sum(lengths) + 25
