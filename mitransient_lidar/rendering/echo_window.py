@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
-from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.transport.opaque import aligned
@@ -315,7 +315,7 @@ def _two_way(
 
     The ends are angles about the other pose. Paths that do not meet the sea, or end behind the pose, are NaN.
     """
-    n, group = scene.refractive_index, scene.group_index
+    group = scene.group_index
     direction = start.directions(angles)
     if scene.submerged:
         distance = (-depth - start.origin[2]) / np.where(direction[:, 2] != 0, direction[:, 2], np.nan)
@@ -323,20 +323,18 @@ def _two_way(
         offset = start.origin + direction * distance[:, np.newaxis] - end.origin
         way_back = np.linalg.norm(offset, axis=1)
         return 1e9 / C0 * group * (distance + way_back), _tangent(end, offset)
+    # The scale of depth is that of the top index layer.
+    sea = LevelSea((scene.refractive_index,), group_index=(group,))
     down = np.where(direction[:, 2] < 0, -direction[:, 2], np.nan)
-    sine = np.hypot(direction[:, 0], direction[:, 1])
-    cosine = np.sqrt(1 - (sine / n) ** 2)
-    one_way = start.origin[2] / down + group * depth / cosine
+    one_way = start.origin[2] / down + sea.lengths(depth, np.hypot(*direction[:, :2].T))[0]
     if np.all(start.origin == end.origin):
         return 2e9 / C0 * one_way, _tangent(end, direction)
-    reach = start.origin[2] / down + depth / (n * cosine)
-    offset = start.origin[:2] + direction[:, :2] * reach[:, np.newaxis] - end.origin[:2]
-    distance = np.hypot(*offset.T)
-    known = np.isfinite(distance)
-    theta, phi = refracted_path(np.where(known, distance, 0), end.origin[2], depth, n)
-    back = end.origin[2] / np.cos(theta) + group * depth / np.cos(phi)
-    across = offset * (np.sin(theta) / np.where(known & (distance > 0), distance, 1))[:, np.newaxis]
-    arriving = np.column_stack([across, -np.cos(theta)])
+    places = sea.at_height(start.origin, direction, -depth)
+    known = np.isfinite(places[:, 0])
+    points = np.column_stack([np.where(known[:, np.newaxis], places, 0.0), np.full(len(places), -depth)])
+    arriving = np.pad(sea.crossing(end.origin, points), ((0, 0), (0, 1))) - end.origin
+    air = np.linalg.norm(arriving, axis=1)
+    back = air + sea.lengths(depth, np.hypot(*arriving[:, :2].T) / air)[0]
     return 1e9 / C0 * np.where(known, one_way + back, np.nan), _tangent(end, arriving)
 
 

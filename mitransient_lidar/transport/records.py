@@ -168,20 +168,17 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     )
     if scene.water is None:
         none = np.zeros(1)
-        return LidarView(view, beam, Water((1.0,), (1.0,), (), none, none), (0.0, 0.0), reach, None)
-    layers, column, plume = scene.water.index_layers, scene.water.column, scene.water.plume
+        return LidarView(view, beam, Water(scene.level_sea, none, none), (0.0, 0.0), reach, None)
+    column, plume = scene.water.column, scene.water.plume
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     kd = [InherentProperties(*map(float, row)).kd for row in rows]
     spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
     attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
-    n, group, boundaries = (
-        tuple(map(float, each)) for each in (layers.refractive_index, layers.group_index, layers.boundaries)
-    )
     heights = [(float(surface.bbox().min.z), float(surface.bbox().max.z)) for surface in scene.surfaces]
     return LidarView(
         view,
         beam,
-        Water(n, group, boundaries, column.layer_tops, attenuation),
+        Water(scene.level_sea, column.layer_tops, attenuation),
         (min(low for low, _ in heights), max(high for _, high in heights)),
         reach,
         0.0 if plume is None else plume.depth,

@@ -205,7 +205,8 @@ class WaterScene:
         layers = self.index_layers
         if layers is None:
             return LevelSea((1.0,))
-        return LevelSea(tuple(map(float, layers.refractive_index)), tuple(map(float, layers.boundaries)))
+        arrays = layers.refractive_index, layers.boundaries, layers.group_index
+        return LevelSea(*(tuple(map(float, each)) for each in arrays))
 
     def relative(self, pose: KernelPose) -> RelativePose:
         """Return a pose relative to the reference point of the scene, as lengths of paths are."""

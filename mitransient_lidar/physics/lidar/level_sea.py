@@ -25,10 +25,26 @@ class LevelSea:
         Indices relative to air from the top down, at least 1, shape (layers,).
     boundaries
         Depths of the boundaries between the layers [m], increasing, shape (layers - 1,).
+    group_index
+        Group indices of the layers; by default the refractive indices.
     """
 
     refractive_index: tuple[float, ...]
     boundaries: tuple[float, ...] = ()
+    group_index: tuple[float, ...] | None = None
+
+    def lengths(self, depth: npt.ArrayLike, sine: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the optical length of rays from the sea level to depths, and the horizontal one over the sine [m].
+
+        Depths [m] and sines of the angles from the vertical in the air broadcast; lengths to points in the air are 0.
+        """
+        depth, sine = np.asarray(depth, dtype=np.float64), np.asarray(sine, dtype=np.float64)
+        optical = horizontal = np.zeros(np.broadcast_shapes(depth.shape, sine.shape))
+        groups = self.group_index or self.refractive_index
+        for index, group, thickness in zip(self.refractive_index, groups, self._thickness(depth), strict=True):
+            length = thickness / np.sqrt(index**2 - sine**2)
+            optical, horizontal = optical + group * index * length, horizontal + length
+        return optical, horizontal
 
     def at_height(self, origin: FloatArray, directions: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
         """Return where rays from points in the air meet a height, in the air or in the water.
@@ -52,10 +68,7 @@ class LevelSea:
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         sine = np.hypot(rays[..., 0], rays[..., 1])
         down = np.where(rays[..., 2] < -_SMALLEST_DESCENT, -rays[..., 2], np.nan)
-        distance = (origin[..., 2] - np.maximum(level, 0)) / down
-        for index, thickness in zip(self.refractive_index, self._thickness(-level), strict=True):
-            # Horizontal distance over the sine in the air.
-            distance = distance + thickness / np.sqrt(index**2 - sine**2)
+        distance = (origin[..., 2] - np.maximum(level, 0)) / down + self.lengths(-level, sine)[1]
         return np.asarray(origin[..., :2] + rays[..., :2] * distance[..., None])
 
     def crossing(self, origin: FloatArray, points: npt.ArrayLike) -> FloatArray:

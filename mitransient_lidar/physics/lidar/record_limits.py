@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
@@ -126,27 +127,15 @@ class Water:
 
     Parameters
     ----------
-    refractive_index, group_index
-        Indices of the index layers, shape (layers,).
-    boundaries
-        Depths between the index layers [m].
+    sea
+        Its index layers.
     tops, attenuation
         Upper edges of the water layers [m], the first one 0, and their system attenuation [1/m].
     """
 
-    refractive_index: tuple[float, ...]
-    group_index: tuple[float, ...]
-    boundaries: tuple[float, ...]
+    sea: LevelSea
     tops: FloatArray
     attenuation: FloatArray
-
-    def path(self, depth: float, sine: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return optical and horizontal length [m] down to a depth [m] of rays with the sine of their angle in air."""
-        edges = [0.0, *self.boundaries, np.inf]
-        thickness = np.clip(depth - np.array(edges[:-1]), 0, np.diff(edges))
-        tilt = sine[:, None] / np.array(self.refractive_index)
-        length = thickness / np.sqrt(1 - tilt**2)
-        return np.asarray(length @ np.array(self.group_index)), np.asarray(np.sum(length * tilt, axis=1))
 
     def decay(self, depth: float) -> float:
         """Return the integral of the attenuation down to a depth [1]."""
@@ -174,33 +163,27 @@ class RecordLimits:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Straight lines from an instrument to places at one height.
+    """Straight lines from an instrument to places x, y [m], shape (n, 2), at one height."""
 
-    Attributes
-    ----------
-    places
-        x, y [m], shape (n, 2).
-    slope
-        Horizontal part of the unit directions, shape (n, 2).
-    length
-        Lengths [m], shape (n,).
-    """
-
+    origin: FloatArray
     places: FloatArray
-    slope: FloatArray
-    length: FloatArray
+    z: float
 
-    @classmethod
-    def between(cls, origin: FloatArray, places: FloatArray, z: float) -> Lines:
-        """Return the lines from a point to places at a height [m]."""
-        offset = places - origin[:2]
-        length = np.sqrt(np.sum(offset**2, axis=1) + (origin[2] - z) ** 2)
-        return cls(places, offset / length[:, None], length)
+    @cached_property
+    def length(self) -> FloatArray:
+        """Lengths [m], shape (n,)."""
+        offset = self.places - self.origin[:2]
+        return np.asarray(np.sqrt(np.sum(offset**2, axis=1) + (self.origin[2] - self.z) ** 2))
 
     @property
     def sine(self) -> FloatArray:
         """Sine of the angle from the vertical."""
-        return np.asarray(np.hypot(*self.slope.T))
+        return np.asarray(np.hypot(*((self.places - self.origin[:2]) / self.length[:, None]).T))
+
+    def below(self, sea: LevelSea, z: float) -> FloatArray:
+        """Return where the lines, refracted by the sea level, meet another height [m], shape (n, 2)."""
+        directions = np.insert(self.places - self.origin[:2], 2, self.z - self.origin[2], axis=1)
+        return sea.at_height(self.origin, directions, z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,11 +225,10 @@ class LidarView:
         (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
-        steepest = float(self._sea[1].sine.min()) / self.water.refractive_index[0]
+        steepest = float(self._sea[1].sine.min()) / self.water.sea.refractive_index[0]
         # Both ways, per vertical metre.
         slant = 2 / np.sqrt(1 - steepest**2)
-        seen = self._footprint(self._sea[1], 0.0)
-        covered = np.zeros(len(seen), dtype=bool)
+        covered = np.zeros(len(self._sea[1].places), dtype=bool)
         firsts, lasts = [], []
         for solid in solids:
             limits = self._heights_of(solid)
@@ -261,7 +243,7 @@ class LidarView:
                 later = 0.0 if direct else later
                 lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
                 low, high = solid.box
-                below = self._footprint(self._sea[1], lowest)
+                below = self._sea[1].below(self.water.sea, min(lowest, 0.0))
                 covered |= np.all((below >= low[:2]) & (below <= high[:2]), axis=1)
         if self.column is not None or not firsts:
             firsts.append(surface[0])
@@ -286,7 +268,8 @@ class LidarView:
         if len(outside) == 0:
             return 0.0
         away = np.linalg.norm(outside[:, None] - beam, axis=-1).min(axis=1)
-        return float(_NS_PER_M * self.water.group_index[0] * min(away.max(), _FARTHEST))
+        index = self.water.sea.group_index or self.water.sea.refractive_index
+        return float(_NS_PER_M * index[0] * min(away.max(), _FARTHEST))
 
     def _lines(self, z: float) -> tuple[Lines, Lines, bool]:
         """Return the lines of laser and receiver to a height, and whether they meet in places lit and seen."""
@@ -294,7 +277,7 @@ class LidarView:
         common = np.concatenate([of_view[self.beam.holds(of_view, z)], of_beam[self.view.holds(of_beam, z)]])
         meet = len(common) > 0
         laser, receiver = (common, common) if meet else (of_beam, of_view)
-        return Lines.between(self.beam.pose.origin, laser, z), Lines.between(self.view.pose.origin, receiver, z), meet
+        return Lines(self.beam.pose.origin, laser, z), Lines(self.view.pose.origin, receiver, z), meet
 
     def _below_instruments(self, z: float) -> float:
         return float(min(z, _HIGHEST * min(self.view.pose.origin[2], self.beam.pose.origin[2])))
@@ -309,15 +292,9 @@ class LidarView:
         """Return the times of the last direct light from a height, through the air and in the water [ns]."""
         total = in_water = 0.0
         for lines in self._lines(self._below_instruments(max(z, self.heights[0])))[:2]:
-            optical, _ = self.water.path(-z, lines.sine)
+            optical, _ = self.water.sea.lengths(-z, lines.sine)
             total, in_water = total + float((lines.length + optical).max()), in_water + float(optical.max())
         return _NS_PER_M * (total - in_water), _NS_PER_M * in_water
-
-    def _footprint(self, lines: Lines, z: float) -> FloatArray:
-        """Return where refracted lines to the sea level meet a height below it [m], shape (n, 2)."""
-        sine = lines.sine
-        _, across = self.water.path(-z, sine)
-        return np.asarray(lines.places + lines.slope * (across / np.where(sine > 0, sine, 1))[:, None])
 
     def _heights_of(self, solid: Solid) -> tuple[float, float] | None:
         """Return limits of the heights of the parts of a solid that may be lit and seen [m], None without such."""
@@ -327,7 +304,7 @@ class LidarView:
             corners = []
             for z in heights:
                 lines = self._sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
-                places = np.concatenate([self._footprint(one, min(z, 0.0)) for one in lines])
+                places = np.concatenate([one.below(self.water.sea, min(z, one.z)) for one in lines])
                 margin = _REACH_PER_DEPTH * max(-z, 0.0)
                 corners += [places.min(axis=0) - margin, places.max(axis=0) + margin]
             narrower = solid.heights_in(np.min(corners, axis=0), np.max(corners, axis=0))

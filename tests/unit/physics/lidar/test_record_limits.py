@@ -7,6 +7,7 @@ import pytest
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid, Water
 from mitransient_lidar.physics.lidar.refraction import refracted_path
@@ -27,7 +28,7 @@ def cone(off_nadir_deg=20.0, half_mrad=15.0, altitude=200.0, x=0.0, is_round=Tru
 
 def water(attenuation=0.1, boundaries=(), indices=(N,), group=(GROUP,), tops=(0.0,)):
     values = np.broadcast_to(attenuation, len(tops)).astype(np.float64)
-    return Water(tuple(indices), tuple(group), tuple(boundaries), np.array(tops), values)
+    return Water(LevelSea(tuple(indices), tuple(boundaries), tuple(group)), np.array(tops), values)
 
 
 def plane(depth, slope=0.0, size=5000.0, name="bottom"):
