@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import significance
 from oracles.beam_average import echo_energies
+from oracles.refracted_path import refracted_path
 from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
+from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 from mitransient_lidar.physics.water.hapke import HapkeSurface
 from mitransient_lidar.physics.water.layers import WaterColumn
 

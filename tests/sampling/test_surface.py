@@ -8,9 +8,10 @@ import pytest
 import significance
 from frequencies import misfit
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+from oracles.refracted_path import refracted_path
 from significance import assert_distribution, largest_chi2
 
-from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path
+from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler

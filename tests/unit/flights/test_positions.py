@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from oracles.refracted_path import refracted_path
 from scipy.spatial.transform import Rotation
 from significance import largest_chi2, largest_z
 from synthetic_shots import DEPTH, THETA, N, result
@@ -17,7 +18,6 @@ from mitransient_lidar.flights.positions import PointClass, fit_surface, positio
 from mitransient_lidar.flights.refracted_paths import PoseErrors
 from mitransient_lidar.flights.sea_surface import SeaSurface
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.refraction import refracted_path
 
 GROUP = 1.364
 INDICES = {"refractive_index": N, "group_index": GROUP}

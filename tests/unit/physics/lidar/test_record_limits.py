@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid, Water
-from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 NS = 1e9 / C0
