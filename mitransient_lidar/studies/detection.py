@@ -16,11 +16,11 @@ from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
-from mitransient_lidar.results.geometry import LidarGeometry
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
@@ -214,9 +214,7 @@ def detect(
 
 def _depth_per_ns(lidar: LidarScene) -> float:
     """Return the depth [m] per delay of the echo [ns]."""
-    pose = lidar.transmitter.pose
-    off_nadir = math.atan2(math.hypot(*(float(part) for part in pose.axis[:2])), -float(pose.axis[2]))
-    return LidarGeometry.level(float(pose.origin[2]), off_nadir, lidar.refractive_index, lidar.group_index).depth_per_ns
+    return LidarGeometry.of_pose(lidar.transmitter.pose, lidar.refractive_index, lidar.group_index).depth_per_ns
 
 
 def _experiment(

@@ -15,6 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.double_passage import (
     LEAST_DEPTH,
     EnhancementTable,
@@ -162,8 +163,8 @@ def _model(lidar: LidarScene) -> EchoEstimate:
     if lidar.targets:
         logger.warning("the estimate leaves out %s", ", ".join(repr(target.id()) for target in lidar.targets))
     energy = lidar.transmitter.energy * lidar.receiver.optics.collection
-    angle = math.radians(pose.off_nadir_deg)
-    system = LidarSystem(float(pose.origin[2]), angle, energy, 1.0, lidar.refractive_index, lidar.group_index)
+    geometry = LidarGeometry.of_pose(pose, lidar.refractive_index, lidar.group_index)
+    system = LidarSystem(**vars(geometry), energy=energy, aperture_area=1.0)
     depth, reflectance = _bottom(lidar)
     phases = [table_of(phase) for phase in water.phases.phases[: water.column.count]]
     covariance, ratio = _slopes(lidar)

@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shot_series import render_shots
-from mitransient_lidar.results.geometry import LidarGeometry
+from mitransient_lidar.results.geometry import lidar_geometry
 
 _PASSES = 8
 
@@ -86,7 +86,7 @@ def _echo_times(shot: xr.Dataset) -> dict[str, float]:
     depth = shot.attrs.get("scene.bottom_depth")
     if depth is None or "surface_time_ns" not in shot.attrs:
         raise UserError("shot-statistics needs a scene with a sea and the parameter bottom_depth")
-    geometry = LidarGeometry.from_attributes(shot.attrs)
+    geometry = lidar_geometry(shot.attrs)
     return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
 
 
@@ -158,7 +158,7 @@ def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]
     """
     if [str(name) for name in shots["pixel"].values] != ["red", "green", "blue", "black"]:
         raise UserError(f"pixels = {list(shots['pixel'].values)} must be the 2x2 of red, green, blue and black")
-    geometry = LidarGeometry.from_attributes(shots.attrs)
+    geometry = lidar_geometry(shots.attrs)
     level = float(geometry.time_of_depth(float(shots.attrs["scene.bottom_depth"])))
     along, across = (shots[f"slope_{name}"].values for name in ("along", "across"))
     surface, bottom = shots["surface_time"], shots["bottom_time"]

@@ -54,10 +54,8 @@ def fitted_record(
     last = max(found, key=lambda each: each.last_ns)
     limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
     if film.gates is not None:
-        sine = float(np.hypot(*scene.receiver.pose.axis[:2])) / scene.refractive_index
-        placed = (scene.group_index, float(np.sqrt(1 - sine**2)))
         for time in (min(each.surface_ns[0] for each in found), max(each.surface_ns[1] for each in found)):
-            spans = film.gates.placed(time, *placed).spans_ns
+            spans = film.gates.placed(time, scene.depth_per_ns).spans_ns
             end = "after the last gate" if spans[-1, 1] > limits[1] else end
             limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
     fixed = film.bin_width_ns, film.time_start_ns, film.bin_count

@@ -10,9 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
@@ -207,6 +209,12 @@ class WaterScene:
             return LevelSea((1.0,))
         arrays = layers.refractive_index, layers.boundaries, layers.group_index
         return LevelSea(*(tuple(map(float, each)) for each in arrays))
+
+    @property
+    def depth_per_ns(self) -> float:
+        """Depth per delay of echoes on the receiver's axis [m/ns]."""
+        down = refract_level(self.receiver.pose.axis, self.refractive_index)
+        return 0.5e-9 * C0 / self.group_index * -float(down[2])
 
     def relative(self, pose: KernelPose) -> RelativePose:
         """Return a pose relative to the reference point of the scene, as lengths of paths are."""

@@ -17,8 +17,9 @@ from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefracti
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.surface_echoes import inside_outline
-from mitransient_lidar.results.geometry import LidarGeometry, optional_number, pose_of
+from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Largest relative standard error with which a reflectance is given.
 LARGEST_ERROR = 0.5

@@ -12,16 +12,11 @@ from mitransient_lidar.analysis.retrieval.surface_slope import PixelEchoes, Pixe
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
-from mitransient_lidar.results.geometry import (
-    LidarGeometry,
-    open_aperture,
-    pose_of,
-    required_number,
-    two_way_efficiency,
-)
+from mitransient_lidar.results.geometry import lidar_system, pose_of, required_number
 
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
 
@@ -90,8 +85,8 @@ def energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
     known = efficiency is not None or "two_way_efficiency" in dataset.attrs or of_scene
     if "signal" in dataset or not known:
         return None
-    energy = 1e-3 * required_number(dataset.attrs, "pulse_energy_mj")
-    return energy * two_way_efficiency(dataset.attrs, efficiency) * open_aperture(dataset.attrs)
+    system = lidar_system(dataset.attrs, efficiency)
+    return system.energy * system.aperture_area
 
 
 def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) -> PixelEchoes:

@@ -19,12 +19,13 @@ from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.dataset import check_axes
 from mitransient_lidar.results.formats import input_format
-from mitransient_lidar.results.geometry import Attributes, LidarGeometry, LinesOfSight, required_number
+from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_geometry, required_number
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -140,7 +141,7 @@ class Waveforms:
         in_blocks = name == "signal" and {"dark_level", "block_level"} <= set(dataset)
         if not np.isfinite(samples).all() and (not in_blocks or np.isinf(samples).any()):
             raise UserError(f"{name} holds values that are not finite: render or record it again")
-        geometry = LidarGeometry.from_attributes(dataset.attrs)
+        geometry = lidar_geometry(dataset.attrs)
         shape = pulse or _pulse(dataset.attrs)
         step = results.time_axis(dataset).bin_width_ns
         response = float(dataset.attrs.get("response_time_ns", 0.0))

@@ -82,9 +82,9 @@ class EchoEstimate:
         ripples = [self._ripples(len(beam), rng)[:, None] for _ in range(2)]
 
         def arrivals(depth: FloatArray, returned: FloatArray) -> Arrivals:
-            in_water = depth / self._cosine
+            in_water = depth / self.system.cos_water
             *shifts, delay, kept = spread.at(in_water)
-            distance = self.system.height / np.cos(self.system.off_nadir) + in_water / self.system.refractive_index
+            distance = self.system.slant_range + in_water / self.system.refractive_index
             down, up = ((shift + tilt * in_water) / distance for shift, tilt in zip(shifts, ripples, strict=True))
             lit = beam[:, :1] + 1j * beam[:, 1:] + down
             to_lit, _ = self._rays(lit.real, lit.imag)
@@ -99,11 +99,6 @@ class EchoEstimate:
 
         water = arrivals(depths, np.asarray(backscatter * thickness / cosine))
         return water, arrivals(np.array([self.bottom_depth]), self.reflectance / np.pi * cosine)
-
-    @property
-    def _cosine(self) -> float:
-        """Cosine of the refracted angle of the axis."""
-        return float(np.cos(snell(self.system.off_nadir, self.system.refractive_index)))
 
     def _rays(self, angle_x: FloatArray, angle_y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return angle from the vertical and azimuth [rad] of points in the tangent plane."""
@@ -124,13 +119,13 @@ class EchoEstimate:
         """
         root = np.linalg.cholesky(self.slope_covariance)
         slopes = rng.standard_normal((count, 2)) @ root.T
-        factor = 1 - np.cos(self.system.off_nadir) / (self.system.refractive_index * self._cosine)
+        factor = 1 - np.cos(self.system.off_nadir) / (self.system.refractive_index * self.system.cos_water)
         return np.asarray(factor * (slopes[:, 0] + 1j * slopes[:, 1]))
 
     def _scattered(self, count: int, steps: int, rng: np.random.Generator) -> _Spread:
         """Draw the forward scattering of paths, at slant distances to the bottom, on the way down and up."""
         tops = np.append(self.column.layer_tops, np.inf)
-        edges = np.append(tops[tops < self.bottom_depth], self.bottom_depth) / self._cosine
+        edges = np.append(tops[tops < self.bottom_depth], self.bottom_depth) / self.system.cos_water
         b = self.column.scattering[: edges.size - 1]
         optical = np.append(0.0, np.cumsum(b * np.diff(edges)))
         number = rng.poisson(2 * optical[-1], count)
@@ -150,10 +145,9 @@ class EchoEstimate:
         grid = np.linspace(0, edges[-1], steps + 1)
         cell = path * steps + np.minimum(np.searchsorted(grid, distance, side="right") - 1, steps - 1)
         detour = 1 / np.cos(theta) - 1
-        speed = 1e-9 * C0 / self.system.group_index
         is_down = rng.random(path.size) < 0.5
         turns = [part * leg for leg in (is_down, ~is_down) for part in (turn.real, turn.imag)]
-        weights = *turns, detour / speed, detour * self.column.absorption[layer]
+        weights = *turns, detour / (2 * self.system.metres_per_ns), detour * self.column.absorption[layer]
         return _Spread(cell, distance, weights, end, grid, count)
 
 

@@ -18,7 +18,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import water_of
 
 THETA = math.radians(20)
-SYSTEM = LidarSystem(200, THETA, 3.645e-3, 0.025, 1.34, 1.364)
+SYSTEM = LidarSystem(200, THETA, 1.34, 1.364, energy=3.645e-3, aperture_area=0.025)
 A, BB = np.array([0.05, 0.15, 0.4]), np.array([0.002, 0.006, 0.03])
 KD = A + 4.18 * (1 - 0.52 * np.exp(-10.8 * A)) * BB  # Lee, Du and Arnone (2005)
 
