@@ -21,7 +21,7 @@ from mitransient_lidar.flights.las import write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.refraction import cos_in_water
 
 _LOG = logging.getLogger(__name__)
 
@@ -128,8 +128,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
         echoes = xr.concat(parts, "shot", combine_attrs="override").isel(shot=order)
     # Depths were measured along the line of sight of the group's lidar.
     index = float(attributes["refractive_index"])
-    own = np.arccos(np.clip(-flown.values("axis_z"), -1, 1))
-    ratio = np.cos(snell(own, index)) / np.cos(snell(np.radians(angle), index))
+    ratio = cos_in_water(flown.values("axis_z"), index) / cos_in_water(np.cos(np.radians(angle)), index)
     for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"):
         echoes[name] = echoes[name] * xr.DataArray(ratio, dims="shot")
     return echoes

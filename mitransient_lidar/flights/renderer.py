@@ -347,7 +347,7 @@ def _columns(poses: PulsePoses) -> dict[str, Column]:
             f"pulse {row} at {poses.time_s[row]:g} s is sent from a height of {poses.origin[row, 2]:g} m: the scanner "
             "must be more than 1 m above the mean sea level"
         )
-    places = (poses.origin - poses.axis * (poses.origin[:, 2:] / poses.axis[:, 2:]))[:, :2]
+    places = poses.ground_point()[:, :2]
     if (farthest := float(np.abs(places).max())) > FARTHEST:
         raise UserError(
             f"the flight reaches {farthest:g} m from the origin of the scene: at most {FARTHEST:g} m may be; give "
@@ -432,9 +432,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
         own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
         first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
         return TimeAxis.covering(first, last, own.bin_width_ns)
-    sine = np.sin(np.radians(angle)) / lidar.refractive_index
-    way = -2e9 / C0 * lidar.group_index * float(bottom.min()) / np.sqrt(1 - sine**2)
-    arrival = 1e9 / C0 * lidar.reference_length + way
+    way, _ = lidar.level_sea.lengths(-float(bottom.min()), np.sin(np.radians(angle)))
+    arrival = 1e9 / C0 * (lidar.reference_length + 2 * float(way))
     if arrival > film.axis.end_ns:
         raise UserError(
             f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "

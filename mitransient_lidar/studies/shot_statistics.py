@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.rendering.passes import ProgressCallback
@@ -134,10 +134,8 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
     Explanation by Tulldahl (2006, figure 12): a face away from the lidar refracts the ray towards the vertical, which
     shortens the path to the bottom. The depth is computed from the time as for a level sea.
     """
-    tilt = np.arctan(slope_along)
-    level = math.asin(math.sin(off_nadir) / refractive_index)
-    in_water = tilt + np.arcsin(np.sin(off_nadir - tilt) / refractive_index)
-    return np.asarray(depth * (math.cos(level) / np.cos(in_water) - 1))
+    level, ray = (SlopeRefraction.of(slope, 0.0, off_nadir, refractive_index) for slope in (0.0, slope_along))
+    return np.asarray(depth * (level.cos_vertical / ray.cos_vertical - 1))
 
 
 def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -13,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.refraction import snell, turn_by_slope
 from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_system, optional_number
 
 # Constants from 40 random level seas (1 to 10 mrad, 100 to 400 m, 0 to 30 degrees off nadir, absorption 0.04 to 0.25,
@@ -145,7 +145,7 @@ class DepthErrors:
         cos_air = np.cos(lines.off_nadir)
         water = snell(lines.off_nadir, self.refractive_index)
         scattering = np.sqrt(self.attenuation_times_backscattering(attenuation, level))
-        turned = self.slope * np.tan(water) * (1 - cos_air / (self.refractive_index * np.cos(water)))
+        turned = self.slope * np.tan(water) * turn_by_slope(lines.off_nadir, self.refractive_index)
         by_water = _OF_DELAY * scattering * self.beam_width + _OF_RIPPLES * self.slope_variance
         relative = np.hypot(np.hypot(_LEAST, by_water), turned)
         pulse = self.pulse_ns / FWHM_PER_SIGMA

@@ -15,6 +15,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, finite, fini
 from mitransient_lidar.flights.poses.attitude import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
+from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Step of the angles of pixels about their axis [deg], and sine of the angle from nadir below which they have none.
 _TURN_DEG, _LEVEL = 10.0, 1e-6
@@ -66,18 +67,10 @@ class Mounting:
 
 
 @dataclass(frozen=True)
-class PulsePoses:
-    """Lines of sight of pulses in the frame of the scene, x east, y north and z up.
-
-    The direction of a pixel at tangent-plane angles (angle_x, angle_y) is the unit vector along
-    ``axis + angle_x * far + angle_y * left``.
-    """
+class PulsePoses(Pose):
+    """Poses of the scanner at pulses in the frame of the scene, x east, y north and z up."""
 
     time_s: FloatArray  #: Times [s], shape (shots,).
-    origin: FloatArray  #: Positions of the scanner [m], shape (shots, 3).
-    axis: FloatArray  #: Unit directions of the pulses, shape (shots, 3).
-    far: FloatArray  #: Unit directions of +angle_x, normal to the axis, shape (shots, 3).
-    left: FloatArray  #: Unit directions of +angle_y, far x axis, shape (shots, 3).
     #: Angles of the pulses across the flight from the vertical [deg], positive to the right of the platform's forward
     #: axis, so that a roll counts as in LAS files, shape (shots,).
     scan_angle_deg: FloatArray

@@ -20,7 +20,7 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.lidar.refraction import fresnel, snell, turn_by_slope
 from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
@@ -115,12 +115,12 @@ class EchoEstimate:
     def _ripples(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return deflections by slopes where light enters or leaves the water [rad], as complex numbers.
 
-        Slopes are Gaussian here. A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)).
+        Slopes are Gaussian here.
         """
         root = np.linalg.cholesky(self.slope_covariance)
         slopes = rng.standard_normal((count, 2)) @ root.T
-        factor = 1 - np.cos(self.system.off_nadir) / (self.system.refractive_index * self.system.cos_water)
-        return np.asarray(factor * (slopes[:, 0] + 1j * slopes[:, 1]))
+        turn = turn_by_slope(self.system.off_nadir, self.system.refractive_index)
+        return np.asarray(turn * (slopes[:, 0] + 1j * slopes[:, 1]))
 
     def _scattered(self, count: int, steps: int, rng: np.random.Generator) -> _Spread:
         """Draw the forward scattering of paths, at slant distances to the bottom, on the way down and up."""

@@ -17,6 +17,17 @@ def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
     return np.asarray(np.arcsin(np.sin(finite_array("theta", theta)) / in_range("n", n, 1, np.inf)))
 
 
+def cos_in_water(cosine: npt.ArrayLike, n: float) -> FloatArray:
+    """Return the cosines of angles of refraction in water for those in air, by Snell's law."""
+    return np.asarray(np.sqrt(1 - (1 - np.asarray(cosine, dtype=np.float64) ** 2) / n**2))
+
+
+def turn_by_slope(theta: npt.ArrayLike, n: float) -> FloatArray:
+    """Return the angle by which a slope turns the refracted ray over the slope, 1 - cos(theta)/(n cos(phi))."""
+    angle = np.asarray(theta, dtype=np.float64)
+    return np.asarray(1 - np.cos(angle) / (n * np.sqrt(1 - (np.sin(angle) / n) ** 2)))
+
+
 def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
     """Return unit directions refracted from air into water by a facet, shape (..., 2 or 3).
 
@@ -31,8 +42,7 @@ def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
     """
     unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     cosine = -np.sum(direction * unit, axis=-1, keepdims=True)
-    in_water = np.sqrt(1 - (1 - cosine**2) / n**2)
-    return np.asarray(direction / n + (cosine / n - in_water) * unit)
+    return np.asarray(direction / n + (cosine / n - cos_in_water(cosine, n)) * unit)
 
 
 def refract_level(direction: FloatArray, n: float) -> FloatArray:
