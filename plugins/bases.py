@@ -106,7 +106,7 @@ def exposed(part: mi.Object) -> tuple[dict[str, Any], list[tuple[str, mi.Object]
     return values, objects
 
 
-class LidarIntegrator(mi.CppADIntegrator):
+class PassIntegrator(mi.CppADIntegrator):
     """Integrator that prepares a scene and renders one pass of it.
 
     It has no state of a scene: every call of ``mi.render`` prepares the scene again, with changes by ``mi.traverse``.

@@ -15,7 +15,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range
 from mitransient_lidar.flights.refracted_paths import PoseErrors, RefractedPaths, Timing
-from mitransient_lidar.flights.sea_surface import SeaSurface
+from mitransient_lidar.flights.sea_surface import SurfaceModel
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.results.geometry import optional_number
 
@@ -71,7 +71,7 @@ def positions(
     *,
     refractive_index: float,
     group_index: float,
-    surface: SeaSurface | None = None,
+    surface: SurfaceModel | None = None,
     errors: PoseErrors | None = None,
     forward: npt.ArrayLike | None = None,
     view_x: npt.ArrayLike = 0.0,
@@ -142,7 +142,7 @@ def positions(
         raise UserError(f"the line of sight of pulse {row}, pixel {column}, must descend to the sea")
     indices = in_range("refractive_index", refractive_index, 1, 2), in_range("group_index", group_index, 1, 3)
     if surface is None:
-        surface = SeaSurface(
+        surface = SurfaceModel(
             slope_deviation=mean_slope(echoes.attrs, _beam_width(echoes, pulses.origin[..., 2] / -direction[..., 2]))
         )
     times = np.zeros(table.shape[0]) if time_s is None else finite_array("time_s", time_s)
@@ -198,7 +198,7 @@ def positions(
     return xr.Dataset(data, attrs={"surface_level_m": surface.level, "surface_level_error_m": surface.level_error})
 
 
-def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SeaSurface:
+def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SurfaceModel:
     """Fit the sea to the surface points of a flight.
 
     Parameters
@@ -206,12 +206,12 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
     points
         Points of `positions`, of the whole flight; with planes they need ``gps_time``.
     slope_deviation, radius
-        As for `SeaSurface.fit`.
+        As for `SurfaceModel.fit`.
 
     Raises
     ------
     UserError
-        As `SeaSurface.fit`, or if ``gps_time`` is missing.
+        As `SurfaceModel.fit`, or if ``gps_time`` is missing.
     """
     own = points.isel(point=points["kind"].values == PointClass.SURFACE)
     if radius > 0 and "gps_time" not in own:
@@ -219,7 +219,7 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
     place = np.stack([own[name].values for name in "xyz"], axis=-1)
     time = own["gps_time"].values if "gps_time" in own else np.zeros(len(place))
     error = own["vertical_uncertainty"].values
-    return SeaSurface.fit(place, error, time, slope_deviation=slope_deviation, radius=radius)
+    return SurfaceModel.fit(place, error, time, slope_deviation=slope_deviation, radius=radius)
 
 
 def _poses(given: dict[str, npt.ArrayLike], shots: int) -> Pose:

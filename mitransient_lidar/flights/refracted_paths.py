@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, shown
-from mitransient_lidar.flights.sea_surface import Facets, SeaSurface
+from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
 from mitransient_lidar.physics.lidar.refraction import cos_in_water, refract
 
 BoolArray = npt.NDArray[np.bool_]
@@ -140,7 +140,7 @@ class RefractedPaths:
         timing: Timing,
         classes: tuple[BoolArray, BoolArray],
         indices: tuple[float, float],
-        surface: SeaSurface,
+        surface: SurfaceModel,
         time_s: FloatArray,
     ) -> RefractedPaths:
         """Trace paths.

@@ -84,7 +84,7 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
     return {
         "layout": pixels.layout,
         "field_of_view_mrad": 1e3 * pixels.field_of_view,
-        "field_of_view_sides_mrad": [1e3 * side for side in getattr(pixels, "sides", [])],
+        "field_of_view_sides_mrad": [1e3 * side for side in pixels.sides or ()],
         "field_of_view_shape": pixels.field_of_view_shape,
         "aperture_area": optics.aperture_area,
         "obscuration": optics.obscuration,

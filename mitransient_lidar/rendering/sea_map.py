@@ -10,6 +10,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.height_maps import HeightMap
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -67,9 +68,10 @@ class SeaMap:
         transmitter = transmitter_of(scene)
         transmitter.pose.require_above_sea()
         # Of a sea of several grids the coarsest.
-        cell = getattr(sea.waves, "cell_size", sea.cell_size)
-        count = min(getattr(sea.waves, "cells", int(sea.size / cell)), int(_LARGEST_SEARCH / cell)) // 2
-        lines = np.arange(-count, count) * cell
+        grid = None if isinstance(sea.waves, HeightMap) else sea.waves
+        cell, cells = (sea.cell_size, int(sea.size / sea.cell_size)) if grid is None else (grid.cell_size, grid.cells)
+        count = min(cells, int(_LARGEST_SEARCH / cell)) // 2
+        lines = np.asarray(np.arange(-count, count) * cell, dtype=np.float64)
         heights = sea.heights(lines, lines)
         azimuth, spread_along, spread_across = footprint(transmitter)
         # A circle of the same area replaces the elliptical footprint.

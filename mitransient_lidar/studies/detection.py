@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -123,7 +124,7 @@ def detect(
     sky = non_negative("background_power_w", background_power_w)
     if list(depths) != sorted(set(depths)) or any(not (math.isfinite(d) and d > 0) for d in depths):
         raise UserError(f"depths = {list(depths)} must be above 0 m and increase")
-    if not isinstance(scene, (str, bytes)) and not hasattr(scene, "__fspath__") and (depths or clutter):
+    if not isinstance(scene, (str, os.PathLike)) and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
     limit = RenderOptions(max_time=max_time).max_time or math.inf
     session = open_scene(scene, params)
@@ -132,7 +133,7 @@ def detect(
             raise UserError(f"scene {session.name} has no parameter {key}, which {option} needs")
     if clutter and session.parameters.get("spectrum") == "flat":
         raise UserError("clutter needs waves: spectrum = flat makes every sea the same")
-    lidar: LidarScene = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
+    lidar = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
     lidar.transmitter.pose.require_above_sea()
     if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 
@@ -16,7 +16,29 @@ from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.sensor.fov_shapes import FovShape
 from mitransient_lidar.transport.sensor.receiver import Receiver
+
+if TYPE_CHECKING:
+    from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
+    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.path_classes import PathClasses
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """Any plugin of this package, with its name as ``type`` and the values of its parameters."""
+
+    parameters: dict[str, Any]
+
+
+@runtime_checkable
+class Automatic(Protocol):
+    """Plugins with parameters that may be automatic, with the values used for these."""
+
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values by name."""
 
 
 @runtime_checkable
@@ -53,7 +75,7 @@ class Daylight(Protocol):
     daylight: str
 
 
-class Sun(Daylight, Protocol):
+class SunEmitter(Daylight, Protocol):
     """The emitter ``sun``: unit direction to it, irradiance on a plane normal to its rays [W m^-2 nm^-1]."""
 
     zenith_deg: float
@@ -68,7 +90,7 @@ class Sun(Daylight, Protocol):
         """Map uniform numbers to directions of the disc."""
 
 
-class Sky(Daylight, Protocol):
+class SkyEmitter(Daylight, Protocol):
     """The emitter ``sky``: unit direction to the sun of a clear one, irradiance [W m^-2 nm^-1]."""
 
     distribution: str
@@ -87,6 +109,14 @@ class LidarSensor(Protocol):
 
 
 @runtime_checkable
+class PixelSensor(Protocol):
+    """The sensor ``pixel_fov``."""
+
+    field: FovShape
+    pixel_name: str
+
+
+@runtime_checkable
 class WaterMedium(Protocol):
     """The medium ``layered_water``."""
 
@@ -95,17 +125,37 @@ class WaterMedium(Protocol):
 
 @runtime_checkable
 class LidarIntegrator(Protocol):
-    """The integrators ``lidar_merging``, ``lidar_volpath`` and ``passive_volpath``."""
+    """The integrators ``lidar_merging`` and ``lidar_volpath``."""
 
     plugin: str
     passive: bool
 
-    def prepare(self, scene: mi.Scene, sensor: mi.Sensor, **options: Any) -> Any:
+    def prepare(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        *,
+        classes: PathClasses | None = None,
+        receiver: Receiver | None = None,
+        layout_of: PassRenderer | None = None,
+        connections: bool = True,
+    ) -> PassRenderer:
+        """Return the renderer of passes of a scene, as `LidarMerging.prepare`."""
+
+
+@runtime_checkable
+class DaylightIntegrator(Protocol):
+    """The integrator ``passive_volpath``."""
+
+    plugin: str
+    passive: bool
+
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
         """Return the renderer of passes of a scene."""
 
 
 @runtime_checkable
-class SeaSurface(Protocol):
+class SeaShape(Protocol):
     """The shape ``ocean_surface``: slope variances, lengths [m]."""
 
     sea: sea_surface.SeaSurface
@@ -128,6 +178,7 @@ class GatedFilm(Protocol):
     """The film ``time_gated_film``."""
 
     is_fixed: bool
+    end: str
     bin_width_ns: float
     time_start_ns: float | None
     bin_count: int | None

@@ -12,12 +12,12 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, Cone, LidarView, Solid, Water
+from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, ColumnDecay, Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.plugin_types import GatedFilm, Transmitter
+from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transmitter
 from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.scene import WaterScene
 
@@ -146,7 +146,7 @@ def _first_hits(scene: WaterScene, transmitter: Transmitter) -> list[mi.SurfaceI
 def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
     """Return the geometry of a lidar, displaced horizontally [m], over the level sea of a scene."""
     pixels, blur, pose = scene.receiver.pixels, scene.receiver.blur, scene.receiver.pose
-    sides = getattr(pixels, "sides", (pixels.field_of_view, pixels.field_of_view))
+    sides = pixels.sides or (pixels.field_of_view, pixels.field_of_view)
     blurred = 0.0 if blur is None else blur.reach
     half_angles = 0.5 * sides[0] + blurred, 0.5 * sides[1] + blurred
     edge = transmitter.profile.reach
@@ -166,7 +166,7 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     )
     if scene.water is None:
         none = np.zeros(1)
-        return LidarView(view, beam, Water(scene.level_sea, none, none), (0.0, 0.0), reach, None)
+        return LidarView(view, beam, scene.level_sea, ColumnDecay(none, none), (0.0, 0.0), reach, None)
     column, plume = scene.water.column, scene.water.plume
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     kd = [InherentProperties(*map(float, row)).kd for row in rows]
@@ -176,7 +176,8 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     return LidarView(
         view,
         beam,
-        Water(scene.level_sea, column.layer_tops, attenuation),
+        scene.level_sea,
+        ColumnDecay(column.layer_tops, attenuation),
         (min(low for low, _ in heights), max(high for _, high in heights)),
         reach,
         0.0 if plume is None else plume.depth,
@@ -185,7 +186,7 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
 
 def _name(shape: mi.Shape) -> str:
     """Return the id of a shape, else its type."""
-    return str(shape.id() or getattr(shape, "parameters", {"type": shape.class_name()})["type"])
+    return str(shape.id() or (shape.parameters["type"] if isinstance(shape, Recorded) else shape.class_name()))
 
 
 def _triangles(shape: mi.Shape) -> FloatArray:

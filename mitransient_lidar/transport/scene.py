@@ -20,7 +20,7 @@ from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
-from mitransient_lidar.transport.plugin_types import SeaSurface, Transmitter
+from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
 from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -124,9 +124,9 @@ class WaterScene:
         return solids_of(self.mitsuba_scene, self.surfaces)
 
     @property
-    def seas(self) -> list[SeaSurface]:
+    def seas(self) -> list[SeaShape]:
         """The ``ocean_surface`` shapes that bound the water."""
-        return [surface for surface in self.surfaces if isinstance(surface, SeaSurface)]
+        return [surface for surface in self.surfaces if isinstance(surface, SeaShape)]
 
     @property
     def bottoms(self) -> list[mi.Shape]:
@@ -172,7 +172,7 @@ class WaterScene:
         """
         sizes = [
             max(surface.cell_size, _FACET_PER_WAVE * surface.beam_wave)
-            if isinstance(surface, SeaSurface)
+            if isinstance(surface, SeaShape)
             else float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
             if surface.is_mesh()

@@ -122,29 +122,20 @@ class Solid:
 
 
 @dataclass(frozen=True, eq=False)
-class Water:
-    """A level sea in layers, with the decay of its column signal.
+class ColumnDecay:
+    """Decay of the column signal: upper edges of the layers [m], the first one 0, and system attenuation [1/m]."""
 
-    Parameters
-    ----------
-    sea
-        Its index layers.
-    tops, attenuation
-        Upper edges of the water layers [m], the first one 0, and their system attenuation [1/m].
-    """
-
-    sea: LevelSea
     tops: FloatArray
     attenuation: FloatArray
 
-    def decay(self, depth: float) -> float:
+    def to(self, depth: float) -> float:
         """Return the integral of the attenuation down to a depth [1]."""
         thickness = np.clip(depth - self.tops, 0, np.diff(self.tops, append=np.inf))
         return float(thickness @ self.attenuation)
 
     def depth_of(self, decay: float) -> float:
         """Return the depth [m] at which the integral of the attenuation reaches a value, else that of its end."""
-        edges = np.array([self.decay(top) for top in self.tops])
+        edges = np.array([self.to(top) for top in self.tops])
         layer = int(np.searchsorted(edges, decay, side="right")) - 1
         if self.attenuation[layer] > 0:
             return float(self.tops[layer] + (decay - edges[layer]) / self.attenuation[layer])
@@ -194,8 +185,8 @@ class LidarView:
     ----------
     view, beam
         Field of view with its blur, and beam.
-    water
-        Water below z = 0; by default none.
+    sea, decay
+        Index layers of the water below z = 0, and its signal.
     heights
         Lowest and highest point of the sea [m].
     reach
@@ -206,7 +197,8 @@ class LidarView:
 
     view: Cone
     beam: Cone
-    water: Water
+    sea: LevelSea
+    decay: ColumnDecay
     heights: tuple[float, float]
     reach: float
     column: float | None
@@ -225,10 +217,10 @@ class LidarView:
         (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
-        steepest = float(self._sea[1].sine.min()) / self.water.sea.refractive_index[0]
+        steepest = float(self._at_sea[1].sine.min()) / self.sea.refractive_index[0]
         # Both ways, per vertical metre.
         slant = 2 / np.sqrt(1 - steepest**2)
-        covered = np.zeros(len(self._sea[1].places), dtype=bool)
+        covered = np.zeros(len(self._at_sea[1].places), dtype=bool)
         firsts, lasts = [], []
         for solid in solids:
             limits = self._heights_of(solid)
@@ -237,26 +229,26 @@ class LidarView:
             lowest, highest = limits
             if self.column is None or highest > self.heights[1]:
                 firsts.append(self._earliest(highest))
-            if np.exp(-slant * self.water.decay(-lowest)) >= SOLID_LEVEL:
+            if np.exp(-slant * self.decay.to(-lowest)) >= SOLID_LEVEL:
                 air, in_water = self._latest(lowest)
                 later = min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water) + self._crossing_ns
                 later = 0.0 if direct else later
                 lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
                 low, high = solid.box
-                below = self._sea[1].below(self.water.sea, min(lowest, 0.0))
+                below = self._at_sea[1].below(self.sea, min(lowest, 0.0))
                 covered |= np.all((below >= low[:2]) & (below <= high[:2]), axis=1)
         if self.column is not None or not firsts:
             firsts.append(surface[0])
             lasts.append((surface[1], "after the surface echo"))
         if self.column is not None and not direct and np.mean(covered) < _COVERED:
-            depth = max(self.water.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
+            depth = max(self.decay.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
             text = f"at a depth of {depth:.3g} m, where the signal of the water has fallen to {COLUMN_LEVEL:g}"
             lasts.append((sum(self._latest(-depth)), text))
         last, end = max(lasts)
         return RecordLimits(min(firsts), last, surface, end)
 
     @cached_property
-    def _sea(self) -> tuple[Lines, Lines]:
+    def _at_sea(self) -> tuple[Lines, Lines]:
         """Lines of laser and receiver to the mean sea level."""
         return self._lines(0.0)[:2]
 
@@ -268,7 +260,7 @@ class LidarView:
         if len(outside) == 0:
             return 0.0
         away = np.linalg.norm(outside[:, None] - beam, axis=-1).min(axis=1)
-        index = self.water.sea.group_index or self.water.sea.refractive_index
+        index = self.sea.group_index or self.sea.refractive_index
         return float(_NS_PER_M * index[0] * min(away.max(), _FARTHEST))
 
     def _lines(self, z: float) -> tuple[Lines, Lines, bool]:
@@ -292,7 +284,7 @@ class LidarView:
         """Return the times of the last direct light from a height, through the air and in the water [ns]."""
         total = in_water = 0.0
         for lines in self._lines(self._below_instruments(max(z, self.heights[0])))[:2]:
-            optical, _ = self.water.sea.lengths(-z, lines.sine)
+            optical, _ = self.sea.lengths(-z, lines.sine)
             total, in_water = total + float((lines.length + optical).max()), in_water + float(optical.max())
         return _NS_PER_M * (total - in_water), _NS_PER_M * in_water
 
@@ -303,8 +295,8 @@ class LidarView:
         for _ in range(_NARROWINGS):
             corners = []
             for z in heights:
-                lines = self._sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
-                places = np.concatenate([one.below(self.water.sea, min(z, one.z)) for one in lines])
+                lines = self._at_sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
+                places = np.concatenate([one.below(self.sea, min(z, one.z)) for one in lines])
                 margin = _REACH_PER_DEPTH * max(-z, 0.0)
                 corners += [places.min(axis=0) - margin, places.max(axis=0) + margin]
             narrower = solid.heights_in(np.min(corners, axis=0), np.max(corners, axis=0))

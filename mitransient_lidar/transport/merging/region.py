@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -168,7 +167,7 @@ class _Grid:
     """
 
     values: mi.Float
-    kind: Any
+    kind: type[mi.Float] | type[mi.UInt32]
     low: mi.Point2f
     per_metre: mi.Point2f
     cells: int
@@ -185,7 +184,7 @@ class _Grid:
         start = (lanes.shot // copies) * (self.cells * self.cells)
         return replace(self, low=lanes.pick(self.low), start=start)
 
-    def at(self, x: mi.Float, y: mi.Float) -> tuple[Any, mi.Float, mi.Float]:
+    def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
         """Return values at (x, y) [m], or those of the nearest point; and offsets from the centres of cells [m]."""
         along, across = (x - self.low.x) * self.per_metre.x, (y - self.low.y) * self.per_metre.y
         i, j = (dr.clip(mi.Int32(dr.floor(number)), 0, self.cells - 1) for number in (along, across))

@@ -16,7 +16,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
 from mitransient_lidar.flights.refracted_paths import PoseErrors
-from mitransient_lidar.flights.sea_surface import SeaSurface
+from mitransient_lidar.flights.sea_surface import SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 
 GROUP = 1.364
@@ -142,7 +142,7 @@ def plane_case(slope=(0.07, -0.04), shots=12):
     rng = np.random.default_rng(4)
     spots = np.repeat(place[:, :2], 6, axis=0) + rng.uniform(-0.5, 0.5, (6 * len(place), 2))
     table = np.column_stack([spots, spots @ slope, np.full(len(spots), 1e-7), np.zeros(len(spots))])
-    sea = SeaSurface(0.0, 0.0, 1.0, 0.1, 1.0, table, 0.0)
+    sea = SurfaceModel(0.0, 0.0, 1.0, 0.1, 1.0, table, 0.0)
     return given, made, bottom, sea, length, ray
 
 
@@ -177,12 +177,12 @@ def test_standard_deviations_are_those_of_random_errors(planes):
         **{"surface_ns": noise / per_ns, "place_ns": by_place / per_ns, "time_ns": late / per_ns, "method": method},
     )
     spot = origin + own_range * ray
-    sea = SeaSurface(slope_deviation=prior)
+    sea = SurfaceModel(slope_deviation=prior)
     if planes:
         around = spot[:2] + rng.uniform(-1, 1, (8, 2))
         height = (around - spot[:2]) @ [0.06, 0.03] + 0.2
         table = np.column_stack([around, height, np.full(8, 0.1), np.zeros(8)])
-        sea = SeaSurface(0.0, 0.0, 0.3, prior, 2.0, table, 0.05)
+        sea = SurfaceModel(0.0, 0.0, 0.3, prior, 2.0, table, 0.05)
     height, slope, height_error, slope_error = (values[0] for values in sea.at(spot[None, :2], np.zeros(1)))
     options = {"angle_x": angle_x, "angle_y": angle_y, "forward": forward, "time_s": [0.0], "errors": errors}
     points = positions(made, **given, **options, **INDICES, surface=sea, view_x=1e-3, view_y=2e-3)
@@ -246,7 +246,7 @@ def mixed():
 
 def test_waveforms_without_an_echo_keep_a_point_where_they_look():
     given = poses(1)
-    sea = SeaSurface(level=0.4, height_deviation=0.2)
+    sea = SurfaceModel(level=0.4, height_deviation=0.2)
     points = positions(mixed(), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, surface=sea, errors=NO_ERRORS)
     assert points["kind"].values.tolist() == [41, 43, 40, 40, 41, 45]
     assert points["pixel"].values.tolist() == [0, 0, 0, 1, 2, 3]
@@ -300,7 +300,7 @@ def test_the_level_of_the_sea_is_known_within_its_error():
         rng = np.random.default_rng(seed)
         z = 0.35 + 0.1 * rng.normal(size=400) + errors * rng.normal(size=400)
         spots = np.column_stack([rng.uniform(0, 100, (400, 2)), z])
-        levels.append(SeaSurface.fit(spots, errors, np.zeros(400), slope_deviation=0.05, radius=0))
+        levels.append(SurfaceModel.fit(spots, errors, np.zeros(400), slope_deviation=0.05, radius=0))
     z_values = np.array([(one.level - 0.35) / one.level_error for one in levels])
     assert abs(z_values.mean()) < largest_z(10**6) / math.sqrt(60)
     assert (z_values**2).sum() < largest_chi2(60)
@@ -326,7 +326,7 @@ def linear_waves(seed, spacing, error):
 def test_planes_follow_long_waves_and_state_their_errors(spacing, error, largest):
     spots, height, slope = linear_waves(8, spacing, error)
     deviation = slope.std()
-    sea = SeaSurface.fit(spots, np.full(len(spots), error), np.zeros(len(spots)), slope_deviation=deviation)
+    sea = SurfaceModel.fit(spots, np.full(len(spots), error), np.zeros(len(spots)), slope_deviation=deviation)
     middle = np.all((spots[:, :2] > 3) & (spots[:, :2] < 37), axis=1)
     facets = sea.at(spots[middle, :2], np.zeros(middle.sum()))
     wrong = facets.slope - slope[middle]
@@ -350,7 +350,7 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
     # A late surface echo takes from the path in the water.
     made = echoes((300 - height + late)[:, None], (length - late / GROUP)[:, None], surface_ns=noise / (0.5e-9 * C0))
     options = {**given, "angle_x": 0.0, "angle_y": 0.0, **INDICES, "errors": NO_ERRORS, "time_s": np.zeros(count)}
-    first = SeaSurface(slope_deviation=slope.std())
+    first = SurfaceModel(slope_deviation=slope.std())
     sea = fit_surface(positions(made, **options, surface=first), slope.std())
     inner = np.all((spots[:, :2] > 3) & (spots[:, :2] < 37), axis=1)
     wrong = []
@@ -365,7 +365,7 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
 
 def test_planes_forget_waves_of_another_time():
     spots, _, slope = linear_waves(8, 1.0, 0.01)
-    sea = SeaSurface.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
+    sea = SurfaceModel.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
     later = sea.at(spots[:50, :2], np.full(50, 10.0))
     np.testing.assert_allclose(later.height, sea.level)
     np.testing.assert_allclose(later.slope, 0)
@@ -401,7 +401,7 @@ def test_the_sea_is_fitted_to_surface_points():
         ({"time_s": [0.0, 1.0]}, "must have one time for each of 1 pulses"),
         ({"errors": PoseErrors(roll_deg=0.1)}, "the forward axis of the platform must be given"),
         ({"forward": [0.0, 0.0, 1.0]}, "forward of pulse 0 must not be vertical"),
-        ({"surface": SeaSurface(points=np.zeros((1, 5)), radius=1.0)}, "give time_s"),
+        ({"surface": SurfaceModel(points=np.zeros((1, 5)), radius=1.0)}, "give time_s"),
     ],
 )
 def test_wrong_input_is_refused(changes, message):
@@ -447,4 +447,4 @@ def test_standard_deviations_of_poses_are_checked():
 )
 def test_a_sea_of_wrong_points_is_refused(points, error, options, message):
     with pytest.raises(UserError, match=message):
-        SeaSurface.fit(points, error, np.zeros(3), **{"slope_deviation": 0.1, **options})
+        SurfaceModel.fit(points, error, np.zeros(3), **{"slope_deviation": 0.1, **options})
