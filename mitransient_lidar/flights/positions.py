@@ -62,10 +62,7 @@ _DESCRIBED = {
 
 def positions(
     echoes: xr.Dataset,
-    origin: npt.ArrayLike,
-    axis: npt.ArrayLike,
-    far: npt.ArrayLike,
-    left: npt.ArrayLike,
+    poses: Pose,
     angle_x: npt.ArrayLike,
     angle_y: npt.ArrayLike,
     *,
@@ -85,9 +82,8 @@ def positions(
     echoes
         Echoes of `echo_table.extract` with one estimator and depths from the surface echo, corrected by
         `depth_correction.correct_depths` or not; over ``shot`` and ``pixel``, or ``row`` and ``column``.
-    origin, axis, far, left
-        Poses of the pulses, as of `physics.lidar.pose.Pose`: positions [m] and orthonormal directions, shape
-        (shots, 3).
+    poses
+        Poses of the pulses, with arrays of shape (shots, 3).
     angle_x, angle_y
         Tangent-plane angles of the pixels' lines of sight [rad], +angle_y to the left; they broadcast to (shots,
         pixels). Those of results are ``sight_x`` and ``sight_y``.
@@ -136,7 +132,7 @@ def positions(
     table = _Table.of(echoes)
     errors = PoseErrors() if errors is None else errors
     angles = (_of_pixels(name, given, table.shape) for name, given in (("angle_x", angle_x), ("angle_y", angle_y)))
-    pulses = _poses({"origin": origin, "axis": axis, "far": far, "left": left}, table.shape[0])
+    pulses = _checked(poses, table.shape[0])
     direction = pulses.directions(np.stack(list(angles), axis=-1))
     for row, column in np.argwhere(direction[..., 2] > -_SMALLEST_DESCENT)[:1]:
         raise UserError(f"the line of sight of pulse {row}, pixel {column}, must descend to the sea")
@@ -222,18 +218,18 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
     return SurfaceModel.fit(place, error, time, slope_deviation=slope_deviation, radius=radius)
 
 
-def _poses(given: dict[str, npt.ArrayLike], shots: int) -> Pose:
+def _checked(poses: Pose, shots: int) -> Pose:
     """Return the poses of pulses, of vectors of shape (shots, 1, 3), or refuse them."""
-    vectors = {name: finite_array(name, value) for name, value in given.items()}
+    vectors = {name: finite_array(name, getattr(poses, name)) for name in ("origin", "axis", "far", "left")}
     for name, value in vectors.items():
         if value.shape != (shots, 3):
             raise UserError(f"{name} of shape {value.shape} must have the shape ({shots}, 3), a vector a pulse")
-    poses = Pose(**{name: value[:, None] for name, value in vectors.items()})
-    frame = poses.frame[:, 0]
+    checked = Pose(**{name: value[:, None] for name, value in vectors.items()})
+    frame = checked.frame[:, 0]
     skew = np.abs(frame @ frame.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ORTHONORMAL
     if skew.any():
         raise UserError(f"axis, far and left of pulse {int(np.argmax(skew))} must be orthonormal")
-    return poses
+    return checked
 
 
 @dataclass(frozen=True, eq=False)

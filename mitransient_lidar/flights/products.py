@@ -21,6 +21,7 @@ from mitransient_lidar.flights.las import write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
 
 _LOG = logging.getLogger(__name__)
@@ -159,20 +160,20 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     echoes = echoes_of(flown, plan.corrections)
     attributes = flown.attributes
     angles = [1e-3 * flown.coordinate(name) for name in ("sight_x", "sight_y")]
-    poses = {name: flown.vectors(name) for name in ("origin", "axis", "far", "left")}
+    poses = Pose(*(flown.vectors(name) for name in ("origin", "axis", "far", "left")))
     time_s = flown.values("time_s")
     options: dict[str, Any] = {
         "refractive_index": float(attributes["refractive_index"]),
         "group_index": float(attributes["group_index"]),
         "errors": plan.errors,
-        "forward": _forward(poses["origin"], time_s),
+        "forward": _forward(poses.origin, time_s),
         "time_s": time_s,
     }
-    points = positions(echoes, *poses.values(), *angles, **options)
+    points = positions(echoes, poses, *angles, **options)
     if np.any(points["kind"].values == PointClass.SURFACE):
-        width = float(attributes.get("divergence_mrad", 1.0)) * 1e-3 * float(np.mean(poses["origin"][:, 2]))
+        width = float(attributes.get("divergence_mrad", 1.0)) * 1e-3 * float(np.mean(poses.origin[:, 2]))
         surface = fit_surface(points, mean_slope(attributes, width), plan.surface_radius)
-        points = positions(echoes, *poses.values(), *angles, surface=surface, **options)
+        points = positions(echoes, poses, *angles, surface=surface, **options)
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot], {"units": "degree"})
     points["line"] = ("point", flown.values("line")[shot], {"units": "1"})

@@ -186,7 +186,8 @@ def detect(
     share = share if math.isfinite(share) else 1.0
     data |= trials.drawn(experiments[0], share, pfa, shots, seed)
     pulse_fwhm_ns = lidar.transmitter.pulse.fwhm_ns
-    data |= trials.depth_errors(experiments[0], shots, seed, pulse_fwhm_ns, _depth_per_ns(lidar))
+    geometry = LidarGeometry.of_pose(lidar.transmitter.pose, lidar.refractive_index, lidar.group_index)
+    data |= trials.depth_errors(experiments[0], shots, seed, pulse_fwhm_ns, geometry.depth_per_ns)
     if depths:
         data |= trials.by_depth(experiments[1:], list(depths), pfa, pd)
     for key in ("background", "difference"):
@@ -211,11 +212,6 @@ def detect(
         pulse_fwhm_ns=pulse_fwhm_ns,
     )
     return xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes)
-
-
-def _depth_per_ns(lidar: LidarScene) -> float:
-    """Return the depth [m] per delay of the echo [ns]."""
-    return LidarGeometry.of_pose(lidar.transmitter.pose, lidar.refractive_index, lidar.group_index).depth_per_ns
 
 
 def _experiment(

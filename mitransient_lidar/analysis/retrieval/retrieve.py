@@ -267,8 +267,7 @@ def bottom(
         reflectance.append(np.pi * energy * np.exp(2 * mean_attenuation * path) / (received * gain))
     slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & _steadier(reflectance[1], reflectance[0])
     reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
-    water_gain = system.water_gain(0.0, lidar.off_nadir)
-    backscatter = column_retrieval.backscatter_of_level(_mean(power / share), water_gain, lidar.group_index)
+    backscatter = _mean(power / share) / system.column_gain
     delay = time - echoes["time_ns"].sel(echo="surface").values
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
@@ -373,10 +372,10 @@ def water(
     column = echoes.sel(echo="column")
     level = column["amplitude"].values
     start = _COLUMN_START * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
-    gain = lidar_system(dataset.attrs, efficiency).water_gain(0.0, lidar.off_nadir)
+    gain = lidar_system(dataset.attrs, efficiency).column_gain
     share = share_in_view(dataset)
     share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
-    backscatter = column_retrieval.backscatter_of_level(level / share, gain, lidar.group_index)
+    backscatter = level / share / gain
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
     found = column_retrieval.water_of_column(
         decay, backscatter, spot_diameter(dataset.attrs), first_path=start, phase_factor=phase_factor

@@ -233,10 +233,9 @@ def _slope_variance(attributes: Attributes) -> float:
 def _column_gain(attributes: Attributes) -> float:
     """Return the power of the column at the surface per backscattering coefficient [W m], NaN if it is unknown.
 
-    The phase function at 180 degrees is taken as bb/(2 pi b); see `column_retrieval.backscatter_of_level`.
+    The phase function at 180 degrees is taken as bb/(2 pi b).
     """
     try:
-        system = lidar_system(attributes)
+        return lidar_system(attributes).column_gain / (2 * math.pi)
     except UserError:
         return math.nan
-    return float(system.water_gain(0.0, system.off_nadir)) * 1e9 * system.metres_per_ns / (2 * math.pi)

@@ -35,3 +35,8 @@ class LidarSystem(LidarGeometry):
         _, transmittance = fresnel(theta, self.refractive_index)
         solid_angle = solid_angle_per_area(self.height, depth, theta, self.refractive_index)
         return np.asarray(self.energy * self.aperture_area * transmittance**2 * solid_angle)
+
+    @property
+    def column_gain(self) -> float:
+        """Power of the column's signal at the surface over the backscatter at 180 degrees, b p(pi) [W m sr]."""
+        return float(self.water_gain(0.0, self.off_nadir)) * 1e9 * self.metres_per_ns
