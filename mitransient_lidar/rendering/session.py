@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.transport.plugin_types import DaylightIntegrator, LidarIntegrator
+    from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
+    from mitransient_lidar.transport.passes import LidarIntegrator
 
 logger = logging.getLogger(__name__)
 
@@ -120,7 +121,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     """
     import mitsuba as mi
 
-    from mitransient_lidar.transport.plugin_types import LidarIntegrator
+    from mitransient_lidar.transport.passes import LidarIntegrator
 
     own = scene.integrator()
     if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 
@@ -18,11 +18,6 @@ from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape
 from mitransient_lidar.transport.sensor.receiver import Receiver
-
-if TYPE_CHECKING:
-    from mitransient_lidar.transport.daylight.renderer import DaylightRenderer
-    from mitransient_lidar.transport.passes import PassRenderer
-    from mitransient_lidar.transport.path_classes import PathClasses
 
 
 @runtime_checkable
@@ -121,37 +116,6 @@ class WaterMedium(Protocol):
     """The medium ``layered_water``."""
 
     water: Water
-
-
-@runtime_checkable
-class LidarIntegrator(Protocol):
-    """The integrators ``lidar_merging`` and ``lidar_volpath``."""
-
-    plugin: str
-    passive: bool
-
-    def prepare(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        *,
-        classes: PathClasses | None = None,
-        receiver: Receiver | None = None,
-        layout_of: PassRenderer | None = None,
-        connections: bool = True,
-    ) -> PassRenderer:
-        """Return the renderer of passes of a scene, as `LidarMerging.prepare`."""
-
-
-@runtime_checkable
-class DaylightIntegrator(Protocol):
-    """The integrator ``passive_volpath``."""
-
-    plugin: str
-    passive: bool
-
-    def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
-        """Return the renderer of passes of a scene."""
 
 
 @runtime_checkable
