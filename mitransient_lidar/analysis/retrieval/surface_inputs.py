@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.surface_slope import PixelEchoes, PixelLight
-from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
@@ -101,8 +100,7 @@ def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) ->
     # Pixels without a column hide as little as possible.
     column = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(level.T, known.T, strict=True)])
     column = np.maximum(1e-9 * width * column, 1e-6 * np.nanmax(energy, initial=1e-30))
-    ns_per_rad = 2e9 / C0 * lidar.slant_range * math.tan(lidar.off_nadir)
-    return PixelEchoes(time, error, energy, energy_error, column, ns_per_rad * light.spread, width)
+    return PixelEchoes(time, error, energy, energy_error, column, lidar.surface_ns_per_rad * light.spread, width)
 
 
 def outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:

@@ -21,6 +21,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.dataset import check_axes
@@ -149,7 +150,7 @@ class Waveforms:
         template = Template.of(shape, step if receiver is None else receiver.bin_ns, response, receiver)
         kernel = shape.kernel(step, response) if receiver is None else template.kernel(step)
         # Two-way time per angle from the axis, in the plane of incidence.
-        ns_per_mrad = 2e6 * geometry.height * math.sin(geometry.off_nadir) / (C0 * math.cos(geometry.off_nadir) ** 2)
+        ns_per_mrad = 1e-3 * geometry.surface_ns_per_rad
         given = None if echo_fwhm_ns is None else positive("echo_fwhm_ns", echo_fwhm_ns)
         width = given or _echo_width(dataset, template, ns_per_mrad)
         echo_shape, focusing = EchoShape.of(template), Focusing.from_attributes(dataset.attrs)
@@ -157,7 +158,7 @@ class Waveforms:
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
         # Crests are earlier than the mean sea level.
         heights = np.atleast_1d(dataset.attrs.get("surface_heights_m", 0.0))
-        of_crest = quiet_until - float(heights[-1]) / (0.5e-9 * C0 * math.cos(geometry.off_nadir))
+        of_crest = quiet_until - float(surface_time_ns(heights[-1], geometry.off_nadir))
         if np.count_nonzero(time < of_crest) >= _FEWEST_QUIET:
             quiet_until = of_crest
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))

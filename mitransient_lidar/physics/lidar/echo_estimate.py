@@ -20,7 +20,7 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.refraction import fresnel, snell, turn_by_slope
+from mitransient_lidar.physics.lidar.refraction import fresnel, snell, surface_time_ns, turn_by_slope
 from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
@@ -64,7 +64,7 @@ class EchoEstimate:
         reflectance, _ = fresnel(0.0, self.system.refractive_index)
         geometry = self.system.aperture_area / (4 * np.cos(theta) ** 3 * self.system.height**2)
         energy = self.system.energy * reflectance * density * geometry / len(beam)
-        return Arrivals(beam[:, 0], beam[:, 1], 2e9 / C0 * self.system.height / np.cos(theta), energy)
+        return Arrivals(beam[:, 0], beam[:, 1], surface_time_ns(self.system.height, theta), energy)
 
     def water_and_bottom(self, beam: FloatArray, steps: int, rng: np.random.Generator) -> tuple[Arrivals, Arrivals]:
         """Return the light of the water, in `steps` of equal depth, and of the bottom, of points of the beam.

@@ -61,6 +61,11 @@ class LidarGeometry:
         return self.height / math.cos(self.off_nadir)
 
     @property
+    def surface_ns_per_rad(self) -> float:
+        """Change of the arrival from the mean sea level with the angle from the vertical [ns/rad]."""
+        return 2e9 / C0 * self.slant_range * math.tan(self.off_nadir)
+
+    @property
     def metres_per_ns(self) -> float:
         """One-way path in the water per nanosecond of delay [m/ns]."""
         return 0.5e-9 * C0 / self.group_index
