@@ -118,7 +118,7 @@ class Differences:
         if others := [name for name in steps or {} if name not in names]:
             raise UserError(f"steps: {others[0]!r} is not among the parameters {', '.join(names)}")
         self._integrator, self._model = integrator, session
-        self._base = renderer or integrator.prepare(session.scene, session.sensor)
+        self._base = (renderer or integrator.prepare(session.scene, session.sensor)).for_differences()
         self.names = list(names)
         self.values = np.array([_checked_value(session.parameters, name) for name in names])
         self.steps = np.array(

@@ -106,6 +106,10 @@ class PassRenderer(ABC):
         scaled.paths = max(round(share * self.paths), 1)
         return scaled
 
+    def for_differences(self) -> PassRenderer:
+        """Return a renderer on which differences of scenes have less noise, by default this one."""
+        return self
+
     def by_origin(self) -> PassRenderer:
         """Return a renderer that separates light by its origin; raise UserError for too many solids."""
         separate = copy.copy(self)

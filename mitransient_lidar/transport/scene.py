@@ -12,6 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.refraction import refract_level
@@ -127,6 +128,16 @@ class WaterScene:
     def seas(self) -> list[SeaShape]:
         """The ``ocean_surface`` shapes that bound the water."""
         return [surface for surface in self.surfaces if isinstance(surface, SeaShape)]
+
+    def mean_slopes(self, shots: int) -> FloatArray:
+        """Return the mean slopes of the sea along x and y under the lidar of each shot [1], shape (shots, 2)."""
+        slope = complex(*self.seas[0].sea.slope) if self.seas else 0j
+        slopes = np.full(shots, slope)
+        turns = [part.turn for part in self.parts if part.turn is not None]
+        if turns:
+            cos, sin = np.array(turns[0], np.float64)
+            slopes = slopes * (cos - 1j * sin)
+        return np.stack([slopes.real, slopes.imag], axis=-1)
 
     @property
     def bottoms(self) -> list[mi.Shape]:

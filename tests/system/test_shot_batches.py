@@ -1,6 +1,7 @@
 """Shots that are rendered together, against the same shots on their own."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -74,12 +75,17 @@ def looking(place, azimuth_deg, off_nadir_deg, height, roll_deg):
 
 @pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.long)])
 @pytest.mark.slow
-def test_poses_of_a_batch_give_what_single_shots_do(integrator):
+def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     """Azimuths all round, other angles, heights and turned pixels, over waves, ripples of a wind and a sloping bottom.
+
+    The sea is inclined, as on a long wave.
 
     Alone, each shot is rendered with a laser and a receiver in its pose, and not displaced.
     """
-    params = {"wind_speed": 6, "bottom_slope_deg": 4}
+    params, scene = {"wind_speed": 6, "bottom_slope_deg": 4}, tmp_path / "inclined.xml"
+    slopes = '<float name="slope_x_deg" value="5"/> <float name="slope_y_deg" value="-3"/>'
+    level = Path("docs/guide/survey_lidar.xml").read_text("utf-8")
+    scene.write_text(level.replace('<medium type="layered_water"', slopes + '<medium type="layered_water"'), "utf-8")
     shots = [
         ((0.0, 0.0), 0.0, 15.0, 300.0, 0.0),
         ((17.3, -42.1), 130.0, 16.0, 290.0, 9.0),
@@ -87,7 +93,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator):
     ]
     given = [looking(*shot) for shot in shots]
     passes = {"lidar_merging": 16, "lidar_volpath": 24}[integrator]
-    renderer = prepared("docs/guide/survey_lidar.xml", params, integrator)
+    renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
     stacked = KernelPose(
@@ -102,9 +108,7 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator):
     together = together.reshape(len(shots), passes, -1, axis.bin_count)
     later = (poses.extra_range(renderer.scene) - lengths) / 0.299792458
     for pose, delay, found in zip(given, later, together, strict=True):
-        session = open_scene(
-            "docs/guide/survey_lidar.xml", params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]}
-        )
+        session = open_scene(scene, params | {"aim_x": pose.ground_point()[0], "aim_y": pose.ground_point()[1]})
         session.scene.emitters()[0].pose = pose
         session.sensor.receiver = replace(session.sensor.receiver, pose=pose)
         session.share_record(replace(axis, start_ns=axis.start_ns + delay))

@@ -175,23 +175,30 @@ class WaterGrid:
         self._uppermost = opaque(uppermost)
         self.bits_z = int(np.clip(math.ceil(math.log2(layers + depth / thickness + 1)), 2, 8))
 
-    def of_shots(
-        self, heights: SurfaceHeights, entries: FloatArray, axes: FloatArray | None, wider: float, bits: int
-    ) -> WaterGrid:
-        """Return the grid of shots with heights and axes of their own, see `BeamRings.of_entries`.
+    def of_shots(self, heights: SurfaceHeights, rings: BeamRings, wider: float, bits: int) -> WaterGrid:
+        """Return the grid of shots with heights and axes of their own.
 
         Cells are wider by a factor, and there are buckets for each shot.
         """
-        grid = copy.copy(self)
-        grid.heights, grid.rings = heights, self.rings.of_entries(entries, axes)
+        grid = self.moved(heights, rings)
         grid.width, grid.bits = self.width * opaque(wider), bits
+        return grid
+
+    def moved(self, heights: SurfaceHeights, rings: BeamRings) -> WaterGrid:
+        """Return the grid below another sea surface and about other axes."""
+        grid = copy.copy(self)
+        grid.heights, grid.rings = heights, rings
+        return grid
+
+    def of_even_width(self, wider: float) -> WaterGrid:
+        """Return the grid of cells that are wider by a factor than those at the surface, at all depths."""
+        grid = copy.copy(self)
+        grid.width, grid.growth = self.width * opaque(wider), opaque(0.0)
         return grid
 
     def repeated(self, copies: int) -> WaterGrid:
         """Return the grid of each shot several times in turn."""
-        grid = copy.copy(self)
-        grid.heights, grid.rings = self.heights.repeated(copies), self.rings.repeated(copies)
-        return grid
+        return self.moved(self.heights.repeated(copies), self.rings.repeated(copies))
 
     @property
     def bits_ring(self) -> int:
@@ -303,7 +310,8 @@ class WaterCells:
         x, y = dr.fma(distance, line.x, point.x), dr.fma(distance, line.y, point.y)
         moved = dr.fma(distance, descent, depth)
         along, across = rings.offset(x, y, moved)
-        slopes, start = rings.along_and_across(slope), rings.offset(point.x, point.y, depth)
+        # Offsets are from the axis that the mean slope refracts.
+        slopes, start = rings.along_and_across(slope - mi.Vector2f(*rings.tilt)), rings.offset(point.x, point.y, depth)
         if looks_up:
             more = grid.profile.spread(start, depth, moved, slopes)
             along, across = along + more[0], across + more[1]

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.patches import SolidPatches
-from mitransient_lidar.transport.merging.photon_map import PHOTONS_OF_CELL, Photon, PhotonMap
+from mitransient_lidar.transport.merging.photon_map import Photon, PhotonMap
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentPoints
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
 from mitransient_lidar.transport.passes import PassRecord
@@ -24,9 +24,14 @@ from mitransient_lidar.transport.scene import LidarScene
 
 
 def store_points(
-    segments: SegmentBuffer, count: int, cells: WaterCells | SphericalCells, classes: PathClasses, shots: Shots
+    segments: SegmentBuffer,
+    count: int,
+    cells: WaterCells | SphericalCells,
+    classes: PathClasses,
+    shots: Shots,
+    most: int,
 ) -> PhotonMap | None:
-    """Store the `count` points of light paths by their cells; return None if there are none."""
+    """Store the `count` points of light paths by their cells, `most` of full ones; return None if there are none."""
     if count == 0:
         return None
     index = dr.arange(mi.UInt32, count)
@@ -35,7 +40,7 @@ def store_points(
     bucket = cells.locate(points.point, points.direction, points.unscattered).bucket
     u = segments.random(index, shots)
     kept = classes.labels_orders, len(points.contribution.sums)
-    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, PHOTONS_OF_CELL, *kept)
+    photons = PhotonMap(shots.count << cells.grid.bits, bucket, u, most, *kept)
     # Computed again, which costs less than keeping the points.
     points = segments.points(index)
     tag = cells.locate(points.point, points.direction, points.unscattered).tag

@@ -13,11 +13,14 @@ from mitransient_lidar.transport.opaque import opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.perturbations import Perturbations, SumStore
 from mitransient_lidar.transport.random_walk import RandomWalkPath
-from mitransient_lidar.transport.rng import Lanes
+from mitransient_lidar.transport.rng import Lanes, Shots
 
 #: Number of photons that are kept of full buckets, of cells and of patches: more take time and reduce the variance
 #: little.
 PHOTONS_OF_CELL, PHOTONS_OF_PATCH = 8, 32
+
+#: Numbers that tell the hits of a path apart; those of paths with more rays may be those of other paths.
+_RAYS_PER_PATH = 509
 
 
 @dataclass(frozen=True)
@@ -185,7 +188,8 @@ class PhotonBuffer:
         self._classes = classes
         self._stored = dr.zeros(mi.UInt32, 1)
         self._patch = dr.empty(mi.UInt32, 2 * capacity)
-        self._lane = dr.empty(mi.UInt32, capacity)
+        # Lane, and number of the ray that ends there.
+        self._ray = dr.empty(mi.UInt32, 2 * capacity)
         self._label = dr.empty(mi.UInt32, capacity if classes.labels_orders else 1)
         # Of each hit: direction and length; `Contribution.packed` and whether it is connectable.
         self._record = dr.empty(mi.Float, 4 * capacity)
@@ -205,7 +209,7 @@ class PhotonBuffer:
         keep = active & (slot < self._capacity)
         where = mi.Vector4f(path.direction.x, path.direction.y, path.direction.z, path.length)
         dr.scatter(self._patch, mi.Point2u(patch.bucket, patch.tag), slot, keep)
-        dr.scatter(self._lane, path.lane, slot, keep)
+        dr.scatter(self._ray, mi.Point2u(path.lane, path.rays), slot, keep)
         dr.scatter(self._record, where, slot, keep)
         carried = path.packed()
         dr.scatter(self._carried, mi.Vector2f(carried, dr.select(connectable, mi.Float(1), 0)), slot, keep)
@@ -218,9 +222,9 @@ class PhotonBuffer:
         self._sums.write(path.sums, slot, keep)
         self._connectable_sums.write(path.sums, path.lane, connectable)
 
-    def sort(self, buckets: int) -> tuple[PhotonMap | None, int]:
+    def sort(self, buckets: int, shots: Shots) -> tuple[PhotonMap | None, int]:
         """Return the photons in a map, or None, and their number, stored or not."""
-        dr.eval(self._stored, self._patch, self._lane, self._record, self._carried, self._label)
+        dr.eval(self._stored, self._patch, self._ray, self._record, self._carried, self._label)
         dr.eval(self._connectable, self._place, self._connectable_label)
         dr.eval(self._sums.packets, self._connectable_sums.packets)
         wanted = int(self._stored[0])
@@ -229,10 +233,10 @@ class PhotonBuffer:
         index = dr.arange(mi.UInt32, min(wanted, self.capacity))
         bucket, tag = dr.gather(mi.Point2u, self._patch, index)
         x, y, z, length = dr.gather(mi.Vector4f, self._record, index)
-        # The hit itself gives its random number, so that those of other paths do not change it.
-        key = dr.reinterpret_array(mi.UInt32, x) ^ dr.reinterpret_array(mi.UInt32, length)
-        lanes = Lanes.of_paths(dr.gather(mi.UInt32, self._lane, index), self._shots, self.photons)
-        u = mi.sample_tea_float32(lanes.number, key)
+        # Neither other paths nor a scene that differs a little change the random number of a hit.
+        lane, ray = dr.gather(mi.Point2u, self._ray, index)
+        lanes = Lanes.of_paths(lane, self._shots, self.photons)
+        u = mi.sample_tea_float32(shots.keys(lanes), lanes.number * _RAYS_PER_PATH + ray)
         carried, connectable = dr.gather(mi.Vector2f, self._carried, index)
         contribution, zero = Contribution.unpacked(carried, self._sums.read(index)), mi.Float(0)
         kept = self._classes.labels_orders, len(contribution.sums)

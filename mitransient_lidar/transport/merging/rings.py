@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -12,6 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.lidar.refraction import refract as refract_at_facet
 from mitransient_lidar.transport.opaque import aligned, opaque
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.snell import refract
@@ -66,50 +67,82 @@ class BeamRings:
         Refractive index of the water over that at the laser.
     growth
         Growth of the core radius with depth [m/m].
+    tilt
+        Mean slopes of the sea along x and y, which refracts the axis [1], shape (1, 2); by default it is level.
 
     The axis begins where it meets the mean sea level, or where each shot's beam meets the sea (`of_entries`).
     """
 
-    def __init__(self, pose: Pose, spread: float, index: float, growth: float = _CORE_PER_METRE) -> None:
+    def __init__(
+        self,
+        pose: Pose,
+        spread: float,
+        index: float,
+        growth: float = _CORE_PER_METRE,
+        tilt: FloatArray | None = None,
+    ) -> None:
         self.spread, self._growth, self._index = opaque(spread), opaque(growth), index
         self._entry = mi.Vector3f(opaque(0.0))
+        #: Ratio of the axes of the ellipses.
+        self.cosine = opaque(max(-float(pose.axis[2]), _SMALLEST_COSINE))
+        self._aim(pose, np.zeros((1, 2)) if tilt is None else tilt)
+
+    def _aim(self, pose: Pose, tilt: FloatArray) -> None:
+        """Lay the axis through that of a pose."""
         horizontal, down = pose.axis[:2], max(-float(pose.axis[2]), _SMALLEST_COSINE)
         spot = pose.origin[:2] + horizontal * (float(pose.origin[2]) / down)
         sine = float(np.hypot(*horizontal))
         azimuth = horizontal / sine if sine > 0 else pose.far[:2]
         self._spot = [opaque(x) for x in spot]
         self._azimuth = [opaque(x) for x in azimuth]
-        cosine = max(math.sqrt(max(1 - (sine / index) ** 2, 0.0)), _SMALLEST_COSINE)
-        #: Horizontal displacement of the axis for each metre of depth.
-        self.shear = [opaque(x / (index * cosine)) for x in horizontal]
-        #: The same where patches are projected along the axis, else 0: axes close to the horizon, or above it.
-        self.slant = self.shear if np.hypot(*horizontal) < _LARGEST_SLANT * index * cosine else [opaque(0.0)] * 2
-        #: Ratio of the axes of the ellipses.
-        self.cosine = opaque(down)
+        self._set_axes(pose.axis[np.newaxis], tilt)
 
-    def of_entries(self, entries: FloatArray, axes: FloatArray | None = None) -> BeamRings:
+    def alike(self, pose: Pose, entries: FloatArray, tilt: FloatArray) -> BeamRings:
+        """Return the same rings about the axis of another pose, below a sea of other mean slopes."""
+        rings = copy.copy(self)
+        rings._aim(pose, tilt)
+        return rings.of_entries(entries)
+
+    def of_entries(
+        self, entries: FloatArray, axes: FloatArray | None = None, tilts: FloatArray | None = None
+    ) -> BeamRings:
         """Return rings about axes that begin elsewhere: displacements of each shot [m], shape (shots, 3).
 
-        Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own.
+        Shots whose beams have directions of their own in air, `axes` of the same shape, have axes of their own, below
+        seas of mean slopes `tilts`, shape (shots, 2).
         """
         rings = copy.copy(self)
         rings._entry = mi.Vector3f(*_columns(entries))
-        if axes is not None:
-            sine = np.hypot(axes[:, 0], axes[:, 1])
-            cosine = np.maximum(np.sqrt(np.maximum(1 - (sine / self._index) ** 2, 0)), _SMALLEST_COSINE)
-            shear = axes[:, :2] / (self._index * cosine)[:, None]
-            is_steep = sine < _LARGEST_SLANT * self._index * cosine
-            rings.shear, rings.slant = _columns(shear), _columns(np.where(is_steep[:, None], shear, 0.0))
+        if axes is not None and tilts is not None:
+            rings._set_axes(axes, tilts)
         return rings
+
+    def _set_axes(self, axes: FloatArray, tilts: FloatArray) -> None:
+        """Refract axes, unit directions in air of one or more shots, shape (shots, 3), by seas of mean slopes."""
+        index, horizontal = self._index, axes[:, :2]
+        sine = np.hypot(*horizontal.T)
+        cosine = np.maximum(np.sqrt(np.maximum(1 - (sine / index) ** 2, 0)), _SMALLEST_COSINE)
+        level = shear = horizontal / (index * cosine)[:, None]
+        if tilts.any():
+            refracted = refract_at_facet(axes, np.column_stack([-tilts, np.ones(len(tilts))]), index)
+            shear = refracted[:, :2] / np.maximum(-refracted[:, 2:], _SMALLEST_COSINE)
+        is_steep = sine < _LARGEST_SLANT * index * cosine
+        #: Horizontal displacement of the axis for each metre of depth.
+        self.shear = _columns(shear)
+        #: The same where patches are projected along the axis, else 0: axes close to the horizon, or above it.
+        self.slant = _columns(np.where(is_steep[:, None], shear, 0.0))
+        #: Horizontal displacement of the axis below level facets for each metre of depth.
+        self._level = _columns(level)
+        #: Mean slopes of the sea along x and y.
+        self.tilt = _columns(tilts)
 
     def repeated(self, copies: int) -> BeamRings:
         """Return the rings of each shot several times in turn."""
         rings = copy.copy(self)
         rings._entry = dr.repeat(self._entry, copies)
-        if any(dr.width(each) > 1 for each in self.shear):
-            sides = self.shear, self.slant
-            rings.shear, rings.slant = ([dr.repeat(each, copies) for each in pair] for pair in sides)
-        dr.eval(rings._entry, rings.shear, rings.slant)
+        if self._differ:
+            rings._of_shots(lambda each: dr.repeat(each, copies))
+        dr.eval(rings._entry, rings.shear, rings.slant, rings._level, rings.tilt)
         return rings
 
     def of(self, lanes: Lanes) -> BeamRings:
@@ -118,9 +151,19 @@ class BeamRings:
             return self
         rings = copy.copy(self)
         rings._entry = lanes.pick(self._entry)
-        if any(dr.width(each) > 1 for each in self.shear):
-            rings.shear, rings.slant = ([lanes.pick(each) for each in sides] for sides in (self.shear, self.slant))
+        if self._differ:
+            rings._of_shots(lanes.pick)
         return rings
+
+    @property
+    def _differ(self) -> bool:
+        """Whether axes differ between shots."""
+        return any(dr.width(each) > 1 for each in self.shear)
+
+    def _of_shots(self, change: Callable[[mi.Float], mi.Float]) -> None:
+        """Change the numbers that differ between shots."""
+        for name in ("shear", "slant", "_level", "tilt"):
+            setattr(self, name, [change(each) for each in getattr(self, name)])
 
     def depth_at(self, z: mi.Float) -> mi.Float:
         """Return the depth of a height [m] below the beginning of the axis [m]."""
@@ -139,7 +182,7 @@ class BeamRings:
 
     def refracted(self, slope: mi.Vector2f) -> mi.Vector3f:
         """Return the unit direction of the axis below facets of a slope."""
-        level = dr.normalize(mi.Vector3f(self.shear[0], self.shear[1], -1))
+        level = dr.normalize(mi.Vector3f(self._level[0], self._level[1], -1))
         index = opaque(self._index)
         x, y = index * level.x, index * level.y
         to_laser = mi.Vector3f(-x, -y, dr.safe_sqrt(1 - x * x - y * y))
@@ -184,4 +227,6 @@ class BeamRings:
 
 def _columns(values: FloatArray) -> list[mi.Float]:
     """Return the columns of values of shots, shape (shots, n)."""
+    if len(values) == 1:
+        return [opaque(float(value)) for value in values[0]]
     return [aligned(mi.Float, column.astype(np.float32)) for column in values.T]
