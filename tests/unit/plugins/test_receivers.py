@@ -47,12 +47,6 @@ def test_direction_and_tangent_are_inverse():
     assert float(pose.tangent(mi.Vector3f((-pose.axis).tolist()))[2][0]) == pytest.approx(-1)
 
 
-def test_tangent_of_a_point_is_that_of_its_direction():
-    pose = KernelPose.from_angles(200.0, 20.0)
-    point = pose.origin + 50 * (pose.axis + 0.02 * pose.far - 0.03 * pose.left)
-    assert pose.angles_of(point - pose.origin) == pytest.approx((0.02, -0.03))
-
-
 def test_look_at_gives_the_axes_of_the_angles():
     """Position and target alone; scaling the transform changes nothing."""
     wanted = KernelPose.from_angles(120.0, 25.0, 2.0, 1.0)
