@@ -19,7 +19,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.las import write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.poses.mounting import pixel_turns
+from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
@@ -72,9 +72,10 @@ class Flown:
         inputs: dict[str, str] = store.attributes["inputs"]
         return store.stored(inputs.get(name, name))[self.rows]
 
-    def vectors(self, name: str) -> FloatArray:
-        """Return vectors of all pulses, shape (pulses, 3)."""
-        return np.column_stack([self.values(f"{name}_{axis}") for axis in "xyz"])
+    @property
+    def poses(self) -> Pose:
+        """Poses of all pulses."""
+        return poses_of(self.values)
 
     def coordinate(self, name: str) -> Any:
         """Return a coordinate of the pixels, times or echoes."""
@@ -114,7 +115,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
         attributes,
     )
     angle = flown.values("group_angle_deg")
-    turns = pixel_turns(flown.vectors("axis"), flown.vectors("far"))
+    turns = pixel_turns(flown.poses)
     kinds, kind = np.unique(np.stack([flown.values("group"), turns]), axis=1, return_inverse=True)
     table = None if corrections == "none" else corrections_for(str(attributes.get("instrument", "")), corrections)
     if table is not None:
@@ -160,8 +161,7 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     echoes = echoes_of(flown, plan.corrections)
     attributes = flown.attributes
     angles = [1e-3 * flown.coordinate(name) for name in ("sight_x", "sight_y")]
-    poses = Pose(*(flown.vectors(name) for name in ("origin", "axis", "far", "left")))
-    time_s = flown.values("time_s")
+    poses, time_s = flown.poses, flown.values("time_s")
     options: dict[str, Any] = {
         "refractive_index": float(attributes["refractive_index"]),
         "group_index": float(attributes["group_index"]),
@@ -297,10 +297,8 @@ def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
 
 def _directions(flown: Flown, shot: IntArray, pixel: IntArray) -> FloatArray:
     """Return the unit lines of sight of points, shape (points, 3)."""
-    axis, far, left = (flown.vectors(name)[shot] for name in ("axis", "far", "left"))
-    x, y = (1e-3 * flown.coordinate(name)[pixel][:, None] for name in ("sight_x", "sight_y"))
-    line = axis + x * far + y * left
-    return np.asarray(line / np.linalg.norm(line, axis=1, keepdims=True))
+    angles = [1e-3 * flown.coordinate(name)[pixel] for name in ("sight_x", "sight_y")]
+    return flown.poses.part(shot).directions(np.stack(angles, axis=1))
 
 
 def _forward(origin: FloatArray, time_s: FloatArray) -> FloatArray:

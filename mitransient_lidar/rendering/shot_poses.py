@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.opaque import aligned
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
@@ -38,10 +39,10 @@ class ShotPoses:
     turns: FloatArray | None = None
     receiver: KernelPose | None = None
     transmitter: KernelPose | None = None
-    in_scene: KernelPose | None = None
+    in_scene: Pose | None = None
 
     @classmethod
-    def of_receiver(cls, lidar: LidarScene, receiver: KernelPose) -> ShotPoses:
+    def of_receiver(cls, lidar: LidarScene, receiver: Pose) -> ShotPoses:
         """Return the poses of shots of a lidar whose receiver has given ones, with arrays of shape (shots, 3).
 
         The transmitter is fixed to the receiver. All axes must go down.
@@ -67,9 +68,9 @@ class ShotPoses:
     def part(self, rows: slice | IntArray) -> ShotPoses:
         """Return some of the shots."""
         turns = None if self.turns is None else self.turns[rows]
-        receiver, transmitter, in_scene = (
-            None if pose is None else pose.part(rows) for pose in (self.receiver, self.transmitter, self.in_scene)
-        )
+        receiver = None if self.receiver is None else self.receiver.part(rows)
+        transmitter = None if self.transmitter is None else self.transmitter.part(rows)
+        in_scene = None if self.in_scene is None else self.in_scene.part(rows)
         return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene)
 
     def repeated(self, copies: int) -> ShotPoses:

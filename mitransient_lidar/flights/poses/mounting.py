@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -114,17 +114,19 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
     )
 
 
-def pixel_turns(axis: FloatArray, far: FloatArray) -> FloatArray:
+def poses_of(column: Callable[[str], FloatArray]) -> Pose:
+    """Return the poses of pulses from columns such as ``origin_x``, by their names."""
+    names = ("origin", "axis", "far", "left")
+    return Pose(*(np.column_stack([column(f"{name}_{axis}") for axis in "xyz"]) for name in names))
+
+
+def pixel_turns(poses: Pose) -> FloatArray:
     """Return the angles [deg] by which pixels are turned about their axis, from far to left, shape (shots,).
 
     They are those to the plane of incidence, rounded to multiples of 10 degrees, -170 to 180; 0 of an axis that is
     vertical.
-
-    Parameters
-    ----------
-    axis, far
-        Unit directions of the pulses and of +angle_x, shape (shots, 3).
     """
+    axis, far = poses.axis, poses.far
     # Left of the plane of incidence is level.
     left = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
     outwards = np.cross(axis, left)
