@@ -12,16 +12,14 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mitransient_lidar.core.validation import IntArray
 from mitransient_lidar.transport.merging.cells import WaterCells
 from mitransient_lidar.transport.merging.merge import SensorSubpath
 from mitransient_lidar.transport.merging.patches import SolidPatches
 from mitransient_lidar.transport.merging.photon_map import Photon, PhotonBuffer
 from mitransient_lidar.transport.merging.segments import SegmentBuffer, SegmentPoints
 from mitransient_lidar.transport.merging.spherical_cells import SphericalCells
-from mitransient_lidar.transport.opaque import aligned, opaque
+from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.passes import PassRecord
 from mitransient_lidar.transport.perturbations import Sums, joined
 from mitransient_lidar.transport.rng import Lanes, Shots
@@ -44,14 +42,14 @@ class ConnectionRates:
         Cells, whose volumes are the rates of merges.
     in_water, on_solids
         Share of the pairs of points, and of points and photons on solids, that are connected.
-    connected
-        Whether there are connections at all.
+    per_path
+        Number of connections of each path from the receiver, with points and with photons on solids; 0 for none.
     """
 
     cells: WaterCells | SphericalCells
     in_water: mi.Float
     on_solids: mi.Float
-    connected: bool
+    per_path: int
 
     @classmethod
     def of_pass(
@@ -65,7 +63,8 @@ class ConnectionRates:
         water = scene.required_water
         connected = wanted and water.plume is None and water.index_layers.count == 1 and not scene.submerged
         rate = 1 / (_POINTS_PER_CONNECTION * photons) if connected else 0.0
-        return cls(cells, opaque(rate / points_per_path), opaque(rate), connected)
+        per_path = max(round(points_per_path / _POINTS_PER_CONNECTION), 1) if connected else 0
+        return cls(cells, opaque(rate / points_per_path), opaque(rate), per_path)
 
     def volume(self, point: mi.Point3f) -> mi.Float:
         """Return the rate of merges at scattering events [m^3]."""
@@ -88,17 +87,14 @@ class _Pairs:
         The points.
     partner
         Numbers of the partners.
-    partners
-        Number of possible partners of the shot.
-    exists
-        Whether there are such points and partners.
+    weight
+        Reciprocal of the expected number of pairs of the same point and partner; 0 where one of them does not exist.
     """
 
     lanes: Lanes
     point: SegmentPoints
     partner: mi.UInt32
-    partners: mi.Float
-    exists: mi.Bool
+    weight: mi.Float
 
 
 class WaterConnections:
@@ -110,29 +106,33 @@ class WaterConnections:
         self.scene, self.record, self.rates = scene, record, rates
         self._water, self._points, self._shots = scene.required_water, points, shots
 
-    def _pairs(self, first_partners: IntArray, stream: int) -> _Pairs:
-        """Return some of the points, and random partners; those of each shot begin at the given numbers."""
-        first_points = self._points.first_points.astype(np.int64)
-        most = int(np.diff(first_points).max())
-        shots = self._shots.count
-        lanes = self._shots.paths(-(-most // _POINTS_PER_CONNECTION))
+    def _pairs(self, light: SegmentBuffer | int, stream: int) -> _Pairs:
+        """Return points of each path, and random partners: points of light paths, or a number of photons of a shot.
+
+        Path and point are drawn one after the other, so that paths with other points, in a scene that differs a little,
+        change no other pairs.
+        """
+        points = self._points
+        lanes = self._shots.paths(points.paths * self.rates.per_path)
         rng = self._shots.streams(stream, lanes)
-        # Arrays, as these numbers differ between passes, which share a kernel.
-        start, count, before, others = (
-            lanes.pick(aligned(mi.UInt32, values.astype(np.uint32)))
-            for first in (first_points, first_partners)
-            for values in (first[:shots], np.diff(first))
-        )
-        within = lanes.number * _POINTS_PER_CONNECTION + rng.next_uint32() % _POINTS_PER_CONNECTION
-        partner = before + mi.UInt32((mi.UInt64(rng.next_uint32()) * mi.UInt64(others)) >> 32)
-        exists = (within < count) & (others > 0)
-        point = self._points.points(start + dr.select(exists, within, 0))
-        return _Pairs(lanes, point, dr.select(exists, partner, 0), mi.Float(others), exists)
+        # Read from memory, so that scenes share a kernel.
+        counts = self.rates.per_path, points.paths, light if isinstance(light, int) else light.paths
+        per_path, paths, photons = (opaque_index(count) for count in counts)
+        path = lanes.number // per_path
+        stratum = (mi.Float(lanes.number - path * per_path) + rng.next_float32()) / mi.Float(per_path)
+        index, count = points.pick(lanes.shot * paths + path, stratum)
+        partner = lanes.shot * photons + mi.UInt32((mi.UInt64(rng.next_uint32()) * mi.UInt64(photons)) >> 32)
+        weight = mi.Float(count) * mi.Float(photons) / mi.Float(per_path)
+        if not isinstance(light, int):
+            partner, others = light.pick(partner, rng.next_float32())
+            weight *= mi.Float(others)
+        exists = weight > 0
+        return _Pairs(lanes, points.points(dr.select(exists, index, 0)), dr.select(exists, partner, 0), weight)
 
     def to_light(self, light: SegmentBuffer, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some points of light paths."""
-        pairs = self._pairs(light.first_points.astype(np.int64), stream)
-        point, exists = pairs.point, pairs.exists
+        pairs = self._pairs(light, stream)
+        point, exists = pairs.point, pairs.weight > 0
         other, scene, rates = light.points(pairs.partner), self.scene.of(pairs.lanes), self.rates.of(pairs.lanes)
         direction, distance, transmittance, pending = self._segment(point, other.point)
         x = self._inverse_scattering_density(point.point, point.direction, direction, exists)
@@ -141,7 +141,7 @@ class WaterConnections:
         total += x * (rates.volume(point.point) + rates.in_water * point.inverse_density)
         total += y * (rates.volume(other.point) + rates.in_water * other.inverse_density)
         total += rates.in_water * x * y * pending
-        scale = rates.in_water * pairs.partners * _POINTS_PER_CONNECTION
+        scale = rates.in_water * pairs.weight
         received, sent = point.contribution, other.contribution
         energy = scale * received.throughput * sent.throughput * transmittance / total
         active = exists & (distance > 0) & dr.isfinite(total)
@@ -157,11 +157,11 @@ class WaterConnections:
 
     def to_solids(self, light: PhotonBuffer, patches: SolidPatches, stream: int) -> None:
         """Connect some of the points of the receiver's paths with some photons on solids."""
-        pairs = self._pairs(light.photons * np.arange(self._shots.count + 1), stream)
+        pairs = self._pairs(light.photons, stream)
         point, patches = pairs.point, patches.of(pairs.lanes)
         place, photon = light.connectable(pairs.partner)
         received, sent = point.contribution, photon.contribution
-        exists = pairs.exists & (sent.throughput != 0)
+        exists = (pairs.weight > 0) & (sent.throughput != 0)
         direction, distance, transmittance, pending = self._segment(point, place)
         tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * distance
         ray = mi.Ray3f(point.point, direction)
@@ -173,7 +173,7 @@ class WaterConnections:
         x = self._inverse_scattering_density(point.point, point.direction, direction, active)
         connection = self.rates.on_solids * x * pending / dr.abs(dr.dot(si.n, direction))
         total = patches.typical_area(si) + connection
-        scale = self.rates.on_solids * pairs.partners * _POINTS_PER_CONNECTION
+        scale = self.rates.on_solids * pairs.weight
         energy = scale * received.throughput * sent.throughput * bsdf * transmittance / total
         active &= (bsdf > 0) & dr.isfinite(total)
         solid, length = self.record.classes.solid(si.shape), point.length + photon.length

@@ -455,7 +455,7 @@ class MergingRenderer(PassRenderer):
             index = dr.arange(mi.UInt32, points)
             cells = cells.of(segments.lanes(index))
             merge_in_water(scene, record, segments.points(index), cells, light.in_cells, rates.in_water)
-        if rates.connected:
+        if rates.per_path:
             connections = WaterConnections(self.scene, record, rates, segments, shots)
             if light.points > 0:
                 connections.to_light(light.segments, _CONNECTION_STREAM)

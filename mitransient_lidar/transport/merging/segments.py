@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque, opaque_index
@@ -137,15 +136,14 @@ class SegmentBuffer:
         self, scene: LidarScene, classes: PathClasses, spacing: float, paths: int, capacity: int, shots: int = 1
     ) -> None:
         self._water, self._perturbations, self._classes = scene.required_water, scene.perturbations, classes
-        self._paths, self._shots = paths, shots
-        #: Number of points before those of each shot, and of all.
-        self.first_points = np.zeros(shots + 1, np.uint32)
+        self.paths, self._shots = paths, shots
         self.spacing = opaque(spacing)
         self.capacity, self._capacity = capacity, opaque_index(capacity)
         self._stored = dr.zeros(mi.UInt32, 1)
         self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)
         self._segments = _SegmentStore(capacity, self._perturbations.count)
+        self._end = mi.UInt32()
         self._first = mi.UInt32()
         self._slot = mi.UInt32()
 
@@ -165,15 +163,13 @@ class SegmentBuffer:
         """Assign numbers to the points; return their number and that of the segments, stored or not."""
         dr.eval(self._stored, self._of_path, self._place)
         self._segments.evaluate()
-        end = dr.cumsum(self._of_path)
-        last = dr.arange(mi.UInt32, self._shots) * self._paths + (self._paths - 1)
-        self.first_points[1:] = np.array(dr.gather(mi.UInt32, end, last))
-        count, wanted = int(self.first_points[-1]), int(self._stored[0])
+        self._end = dr.cumsum(self._of_path)
+        count, wanted = int(self._end[self._shots * self.paths - 1]), int(self._stored[0])
         if wanted > self.capacity or count == 0:
             return count, wanted
         slot = dr.arange(mi.UInt32, wanted)
         lane, before = dr.gather(mi.Point2u, self._place, slot)
-        first = dr.gather(mi.UInt32, end, lane) - dr.gather(mi.UInt32, self._of_path, lane) + before
+        first = dr.gather(mi.UInt32, self._end, lane) - dr.gather(mi.UInt32, self._of_path, lane) + before
         begins, self._slot = dr.zeros(mi.UInt32, count), dr.empty(mi.UInt32, count)
         dr.scatter(begins, first, first)
         dr.scatter(self._slot, slot, first)
@@ -185,13 +181,19 @@ class SegmentBuffer:
     def lanes(self, index: mi.UInt32) -> Lanes:
         """Return the lanes of points by number: shots, and paths within them."""
         segment = dr.gather(mi.UInt32, self._slot, dr.gather(mi.UInt32, self._first, index))
-        return Lanes.of_paths(dr.gather(mi.UInt32, self._place, 2 * segment), self._shots, self._paths)
+        return Lanes.of_paths(dr.gather(mi.UInt32, self._place, 2 * segment), self._shots, self.paths)
+
+    def pick(self, path: mi.UInt32, u: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
+        """Return one of the points of each path by uniform random numbers, and how many points the path has."""
+        count = dr.gather(mi.UInt32, self._of_path, path)
+        within = dr.minimum(mi.UInt32(u * mi.Float(count)), dr.maximum(count, 1) - 1)
+        return dr.gather(mi.UInt32, self._end, path) - count + within, count
 
     def random(self, index: mi.UInt32, shots: Shots) -> mi.Float:
         """Return uniform random numbers of points by number, which points of other paths do not change."""
         first = dr.gather(mi.UInt32, self._first, index)
         lane, before = dr.gather(mi.Point2u, self._place, dr.gather(mi.UInt32, self._slot, first))
-        lanes = Lanes.of_paths(lane, self._shots, self._paths)
+        lanes = Lanes.of_paths(lane, self._shots, self.paths)
         key = lanes.number * _KEYS_PER_PATH + before + index - first
         return mi.sample_tea_float32(key, shots.keys(lanes))
 
