@@ -13,7 +13,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.sea_mesh import SeaMesh
 from mitransient_lidar.transport.opaque import aligned
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 from mitransient_lidar.transport.sensor.receiver import Receiver, ReceiverOptics
@@ -106,7 +106,7 @@ def exposed(part: mi.Object) -> tuple[dict[str, Any], list[tuple[str, mi.Object]
     return values, objects
 
 
-class LidarIntegrator(mi.CppADIntegrator):
+class PassIntegrator(mi.CppADIntegrator):
     """Integrator that prepares a scene and renders one pass of it.
 
     It has no state of a scene: every call of ``mi.render`` prepares the scene again, with changes by ``mi.traverse``.
@@ -176,7 +176,7 @@ class ReceiverSensor(mi.Sensor):
 
     def __init__(self, props: mi.Properties, pixels: PixelArray) -> None:
         super().__init__(props)
-        pose, optics = Pose.from_properties(props), ReceiverOptics.from_properties(props)
+        pose, optics = KernelPose.from_properties(props), ReceiverOptics.from_properties(props)
         self.receiver = Receiver(pose, optics, pixels, PointSpread.from_properties(props))
         self.m_needs_sample_2 = True
         self.m_needs_sample_3 = self.receiver.blur is not None

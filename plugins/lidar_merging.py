@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import integer
-from mitransient_lidar.plugins.bases import LidarIntegrator, recorded
+from mitransient_lidar.plugins.bases import PassIntegrator, recorded
 from mitransient_lidar.transport.merging.renderer import MergingOptions, MergingRenderer, paths_of_pass
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -15,7 +15,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.volpath import VolpathOptions, VolpathRenderer
 
 
-class LidarMerging(LidarIntegrator):
+class LidarMerging(PassIntegrator):
     r"""Bidirectional transient volumetric integrator (``lidar_merging``).
 
     ================  =======  =========================================================================================

@@ -14,7 +14,7 @@ from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.plugins.bases import EmitterWithoutExtent, RecordedProperties, recorded
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam, ImageBeam, TopHatBeam
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.sensor.image_sampling import read_image
 
 _PROFILES = ("gaussian", "top_hat", "image")
@@ -94,7 +94,7 @@ class LidarTransmitter(EmitterWithoutExtent):
 
     def __init__(self, props: RecordedProperties) -> None:
         super().__init__(props)
-        self.pose = Pose.from_properties(props)
+        self.pose = KernelPose.from_properties(props)
         self.pulse_energy = 1e-3 * ranged("pulse_energy_mj", props.get("pulse_energy_mj", 5.0))
         self.optical_efficiency = in_range("optical_efficiency", props.get("optical_efficiency", 0.9), 1e-12, 1.0)
         self.wavelength_nm = in_range("wavelength_nm", props.get("wavelength_nm", 532.0), 300.0, 1100.0)

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer
-from mitransient_lidar.plugins.bases import LidarIntegrator, recorded
+from mitransient_lidar.plugins.bases import PassIntegrator, recorded
 from mitransient_lidar.transport.passes import PassRenderer
 from mitransient_lidar.transport.path_classes import PathClasses
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
@@ -14,7 +14,7 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 from mitransient_lidar.transport.volpath import CONNECTIONS, VolpathOptions, VolpathRenderer
 
 
-class VolpathIntegrator(LidarIntegrator):
+class VolpathIntegrator(PassIntegrator):
     """Integrator with the options of the path tracer; `guiding_probability` is the default."""
 
     #: Default of the roulette's threshold.

@@ -8,6 +8,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import RANGES, ranged
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.plugins.bases import ReceiverSensor, recorded
+from mitransient_lidar.transport.plugin_types import PixelSensor
 from mitransient_lidar.transport.sensor.hex_pixels import HexPixels
 from mitransient_lidar.transport.sensor.pixel_maps import MappedPixels
 from mitransient_lidar.transport.sensor.pixels import LayoutPixels, PixelArray, ShapedPixels, parse_layout
@@ -111,7 +112,7 @@ def _nested_pixels(props: mi.Properties, nested: list[mi.Sensor]) -> PixelArray:
     for name in _OWN:
         if name in props:
             raise UserError(f"multipixel_receiver: give nested pixel_fov sensors or {name}, not both")
-    if not all(hasattr(pixel, "field") for pixel in nested):
+    if not all(isinstance(pixel, PixelSensor) for pixel in nested):
         raise UserError("multipixel_receiver: nested sensors must be pixel_fov")
     names = [pixel.pixel_name or f"pixel{index}" for index, pixel in enumerate(nested)]
     return ShapedPixels([pixel.field for pixel in nested], names)

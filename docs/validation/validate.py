@@ -81,7 +81,7 @@ def passes(scene: Any, count: int, **options: Any) -> FloatArray:
 
 def levels() -> list[Row]:
     """Levels of surface, column and bottom of both integrators: 20 degrees, 200 m, beam of 10 and view of 30 mrad."""
-    system = LidarSystem(200.0, np.radians(20.0), 5e-3 * 0.81 * 0.9, 0.025)
+    system = LidarSystem(200.0, np.radians(20.0), 1.34, 1.34, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
     sigma, depth, rho, edges = 5e-3, 8.0, 0.1, 1390.0 + np.arange(161)
     seen = lambda x, y: np.hypot(x, y) < 15e-3  # noqa: E731
     column = WaterColumn(*(np.array([value]) for value in (0.0, 0.2, 0.08, 0.0032)))

@@ -18,7 +18,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite, in_range
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver, Setting, instrument_receiver
+from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
 from mitransient_lidar.physics.receiver.receiver_files import receiver as receiver_named
 
 _LOG = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 def detect_waveforms(
     dataset: xr.Dataset,
-    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
+    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
     shots: int = 1,
     seed: int = 0,
     background_power: npt.ArrayLike | xr.DataArray = 0.0,
@@ -43,7 +43,7 @@ def detect_waveforms(
     ----------
     dataset : xarray.Dataset
         A result with ``waveform`` [W] over (pixel, time) or (row, column, time), optionally after ``shot``.
-    chain : Receiver, ReceiverChain, str or path-like, optional
+    chain : ReceiverChannels, ReceiverChain, str or path-like, optional
         The receiver of every channel, or one chain for all; a name in `physics.receiver.presets.RECEIVERS` or of an
         instrument, or a TOML file (`physics.receiver.receiver_files.parse_receiver`). By default that of the instrument
         of the result, and the preset ``apd`` without one.
@@ -117,7 +117,7 @@ class PixelChain(NamedTuple):
 
 def pixel_chains(
     dataset: xr.Dataset,
-    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
+    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
     background_power: npt.ArrayLike | xr.DataArray = 0.0,
     *,
     gain: Setting | None = None,
@@ -142,11 +142,11 @@ def pixel_chains(
 
 def _channels(
     dataset: xr.Dataset,
-    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None,
+    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None,
     gain: Setting | None,
     optical_density: Setting | None,
     background_power: npt.ArrayLike | xr.DataArray,
-) -> tuple[Receiver, list[tuple[Channel, list[int]]], FloatArray]:
+) -> tuple[ReceiverChannels, list[tuple[Channel, list[int]]], FloatArray]:
     """Return the receiver, its channels with the numbers of their pixels, and the background."""
     receiver = receiver_of_result(dataset, chain, gain, optical_density)
     dims = tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot")
@@ -162,10 +162,10 @@ def _channels(
 
 def receiver_of_result(
     dataset: xr.Dataset,
-    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
+    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
     gain: Setting | None = None,
     optical_density: Setting | None = None,
-) -> Receiver:
+) -> ReceiverChannels:
     """Return the receiver that `detect_waveforms` would use, with its settings, of which some may be 'auto'."""
     if chain is not None:
         receiver = receiver_of("chain", chain)
@@ -385,7 +385,7 @@ def _in_range(
     return (chain.with_gain(factor) if gain == "auto" and factor < 1 else used), chosen, attributes
 
 
-def receiver_of(parameter: str, given: Receiver | ReceiverChain | str | os.PathLike[str]) -> Receiver:
+def receiver_of(parameter: str, given: ReceiverChannels | ReceiverChain | str | os.PathLike[str]) -> ReceiverChannels:
     """Return a receiver from itself, its chain, a name, or a TOML file, as the named parameter."""
     try:
         return receiver_named(given)

@@ -15,7 +15,8 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, in_range
 from mitransient_lidar.flights.refracted_paths import PoseErrors, RefractedPaths, Timing
-from mitransient_lidar.flights.sea_surface import SeaSurface
+from mitransient_lidar.flights.sea_surface import SurfaceModel
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.results.geometry import optional_number
 
 _PER_NS = 0.5e-9 * C0  # distance in air per nanosecond of a two-way time [m/ns]
@@ -61,16 +62,13 @@ _DESCRIBED = {
 
 def positions(
     echoes: xr.Dataset,
-    origin: npt.ArrayLike,
-    axis: npt.ArrayLike,
-    far: npt.ArrayLike,
-    left: npt.ArrayLike,
+    poses: Pose,
     angle_x: npt.ArrayLike,
     angle_y: npt.ArrayLike,
     *,
     refractive_index: float,
     group_index: float,
-    surface: SeaSurface | None = None,
+    surface: SurfaceModel | None = None,
     errors: PoseErrors | None = None,
     forward: npt.ArrayLike | None = None,
     view_x: npt.ArrayLike = 0.0,
@@ -84,8 +82,8 @@ def positions(
     echoes
         Echoes of `echo_table.extract` with one estimator and depths from the surface echo, corrected by
         `depth_correction.correct_depths` or not; over ``shot`` and ``pixel``, or ``row`` and ``column``.
-    origin, axis, far, left
-        Poses of the pulses, as of `transport.pose.Pose`: positions [m] and orthonormal directions, shape (shots, 3).
+    poses
+        Poses of the pulses, with arrays of shape (shots, 3).
     angle_x, angle_y
         Tangent-plane angles of the pixels' lines of sight [rad], +angle_y to the left; they broadcast to (shots,
         pixels). Those of results are ``sight_x`` and ``sight_y``.
@@ -134,10 +132,15 @@ def positions(
     table = _Table.of(echoes)
     errors = PoseErrors() if errors is None else errors
     angles = (_of_pixels(name, given, table.shape) for name, given in (("angle_x", angle_x), ("angle_y", angle_y)))
-    pulses = _Pulses.of({"origin": origin, "axis": axis, "far": far, "left": left}, *angles)
+    pulses = _checked(poses, table.shape[0])
+    direction = pulses.directions(np.stack(list(angles), axis=-1))
+    for row, column in np.argwhere(direction[..., 2] > -_SMALLEST_DESCENT)[:1]:
+        raise UserError(f"the line of sight of pulse {row}, pixel {column}, must descend to the sea")
     indices = in_range("refractive_index", refractive_index, 1, 2), in_range("group_index", group_index, 1, 3)
     if surface is None:
-        surface = SeaSurface(slope_deviation=mean_slope(echoes.attrs, _beam_width(echoes, pulses)))
+        surface = SurfaceModel(
+            slope_deviation=mean_slope(echoes.attrs, _beam_width(echoes, pulses.origin[..., 2] / -direction[..., 2]))
+        )
     times = np.zeros(table.shape[0]) if time_s is None else finite_array("time_s", time_s)
     if times.shape != table.shape[:1]:
         raise UserError(f"time_s of shape {times.shape} must have one time for each of {table.shape[0]} pulses")
@@ -151,11 +154,11 @@ def positions(
     shot, pixel, echo = table.points()
     timing = table.timing(shot, pixel, echo)
     paths = RefractedPaths.trace(
-        *(pulses.origin[shot], pulses.direction[shot, pixel], timing, (echo > 0, echo < 0)),
+        *(pulses.origin[shot, 0], direction[shot, pixel], timing, (echo > 0, echo < 0)),
         *(indices, surface, times[shot]),
     )
     sides = np.stack(
-        [view[shot, pixel, None] * side[shot] for view, side in zip(views, (pulses.far, pulses.left), strict=True)]
+        [view[shot, pixel, None] * side[shot, 0] for view, side in zip(views, (pulses.far, pulses.left), strict=True)]
     )
     variance = paths.variance(errors, rotations[:, shot], sides, surface.slope_deviation)
     x, y, z = paths.place.T
@@ -191,7 +194,7 @@ def positions(
     return xr.Dataset(data, attrs={"surface_level_m": surface.level, "surface_level_error_m": surface.level_error})
 
 
-def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SeaSurface:
+def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0) -> SurfaceModel:
     """Fit the sea to the surface points of a flight.
 
     Parameters
@@ -199,12 +202,12 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
     points
         Points of `positions`, of the whole flight; with planes they need ``gps_time``.
     slope_deviation, radius
-        As for `SeaSurface.fit`.
+        As for `SurfaceModel.fit`.
 
     Raises
     ------
     UserError
-        As `SeaSurface.fit`, or if ``gps_time`` is missing.
+        As `SurfaceModel.fit`, or if ``gps_time`` is missing.
     """
     own = points.isel(point=points["kind"].values == PointClass.SURFACE)
     if radius > 0 and "gps_time" not in own:
@@ -212,34 +215,21 @@ def fit_surface(points: xr.Dataset, slope_deviation: float, radius: float = 2.0)
     place = np.stack([own[name].values for name in "xyz"], axis=-1)
     time = own["gps_time"].values if "gps_time" in own else np.zeros(len(place))
     error = own["vertical_uncertainty"].values
-    return SeaSurface.fit(place, error, time, slope_deviation=slope_deviation, radius=radius)
+    return SurfaceModel.fit(place, error, time, slope_deviation=slope_deviation, radius=radius)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pulses:
-    """Poses of pulses, shape (shots, 3), and unit directions of the pixels' lines of sight, (shots, pixels, 3)."""
-
-    origin: FloatArray
-    far: FloatArray
-    left: FloatArray
-    direction: FloatArray
-
-    @classmethod
-    def of(cls, given: dict[str, npt.ArrayLike], x: FloatArray, y: FloatArray) -> _Pulses:
-        """Check poses, and compute the lines of sight at tangent-plane angles [rad], shape (shots, pixels)."""
-        vectors = {name: finite_array(name, value) for name, value in given.items()}
-        for name, value in vectors.items():
-            if value.shape != (len(x), 3):
-                raise UserError(f"{name} of shape {value.shape} must have the shape ({len(x)}, 3), a vector a pulse")
-        frame = np.stack([vectors[name] for name in ("axis", "far", "left")], axis=1)
-        skew = np.abs(frame @ frame.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ORTHONORMAL
-        if skew.any():
-            raise UserError(f"axis, far and left of pulse {int(np.argmax(skew))} must be orthonormal")
-        direction = frame[:, None, 0] + x[..., None] * frame[:, None, 1] + y[..., None] * frame[:, None, 2]
-        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        for shot, pixel in np.argwhere(direction[..., 2] > -_SMALLEST_DESCENT)[:1]:
-            raise UserError(f"the line of sight of pulse {shot}, pixel {pixel}, must descend to the sea")
-        return cls(vectors["origin"], frame[:, 1], frame[:, 2], direction)
+def _checked(poses: Pose, shots: int) -> Pose:
+    """Return the poses of pulses, of vectors of shape (shots, 1, 3), or refuse them."""
+    vectors = {name: finite_array(name, getattr(poses, name)) for name in ("origin", "axis", "far", "left")}
+    for name, value in vectors.items():
+        if value.shape != (shots, 3):
+            raise UserError(f"{name} of shape {value.shape} must have the shape ({shots}, 3), a vector a pulse")
+    checked = Pose(**{name: value[:, None] for name, value in vectors.items()})
+    frame = checked.frame[:, 0]
+    skew = np.abs(frame @ frame.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ORTHONORMAL
+    if skew.any():
+        raise UserError(f"axis, far and left of pulse {int(np.argmax(skew))} must be orthonormal")
+    return checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,11 +295,10 @@ def _of_pixels(name: str, given: npt.ArrayLike, shape: tuple[int, int]) -> Float
         raise UserError(f"{name} of shape {np.shape(given)} must broadcast to {shape}, pulses and pixels") from None
 
 
-def _beam_width(echoes: xr.Dataset, pulses: _Pulses) -> float:
+def _beam_width(echoes: xr.Dataset, ranges: FloatArray) -> float:
     """Return the diameter of the beam, or of the view if that is smaller, on the sea [m]."""
     widths = [optional_number(echoes.attrs, f"{name}_mrad") for name in ("divergence", "field_of_view")]
-    distance = float(np.median(pulses.origin[:, None, 2] / -pulses.direction[..., 2]))
-    return 1e-3 * distance * min((one for one in widths if one is not None), default=0.0)
+    return 1e-3 * float(np.median(ranges)) * min((one for one in widths if one is not None), default=0.0)
 
 
 def _returns(shot: IntArray, pixel: IntArray) -> tuple[IntArray, IntArray]:

@@ -19,9 +19,10 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.las import write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.poses.mounting import pixel_turns
+from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.lidar.refraction import cos_in_water
 
 _LOG = logging.getLogger(__name__)
 
@@ -71,9 +72,10 @@ class Flown:
         inputs: dict[str, str] = store.attributes["inputs"]
         return store.stored(inputs.get(name, name))[self.rows]
 
-    def vectors(self, name: str) -> FloatArray:
-        """Return vectors of all pulses, shape (pulses, 3)."""
-        return np.column_stack([self.values(f"{name}_{axis}") for axis in "xyz"])
+    @property
+    def poses(self) -> Pose:
+        """Poses of all pulses."""
+        return poses_of(self.values)
 
     def coordinate(self, name: str) -> Any:
         """Return a coordinate of the pixels, times or echoes."""
@@ -113,7 +115,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
         attributes,
     )
     angle = flown.values("group_angle_deg")
-    turns = pixel_turns(flown.vectors("axis"), flown.vectors("far"))
+    turns = pixel_turns(flown.poses)
     kinds, kind = np.unique(np.stack([flown.values("group"), turns]), axis=1, return_inverse=True)
     table = None if corrections == "none" else corrections_for(str(attributes.get("instrument", "")), corrections)
     if table is not None:
@@ -128,8 +130,7 @@ def echoes_of(flown: Flown, corrections: str = "none") -> xr.Dataset:
         echoes = xr.concat(parts, "shot", combine_attrs="override").isel(shot=order)
     # Depths were measured along the line of sight of the group's lidar.
     index = float(attributes["refractive_index"])
-    own = np.arccos(np.clip(-flown.values("axis_z"), -1, 1))
-    ratio = np.cos(snell(own, index)) / np.cos(snell(np.radians(angle), index))
+    ratio = cos_in_water(flown.values("axis_z"), index) / cos_in_water(np.cos(np.radians(angle)), index)
     for name in ("depth_m", "depth_m_stderr", "depth_m_method_error"):
         echoes[name] = echoes[name] * xr.DataArray(ratio, dims="shot")
     return echoes
@@ -160,20 +161,19 @@ def points_of(flown: Flown, plan: FlightPlan) -> xr.Dataset:
     echoes = echoes_of(flown, plan.corrections)
     attributes = flown.attributes
     angles = [1e-3 * flown.coordinate(name) for name in ("sight_x", "sight_y")]
-    poses = {name: flown.vectors(name) for name in ("origin", "axis", "far", "left")}
-    time_s = flown.values("time_s")
+    poses, time_s = flown.poses, flown.values("time_s")
     options: dict[str, Any] = {
         "refractive_index": float(attributes["refractive_index"]),
         "group_index": float(attributes["group_index"]),
         "errors": plan.errors,
-        "forward": _forward(poses["origin"], time_s),
+        "forward": _forward(poses.origin, time_s),
         "time_s": time_s,
     }
-    points = positions(echoes, *poses.values(), *angles, **options)
+    points = positions(echoes, poses, *angles, **options)
     if np.any(points["kind"].values == PointClass.SURFACE):
-        width = float(attributes.get("divergence_mrad", 1.0)) * 1e-3 * float(np.mean(poses["origin"][:, 2]))
+        width = float(attributes.get("divergence_mrad", 1.0)) * 1e-3 * float(np.mean(poses.origin[:, 2]))
         surface = fit_surface(points, mean_slope(attributes, width), plan.surface_radius)
-        points = positions(echoes, *poses.values(), *angles, surface=surface, **options)
+        points = positions(echoes, poses, *angles, surface=surface, **options)
     shot = points["shot"].values
     points["scan_angle_deg"] = ("point", flown.values("scan_angle_deg")[shot], {"units": "degree"})
     points["line"] = ("point", flown.values("line")[shot], {"units": "1"})
@@ -297,10 +297,8 @@ def _with_packets(flown: Flown, points: xr.Dataset) -> Iterator[xr.Dataset]:
 
 def _directions(flown: Flown, shot: IntArray, pixel: IntArray) -> FloatArray:
     """Return the unit lines of sight of points, shape (points, 3)."""
-    axis, far, left = (flown.vectors(name)[shot] for name in ("axis", "far", "left"))
-    x, y = (1e-3 * flown.coordinate(name)[pixel][:, None] for name in ("sight_x", "sight_y"))
-    line = axis + x * far + y * left
-    return np.asarray(line / np.linalg.norm(line, axis=1, keepdims=True))
+    angles = [1e-3 * flown.coordinate(name)[pixel] for name in ("sight_x", "sight_y")]
+    return flown.poses.part(shot).directions(np.stack(angles, axis=1))
 
 
 def _forward(origin: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 from mitransient_lidar.analysis.receiver import detect_waveforms, receiver_of_result
 from mitransient_lidar.campaigns.design import Column
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.physics.receiver.receiver_files import Receiver
+from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 
 #: Bins whose variances are pooled, and bins of a mean power.
 _POOLED_BINS, _MEAN_BINS = 21, 5
@@ -89,7 +89,7 @@ def pooled_errors(waveform: xr.DataArray, stderr: xr.DataArray) -> xr.DataArray:
     return stderr.transpose("shot", "pixel", "time").copy(data=np.maximum(error, pooled))
 
 
-def _receiver(series: xr.Dataset, plan: FlightPlan) -> Receiver:
+def _receiver(series: xr.Dataset, plan: FlightPlan) -> ReceiverChannels:
     """Return the receiver of a flight, with its settings, of which some may be automatic."""
     return receiver_of_result(series, plan.receiver, plan.gain, plan.optical_density)
 

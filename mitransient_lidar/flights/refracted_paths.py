@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, non_negative, shown
-from mitransient_lidar.flights.sea_surface import Facets, SeaSurface
-from mitransient_lidar.physics.lidar.refraction import refract
+from mitransient_lidar.flights.sea_surface import Facets, SurfaceModel
+from mitransient_lidar.physics.lidar.refraction import cos_in_water, refract
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -140,7 +140,7 @@ class RefractedPaths:
         timing: Timing,
         classes: tuple[BoolArray, BoolArray],
         indices: tuple[float, float],
-        surface: SeaSurface,
+        surface: SurfaceModel,
         time_s: FloatArray,
     ) -> RefractedPaths:
         """Trace paths.
@@ -171,7 +171,7 @@ class RefractedPaths:
         normal = np.column_stack([-facets.slope, np.ones(len(place))])
         above = place[:, 2] - facets.height
         distance = np.where(on_model, distance - above / _dot(normal, direction), distance)
-        cos_level = np.sqrt(1 - (1 - direction[:, 2] ** 2) / n**2)
+        cos_level = cos_in_water(direction[:, 2], n)
         arrival = timing.surface_range + group * timing.depth / cos_level
         length = np.where(in_water, (arrival - distance) / group, 0.0)
         refracted = refract(direction, normal, n)
@@ -229,7 +229,7 @@ class RefractedPaths:
         columns.append(self.facets.height_error[:, None] * np.where(model, with_distance / to_plane, 0.0))
         slopes = [self.length[:, None] * one for one in _tilted(d, normal, n)]
         columns += [error[:, None] * one for error, one in zip(self.facets.slope_error.T, slopes, strict=True)]
-        cos_level = np.sqrt(1 - (1 - d[:, 2] ** 2) / n**2)
+        cos_level = cos_in_water(d[:, 2], n)
         by_surface = timing.surface_method * cos_level / self.group_index
         by_slopes = slope_deviation**2 * sum(one[:, 2] ** 2 for one in slopes)
         rest = np.maximum(timing.depth_method**2 - by_surface**2 - by_slopes, 0.0)
@@ -250,7 +250,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 def _factor(direction: FloatArray, unit: FloatArray, n: float) -> FloatArray:
     """Return the factor f = c/n - c_w of the unit normals in refracted directions, shape (N,)."""
     c = -_dot(direction, unit)
-    return np.asarray(c / n - np.sqrt(1 - (1 - c**2) / n**2))
+    return np.asarray(c / n - cos_in_water(c, n))
 
 
 def _bent(direction: FloatArray, normal: FloatArray, n: float, change: FloatArray) -> FloatArray:
@@ -276,4 +276,4 @@ def _tilted(direction: FloatArray, normal: FloatArray, n: float) -> list[FloatAr
 def _slope_of_factor(direction: FloatArray, unit: FloatArray, n: float) -> FloatArray:
     """Return df/dc = (1 - c/(n c_w))/n of the factor f of `_factor`, shape (N,)."""
     c = -_dot(direction, unit)
-    return np.asarray((1 - c / (n * np.sqrt(1 - (1 - c**2) / n**2))) / n)
+    return np.asarray((1 - c / (n * cos_in_water(c, n))) / n)

@@ -19,7 +19,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.plan import FlightPlan
-from mitransient_lidar.flights.poses.mounting import PulsePoses, pixel_turns
+from mitransient_lidar.flights.poses.mounting import PulsePoses, pixel_turns, poses_of
 from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -229,7 +229,7 @@ class FlightRenderer:
 
     def _with_turned_pixels(self, recorded: xr.Dataset, inputs: Mapping[str, Column]) -> xr.Dataset:
         """Return the record of pulses of one group with the lines of sight of pixels that are turned about the axis."""
-        turns = pixel_turns(*(_vectors(inputs, name) for name in ("axis", "far")))
+        turns = pixel_turns(poses_of(inputs.__getitem__))
         if not turns.any():
             return recorded
         lines = [_turned_lines(self, *self._lidar_and_record(inputs), turn) for turn in turns.tolist()]
@@ -319,18 +319,11 @@ def _lidar_of(inputs: Mapping[str, Column]) -> tuple[float, float, float, float]
     return angle, height, x, y
 
 
-def _vectors(inputs: Mapping[str, Column], name: str) -> FloatArray:
-    """Return vectors of pulses, shape (pulses, 3)."""
-    return np.column_stack([inputs[f"{name}_{axis}"] for axis in "xyz"])
-
-
 def _shot_poses(lidar: LidarScene, inputs: Mapping[str, Column]) -> ShotPoses:
     """Return the poses of pulses of one group."""
     from mitransient_lidar.rendering.shot_poses import ShotPoses
-    from mitransient_lidar.transport.pose import Pose
 
-    origin, axis, far, left = (_vectors(inputs, name) for name in ("origin", "axis", "far", "left"))
-    return ShotPoses.of_receiver(lidar, Pose(origin, axis, far, left))
+    return ShotPoses.of_receiver(lidar, poses_of(inputs.__getitem__))
 
 
 def _columns(poses: PulsePoses) -> dict[str, Column]:
@@ -347,7 +340,7 @@ def _columns(poses: PulsePoses) -> dict[str, Column]:
             f"pulse {row} at {poses.time_s[row]:g} s is sent from a height of {poses.origin[row, 2]:g} m: the scanner "
             "must be more than 1 m above the mean sea level"
         )
-    places = (poses.origin - poses.axis * (poses.origin[:, 2:] / poses.axis[:, 2:]))[:, :2]
+    places = poses.ground_point()[:, :2]
     if (farthest := float(np.abs(places).max())) > FARTHEST:
         raise UserError(
             f"the flight reaches {farthest:g} m from the origin of the scene: at most {FARTHEST:g} m may be; give "
@@ -415,7 +408,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
         raise UserError(f"scene {plan.scene} has no bottom below the flight")
     # The axis may meet a target before the bottom.
     level = float(np.nanmedian(bottom)) if np.isfinite(bottom).any() else -1.0
-    x, y = lidar.level_sea.at_height(_vectors(inputs, "origin"), _vectors(inputs, "axis"), level).T
+    given = poses_of(inputs.__getitem__)
+    x, y = lidar.level_sea.at_height(given.origin, given.axis, level).T
     bottom = np.where(np.isnan(bottom), solids_below(lidar, x, y, bottoms=True)[0], bottom)
     if missed := np.count_nonzero(np.isnan(bottom)):
         row = int(np.argmax(np.isnan(bottom)))
@@ -432,9 +426,8 @@ def _record_of(plan: FlightPlan, record: SceneRecord, inputs: Mapping[str, Colum
         own = find_lidar_scene(session.scene, session.sensor, shifts=shifts).axis
         first, last = own.start_ns - _MARGIN_NS, own.end_ns + _MARGIN_NS
         return TimeAxis.covering(first, last, own.bin_width_ns)
-    sine = np.sin(np.radians(angle)) / lidar.refractive_index
-    way = -2e9 / C0 * lidar.group_index * float(bottom.min()) / np.sqrt(1 - sine**2)
-    arrival = 1e9 / C0 * lidar.reference_length + way
+    way, _ = lidar.level_sea.lengths(-float(bottom.min()), np.sin(np.radians(angle)))
+    arrival = 1e9 / C0 * (lidar.reference_length + 2 * float(way))
     if arrival > film.axis.end_ns:
         raise UserError(
             f"no bottom within the record: that of pulse {inputs['pulse'][depths[0]]}, {-bottom.min():.1f} m deep, "

@@ -35,7 +35,7 @@ class Facets(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SeaSurface:
+class SurfaceModel:
     """Mean level of the sea and, with surface points, local planes through them.
 
     Attributes
@@ -73,7 +73,7 @@ class SeaSurface:
         *,
         slope_deviation: float,
         radius: float = 2.0,
-    ) -> SeaSurface:
+    ) -> SurfaceModel:
         """Fit level and planes to the surface points of a flight.
 
         Parameters

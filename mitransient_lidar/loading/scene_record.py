@@ -223,16 +223,17 @@ def object_values(part: mi.Object) -> dict[str, Any]:
     import mitsuba as mi
 
     from mitransient_lidar.plugins.bases import exposed
+    from mitransient_lidar.transport.plugin_types import Automatic, Recorded
 
-    own: dict[str, Any] | None = getattr(part, "parameters", None)
-    if own is None:
+    if not isinstance(part, Recorded):
         values, objects = exposed(part)
         small = {name: _plain(value) for name, value in values.items() if dr.width(value) <= _MOST_VALUES}
         return {"class": part.class_name(), **small, **_named(objects)}
+    own = part.parameters
     objects = [(name, value) for name, value in own.items() if isinstance(value, mi.Object)]
     plain = {name: _plain(value) for name, value in own.items() if not isinstance(value, mi.Object)}
     known: list[str] = ["type", *plugin_parameters(str(own["type"]))]
-    used = {"used": part.used_values} if getattr(part, "used_values", None) else {}
+    used = {"used": part.used_values} if isinstance(part, Automatic) and part.used_values else {}
     return {**dict.fromkeys(known), **plain, **used, **_named(objects)}
 
 

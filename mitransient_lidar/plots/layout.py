@@ -20,9 +20,10 @@ from matplotlib.patheffects import withStroke
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.results.formats import picture_order
-from mitransient_lidar.results.geometry import optional_number
+from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Most cells along a side of an imager that are drawn with edges.
 _EDGED_CELLS = 16
@@ -198,13 +199,10 @@ def _draw_plane(ax: Axes, dataset: xr.Dataset, ground: _Ground, plane: _Plane, h
 
 @dataclass(frozen=True)
 class _Ground:
-    """Map of angles and positions to distances to the left of and along the lidar's azimuth on a horizontal plane [m].
+    """Map of angles and positions to distances [m] to the left of and along the lidar's azimuth on a level plane."""
 
-    A pose has origin, axis, far and left, shape (4, 3).
-    """
-
-    receiver: FloatArray
-    transmitter: FloatArray
+    receiver: Pose
+    transmitter: Pose
     azimuth: float  #: Direction of the receiver's axis, from +x towards +y [rad].
     sea: LevelSea
     z: float = 0.0  #: Height of the plane [m].
@@ -213,7 +211,7 @@ class _Ground:
     def of_result(cls, attributes: dict[str, Any]) -> _Ground:
         receiver, transmitter = (_pose(attributes, f"{name}_pose") for name in ("receiver", "transmitter"))
         # A vertical axis has no azimuth; its far direction has one.
-        x, y = receiver[1 if math.hypot(*receiver[1, :2]) > 1e-6 else 2, :2]
+        x, y = (receiver.axis if math.hypot(*receiver.axis[:2]) > 1e-6 else receiver.far)[:2]
         return cls(receiver, transmitter, math.atan2(y, x), _sea(attributes) or LevelSea((1.0,)))
 
     def at(self, z: float) -> _Ground:
@@ -226,10 +224,9 @@ class _Ground:
         x, y = points[..., 0], points[..., 1]
         return np.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)
 
-    def project(self, pose: FloatArray, angles: FloatArray) -> FloatArray:
+    def project(self, pose: Pose, angles: FloatArray) -> FloatArray:
         """Return (across, along) of rays (angle_x, angle_y) [mrad], shape (..., 2); NaN for rays above the horizon."""
-        rays = pose[1] + 1e-3 * (angles[..., :1] * pose[2] + angles[..., 1:] * pose[3])
-        return self.place(self.sea.at_height(pose[0], rays, self.z))
+        return self.place(self.sea.at_height(pose.origin, pose.rays(1e-3 * angles), self.z))
 
     def axis_names(self) -> tuple[str, str]:
         """Return the names of the axes across and along the lidar's azimuth, with the direction of +x."""
@@ -243,27 +240,29 @@ class _Ground:
         """Return the points where the receiver's axis, and the laser's where it differs, meet a height, as text."""
         drawn = [("axis", self.receiver), *([("laser", self.transmitter)] if self.axes_differ(z) else [])]
         # Adding 0 turns -0 into 0.
-        places = [(name, np.round([*self.sea.at_height(pose[0], pose[1], z), z], 3) + 0.0) for name, pose in drawn]
+        places = [(name, np.round([*self._axis_at(pose, z), z], 3) + 0.0) for name, pose in drawn]
         return [f"{name} at ({x:.3f}, {y:.3f}, {z:.3f}) m" for name, (x, y, z) in places]
 
     def axes_differ(self, z: float) -> bool:
         """Return whether the laser's axis meets a height more than a millimetre away from the receiver's."""
-        points = [self.sea.at_height(pose[0], pose[1], z) for pose in (self.receiver, self.transmitter)]
+        points = [self._axis_at(pose, z) for pose in (self.receiver, self.transmitter)]
         return float(np.linalg.norm(points[0] - points[1])) > _SAME_POINT
 
+    def _axis_at(self, pose: Pose, z: float) -> FloatArray:
+        return self.sea.at_height(pose.origin, pose.axis, z)
 
-def _pose(attributes: dict[str, Any], name: str) -> FloatArray:
+
+def _pose(attributes: dict[str, Any], name: str) -> Pose:
     """Return a pose; for a result without poses that of its altitude and off-nadir angle."""
-    if len(attributes.get(name, ())) == 12:
-        pose = np.array(attributes[name], dtype=np.float64).reshape(4, 3)
-        if pose[0, 2] < 0:
+    pose = pose_of(attributes, name)
+    if pose is not None:
+        if pose.submerged:
             raise UserError("the lidar is under water: it has no layout on the sea to draw.")
         return pose
     altitude, off_nadir_deg = (optional_number(attributes, key) for key in ("altitude", "off_nadir_deg"))
     if altitude is None or off_nadir_deg is None:
         raise UserError("the result has no altitude and off_nadir_deg among its attributes: it has no layout to draw.")
-    sin, cos = math.sin(math.radians(off_nadir_deg)), math.cos(math.radians(off_nadir_deg))
-    return np.array([[-altitude * sin / cos, 0, altitude], [sin, 0, -cos], [cos, 0, sin], [0, 1, 0]])
+    return Pose.from_angles(altitude, off_nadir_deg)
 
 
 def _draw_pixels(ax: Axes, dataset: xr.Dataset, ground: _Ground, handles: list[Any]) -> FloatArray:
@@ -380,7 +379,7 @@ def _target_line(target: dict[str, Any], outline: str, ground: _Ground) -> Float
     """
     if outline == "seen" and outline not in target:
         line = _points(target["line"])
-        return ground.sea.crossing(ground.receiver[0], np.insert(line, 2, _middle(target), axis=1))
+        return ground.sea.crossing(ground.receiver.origin, np.insert(line, 2, _middle(target), axis=1))
     return _points(target.get(outline, []))
 
 

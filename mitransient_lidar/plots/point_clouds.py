@@ -82,13 +82,12 @@ def plot_flight(flown: Flown, points: xr.Dataset, folder: Path) -> list[Path]:
 
 def _draw_track(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     """Draw the track of the scanner, and where the axes of its pulses meet the sea level."""
-    origin, axis = flown.vectors("origin"), flown.vectors("axis")
-    place = origin - axis * (origin[:, 2:] / axis[:, 2:])
-    ax.plot(*place[:, :2].T, ".", color="#1f77b4", markersize=1.5, label="pulses at the sea level")
-    ax.plot(*origin[:, :2].T, color="black", linewidth=1.5, label="scanner")
+    poses = flown.poses
+    ax.plot(*poses.ground_point()[:, :2].T, ".", color="#1f77b4", markersize=1.5, label="pulses at the sea level")
+    ax.plot(*poses.origin[:, :2].T, color="black", linewidth=1.5, label="scanner")
     if np.any(chosen := points["true_target"].values.astype(bool)):
         ax.plot(points["x"].values[chosen], points["y"].values[chosen], ".", color="#d62728", label="above a target")
-    _set_map(ax, f"{len(origin)} pulses")
+    _set_map(ax, f"{len(poses.origin)} pulses")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), fontsize="small")
 
 
@@ -139,7 +138,7 @@ def _draw_profile(ax: Axes, flown: Flown, points: xr.Dataset) -> None:
     cells = np.linspace(first, last, shape[0] + 1), np.linspace(-depth, _ABOVE, shape[1] + 1)
     total, number = np.zeros(shape), np.zeros(shape)
     signal, start = flown.values("signal"), flown.values("sample_start_ns")
-    origin, axis = flown.vectors("origin"), flown.vectors("axis")
+    origin, axis = flown.poses.origin, flown.poses.axis
     for shot in seen[:: max(len(seen) // _MOST_WAVEFORMS, 1)]:
         way = _PER_NS * (start[shot] + (np.arange(signal.shape[-1]) + 0.5) * width)
         to_sea = -origin[shot, 2] / axis[shot, 2]

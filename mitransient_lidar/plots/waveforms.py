@@ -16,7 +16,7 @@ from matplotlib.path import Path as Line
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.plots import drawing
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 Scale = Literal["both", "linear", "log"]
 
@@ -184,7 +184,7 @@ def _draw_waveforms(ax: Axes, dataset: xr.Dataset, curves: _Curves, *, log: bool
 
 def _add_depth_axis(ax: Axes, dataset: xr.Dataset) -> None:
     try:
-        geometry = LidarGeometry.from_attributes(dataset.attrs, surface="measured")
+        geometry = lidar_geometry(dataset.attrs, surface="measured")
         zero, metres_per_ns, label = geometry.surface_time_ns, geometry.depth_per_ns, "depth on the axis (m)"
         if dataset.sizes.get("pixel") == 1:
             line = LinesOfSight.from_dataset(dataset)

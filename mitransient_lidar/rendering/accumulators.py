@@ -369,9 +369,8 @@ def _placed(scene: LidarScene, surface_time_ns: float | None, start_ns: float) -
             f"gate_start_depth = {plan.start_depth:g} m counts from the surface echo, and the receiver sees no "
             "surface: give gate_start_ns"
         )
-    sine = np.sqrt(max(0.0, 1 - float(scene.receiver.pose.axis[2]) ** 2)) / scene.refractive_index
     surface = 0.0 if surface_time_ns is None else surface_time_ns
-    train = plan.placed(surface, scene.group_index, float(np.sqrt(1 - sine**2)))
+    train = plan.placed(surface, scene.depth_per_ns)
     echo = {} if surface_time_ns is None else {"surface_time_ns": surface, "window_start_ns": start_ns}
     check_train(train, echo, scene.axis)
     return train

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.passes import PassRenderer
-    from mitransient_lidar.transport.plugin_types import SeaSurface, Transmitter
+    from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
     from mitransient_lidar.transport.scene import LidarScene
 
 #: Largest number of parameters of a render.
@@ -164,7 +164,7 @@ def _is_gaussian(transmitter: Transmitter) -> bool:
     return transmitter.beam_profile == "gaussian" and not transmitter.parameters.get("divergence_across_mrad")
 
 
-def _rippled(scene: LidarScene) -> list[SeaSurface]:
+def _rippled(scene: LidarScene) -> list[SeaShape]:
     """Return the sea surfaces of a scene whose ripples have a variance."""
     return [sea for sea in scene.seas if sea.has_ripples and sum(sea.ripple_variance) > 0]
 

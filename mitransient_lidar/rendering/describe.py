@@ -14,11 +14,11 @@ import numpy.typing as npt
 import xarray as xr
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.rendering.echo_window import EchoProbe, lines_of_sight
 from mitransient_lidar.transport.opaque import aligned, is_one_of
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.outlines import pixel_outlines, simplified
@@ -84,7 +84,7 @@ def describe_lidar(scene: LidarScene) -> dict[str, Any]:
     return {
         "layout": pixels.layout,
         "field_of_view_mrad": 1e3 * pixels.field_of_view,
-        "field_of_view_sides_mrad": [1e3 * side for side in getattr(pixels, "sides", [])],
+        "field_of_view_sides_mrad": [1e3 * side for side in pixels.sides or ()],
         "field_of_view_shape": pixels.field_of_view_shape,
         "aperture_area": optics.aperture_area,
         "obscuration": optics.obscuration,
@@ -149,7 +149,7 @@ def describe_layout(scene: LidarScene) -> dict[str, Any]:
     if receiver.pixels.grid is None and receiver.pixels.count <= _MOST_PIXELS:
         texts["pixel_outlines"] = [[_flat(1e3 * line) for line in lines] for lines in pixel_outlines(receiver.pixels)]
     described: dict[str, Any] = {
-        f"{name}_pose": np.concatenate([pose.origin, pose.axis, pose.far, pose.left]).tolist()
+        f"{name}_pose": [*pose.origin.tolist(), *pose.frame.ravel().tolist()]
         for name, pose in (("transmitter", transmitter.pose), ("receiver", receiver.pose))
     }
     if bottom is not None:
@@ -169,9 +169,9 @@ def _is_near(scene: LidarScene, solid: mi.Shape) -> bool:
     pose, box = scene.receiver.pose, solid.bbox()
     low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
     ticks = 0.5 * scene.receiver.pixels.field_of_view * np.linspace(-1, 1, _VIEW_TICKS)
-    angle_x, angle_y = (g.reshape(-1, 1) for g in np.meshgrid(ticks, ticks))
+    angles = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     height = min(0.5 * (low[2] + high[2]), 0.5 * float(pose.origin[2]))
-    seen = scene.level_sea.at_height(pose.origin, pose.axis + angle_x * pose.far + angle_y * pose.left, height)
+    seen = scene.level_sea.at_height(pose.origin, pose.rays(angles), height)
     seen = seen[np.isfinite(seen).all(axis=1)]
     if len(seen) == 0:
         return False

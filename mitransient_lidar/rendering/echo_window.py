@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.rendering.accuracy import ErrorWindow
 from mitransient_lidar.results.geometry import LinesOfSight
 from mitransient_lidar.transport.opaque import aligned
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import pass_streams
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
@@ -205,9 +205,9 @@ def lines_of_sight(scene: LidarScene, turn_deg: float = 0.0) -> LinesOfSight:
         np.where(lit, sight.time, _two_way(scene, *poses, centres, at)[0])
         for sight, at in zip((surface, below), depths, strict=True)
     )
-    directions = _directions(poses[0], seen)
+    directions = poses[0].directions(seen)
     off_nadir = np.arccos(np.clip(-directions[:, 2], -1, 1))
-    x, y = seen.T if turn_deg == 0 else _tangent(scene.receiver.pose, directions).T
+    x, y = seen.T if turn_deg == 0 else scene.receiver.pose.angles_of(directions).T
     spread, share = (np.where(lit, values, 0.0) for values in (surface.spread, surface.share))
     depth_per_ns = (depths[1] - depths[0]) / (deep - time)
     return LinesOfSight(x, y, off_nadir, time - depths[0] / depth_per_ns, spread, depth_per_ns, share)
@@ -219,9 +219,8 @@ def _turned(scene: LidarScene, turn_deg: float) -> tuple[Pose, Pose]:
     if turn_deg == 0:
         return own, other
     cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    before = np.stack([own.axis, own.far, own.left])
-    after = np.stack([own.axis, cos * own.far + sin * own.left, cos * own.left - sin * own.far])
-    rotation = after.T @ before
+    turn = np.array([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
+    rotation = (turn @ own.frame).T @ own.frame
     shift = own.origin - rotation @ own.origin
     return own.moved(rotation, shift), other.moved(rotation, shift)
 
@@ -316,39 +315,30 @@ def _two_way(
 
     The ends are angles about the other pose. Paths that do not meet the sea, or end behind the pose, are NaN.
     """
-    n, group = scene.refractive_index, scene.group_index
-    direction = _directions(start, angles)
+    group = scene.group_index
+    direction = start.directions(angles)
     if scene.submerged:
         distance = (-depth - start.origin[2]) / np.where(direction[:, 2] != 0, direction[:, 2], np.nan)
         distance = np.where(distance > 0, distance, np.nan)
         offset = start.origin + direction * distance[:, np.newaxis] - end.origin
         way_back = np.linalg.norm(offset, axis=1)
         return 1e9 / C0 * group * (distance + way_back), _tangent(end, offset)
+    # The scale of depth is that of the top index layer.
+    sea = LevelSea((scene.refractive_index,), group_index=(group,))
     down = np.where(direction[:, 2] < 0, -direction[:, 2], np.nan)
-    sine = np.hypot(direction[:, 0], direction[:, 1])
-    cosine = np.sqrt(1 - (sine / n) ** 2)
-    one_way = start.origin[2] / down + group * depth / cosine
+    one_way = start.origin[2] / down + sea.lengths(depth, np.hypot(*direction[:, :2].T))[0]
     if np.all(start.origin == end.origin):
         return 2e9 / C0 * one_way, _tangent(end, direction)
-    reach = start.origin[2] / down + depth / (n * cosine)
-    offset = start.origin[:2] + direction[:, :2] * reach[:, np.newaxis] - end.origin[:2]
-    distance = np.hypot(*offset.T)
-    known = np.isfinite(distance)
-    theta, phi = refracted_path(np.where(known, distance, 0), end.origin[2], depth, n)
-    back = end.origin[2] / np.cos(theta) + group * depth / np.cos(phi)
-    across = offset * (np.sin(theta) / np.where(known & (distance > 0), distance, 1))[:, np.newaxis]
-    arriving = np.column_stack([across, -np.cos(theta)])
+    places = sea.at_height(start.origin, direction, -depth)
+    known = np.isfinite(places[:, 0])
+    points = np.column_stack([np.where(known[:, np.newaxis], places, 0.0), np.full(len(places), -depth)])
+    arriving = np.pad(sea.crossing(end.origin, points), ((0, 0), (0, 1))) - end.origin
+    air = np.linalg.norm(arriving, axis=1)
+    back = air + sea.lengths(depth, np.hypot(*arriving[:, :2].T) / air)[0]
     return 1e9 / C0 * np.where(known, one_way + back, np.nan), _tangent(end, arriving)
-
-
-def _directions(pose: Pose, angles: FloatArray) -> FloatArray:
-    """Return the unit directions of tangent-plane angles [rad], shape (n, 3)."""
-    along = pose.axis + angles[:, :1] * pose.far + angles[:, 1:] * pose.left
-    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
 
 def _tangent(pose: Pose, directions: FloatArray) -> FloatArray:
     """Return the tangent-plane angles [rad] of directions, NaN behind the pose; shape (n, 2)."""
-    along = directions @ pose.axis
-    ahead = np.where(along > 0, along, np.nan)
-    return np.asarray(np.stack([directions @ pose.far, directions @ pose.left], axis=1) / ahead[:, np.newaxis])
+    ahead = np.where(directions @ pose.axis > 0, 1.0, np.nan)
+    return pose.angles_of(directions * ahead[:, np.newaxis])

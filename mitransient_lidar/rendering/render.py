@@ -194,7 +194,7 @@ def render_again(result: xarray.Dataset | str | Path, **options: Any) -> xarray.
 
 def _render(
     session: Session,
-    integrator: Any,
+    integrator: str | Mapping[str, Any] | mi.Integrator | None,
     options: RenderOptions,
     reweight: Sequence[Mapping[str, float]],
     progress: ProgressCallback | None,

@@ -13,9 +13,9 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import DryBottomError, UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.rendering.echo_window import EchoProbe, SolidEcho
 from mitransient_lidar.transport.opaque import is_one_of, opaque_point
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.records import total_reflection_ns
 from mitransient_lidar.transport.rng import pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
@@ -287,9 +287,8 @@ def _warn_of_axes(scene: LidarScene, view: _Rays, beam: _Rays) -> None:
     apart = np.linalg.norm(view.axis_at_height(heights) - beam.axis_at_height(heights), axis=-1)
     if not np.isfinite(apart).all():
         return
-    ranges = [float(np.linalg.norm(pose.ground_point() - pose.origin)) for pose in (beam.pose, view.pose)]
-    beam_radius = 0.5 * min(scene.transmitter.profile.divergence) * ranges[0]
-    view_radius = 0.5 * scene.receiver.pixels.field_of_view * ranges[1]
+    beam_radius = 0.5 * min(scene.transmitter.profile.divergence) * beam.pose.ground_range
+    view_radius = 0.5 * scene.receiver.pixels.field_of_view * view.pose.ground_range
     if apart.min() > max(_APART_PER_BEAM * beam_radius, _APART_PER_VIEW * view_radius):
         logger.warning(
             "the axes of laser and receiver do not meet: on the sea level they are %.3g m apart, %.2g times the beam's "

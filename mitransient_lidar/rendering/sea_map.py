@@ -10,12 +10,12 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.sea.height_maps import HeightMap
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.transport.plugin_types import Transmitter
-    from mitransient_lidar.transport.pose import Pose
 
 #: Slopes along and across the lidar's azimuth of each kind of shot, in units of `slope_sigmas` standard deviations.
 SLOPE_KINDS = {"towards": (1.0, 0.0), "level": (0.0, 0.0), "away": (-1.0, 0.0), "sideways": (0.0, 1.0)}
@@ -68,9 +68,10 @@ class SeaMap:
         transmitter = transmitter_of(scene)
         transmitter.pose.require_above_sea()
         # Of a sea of several grids the coarsest.
-        cell = getattr(sea.waves, "cell_size", sea.cell_size)
-        count = min(getattr(sea.waves, "cells", int(sea.size / cell)), int(_LARGEST_SEARCH / cell)) // 2
-        lines = np.arange(-count, count) * cell
+        grid = None if isinstance(sea.waves, HeightMap) else sea.waves
+        cell, cells = (sea.cell_size, int(sea.size / sea.cell_size)) if grid is None else (grid.cell_size, grid.cells)
+        count = min(cells, int(_LARGEST_SEARCH / cell)) // 2
+        lines = np.asarray(np.arange(-count, count) * cell, dtype=np.float64)
         heights = sea.heights(lines, lines)
         azimuth, spread_along, spread_across = footprint(transmitter)
         # A circle of the same area replaces the elliptical footprint.
@@ -132,8 +133,6 @@ def transmitter_of(scene: mi.Scene) -> Transmitter:
 
 def footprint(transmitter: Transmitter) -> tuple[float, float, float]:
     """Return the beam's azimuth [rad], and its spread on the mean sea level along and across it [m]."""
-    pose: Pose = transmitter.pose
-    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
-    cosine = max(-float(pose.axis[2]), 1e-3)
-    azimuth = math.atan2(pose.axis[1], pose.axis[0]) if math.hypot(*pose.axis[:2]) > 1e-9 else 0.0
-    return azimuth, across / cosine, across
+    pose = transmitter.pose
+    across = transmitter.widest_angular_spread * pose.ground_range
+    return float(pose.azimuth), across / max(-float(pose.axis[2]), 1e-3), across

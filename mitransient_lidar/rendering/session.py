@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-    from mitransient_lidar.transport.plugin_types import LidarIntegrator
+    from mitransient_lidar.transport.daylight.renderer import DaylightIntegrator
+    from mitransient_lidar.transport.passes import LidarIntegrator
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,10 @@ class Session:
     record: SceneRecord | None = None
 
     def attributes(
-        self, integrator: Any = None, used: Mapping[str, float] | None = None, **others: Any
+        self,
+        integrator: LidarIntegrator | DaylightIntegrator | None = None,
+        used: Mapping[str, float] | None = None,
+        **others: Any,
     ) -> dict[str, Any]:
         """Return the attributes of a result: scene, versions, integrator, others, and those of `scene_record`.
 
@@ -49,11 +53,13 @@ class Session:
 
         `used` are the values that were chosen for automatic parameters of the integrator.
         """
+        from mitransient_lidar.transport.plugin_types import GatedFilm
+
         recorded = {} if self.record is None else self.record.attributes()
         own = {} if integrator is None else {"integrator": integrator.plugin}
         recorded["plugin_parameters"] = plugin_values(self.scene, integrator, used)
-        end = getattr(self.sensor.film(), "end", "")
-        own |= {"record_end": end} if end else {}
+        film = self.sensor.film()
+        own |= {"record_end": film.end} if isinstance(film, GatedFilm) and film.end else {}
         return {"scene": self.name, **variants.versions(), **own, **others, **recorded}
 
     def share_record(self, axis: TimeAxis) -> None:
@@ -95,7 +101,15 @@ def open_scene(
     return Session(loaded.scene, sensors[0], loaded.name, loaded.parameters, loaded.record)
 
 
-def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> LidarIntegrator:
+@overload
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[False] = False) -> LidarIntegrator: ...
+
+
+@overload
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: Literal[True]) -> DaylightIntegrator: ...
+
+
+def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> LidarIntegrator | DaylightIntegrator:
     """Return an integrator from its name, a dict or itself, by default that of the scene.
 
     For `passive` the default is ``passive_volpath`` if that of the scene is not one for daylight.
@@ -107,7 +121,7 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     """
     import mitsuba as mi
 
-    from mitransient_lidar.transport.plugin_types import LidarIntegrator
+    from mitransient_lidar.transport.passes import LidarIntegrator
 
     own = scene.integrator()
     if wanted is None and passive and not (isinstance(own, LidarIntegrator) and own.passive):

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.transport.opaque import aligned
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene, ScenePart
 
 
@@ -36,8 +37,8 @@ class ShotPoses:
 
     places: FloatArray
     turns: FloatArray | None = None
-    receiver: Pose | None = None
-    transmitter: Pose | None = None
+    receiver: KernelPose | None = None
+    transmitter: KernelPose | None = None
     in_scene: Pose | None = None
 
     @classmethod
@@ -47,11 +48,9 @@ class ShotPoses:
         The transmitter is fixed to the receiver. All axes must go down.
         """
         own = lidar.receiver.pose
-        places = receiver.origin - receiver.axis * (receiver.origin[:, 2:] / receiver.axis[:, 2:])
+        places = receiver.ground_point()
         # The rotation from the lidar to each shot, and that about the vertical which is nearest to it.
-        whole = np.stack([receiver.axis, receiver.far, receiver.left], axis=-1) @ np.stack(
-            [own.axis, own.far, own.left]
-        )
+        whole = np.swapaxes(receiver.frame, 1, 2) @ own.frame
         azimuth = whole[:, 0, 0] + whole[:, 1, 1] + 1j * (whole[:, 1, 0] - whole[:, 0, 1])
         turns = azimuth / np.abs(azimuth)
         to_frame = _rotations(np.conj(turns))
@@ -69,9 +68,9 @@ class ShotPoses:
     def part(self, rows: slice | IntArray) -> ShotPoses:
         """Return some of the shots."""
         turns = None if self.turns is None else self.turns[rows]
-        receiver, transmitter, in_scene = (
-            None if pose is None else _rows(pose, rows) for pose in (self.receiver, self.transmitter, self.in_scene)
-        )
+        receiver = None if self.receiver is None else self.receiver.part(rows)
+        transmitter = None if self.transmitter is None else self.transmitter.part(rows)
+        in_scene = None if self.in_scene is None else self.in_scene.part(rows)
         return ShotPoses(self.places[rows], turns, receiver, transmitter, in_scene)
 
     def repeated(self, copies: int) -> ShotPoses:
@@ -122,12 +121,6 @@ def _rotations(turns: npt.NDArray[np.complex128]) -> FloatArray:
     found[:, 1, 0], found[:, 0, 1] = turns.imag, -turns.imag
     found[:, 2, 2] = 1.0
     return found
-
-
-def _rows(pose: Pose, rows: slice | IntArray) -> Pose:
-    """Return the poses of some of the shots."""
-    origin, axis, far, left = (each[rows] for each in (pose.origin, pose.axis, pose.far, pose.left))
-    return Pose(origin, axis, far, left, np.broadcast_to(pose.delay, len(pose.origin))[rows])
 
 
 def _vectors(horizontal: FloatArray) -> mi.Vector3f:

@@ -87,7 +87,7 @@ class ShotScene:
     def _prepare(self, session: Session) -> PassRenderer:
         """Return the renderer of a loaded scene, with the time bins of all shots."""
         session.share_record(self._axis)
-        renderer: PassRenderer = self._integrator.prepare(session.scene, session.sensor)
+        renderer = self._integrator.prepare(session.scene, session.sensor)
         from mitransient_lidar.rendering.derivatives import path_parameters, perturbations
 
         renderer = renderer.by_origin() if self._components else renderer

@@ -9,6 +9,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import BoolArray, FloatArray
 from mitransient_lidar.physics.water.water_types import InherentProperties
+from mitransient_lidar.rendering.sea_map import footprint
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -54,7 +55,7 @@ def truth_coordinates(sea: SeaSurface | None, lidar: LidarScene, shots: ShotPose
     turns = np.zeros(len(places))
     if shots.in_scene is not None:
         # The rotation of the shot's frame also turns with the pixels.
-        turns = _azimuth(shots.in_scene.axis) - _azimuth(lidar.receiver.pose.axis)
+        turns = shots.in_scene.azimuth - lidar.receiver.pose.azimuth
     rows = zip(places, turns, strict=True)
     along, across, height = np.array([footprint_means(sea, lidar.transmitter, x, y, turn) for (x, y), turn in rows]).T
     found = -axis_on_bottom(lidar, places - lidar.receiver.pose.ground_point()[:2], shots.in_scene)[:, 2]
@@ -144,10 +145,8 @@ def footprint_means(
     """
     if sea is None or not math.isfinite(sea.cell_size):
         return 0.0, 0.0, 0.0
-    pose = transmitter.pose
-    across = transmitter.widest_angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
-    along = across / max(-float(pose.axis[2]), 1e-3)
-    azimuth = float(_azimuth(pose.axis)) + turn
+    azimuth, along, across = footprint(transmitter)
+    azimuth += turn
     reach = max(math.ceil(_REACH * along / sea.cell_size), _FEWEST_CELLS)
     steps = np.arange(-reach, reach + 1)
     lines_x, lines_y = (
@@ -162,8 +161,3 @@ def footprint_means(
     values = (cos * right + sin * up, cos * up - sin * right, heights)
     slope_along, slope_across, height = (float(np.sum(weight * value)) for value in values)
     return slope_along, slope_across, height
-
-
-def _azimuth(axis: FloatArray) -> FloatArray:
-    """Return the azimuths of axes from +x to +y [rad], 0 of vertical ones, shape (...,)."""
-    return np.where(np.hypot(axis[..., 0], axis[..., 1]) > 1e-9, np.arctan2(axis[..., 1], axis[..., 0]), 0.0)

@@ -25,7 +25,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 _ROUNDING = 1e-6  # fraction of a bin by which rounded times may exceed the record
 
@@ -77,7 +77,7 @@ def train_from_options(
     if start_ns is not None and start_depth_m is None:
         start = start_ns
     elif start_depth_m is not None and start_ns is None:
-        start = float(LidarGeometry.from_attributes(attributes, surface="measured").time_of_depth(start_depth_m))
+        start = float(lidar_geometry(attributes, surface="measured").time_of_depth(start_depth_m))
     else:
         raise UserError("a gate train needs one start: either start_ns or start_depth_m")
     if profile_file is not None and width_ns is None:
@@ -91,7 +91,7 @@ def train_from_options(
 def gate_depths(train: GateTrain, attributes: Mapping[str, Any]) -> FloatArray:
     """Return the depths [m] of the gates' middles on the axis, NaN if an attribute of the geometry is missing."""
     try:
-        return LidarGeometry.from_attributes(attributes, surface="measured").depth_of_time(train.middles_ns)
+        return lidar_geometry(attributes, surface="measured").depth_of_time(train.middles_ns)
     except UserError:
         return np.full(train.count, np.nan)
 

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, in_range
-from mitransient_lidar.physics.lidar import gate_train, refraction
+from mitransient_lidar.physics.lidar import refraction
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.physics.lidar.pose import Pose
 
 Attributes = Mapping[str, Any]
 
@@ -35,127 +36,6 @@ _SIGHT = {
     "depth_per_ns": ("m ns-1", "depth per delay along the line of sight", 10),
     "beam_share": ("1", "share of the beam's energy in the pixel", 9),
 }
-
-
-@dataclass(frozen=True)
-class LidarGeometry:
-    """Co-located lidar over a level sea, along its axis."""
-
-    height: float  #: Height above the mean sea level [m].
-    off_nadir: float  #: Angle of the axis from the vertical [rad].
-    refractive_index: float
-    group_index: float
-    surface_time_ns: float  #: Arrival time of the surface echo [ns], the zero of the depth axis.
-
-    @classmethod
-    def level(cls, height: float, off_nadir: float, refractive_index: float, group_index: float) -> LidarGeometry:
-        """Return the geometry whose surface echo arrives from the mean sea level along the axis.
-
-        A height below the sea level raises UserError.
-        """
-        _require_height(height)
-        surface = float(refraction.surface_time_ns(height, off_nadir))
-        return cls(height, off_nadir, refractive_index, group_index, surface)
-
-    @classmethod
-    def from_attributes(
-        cls, attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any"
-    ) -> LidarGeometry:
-        """Read the attributes of a result.
-
-        Parameters
-        ----------
-        attributes
-            ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally,
-            ``surface_time_ns``, the mean arrival over the pixels.
-        surface
-            Time of the surface echo: ``measured`` is ``surface_time_ns``, ``level`` that of the mean sea level on the
-            axis, ``any`` the first of these that is known.
-
-        Raises
-        ------
-        UserError
-            If an attribute is missing or is not a number of at least 0, or the lidar is under water.
-        """
-        if surface == "measured":
-            required_number(attributes, "surface_time_ns")
-        names = ("altitude", "off_nadir_deg", "refractive_index", "group_index")
-        _require_height(optional_number(attributes, "altitude"))
-        height, degrees, refractive_index, group_index = (required_number(attributes, name) for name in names)
-        geometry = cls.level(height, math.radians(degrees), refractive_index, group_index)
-        measured = None if surface == "level" else optional_number(attributes, "surface_time_ns")
-        return geometry if measured is None else replace(geometry, surface_time_ns=measured)
-
-    @property
-    def cos_water(self) -> float:
-        """Cosine of the axis's angle from the vertical in the water."""
-        return float(np.cos(refraction.snell(self.off_nadir, self.refractive_index)))
-
-    @property
-    def slant_range(self) -> float:
-        """Distance to the mean sea level along the axis [m]."""
-        return self.height / math.cos(self.off_nadir)
-
-    @property
-    def metres_per_ns(self) -> float:
-        """One-way path in the water per nanosecond of delay [m/ns]."""
-        return 1e-9 * C0 / (2 * self.group_index)
-
-    @property
-    def depth_per_ns(self) -> float:
-        """Depth per nanosecond of delay [m/ns]."""
-        return self.metres_per_ns * self.cos_water
-
-    def path_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
-        """Return the one-way path in the water [m] of echoes at times [ns]."""
-        return np.asarray(self.metres_per_ns * (np.asarray(time_ns, dtype=np.float64) - self.surface_time_ns))
-
-    def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
-        """Return the depth [m] of echoes at times [ns]."""
-        return gate_train.depth_of_time(time_ns, self.surface_time_ns, self.group_index, self.cos_water)
-
-    def time_of_depth(self, depth: npt.ArrayLike) -> FloatArray:
-        """Return the arrival times [ns] of echoes from depths [m]."""
-        return gate_train.time_of_depth(depth, self.surface_time_ns, self.group_index, self.cos_water)
-
-    def solid_angle_per_area(self, path: npt.ArrayLike) -> FloatArray:
-        """Return the solid angle of the aperture per area [sr/m^2] at one-way paths in the water [m]."""
-        depth = np.asarray(path, dtype=np.float64) * self.cos_water
-        return refraction.solid_angle_per_area(self.height, depth, self.off_nadir, self.refractive_index)
-
-    def spreading(self, path: npt.ArrayLike) -> FloatArray:
-        """Return the solid angle of the aperture at paths in the water [m] over that at the surface; 1 above it."""
-        return np.asarray(self.solid_angle_per_area(np.maximum(path, 0)) / self.solid_angle_per_area(0.0))
-
-    def surface_depth(self, edge: float) -> float:
-        """Return the depth [m] on the axis that is simultaneous with the far surface echo of a half angle [rad]."""
-        farthest = self.height / math.cos(min(self.off_nadir + edge, 0.5 * math.pi - 1e-3))
-        return (farthest - self.slant_range) / self.group_index * self.cos_water
-
-    def spot_diameter(self, attributes: Attributes) -> float:
-        """Return the diameter of the receiver's field of view on the sea surface [m]."""
-        return 1e-3 * required_number(attributes, "field_of_view_mrad") * self.height / math.cos(self.off_nadir)
-
-    def lidar_system(self, attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
-        """Return the system of the lidar equation, with the energy of the whole beam and the open area of the aperture.
-
-        The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default
-        it is the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see.
-
-        Raises
-        ------
-        UserError
-            If the efficiency is out of range or unknown, or another attribute is missing.
-        """
-        energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
-        return LidarSystem(
-            self.height,
-            self.off_nadir,
-            energy,
-            open_aperture(attributes),
-            self.refractive_index,
-            self.group_index,
-        )
 
 
 @dataclass(frozen=True)
@@ -217,17 +97,15 @@ class LinesOfSight:
             found = {name: coordinate(name) for name in _SIGHT}
             found["off_nadir"] = np.radians(found["off_nadir"])
             return cls(**found | {name: 1e-3 * found[name] for name in ("sight_x", "sight_y")})
-        axis = LidarGeometry.from_attributes(dataset.attrs)
+        axis = lidar_geometry(dataset.attrs)
         known = "angle_x" in dataset.coords and "angle_y" in dataset.coords
         count = math.prod(shape)
         x, y = (1e-3 * coordinate(name) if known else np.zeros(count) for name in ("angle_x", "angle_y"))
-        down = np.cos(axis.off_nadir) - np.sin(axis.off_nadir) * x
-        if "receiver_pose" in dataset.attrs:
-            _, (_, _, along), (_, _, far), (_, _, left) = np.reshape(dataset.attrs["receiver_pose"], (4, 3))
-            down = -(along + far * x + left * y)
+        pose = pose_of(dataset.attrs) or Pose.from_angles(axis.height, math.degrees(axis.off_nadir))
+        down = -pose.directions(np.stack([x, y], axis=1))[:, 2]
         if np.any(down <= 0):
             raise UserError("angle_x and angle_y must point below the horizon: the lines of sight must meet the sea")
-        off_nadir = np.arccos(np.minimum(down / np.sqrt(1 + x**2 + y**2), 1))
+        off_nadir = np.arccos(np.minimum(down, 1))
         time = refraction.surface_time_ns(axis.height, off_nadir)
         measured = optional_number(dataset.attrs, "surface_time_ns")
         if measured is not None:
@@ -289,9 +167,59 @@ class LinesOfSight:
         return np.asarray(at(geometry.height, depth, theta, n) / at(geometry.height, 0.0, theta, n))
 
 
-def _require_height(height: float | None) -> None:
-    if height is not None and height < 0:
+def lidar_geometry(attributes: Attributes, *, surface: Literal["any", "level", "measured"] = "any") -> LidarGeometry:
+    """Read the geometry of a lidar from the attributes of a result.
+
+    Parameters
+    ----------
+    attributes
+        ``altitude`` [m], ``off_nadir_deg``, ``refractive_index``, ``group_index`` and, optionally, ``surface_time_ns``,
+        the mean arrival over the pixels.
+    surface
+        Time of the surface echo: ``measured`` is ``surface_time_ns``, ``level`` that of the mean sea level on the axis,
+        ``any`` the first of these that is known.
+
+    Raises
+    ------
+    UserError
+        If an attribute is missing, is not a number of at least 0 or out of range, or the lidar is under water.
+    """
+    if surface == "measured":
+        required_number(attributes, "surface_time_ns")
+    if (height := optional_number(attributes, "altitude")) is not None and height < 0:
         raise UserError(f"altitude = {height:g} is under water: this needs a lidar above the sea")
+    names = ("altitude", "off_nadir_deg", "refractive_index", "group_index")
+    height, degrees, refractive_index, group_index = (required_number(attributes, name) for name in names)
+    measured = None if surface == "level" else optional_number(attributes, "surface_time_ns")
+    time = math.nan if measured is None else measured
+    return LidarGeometry(height, math.radians(degrees), refractive_index, group_index, surface_time_ns=time)
+
+
+def lidar_system(attributes: Attributes, efficiency: float | None = None) -> LidarSystem:
+    """Return the system of the lidar equation, with the energy of the whole beam and the open area of the aperture.
+
+    The efficiency, 0 to 1, includes transmitter, receiver and two-way transmittance of the atmosphere; by default it is
+    the attribute ``two_way_efficiency``. `share_in_view` is the share of the energy that the pixels see.
+
+    Raises
+    ------
+    UserError
+        If the efficiency is out of range or unknown, or another attribute is missing.
+    """
+    energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes, efficiency)
+    geometry = lidar_geometry(attributes)
+    return LidarSystem(**vars(geometry), energy=energy, aperture_area=open_aperture(attributes))
+
+
+def spot_diameter(attributes: Attributes) -> float:
+    """Return the diameter of the receiver's field of view on the sea surface [m]."""
+    return 1e-3 * required_number(attributes, "field_of_view_mrad") * lidar_geometry(attributes).slant_range
+
+
+def pose_of(attributes: Attributes, name: str = "receiver_pose") -> Pose | None:
+    """Return the pose of the receiver, or ``transmitter_pose``, of a result that has it among its attributes."""
+    given = attributes.get(name, ())
+    return Pose(*np.reshape(np.asarray(given, dtype=np.float64), (4, 3))) if len(given) == 12 else None
 
 
 def _columns(values: FloatArray, dimensions: int) -> FloatArray:

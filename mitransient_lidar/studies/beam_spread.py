@@ -12,7 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
-from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import TOLERATED_LOSS, open_scene, pass_attributes
@@ -229,15 +229,11 @@ def _in_view(lidar: LidarScene, light: PlaneCrossings, depth: float) -> npt.NDAr
     import mitsuba as mi
 
     pose, pixels = lidar.receiver.pose, lidar.receiver.pixels
-    x, y = light.x - pose.origin[0], light.y - pose.origin[1]
-    distance = np.hypot(x, y)
-    theta, _ = refracted_path(distance, pose.origin[2], depth, lidar.refractive_index)
-    across = np.sin(theta) / np.maximum(distance, 1e-9)
-    direction = np.stack([across * x, across * y, -np.cos(theta)], axis=1)
-    along = direction @ pose.axis
-    angle_x, angle_y = (direction @ side / along for side in (pose.far, pose.left))
+    points = np.stack([light.x, light.y, np.full_like(light.x, -depth)], axis=1)
+    seen = np.pad(LevelSea((lidar.refractive_index,)).crossing(pose.origin, points), ((0, 0), (0, 1))) - pose.origin
+    angle_x, angle_y = pose.angles_of(seen).T
     _, count = pixels.pixel_at(mi.Float(angle_x), mi.Float(angle_y), mi.Float(0.5))
-    return (along > 0) & (np.array(count) > 0)
+    return (seen @ pose.axis > 0) & (np.array(count) > 0)
 
 
 def _describe(lidar: LidarScene) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from mitransient_lidar.analysis.receiver import DENSEST, receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import in_range, integer, non_negative, positive, shown
-from mitransient_lidar.physics.receiver.receiver_files import Receiver
+from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.render import render
@@ -151,7 +151,7 @@ def bounds(
     return _compared(found, designs, attributes)
 
 
-def _receivers(given: Any, gain: Any) -> dict[str, Receiver | None]:
+def _receivers(given: Any, gain: Any) -> dict[str, ReceiverChannels | None]:
     """Return receivers by name, None with an empty name for that of the scene's instrument."""
     listed = list(given) if isinstance(given, (list, tuple)) else [given]
     found = [None if one is None else receiver_of("receiver", one) for one in listed]

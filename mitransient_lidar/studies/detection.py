@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,11 +17,11 @@ from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
-from mitransient_lidar.results.geometry import LidarGeometry
 from mitransient_lidar.studies.target_signal import find_target, target_signal
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def detect(
     sky = non_negative("background_power_w", background_power_w)
     if list(depths) != sorted(set(depths)) or any(not (math.isfinite(d) and d > 0) for d in depths):
         raise UserError(f"depths = {list(depths)} must be above 0 m and increase")
-    if not isinstance(scene, (str, bytes)) and not hasattr(scene, "__fspath__") and (depths or clutter):
+    if not isinstance(scene, (str, os.PathLike)) and (depths or clutter):
         raise UserError("depths and clutter need an XML scene, whose parameters they set")
     limit = RenderOptions(max_time=max_time).max_time or math.inf
     session = open_scene(scene, params)
@@ -132,7 +133,7 @@ def detect(
             raise UserError(f"scene {session.name} has no parameter {key}, which {option} needs")
     if clutter and session.parameters.get("spectrum") == "flat":
         raise UserError("clutter needs waves: spectrum = flat makes every sea the same")
-    lidar: LidarScene = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
+    lidar = choose_integrator(session.scene, integrator).prepare(session.scene, session.sensor).scene
     lidar.transmitter.pose.require_above_sea()
     if lidar.receiver.optics.response_time_ns > 0 and chain.amplifier is not None:
         _LOG.warning("the scene has a response time, and the amplifier's bandwidth smooths its light again")
@@ -185,7 +186,8 @@ def detect(
     share = share if math.isfinite(share) else 1.0
     data |= trials.drawn(experiments[0], share, pfa, shots, seed)
     pulse_fwhm_ns = lidar.transmitter.pulse.fwhm_ns
-    data |= trials.depth_errors(experiments[0], shots, seed, pulse_fwhm_ns, _depth_per_ns(lidar))
+    geometry = LidarGeometry.of_pose(lidar.transmitter.pose, lidar.refractive_index, lidar.group_index)
+    data |= trials.depth_errors(experiments[0], shots, seed, pulse_fwhm_ns, geometry.depth_per_ns)
     if depths:
         data |= trials.by_depth(experiments[1:], list(depths), pfa, pd)
     for key in ("background", "difference"):
@@ -210,13 +212,6 @@ def detect(
         pulse_fwhm_ns=pulse_fwhm_ns,
     )
     return xr.Dataset(data, coords={"combination": list(COMBINATIONS)}, attrs=attributes)
-
-
-def _depth_per_ns(lidar: LidarScene) -> float:
-    """Return the depth [m] per delay of the echo [ns]."""
-    pose = lidar.transmitter.pose
-    off_nadir = math.atan2(math.hypot(*(float(part) for part in pose.axis[:2])), -float(pose.axis[2]))
-    return LidarGeometry.level(float(pose.origin[2]), off_nadir, lidar.refractive_index, lidar.group_index).depth_per_ns
 
 
 def _experiment(

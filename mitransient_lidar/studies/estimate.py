@@ -15,6 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.double_passage import (
     LEAST_DEPTH,
     EnhancementTable,
@@ -162,8 +163,8 @@ def _model(lidar: LidarScene) -> EchoEstimate:
     if lidar.targets:
         logger.warning("the estimate leaves out %s", ", ".join(repr(target.id()) for target in lidar.targets))
     energy = lidar.transmitter.energy * lidar.receiver.optics.collection
-    angle = math.radians(pose.off_nadir_deg)
-    system = LidarSystem(float(pose.origin[2]), angle, energy, 1.0, lidar.refractive_index, lidar.group_index)
+    geometry = LidarGeometry.of_pose(pose, lidar.refractive_index, lidar.group_index)
+    system = LidarSystem(**vars(geometry), energy=energy, aperture_area=1.0)
     depth, reflectance = _bottom(lidar)
     phases = [table_of(phase) for phase in water.phases.phases[: water.column.count]]
     covariance, ratio = _slopes(lidar)
@@ -175,11 +176,14 @@ def _bottom(lidar: LidarScene) -> tuple[float, float]:
     """Return the depth of the bottom, or of the last light [m], and its reflectance."""
     import mitsuba as mi
 
+    from mitransient_lidar.transport.plugin_types import Recorded
+
     column = lidar.required_water.column
     if not lidar.bottoms:
         darkest = _DARK / max(float((column.absorption + column.backscattering).min()), 1e-3)
         return min(darkest, 1e-9 * C0 / 2 * (lidar.axis.end_ns - lidar.axis.start_ns)), 0.0
-    if getattr(lidar.bottoms[0].bsdf(), "parameters", {}).get("type") == "sediment":
+    bsdf = lidar.bottoms[0].bsdf()
+    if isinstance(bsdf, Recorded) and bsdf.parameters["type"] == "sediment":
         raise UserError("model = 'hapke' gives the bottom an opposition effect, which an estimate lacks")
     place = lidar.receiver.pose.ground_point()
     si = _below(lidar, mi.Point3f(float(place[0]), float(place[1]), float(lidar.empty_heights[1])))

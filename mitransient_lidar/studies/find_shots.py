@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
     import xarray as xr
 
-    from mitransient_lidar.transport.pose import Pose
+    from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Largest number of pixels whose footprints are mapped.
 _MOST_MAPPED_PIXELS = 64
@@ -137,13 +137,12 @@ def _pixel_map(scene: mi.Scene) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     receiver = scene.sensors()[0].receiver
     pose: Pose = receiver.pose
     centre = pose.ground_point()
-    reach = 0.6 * receiver.pixels.field_of_view * float(np.linalg.norm(centre - pose.origin)) / -float(pose.axis[2])
+    reach = 0.6 * receiver.pixels.field_of_view * pose.ground_range / -float(pose.axis[2])
     lines = np.linspace(-reach, reach, 301)
     x, y = np.meshgrid(lines, lines)
     if receiver.pixels.count > _MOST_MAPPED_PIXELS:
         return lines, np.full(x.shape, -1)
-    points = np.stack([x + centre[0], y + centre[1], np.zeros_like(x)], axis=-1).reshape(-1, 3) - pose.origin
-    depth = points @ pose.axis
-    angle_x, angle_y = ((points @ side / depth).astype(np.float32) for side in (pose.far, pose.left))
+    points = np.stack([x + centre[0], y + centre[1], np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    angle_x, angle_y = pose.angles_of(points - pose.origin).astype(np.float32).T
     index, held = receiver.pixels.pixel_at(mi.Float(angle_x), mi.Float(angle_y), mi.Float(0.5))
     return lines, np.where(np.array(held) > 0, np.array(index).astype(int), -1).reshape(x.shape)

@@ -18,12 +18,12 @@ from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnB
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, PassLog, ProgressCallback, run_passes
 from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene, warn_of_edge_loss
-from mitransient_lidar.results.geometry import LidarGeometry
 
 if TYPE_CHECKING:
     from mitransient_lidar.transport.scene import LidarScene
@@ -183,13 +183,12 @@ def _with_widest(scene: Any, params: Mapping[str, Any] | None, widest: float) ->
 
 def _geometry(lidar: LidarScene, half_view: float) -> tuple[LidarGeometry, float]:
     """Return the geometry, and the edge of the beam within a half angle [rad]; reject a view of the horizon."""
-    pose = lidar.receiver.pose
-    off_nadir = math.acos(min(1.0, -float(pose.axis[2])))
-    widest = 2e3 * math.tan(0.5 * math.pi - off_nadir)
+    geometry = LidarGeometry.of_pose(lidar.receiver.pose, lidar.refractive_index, lidar.group_index)
+    widest = 2e3 * math.tan(0.5 * math.pi - geometry.off_nadir)
     if 2e3 * half_view >= widest:
         raise UserError(f"fov_mrad = {2e3 * half_view:g} must be less than {widest:.4g}: it would reach the horizon")
     edge = min(BEAM_EDGE * lidar.transmitter.widest_angular_spread, half_view)
-    return LidarGeometry.level(float(pose.origin[2]), off_nadir, lidar.refractive_index, lidar.group_index), edge
+    return geometry, edge
 
 
 def _water(lidar: LidarScene, min_depth: float, max_depth: float) -> InherentProperties:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefraction
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.shot_series import render_shots
-from mitransient_lidar.results.geometry import LidarGeometry
+from mitransient_lidar.results.geometry import lidar_geometry
 
 _PASSES = 8
 
@@ -86,7 +86,7 @@ def _echo_times(shot: xr.Dataset) -> dict[str, float]:
     depth = shot.attrs.get("scene.bottom_depth")
     if depth is None or "surface_time_ns" not in shot.attrs:
         raise UserError("shot-statistics needs a scene with a sea and the parameter bottom_depth")
-    geometry = LidarGeometry.from_attributes(shot.attrs)
+    geometry = lidar_geometry(shot.attrs)
     return {"surface": geometry.surface_time_ns, "bottom": float(geometry.time_of_depth(float(depth)))}
 
 
@@ -134,10 +134,8 @@ def depth_bias(slope_along: FloatArray, depth: float, off_nadir: float, refracti
     Explanation by Tulldahl (2006, figure 12): a face away from the lidar refracts the ray towards the vertical, which
     shortens the path to the bottom. The depth is computed from the time as for a level sea.
     """
-    tilt = np.arctan(slope_along)
-    level = math.asin(math.sin(off_nadir) / refractive_index)
-    in_water = tilt + np.arcsin(np.sin(off_nadir - tilt) / refractive_index)
-    return np.asarray(depth * (math.cos(level) / np.cos(in_water) - 1))
+    level, ray = (SlopeRefraction.of(slope, 0.0, off_nadir, refractive_index) for slope in (0.0, slope_along))
+    return np.asarray(depth * (level.cos_vertical / ray.cos_vertical - 1))
 
 
 def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -158,7 +156,7 @@ def slope_effects(shots: xr.Dataset) -> dict[str, tuple[FloatArray, FloatArray]]
     """
     if [str(name) for name in shots["pixel"].values] != ["red", "green", "blue", "black"]:
         raise UserError(f"pixels = {list(shots['pixel'].values)} must be the 2x2 of red, green, blue and black")
-    geometry = LidarGeometry.from_attributes(shots.attrs)
+    geometry = lidar_geometry(shots.attrs)
     level = float(geometry.time_of_depth(float(shots.attrs["scene.bottom_depth"])))
     along, across = (shots[f"slope_{name}"].values for name in ("along", "across"))
     surface, bottom = shots["surface_time"], shots["bottom_time"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+
+#: Type of a Dr.Jit array.
+ArrayT = TypeVar("ArrayT")
 
 
 def opaque(value: float) -> mi.Float:
@@ -41,7 +44,7 @@ def is_one_of(pointer: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
     return found
 
 
-def aligned(array_type: Any, values: NDArray[Any]) -> Any:
+def aligned(array_type: Callable[[Any], ArrayT], values: NDArray[np.generic]) -> ArrayT:
     """Return values as a flat Dr.Jit array that starts at a multiple of 64 bytes.
 
     Dr.Jit leaves arrays of NumPy where they are, and compiles another kernel for an array that is not aligned.

@@ -6,6 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +17,7 @@ from mitransient_lidar.transport.perturbations import Perturbation, Perturbation
 from mitransient_lidar.transport.ripple_focusing import Echo, RippleFocusing
 from mitransient_lidar.transport.rng import Shots
 from mitransient_lidar.transport.scene import LidarScene
-from mitransient_lidar.transport.sensor.receiver import SensorSampler
+from mitransient_lidar.transport.sensor.receiver import Receiver, SensorSampler
 
 
 class PassRecord:
@@ -163,3 +164,23 @@ class PassRenderer(ABC):
     @abstractmethod
     def trace(self, record: PassRecord, shots: Shots, paths: int) -> None:
         """Trace the paths of one pass into a record, a number of them for each shot."""
+
+
+@runtime_checkable
+class LidarIntegrator(Protocol):
+    """The integrators ``lidar_merging`` and ``lidar_volpath``."""
+
+    plugin: str
+    passive: bool
+
+    def prepare(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        *,
+        classes: PathClasses | None = None,
+        receiver: Receiver | None = None,
+        layout_of: PassRenderer | None = None,
+        connections: bool = True,
+    ) -> PassRenderer:
+        """Return the renderer of passes of a scene, as `LidarMerging.prepare`."""

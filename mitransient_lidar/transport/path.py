@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import WaterScene
 
 #: Surface length of paths that have not met the sea first [m].
@@ -83,7 +83,7 @@ class Path(Contribution):
 
     @staticmethod
     def initial(
-        scene: WaterScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, active: mi.Bool
+        scene: WaterScene, pose: KernelPose, angles: mi.Point2f, throughput: mi.Float, active: mi.Bool
     ) -> dict[str, Any]:
         """Return the fields of paths that start from a pose at tangent-plane angles."""
         direction = pose.direction(angles.x, angles.y)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mitransient_lidar.transport.medium.free_flight import LayeredFlight
+from mitransient_lidar.transport.medium.tabulated_phase import NumberedPhase
 from mitransient_lidar.transport.path import Path, advance
 from mitransient_lidar.transport.perturbations import Sums
 from mitransient_lidar.transport.scene import WaterScene
@@ -64,7 +64,7 @@ class ScatteringEvent:
     """A scattering event: interaction, phase function (None without water), and number of the scatterer."""
 
     interaction: mi.MediumInteraction3f
-    phase: Any
+    phase: mi.PhaseFunctionPtr | NumberedPhase
     scatterer: mi.UInt32
 
 

@@ -15,15 +15,32 @@ from mitransient_lidar.physics.sea import sea_surface
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.laser.beam_profiles import BeamProfile
 from mitransient_lidar.transport.medium.water import Water
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
+from mitransient_lidar.transport.sensor.fov_shapes import FovShape
 from mitransient_lidar.transport.sensor.receiver import Receiver
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """Any plugin of this package, with its name as ``type`` and the values of its parameters."""
+
+    parameters: dict[str, Any]
+
+
+@runtime_checkable
+class Automatic(Protocol):
+    """Plugins with parameters that may be automatic, with the values used for these."""
+
+    @property
+    def used_values(self) -> dict[str, float]:
+        """Values by name."""
 
 
 @runtime_checkable
 class Transmitter(Protocol):
     """The emitter ``lidar_transmitter``: energies [J], rms angles of the beam [rad]."""
 
-    pose: Pose
+    pose: KernelPose
     parameters: dict[str, Any]
     wavelength_nm: float
     pulse_energy: float
@@ -53,7 +70,7 @@ class Daylight(Protocol):
     daylight: str
 
 
-class Sun(Daylight, Protocol):
+class SunEmitter(Daylight, Protocol):
     """The emitter ``sun``: unit direction to it, irradiance on a plane normal to its rays [W m^-2 nm^-1]."""
 
     zenith_deg: float
@@ -68,7 +85,7 @@ class Sun(Daylight, Protocol):
         """Map uniform numbers to directions of the disc."""
 
 
-class Sky(Daylight, Protocol):
+class SkyEmitter(Daylight, Protocol):
     """The emitter ``sky``: unit direction to the sun of a clear one, irradiance [W m^-2 nm^-1]."""
 
     distribution: str
@@ -87,6 +104,14 @@ class LidarSensor(Protocol):
 
 
 @runtime_checkable
+class PixelSensor(Protocol):
+    """The sensor ``pixel_fov``."""
+
+    field: FovShape
+    pixel_name: str
+
+
+@runtime_checkable
 class WaterMedium(Protocol):
     """The medium ``layered_water``."""
 
@@ -94,18 +119,7 @@ class WaterMedium(Protocol):
 
 
 @runtime_checkable
-class LidarIntegrator(Protocol):
-    """The integrators ``lidar_merging``, ``lidar_volpath`` and ``passive_volpath``."""
-
-    plugin: str
-    passive: bool
-
-    def prepare(self, scene: mi.Scene, sensor: mi.Sensor, **options: Any) -> Any:
-        """Return the renderer of passes of a scene."""
-
-
-@runtime_checkable
-class SeaSurface(Protocol):
+class SeaShape(Protocol):
     """The shape ``ocean_surface``: slope variances, lengths [m]."""
 
     sea: sea_surface.SeaSurface
@@ -128,6 +142,7 @@ class GatedFilm(Protocol):
     """The film ``time_gated_film``."""
 
     is_fixed: bool
+    end: str
     bin_width_ns: float
     time_start_ns: float | None
     bin_count: int | None

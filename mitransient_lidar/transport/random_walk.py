@@ -12,7 +12,7 @@ import mitsuba as mi
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.path import Path
 from mitransient_lidar.transport.path_step import PathStep, Vertex
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.snell import refract_level
 
@@ -47,7 +47,7 @@ class RandomWalkPath(Path):
 
     @classmethod
     def start(
-        cls, scene: LidarScene, pose: Pose, angles: mi.Point2f, throughput: mi.Float, offset: mi.Float
+        cls, scene: LidarScene, pose: KernelPose, angles: mi.Point2f, throughput: mi.Float, offset: mi.Float
     ) -> RandomWalkPath:
         """Return paths from laser or receiver at tangent-plane angles, without those of throughput 0."""
         count = dr.width(angles)
@@ -112,7 +112,7 @@ class RandomWalk:
         self,
         scene: LidarScene,
         mode: mi.TransportMode,
-        destination: Pose,
+        destination: KernelPose,
         path_end: float,
         rates: EstimateRates | None = None,
     ) -> None:

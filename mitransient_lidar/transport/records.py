@@ -12,12 +12,12 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, Cone, LidarView, Solid, Water
+from mitransient_lidar.physics.lidar.record_limits import COLUMN_LEVEL, ColumnDecay, Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.transport.opaque import opaque_point
-from mitransient_lidar.transport.plugin_types import GatedFilm, Transmitter
+from mitransient_lidar.transport.plugin_types import GatedFilm, Recorded, Transmitter
 from mitransient_lidar.transport.rng import unit_points
 from mitransient_lidar.transport.scene import WaterScene
 
@@ -54,10 +54,8 @@ def fitted_record(
     last = max(found, key=lambda each: each.last_ns)
     limits, end = (min(each.first_ns for each in found), last.last_ns), last.end
     if film.gates is not None:
-        sine = float(np.hypot(*scene.receiver.pose.axis[:2])) / scene.refractive_index
-        placed = (scene.group_index, float(np.sqrt(1 - sine**2)))
         for time in (min(each.surface_ns[0] for each in found), max(each.surface_ns[1] for each in found)):
-            spans = film.gates.placed(time, *placed).spans_ns
+            spans = film.gates.placed(time, scene.depth_per_ns).spans_ns
             end = "after the last gate" if spans[-1, 1] > limits[1] else end
             limits = min(limits[0], spans[0, 0]), max(limits[1], spans[-1, 1])
     fixed = film.bin_width_ns, film.time_start_ns, film.bin_count
@@ -148,13 +146,13 @@ def _first_hits(scene: WaterScene, transmitter: Transmitter) -> list[mi.SurfaceI
 def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float, float]) -> LidarView:
     """Return the geometry of a lidar, displaced horizontally [m], over the level sea of a scene."""
     pixels, blur, pose = scene.receiver.pixels, scene.receiver.blur, scene.receiver.pose
-    sides = getattr(pixels, "sides", (pixels.field_of_view, pixels.field_of_view))
+    sides = pixels.sides or (pixels.field_of_view, pixels.field_of_view)
     blurred = 0.0 if blur is None else blur.reach
     half_angles = 0.5 * sides[0] + blurred, 0.5 * sides[1] + blurred
     edge = transmitter.profile.reach
     moved = np.array([*shift, 0.0])
     view, beam = (
-        Cone(one.origin + moved, np.stack([one.axis, one.far, one.left]), angles, is_round)
+        Cone(replace(one, origin=one.origin + moved), angles, is_round)
         for one, angles, is_round in (
             (pose, half_angles, pixels.field_of_view_shape == "circle"),
             (transmitter.pose, (edge, edge), True),
@@ -163,26 +161,23 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
     boxes = [shape.bbox() for shape in scene.mitsuba_scene.shapes()]
     corners = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 3)[:, :2]
     reach = max(
-        (float(np.hypot(*(np.abs(corners - one.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
+        (float(np.hypot(*(np.abs(corners - one.pose.origin[:2]).max(axis=0)))) for one in (view, beam) if len(corners)),
         default=float(pose.origin[2]),
     )
     if scene.water is None:
         none = np.zeros(1)
-        return LidarView(view, beam, Water((1.0,), (1.0,), (), none, none), (0.0, 0.0), reach, None)
-    layers, column, plume = scene.water.index_layers, scene.water.column, scene.water.plume
+        return LidarView(view, beam, scene.level_sea, ColumnDecay(none, none), (0.0, 0.0), reach, None)
+    column, plume = scene.water.column, scene.water.plume
     rows = zip(column.absorption, column.scattering, column.backscattering, strict=True)
     kd = [InherentProperties(*map(float, row)).kd for row in rows]
-    slant_range = float(np.linalg.norm(pose.ground_point() - pose.origin))
-    spot = slant_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
+    spot = pose.ground_range * np.hypot(pixels.field_of_view, 4 * transmitter.widest_angular_spread)
     attenuation = system_attenuation(column.attenuation, np.minimum(kd, column.attenuation), spot)
-    n, group, boundaries = (
-        tuple(map(float, each)) for each in (layers.refractive_index, layers.group_index, layers.boundaries)
-    )
     heights = [(float(surface.bbox().min.z), float(surface.bbox().max.z)) for surface in scene.surfaces]
     return LidarView(
         view,
         beam,
-        Water(n, group, boundaries, column.layer_tops, attenuation),
+        scene.level_sea,
+        ColumnDecay(column.layer_tops, attenuation),
         (min(low for low, _ in heights), max(high for _, high in heights)),
         reach,
         0.0 if plume is None else plume.depth,
@@ -191,7 +186,7 @@ def _lidar_view(scene: WaterScene, transmitter: Transmitter, shift: tuple[float,
 
 def _name(shape: mi.Shape) -> str:
     """Return the id of a shape, else its type."""
-    return str(shape.id() or getattr(shape, "parameters", {"type": shape.class_name()})["type"])
+    return str(shape.id() or (shape.parameters["type"] if isinstance(shape, Recorded) else shape.class_name()))
 
 
 def _triangles(shape: mi.Shape) -> FloatArray:

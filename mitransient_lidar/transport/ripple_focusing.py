@@ -103,7 +103,6 @@ class RippleFocusing:
         depths = np.geomspace(LEAST_DEPTH, _DEEPEST, _DEPTHS)
         spread = slope_spread(theta, scene.refractive_index)
         tables = [EnhancementTable.of(structure, depths, spread) for structure in structures]
-        distance = float(np.linalg.norm(receiver.ground_point() - receiver.origin))
         offset = transmitter.origin - receiver.origin
         apart = complex(*(float(offset @ side) for side in (receiver.far, receiver.left)))
         radius = np.sqrt(scene.receiver.optics.aperture_area / np.pi)
@@ -113,7 +112,7 @@ class RippleFocusing:
             # The same random numbers for all water.
             rng = np.random.default_rng(0)
             disc = radius * np.sqrt(rng.random(_SAMPLES)) * np.exp(2j * np.pi * rng.random(_SAMPLES))
-            between = (apart + disc) / (index * distance) * depths[:, None, None]
+            between = (apart + disc) / (index * receiver.ground_range) * depths[:, None, None]
             moves = displacements(column, phases, depths, _MOST_EVENTS, _SAMPLES, rng)
             moved = np.abs(between + moves) / cos_water
             true, drawn = (table.at(depths[:, None, None], moved).mean(axis=-1) for table in tables)

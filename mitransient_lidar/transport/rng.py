@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.transport.opaque import aligned
+from mitransient_lidar.transport.opaque import ArrayT, aligned
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Lanes:
         shot = lane // paths
         return cls(shots, shot, lane - shot * paths)
 
-    def pick(self, values: Any) -> Any:
+    def pick(self, values: ArrayT) -> ArrayT:
         """Return the value of the lane's shot, of arrays with one entry a shot."""
         return values if self.shots == 1 else dr.gather(type(values), values, self.shot)
 

@@ -10,17 +10,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.gate_train import GatePlan
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.transport.medium.index_layers import IndexLayers
 from mitransient_lidar.transport.medium.water import Water
 from mitransient_lidar.transport.opaque import is_one_of, opaque, opaque_point
 from mitransient_lidar.transport.perturbations import Perturbations
-from mitransient_lidar.transport.plugin_types import SeaSurface, Transmitter
-from mitransient_lidar.transport.pose import Pose, RelativePose
+from mitransient_lidar.transport.plugin_types import SeaShape, Transmitter
+from mitransient_lidar.transport.pose import KernelPose, RelativePose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
@@ -97,7 +99,7 @@ class WaterScene:
     surfaces: list[mi.Shape]
     slope_variance: float
     parts: tuple[ScenePart, ...] = field(default=(), kw_only=True)
-    receiver_poses: Pose | None = field(default=None, kw_only=True)
+    receiver_poses: KernelPose | None = field(default=None, kw_only=True)
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
 
     def of(self: SceneT, lanes: Lanes) -> SceneT:
@@ -113,7 +115,7 @@ class WaterScene:
         return replace(self, parts=tuple(parts)) if parts else self
 
     @property
-    def receiver_pose(self) -> Pose:
+    def receiver_pose(self) -> KernelPose:
         """Pose of the receiver for paths."""
         return self.receiver_poses or self.receiver.pose
 
@@ -123,9 +125,9 @@ class WaterScene:
         return solids_of(self.mitsuba_scene, self.surfaces)
 
     @property
-    def seas(self) -> list[SeaSurface]:
+    def seas(self) -> list[SeaShape]:
         """The ``ocean_surface`` shapes that bound the water."""
-        return [surface for surface in self.surfaces if isinstance(surface, SeaSurface)]
+        return [surface for surface in self.surfaces if isinstance(surface, SeaShape)]
 
     def mean_slopes(self, shots: int) -> FloatArray:
         """Return the mean slopes of the sea along x and y under the lidar of each shot [1], shape (shots, 2)."""
@@ -181,7 +183,7 @@ class WaterScene:
         """
         sizes = [
             max(surface.cell_size, _FACET_PER_WAVE * surface.beam_wave)
-            if isinstance(surface, SeaSurface)
+            if isinstance(surface, SeaShape)
             else float(np.sqrt(2 * surface.surface_area()[0] / surface.face_count()))
             for surface in self.surfaces
             if surface.is_mesh()
@@ -216,13 +218,20 @@ class WaterScene:
         layers = self.index_layers
         if layers is None:
             return LevelSea((1.0,))
-        return LevelSea(tuple(map(float, layers.refractive_index)), tuple(map(float, layers.boundaries)))
+        arrays = layers.refractive_index, layers.boundaries, layers.group_index
+        return LevelSea(*(tuple(map(float, each)) for each in arrays))
 
-    def relative(self, pose: Pose) -> RelativePose:
+    @property
+    def depth_per_ns(self) -> float:
+        """Depth per delay of echoes on the receiver's axis [m/ns]."""
+        down = refract_level(self.receiver.pose.axis, self.refractive_index)
+        return 0.5e-9 * C0 / self.group_index * -float(down[2])
+
+    def relative(self, pose: KernelPose) -> RelativePose:
         """Return a pose relative to the reference point of the scene, as lengths of paths are."""
         return RelativePose(pose, self.receiver.pose.nearby_point())
 
-    def first_points(self, pose: Pose, angles: mi.Point2f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Float]:
+    def first_points(self, pose: KernelPose, angles: mi.Point2f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Float]:
         """Return where paths from a pose start [m], at tangent-plane angles, and their relative lengths there [m].
 
         Paths from more than 10 km above the scene start 1 m above all shapes: traced from farther away in single
@@ -327,7 +336,7 @@ class LidarScene(WaterScene):
     transmitter: Transmitter
     axis: TimeAxis
     gates: GatePlan | None
-    transmitter_poses: Pose | None = field(default=None, kw_only=True)
+    transmitter_poses: KernelPose | None = field(default=None, kw_only=True)
 
     def of(self, lanes: Lanes) -> LidarScene:
         """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
@@ -336,7 +345,7 @@ class LidarScene(WaterScene):
         return moved if poses is None else replace(moved, transmitter_poses=poses.of(lanes))
 
     @property
-    def transmitter_pose(self) -> Pose:
+    def transmitter_pose(self) -> KernelPose:
         """Pose of the transmitter for paths."""
         return self.transmitter_poses or self.transmitter.pose
 

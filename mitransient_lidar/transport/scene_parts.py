@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.sea.resolution import Footprint
 from mitransient_lidar.transport.medium.water import Water
@@ -17,11 +18,10 @@ from mitransient_lidar.transport.plugin_types import (
     Daylight,
     GatedFilm,
     LidarSensor,
-    SeaSurface,
+    SeaShape,
     Transmitter,
     WaterMedium,
 )
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
@@ -127,9 +127,9 @@ def _without_sea(pose: Pose) -> Footprint:
     return Footprint(place, abs(float(pose.origin[2])), 0.0, True, 0.0, np.inf)
 
 
-def seas_of(scene: mi.Scene) -> list[SeaSurface]:
+def seas_of(scene: mi.Scene) -> list[SeaShape]:
     """Return the ``ocean_surface`` shapes of a scene."""
-    return [shape for shape in scene.shapes() if isinstance(shape, SeaSurface)]
+    return [shape for shape in scene.shapes() if isinstance(shape, SeaShape)]
 
 
 def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
@@ -157,13 +157,13 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
             waters.append(medium.water)
     for shape in solids_of(scene, surfaces):
         name = shape.id()
-        if isinstance(shape, SeaSurface):
+        if isinstance(shape, SeaShape):
             raise UserError(f"ocean_surface {name!r}: needs a layered_water as its interior medium")
     if len(waters) > 1:
         raise UserError(f"media: the scene has {len(waters)} layered_water; allowed is one that shapes share")
     for water in waters:
         _check_layers(scene, surfaces, water)
-    variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaSurface) and sea.has_ripples]
+    variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
 
 
@@ -196,10 +196,9 @@ def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
 
 def _check_cells(surfaces: list[mi.Shape], transmitter: Transmitter) -> None:
     """Refuse waves in cells longer than the beam is wide: a shot would meet a single slope."""
-    spot = transmitter.pose.ground_point()
-    footprint = 2 * transmitter.angular_spread * float(np.linalg.norm(spot - transmitter.pose.origin))
+    footprint = 2 * transmitter.angular_spread * transmitter.pose.ground_range
     for surface in surfaces:
-        if isinstance(surface, SeaSurface) and footprint < surface.cell_size < np.inf:
+        if isinstance(surface, SeaShape) and footprint < surface.cell_size < np.inf:
             raise UserError(
                 f"cell_size = {surface.cell_size:.3g} m is coarser than the beam's footprint on the sea, "
                 f"{footprint:.3g} m: it must be finer, or 'auto'"

@@ -40,7 +40,7 @@ def expected_bottom(density, field):
     angle_x, angle_y = angle_x[seen], angle_y[seen]
     sin, cos = np.sin(np.radians(20)), np.cos(np.radians(20))
     theta = np.arctan2(np.hypot(sin + angle_x * cos, angle_y), cos - angle_x * sin)
-    system = LidarSystem(200.0, np.radians(20), ENERGY, 0.025, 1.34, 1.34)
+    system = LidarSystem(200.0, np.radians(20), 1.34, 1.34, energy=ENERGY, aperture_area=0.025)
     echo = bottom_energy(system, WaterColumn.from_text(0, 0.1, 0, 0), DEPTH, 0.1, theta)
     return float(np.sum(density(angle_x, angle_y) * echo) * 5e-5**2)
 
@@ -130,7 +130,7 @@ def test_bottom_in_beam_and_view_of_millimetres(lidar_scene, passes, integrator,
         bottom=depth,
     )
     collection, energy = scene.sensors()[0].receiver.optics.collection, scene.emitters()[0].energy
-    system = LidarSystem(height, 0.0, energy * collection, 1.0, index, 1.34)
+    system = LidarSystem(height, 0.0, index, 1.34, energy=energy * collection, aperture_area=1.0)
     whole = float(bottom_energy(system, WaterColumn.from_text(0, 0.1, 0, 0), depth, 0.1, np.array(0.0)))
     wider = (1 + depth / (index * height)) ** 2
     spot = spread**2 * wider + 2 * ((1 - 1 / index) * depth) ** 2 * variance

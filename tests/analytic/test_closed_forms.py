@@ -99,7 +99,7 @@ BOTH_IN_ALL_CASES = pytest.mark.parametrize(
 def case(request):
     """Return a case with its lidar, time bins, and the predicates of its four pixels."""
     altitude, angle, index, beam, view, bottom, edge, c, b, (phase, backward, ratios) = CASES[request.param]
-    system = LidarSystem(altitude, np.radians(angle), ENERGY, AREA, index, GROUP_INDEX)
+    system = LidarSystem(altitude, np.radians(angle), index, GROUP_INDEX, energy=ENERGY, aperture_area=AREA)
     surface_ns = float(surface_time_ns(altitude, np.radians(angle)))
     bottom_ns = float(bottom_time_ns(altitude, bottom, np.radians(angle), index, GROUP_INDEX))
     start = BIN_NS * (surface_ns // BIN_NS - 10)
@@ -184,7 +184,7 @@ def test_surface_of_measured_slopes(lidar_scene, passes, integrator, wind, angle
         bottom=None,
     )
     collection, energy = scene.sensors()[0].receiver.optics.collection, scene.emitters()[0].energy
-    system = LidarSystem(200.0, np.radians(angle), energy * collection, 1.0, 1.34, GROUP_INDEX)
+    system = LidarSystem(200.0, np.radians(angle), 1.34, GROUP_INDEX, energy=energy * collection, aperture_area=1.0)
     along, across = 3.16e-3 * wind, 0.003 + 1.92e-3 * wind
     bearing = np.radians(wind_from_deg)
     y, x = np.tan(np.radians(angle)) * np.array([np.cos(bearing), np.sin(bearing)]) / np.sqrt([along, across])
@@ -252,7 +252,7 @@ def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, int
     properties = attenuation, scattering, 0.5 * scattering
     water = dict(zip(("attenuation", "scattering", "backscattering"), properties, strict=True))
     water |= {"phase_function": "hg", "phase_g": 0.0}
-    system = LidarSystem(height, 0.0, ENERGY, AREA, index, GROUP_INDEX)
+    system = LidarSystem(height, 0.0, index, GROUP_INDEX, energy=ENERGY, aperture_area=AREA)
     column = WaterColumn(*(np.array([value]) for value in (0.0, *properties)))
     depth = 0.5 * C0 / GROUP_INDEX * 1e-9 * bin_ns / parts * np.arange(bins * parts + 1)
     whole = column_energy(system, column, henyey_greenstein(np.pi, 0.0), depth[:-1], depth[1:], 0.0)
@@ -286,7 +286,7 @@ def test_column_ends_at_the_bottom(lidar_scene, passes, options):
     surface_ns = float(surface_time_ns(height, 0.0))
     bottom_ns = float(bottom_time_ns(height, depth, 0.0, 1.34, GROUP_INDEX))
     edges = surface_ns + 2.0 + (bottom_ns + 1.0 - surface_ns) / 200 * np.array([0, 137, 200])
-    system = LidarSystem(height, 0.0, ENERGY, AREA, 1.34, GROUP_INDEX)
+    system = LidarSystem(height, 0.0, 1.34, GROUP_INDEX, energy=ENERGY, aperture_area=AREA)
     water = {"attenuation": 0.15, "scattering": 2e-4, "backscattering": 1e-4, "phase_function": "hg", "phase_g": 0.0}
     column = WaterColumn(*(np.array([value]) for value in (0.0, 0.15, 2e-4, 1e-4)))
     seen = lambda x, y: np.hypot(x, y) < 15e-3  # noqa: E731

@@ -92,7 +92,7 @@ def test_each_part_has_its_closed_form(lidar_scene, z_score, integrator):
     passes = [renderer.render_pass(seed).histogram.energy().sum(axis=-1) for seed in range(count)]
     column = WaterColumn.from_text(0, 0.1, scattering, 0)
     backward = float(henyey_greenstein(np.pi, 0.6))
-    lidar = LidarSystem(200.0, 0.0, 5e-3 * 0.81 * 0.9, 0.025, 1.34, 1.34)
+    lidar = LidarSystem(200.0, 0.0, 1.34, 1.34, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
     half = 15e-3
     echo = echo_energies(
         lidar, 5e-3, column, backward, 8.0, 0.1, (variance / 2, variance / 2), lambda x, y: x**2 + y**2 <= half**2

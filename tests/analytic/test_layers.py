@@ -70,7 +70,7 @@ def steepest_ns(ratio, start_ns, near_ns):
 
 def closed_form_ns(side):
     """Where `steepest_ns` sees the step of figure 15 in the closed form: side -1 near pixels, 1 far ones, 0 all."""
-    lidar = LidarSystem(200.0, ANGLE, 1.0, 1.0, INDEX, INDEX)
+    lidar = LidarSystem(200.0, ANGLE, INDEX, INDEX, energy=1.0, aperture_area=1.0)
     start = 1425.0
     backward = float(fournier_forand(np.pi, *fournier_forand_parameters(0.04)))
 

@@ -5,18 +5,19 @@ import numpy as np
 import pytest
 import significance
 from oracles.beam_average import echo_energies
+from oracles.refracted_path import refracted_path
 from significance import largest_z
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path, solid_angle_per_area
+from mitransient_lidar.physics.lidar.refraction import fresnel, solid_angle_per_area
 from mitransient_lidar.physics.water.hapke import HapkeSurface
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 SIGMA = 5e-3
 HEIGHT, OFF_NADIR, INDEX = 200.0, np.radians(20.0), 1.34
-LIDAR = LidarSystem(HEIGHT, OFF_NADIR, 5e-3 * 0.81 * 0.9, 0.025, INDEX, INDEX)
+LIDAR = LidarSystem(HEIGHT, OFF_NADIR, INDEX, INDEX, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
 ABSORPTION = 0.1
 CLEAR = {"attenuation": ABSORPTION, "scattering": 0.0, "backscattering": 0.0}
 #: One pixel, and a sea so smooth that it neither spreads light nor view.
@@ -124,7 +125,7 @@ def test_plate_that_fills_the_beam_is_a_bottom(lidar_scene, passes, integrator):
     assert abs(mean - expected) < largest_z(24) * error + 1e-3 * expected
 
 
-OBLIQUE = LidarSystem(97.5, np.radians(54.0), 5e-3 * 0.81 * 0.9, 0.025, INDEX, INDEX)
+OBLIQUE = LidarSystem(97.5, np.radians(54.0), INDEX, INDEX, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
 #: Lidar, beam [rad], centre [m] and radius of a sphere: on the beam's axis, steep beside it, and wider than the beam.
 SPHERES = {
     "small": (LIDAR, SIGMA, (1.5, 0.2, -5.0), 0.6),

@@ -59,7 +59,7 @@ def test_mean_surface_echo_is_that_of_the_slopes_that_the_sea_states(wind, angle
     The same seas with waves of half the length have the same echo: slopes move from the ripples to the facets, and none
     is counted twice.
     """
-    lidar = LidarSystem(HEIGHT, np.radians(angle), 5e-3 * 0.81 * 0.9, 0.025, 1.34, 1.34)
+    lidar = LidarSystem(HEIGHT, np.radians(angle), 1.34, 1.34, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
     water = WaterColumn.from_text(0.0, 0.3, 0.15, 0.006)
     means = []
     for wave in (1.5, 0.75):

@@ -8,16 +8,17 @@ import pytest
 import significance
 from frequencies import misfit
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+from oracles.refracted_path import refracted_path
 from significance import assert_distribution, largest_chi2
 
-from mitransient_lidar.physics.lidar.refraction import fresnel, refracted_path
+from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import GramCharlierSeries, cox_munk
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
-    pose = Pose.from_angles(altitude, angle)
+    pose = KernelPose.from_angles(altitude, angle)
     parts = {"refractive_index": 1.34, "slope_variance": slope_variance, "index_layers": None}
     return RefractedLaserSampler(SimpleNamespace(transmitter_pose=pose, **parts))
 
@@ -78,7 +79,7 @@ def test_laser_is_seen_where_snells_law_says(altitude, angle, depth):
     lobe = lobe_at(angle, altitude=altitude)
     point = np.array([0.7, 0.4, -depth])
     laser = lobe.direction_from(mi.Point3f(point.tolist()))
-    origin = Pose.from_angles(altitude, angle).origin
+    origin = KernelPose.from_angles(altitude, angle).origin
     radius = float(np.hypot(*(origin - point)[:2]))
     theta, phi = refracted_path(radius, altitude, depth, 1.34)
     in_air, in_water = (np.array(v).ravel() for v in (laser.in_air, laser.in_water))

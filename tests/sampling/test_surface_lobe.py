@@ -11,14 +11,14 @@ from mitsuba.chi2 import ChiSquareTest, SphericalDomain
 from scipy.stats import norm
 from significance import assert_distribution, largest_z
 
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.refracted_connection import RefractedLaserSampler
 
 COUNT = 2**20
 
 
 def lobe_at(angle, slope_variance=0.02, altitude=200.0):
-    pose = Pose.from_angles(altitude, angle)
+    pose = KernelPose.from_angles(altitude, angle)
     parts = {"refractive_index": 1.34, "slope_variance": slope_variance, "index_layers": None}
     return RefractedLaserSampler(SimpleNamespace(transmitter_pose=pose, **parts))
 
@@ -34,7 +34,7 @@ def test_at_the_surface_the_laser_is_straight_ahead(angle, point):
     """At z = 0, and in a crest above it: the line to the laser, refracted where the point is."""
     lobe = lobe_at(angle)
     laser = lobe.direction_from(mi.Point3f(*point))
-    line = Pose.from_angles(200.0, angle).origin - np.array([point[0], point[1], 0.0])
+    line = KernelPose.from_angles(200.0, angle).origin - np.array([point[0], point[1], 0.0])
     line /= np.linalg.norm(line)
     np.testing.assert_allclose(np.array(laser.in_air).ravel(), line, atol=2e-6)
     water = line / 1.34

@@ -89,7 +89,7 @@ def test_points_of_a_flight_lie_where_surface_and_bottom_are(tmp_path, seed, tur
     horizontal = points["horizontal_uncertainty"].values / np.sqrt(2)
     assert np.median(horizontal[bottom]) < 0.1
     beside = np.column_stack([points["x"], points["y"]]) - refracted_places(points, flown)
-    axis = flown.vectors("axis")[points["shot"].values, :2]
+    axis = flown.poses.axis[points["shot"].values, :2]
     ahead = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     away, across = np.sum(beside * ahead, axis=1), beside[:, 1] * ahead[:, 0] - beside[:, 0] * ahead[:, 1]
     for error in (*beside.T, away, across):
@@ -150,7 +150,7 @@ def assert_within(error, stated, own, points):
 def refracted_places(points, flown):
     """Return where refracted lines of sight meet the plane of the bottom below a level sea: x and y [m]."""
     shot, pixel = points["shot"].values, points["pixel"].values
-    origin, axis, far, left = (flown.vectors(name)[shot] for name in ("origin", "axis", "far", "left"))
+    origin, axis, far, left = (getattr(flown.poses, name)[shot] for name in ("origin", "axis", "far", "left"))
     sight = [1e-3 * flown.coordinate(name)[pixel][:, None] for name in ("sight_x", "sight_y")]
     line = axis + sight[0] * far + sight[1] * left
     line /= np.linalg.norm(line, axis=1, keepdims=True)

@@ -11,6 +11,7 @@ from mitransient_lidar import scenes
 from mitransient_lidar.analysis.waveforms.echo_table import extract
 from mitransient_lidar.flights.positions import PointClass, positions
 from mitransient_lidar.flights.refracted_paths import PoseErrors
+from mitransient_lidar.physics.lidar.pose import Pose
 
 SEABED = """<shape type="seabed"><float name="depth" value="8"/><float name="size" value="80"/>
 <float name="slope_x_deg" value="-4"/><float name="slope_y_deg" value="8"/></shape>"""
@@ -25,10 +26,10 @@ def test_points_of_a_tilted_bottom_have_its_heights(tmp_path):
     (tmp_path / "tilted.xml").write_text(text.replace('<include filename="_flat_bottom.xml"/>', SEABED))
     params = {"layout": "2x2", "time_start_ns": 1400, "bin_count": 200, "spectrum": "flat"}
     shot = mitransient_lidar.render(tmp_path / "tilted.xml", params=params, passes=8)
-    origin, axis, far, left = np.reshape(shot.attrs["receiver_pose"], (4, 1, 3))
+    pose = Pose(*np.reshape(shot.attrs["receiver_pose"], (4, 1, 3)))
     sight = (1e-3 * shot[name].values for name in ("sight_x", "sight_y"))
     points = positions(
-        *(extract(shot).expand_dims("shot"), origin, axis, far, left, *sight),
+        *(extract(shot).expand_dims("shot"), pose, *sight),
         refractive_index=shot.attrs["refractive_index"],
         group_index=shot.attrs["group_index"],
         errors=PoseErrors(0, 0, 0, 0, 0, 0),

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run
+from oracles.refracted_path import refracted_path
 
 import mitransient_lidar
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.physics.lidar.refraction import refracted_path
 
 DOCS = Path(__file__).parents[2] / "docs" / "guide"
 SCENE, GATED, MESH = (DOCS / name for name in ("survey_lidar.xml", "gated_target.xml", "pyramid.ply"))

@@ -17,7 +17,7 @@ from mitransient_lidar.rendering.session import choose_integrator, open_scene
 from mitransient_lidar.rendering.shot_batches import ShotBatches
 from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.rendering.shot_series import render_shots
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes
 
 PLACES = np.array([[0.0, 0.0], [17.3, -42.1], [-250.4, 130.2]])
@@ -70,7 +70,7 @@ def looking(place, azimuth_deg, off_nadir_deg, height, roll_deg):
     up = np.array([0.0, 0.0, 1.0])
     axis, far = np.sin(angle) * ahead - np.cos(angle) * up, np.cos(angle) * ahead + np.sin(angle) * up
     turned = np.cos(roll) * far + np.sin(roll) * side, np.cos(roll) * side - np.sin(roll) * far
-    return Pose(np.array([*place, 0.0]) - axis * height / np.cos(angle), axis, *turned)
+    return KernelPose(np.array([*place, 0.0]) - axis * height / np.cos(angle), axis, *turned)
 
 
 @pytest.mark.parametrize("integrator", ["lidar_merging", pytest.param("lidar_volpath", marks=pytest.mark.long)])
@@ -96,7 +96,9 @@ def test_poses_of_a_batch_give_what_single_shots_do(integrator, tmp_path):
     renderer = prepared(scene, params, integrator)
     share = {"lidar_merging": 2**12, "lidar_volpath": 2**15}[integrator] / renderer.paths
     batches = ShotBatches(renderer, (0.0, 0.0), passes, share, None, [], lambda x, y: None)
-    stacked = Pose(*(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left")))
+    stacked = KernelPose(
+        *(np.array([getattr(pose, name) for pose in given]) for name in ("origin", "axis", "far", "left"))
+    )
     lengths = np.array([0.0, 0.11, 0.07])
     poses = ShotPoses.of_receiver(renderer.scene, stacked).delayed(lengths)
     np.testing.assert_allclose(poses.places, [shot[0] for shot in shots], atol=1e-9)

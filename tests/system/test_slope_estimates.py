@@ -14,12 +14,12 @@ from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval import retrieve
 from mitransient_lidar.loading import catalogue
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import InherentProperties
 from mitransient_lidar.rendering import shot_series
-from mitransient_lidar.results.geometry import LidarGeometry
 
 #: Slopes along and across.
 TILTS = ((-0.15, 0.0), (0.0, 0.07), (0.15, -0.07))
@@ -169,9 +169,9 @@ def test_waters_in_closed_form(name):
     """
     absorption, scattering, backscattering = WATERS[name]
     angle, index, group = math.radians(20), 1.34, 1.364
-    system = LidarSystem(200.0, angle, 5e-3 * 0.81 * 0.9, 0.025, index, group)
+    system = LidarSystem(200.0, angle, index, group, energy=5e-3 * 0.81 * 0.9, aperture_area=0.025)
     time = TimeAxis(1390.0, 0.5, 160)
-    geometry = LidarGeometry.level(200.0, angle, index, group)
+    geometry = LidarGeometry(200.0, angle, index, group)
     depth = geometry.depth_of_time(time.centres_ns)
     water = WaterColumn([0.0], [absorption + scattering], [scattering], [backscattering])
     backward_phase = backscattering / (2 * math.pi * scattering)

@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 
 
-class SampleMoments(NamedTuple):
+class ShotMoments(NamedTuple):
     """Mean, shape (..., sample), and covariance, shape (..., sample, sample), of the samples of a shot."""
 
     mean: FloatArray
@@ -23,7 +23,7 @@ class SampleMoments(NamedTuple):
 
 def sample_moments(
     chain: ReceiverChain, power: npt.ArrayLike, bin_width_ns: float, samples: slice, background: npt.ArrayLike = 0.0
-) -> SampleMoments:
+) -> ShotMoments:
     """Return mean and covariance of some samples of a shot in closed form, in `chain.units` and their square.
 
     The arguments are those of `ReceiverChain.expected`, and the indices of the samples, without a step.
@@ -65,7 +65,7 @@ def sample_moments(
     known = np.sqrt(np.maximum(expected.variance[..., samples] - rounding, 0))
     scale = np.divide(known, deviation, out=np.zeros_like(known), where=deviation > 0)
     covariance = covariance * scale[..., :, None] * scale[..., None, :] + rounding[..., None] * np.eye(len(chosen))
-    return SampleMoments(expected.mean[..., samples], covariance)
+    return ShotMoments(expected.mean[..., samples], covariance)
 
 
 def within_range(

@@ -12,7 +12,8 @@ import xarray as xr
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, integer
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry, optional_number
 
 _COLUMN_GATES, _DEEP_GATES = 4, 2  # gates before and behind an echo from which the column under it is estimated
 _SIGNIFICANT = 0.5  # least significance of an echo's gate, relative to the most significant gate
@@ -200,7 +201,7 @@ def depth_image(stack: xr.Dataset, *, reach: int | None = None) -> DepthImage:
     found = range_from_gates(energy, stderr, middles, reach=reach)
     try:
         lines = LinesOfSight.from_dataset(stack)
-        geometry = LidarGeometry.from_attributes(stack.attrs)
+        geometry = lidar_geometry(stack.attrs)
     except UserError:
         if "gate_depth" not in stack.coords:
             raise

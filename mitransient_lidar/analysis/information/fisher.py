@@ -20,7 +20,7 @@ from mitransient_lidar.analysis.receiver import PixelChain, pixel_chains
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Receiver, Setting
+from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels, Setting
 from mitransient_lidar.physics.receiver.sample_moments import sample_moments
 
 _LOG = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class _Gram(NamedTuple):
 
 def fisher_information(
     dataset: xr.Dataset | Sequence[xr.Dataset],
-    chain: Receiver | ReceiverChain | str | os.PathLike[str] | None = None,
+    chain: ReceiverChannels | ReceiverChain | str | os.PathLike[str] | None = None,
     background_power: npt.ArrayLike | xr.DataArray = 0.0,
     *,
     gain: Setting | None = None,

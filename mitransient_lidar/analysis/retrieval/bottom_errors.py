@@ -17,8 +17,9 @@ from mitransient_lidar.analysis.retrieval.slope_corrections import SlopeRefracti
 from mitransient_lidar.analysis.waveforms.records import Waveforms
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.surface_echoes import inside_outline
-from mitransient_lidar.results.geometry import LidarGeometry, optional_number
+from mitransient_lidar.results.geometry import optional_number, pose_of
 
 #: Largest relative standard error with which a reflectance is given.
 LARGEST_ERROR = 0.5
@@ -211,9 +212,9 @@ def target_flags(
 def hidden_share(attributes: Mapping[str, Any], targets: list[dict[str, Any]]) -> float:
     """Return the share of a Gaussian beam that meets targets of a result, 0 to 1; 0 if the beam is unknown."""
     divergence = optional_number(attributes, "divergence_mrad")
-    if "receiver_pose" not in attributes or divergence is None:
+    pose = pose_of(attributes)
+    if pose is None or divergence is None:
         return 0.0
-    origin, axis, far, left = np.reshape(attributes["receiver_pose"], (4, 3))
     along = 0.5e-3 * divergence
     across = 0.5e-3 * (optional_number(attributes, "divergence_across_mrad") or divergence)
     turn = math.radians(optional_number(attributes, "ellipse_deg") or 0.0)
@@ -226,7 +227,6 @@ def hidden_share(attributes: Mapping[str, Any], targets: list[dict[str, Any]]) -
     for target in targets:
         line = np.reshape(target.get("seen", []), (-1, 2))
         if len(line) >= 3:
-            rays = np.pad(line, ((0, 0), (0, 1))) - origin
-            corners = np.stack([rays @ far, rays @ left], axis=1) / (rays @ axis)[:, np.newaxis]
+            corners = pose.angles_of(np.pad(line, ((0, 0), (0, 1))) - pose.origin)
             hidden |= inside_outline([corners], angle_x, angle_y)
     return float(np.sum(weight * hidden) / np.sum(weight))

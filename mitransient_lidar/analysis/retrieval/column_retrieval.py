@@ -60,19 +60,6 @@ class WaterEstimate:
         return {"absorption": np.hypot(kd, per_bb * backscattering), "backscattering": backscattering, "kd": kd}
 
 
-def backscatter_of_level(level: npt.ArrayLike, gain: npt.ArrayLike, group_index: float) -> FloatArray:
-    """Return b p(pi) = 2 n_g level/(c0 gain) [1/(m sr)], the backscatter at 180 degrees, including multiple scattering.
-
-    `level` is the power of the column's signal, extrapolated to the surface [W], and `gain` the energy received per
-    backscatter and metre there [J sr]: `LidarSystem.water_gain` times the fraction of the beam in view.
-    """
-    factor = np.asarray(gain, dtype=np.float64)
-    if np.any(factor <= 0):
-        raise UserError(f"gain = {factor.min():g} must be greater than 0")
-    speed = C0 / (2 * group_index)
-    return np.asarray(np.asarray(level, dtype=np.float64) / (speed * factor))
-
-
 def water_of_column(
     decay: npt.ArrayLike,
     backscatter: npt.ArrayLike,
@@ -86,8 +73,9 @@ def water_of_column(
     Parameters
     ----------
     decay, backscatter : array_like
-        Attenuation K along the path of the column's signal, exp(-2 K s) [1/m], and `backscatter_of_level` of its level
-        at the surface, extrapolated with K [1/(m sr)].
+        Attenuation K along the path of the column's signal, exp(-2 K s) [1/m], and backscatter b p(pi)
+        including multiple scattering [1/(m sr)]: the power at the surface, extrapolated with K, over
+        `LidarSystem.column_gain` and the fraction of the beam in view.
     spot_diameter : float
         Diameter of the receiver's field of view on the sea surface [m], at least 6.
     first_path : float
@@ -152,7 +140,7 @@ def bottom_reflectance(
 
     It is rho = pi (c0/2 n_g) backscatter energy/(power cos(alpha)) [1], NaN where the column is unknown, with the
     energy of the bottom echo [J], the power of the column, extrapolated to the time of the echo [W], its
-    `backscatter_of_level` [1/(m sr)], and the angle of the light from the vertical in the water, alpha.
+    backscatter [1/(m sr)], and the angle of the light from the vertical in the water, alpha.
 
     Notes
     -----

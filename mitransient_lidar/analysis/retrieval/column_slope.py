@@ -11,8 +11,9 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, non_negative, positive
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import LidarGeometry, required_number
+from mitransient_lidar.results.geometry import lidar_geometry, required_number
 
 _FEWEST_BINS = 3  # of a fit
 _LARGEST_ERROR = 0.5  # relative standard error of a bin: the logarithm of a noisier one is biased
@@ -120,7 +121,7 @@ def effective_attenuation(dataset: xr.Dataset, min_depth: float, max_depth: floa
     0.287 (waves) to 0.304 (ripples alone, a field of view of 4 mrad).
     """
     beam, view = (required_number(dataset.attrs, name) for name in ("divergence_mrad", "field_of_view_mrad"))
-    geometry = LidarGeometry.from_attributes(dataset.attrs, surface="level")
+    geometry = lidar_geometry(dataset.attrs, surface="level")
     edge = 0.5e-3 * min(BEAM_EDGE * beam, view)
     column = ColumnBins.between(geometry, edge, results.time_axis(dataset), min_depth, max_depth)
     bins = dataset.sizes["time"]

@@ -23,11 +23,13 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
 from mitransient_lidar.physics.sea.surface_echoes import PixelMap, SeaLidar, sea_shots
 from mitransient_lidar.results.geometry import (
-    LidarGeometry,
     LinesOfSight,
+    lidar_geometry,
+    lidar_system,
     optional_number,
     required_number,
     share_in_view,
+    spot_diameter,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -91,7 +93,7 @@ def surface_slopes(
     Times are those of the ``gaussian`` estimator. The light of a pixel is that of a Gaussian beam inside its outline,
     or without outlines a point at its centre.
     """
-    lidar = LidarGeometry.from_attributes(dataset.attrs)
+    lidar = lidar_geometry(dataset.attrs)
     if "pixel" not in dataset.dims or dataset.sizes["pixel"] < 2:
         raise UserError("surface slopes need waveforms of at least 2 pixels over the dimension pixel")
     if slope_deviation is not None and wind_speed is not None:
@@ -109,7 +111,7 @@ def surface_slopes(
         measured = surface_inputs.pixel_echoes(echoes, lidar, light)
         lines = surface_inputs.outlines(dataset)
         beam = 0.5e-3 * required_number(dataset.attrs, "divergence_mrad")
-        sender = SeaLidar(lidar.height, lidar.off_nadir, beam, PixelMap.of_outlines(lines), lidar.refractive_index)
+        sender = SeaLidar(**vars(lidar), beam=beam, pixels=PixelMap.of_outlines(lines))
         sea = surface_slope.slopes_on_sea(measured, sea_shots(sender, *wind), scale)
         per_height = np.array([1, 1, 1 / math.cos(lidar.off_nadir)])
         seen = np.isfinite(time).any(axis=1)
@@ -223,7 +225,7 @@ def bottom(
     is not applied to any, as focusing by waves may have the opposite effect; with fewer shots their scatter is not
     known.
     """
-    lidar = LidarGeometry.from_attributes(dataset.attrs)
+    lidar = lidar_geometry(dataset.attrs)
     summed = _summed(dataset)
     echoes = echo_table.extract(summed, depth_from="mean", layers=2).isel(pixel=0)
     margin = 0.5 * float(echoes.attrs["echo_fwhm_ns"]) * lidar.depth_per_ns
@@ -242,7 +244,7 @@ def bottom(
     ]
     depth = [bottom_depth(distance, path, lidar.height, lidar.off_nadir, one) for distance, path, one in surfaces]
 
-    system = lidar.lidar_system(dataset.attrs, efficiency)
+    system = lidar_system(dataset.attrs, efficiency)
     power, attenuation = column["amplitude"].values, echoes["attenuation"].values
     mean_attenuation = _mean(attenuation)
     if math.isnan(mean_attenuation):
@@ -265,8 +267,7 @@ def bottom(
         reflectance.append(np.pi * energy * np.exp(2 * mean_attenuation * path) / (received * gain))
     slope_corrected = helpful["reflectance"] & np.isfinite(reflectance[1]) & _steadier(reflectance[1], reflectance[0])
     reflectance[1] = np.where(slope_corrected, reflectance[1], reflectance[0])
-    water_gain = system.water_gain(0.0, lidar.off_nadir)
-    backscatter = column_retrieval.backscatter_of_level(_mean(power / share), water_gain, lidar.group_index)
+    backscatter = _mean(power / share) / system.column_gain
     delay = time - echoes["time_ns"].sel(echo="surface").values
     spreading = lidar.spreading(np.nan_to_num(delay) * lidar.metres_per_ns)
     at_bottom = power * spreading * np.exp(-2 * attenuation * delay * lidar.metres_per_ns)
@@ -364,20 +365,20 @@ def water(
     UserError
         If the view is too narrow, the dataset lacks an attribute or a number is out of range.
     """
-    lidar = LidarGeometry.from_attributes(dataset.attrs)
+    lidar = lidar_geometry(dataset.attrs)
     summed = _summed(dataset)
     end = lidar.surface_time_ns + positive("deepest_path", deepest_path) / lidar.metres_per_ns
     echoes = echo_table.extract(summed.isel(time=summed["time"].values < end)).isel(pixel=0)
     column = echoes.sel(echo="column")
     level = column["amplitude"].values
     start = _COLUMN_START * float(echoes.attrs["echo_fwhm_ns"]) * lidar.metres_per_ns
-    gain = lidar.lidar_system(dataset.attrs, efficiency).water_gain(0.0, lidar.off_nadir)
+    gain = lidar_system(dataset.attrs, efficiency).column_gain
     share = share_in_view(dataset)
     share = np.where(share < bottom_errors.LEAST_SHARE, np.nan, share)
-    backscatter = column_retrieval.backscatter_of_level(level / share, gain, lidar.group_index)
+    backscatter = level / share / gain
     decay, decay_error = echoes["attenuation"].values, echoes["attenuation_stderr"].values
     found = column_retrieval.water_of_column(
-        decay, backscatter, lidar.spot_diameter(dataset.attrs), first_path=start, phase_factor=phase_factor
+        decay, backscatter, spot_diameter(dataset.attrs), first_path=start, phase_factor=phase_factor
     )
     table = {
         "column_attenuation": (decay, "1/m", "attenuation of the column's signal along the path"),
@@ -415,7 +416,7 @@ def retrieve(
         efficiency=efficiency,
     )
     parts = [slopes, bottom(dataset, slopes, efficiency=efficiency)]
-    spot = LidarGeometry.from_attributes(dataset.attrs).spot_diameter(dataset.attrs)
+    spot = spot_diameter(dataset.attrs)
     if spot >= column_retrieval.SMALLEST_SPOT:
         parts.append(water(dataset, efficiency=efficiency))
     found = xr.merge(parts, combine_attrs="override", join="exact", compat="override")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.refraction import fresnel
+from mitransient_lidar.physics.lidar.refraction import cos_in_water, fresnel
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class SlopeRefraction:
         length = np.sqrt(1 + a**2 + b**2)
         cos_air = (a * np.sin(off_nadir) + np.cos(off_nadir)) / length
         cos_air = np.where(cos_air > 0, cos_air, np.nan)
-        cos_water = np.sqrt(1 - (1 - cos_air**2) / n**2)
+        cos_water = cos_in_water(cos_air, n)
         return cls(cos_air, cos_water, np.cos(off_nadir) / n + (cos_water - cos_air / n) / length)
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.analysis.retrieval.surface_slope import PixelEchoes, PixelLight
-from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED
 from mitransient_lidar.physics.sea.surface_echoes import LEAST_WIND_SPEED
 from mitransient_lidar.physics.sea.wave_spectrum import GRAVITY
-from mitransient_lidar.results.geometry import LidarGeometry, open_aperture, required_number, two_way_efficiency
+from mitransient_lidar.results.geometry import lidar_system, pose_of, required_number
 
 _MOST_PIXELS = 64  # whose echoes are modelled on a sea
 
@@ -72,8 +72,8 @@ def wind(dataset: xr.Dataset, speed: float | None, direction_deg: float | None) 
             return None
         speed = known
     direction = attributes.get("scene.wind_direction_deg", 0) if direction_deg is None else direction_deg
-    axis = np.asarray(attributes.get("receiver_pose", [0.0, 0, 0, 1, 0]), dtype=np.float64)[3:5]
-    azimuth = math.atan2(axis[1], axis[0]) if np.hypot(*axis) > 1e-9 else 0.0
+    pose = pose_of(attributes)
+    azimuth = 0.0 if pose is None else float(pose.azimuth)
     return speed, math.radians(finite("wind_direction_deg", direction)) - azimuth
 
 
@@ -84,8 +84,8 @@ def energy_scale(dataset: xr.Dataset, efficiency: float | None) -> float | None:
     known = efficiency is not None or "two_way_efficiency" in dataset.attrs or of_scene
     if "signal" in dataset or not known:
         return None
-    energy = 1e-3 * required_number(dataset.attrs, "pulse_energy_mj")
-    return energy * two_way_efficiency(dataset.attrs, efficiency) * open_aperture(dataset.attrs)
+    system = lidar_system(dataset.attrs, efficiency)
+    return system.energy * system.aperture_area
 
 
 def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) -> PixelEchoes:
@@ -100,8 +100,7 @@ def pixel_echoes(echoes: xr.Dataset, lidar: LidarGeometry, light: PixelLight) ->
     # Pixels without a column hide as little as possible.
     column = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(level.T, known.T, strict=True)])
     column = np.maximum(1e-9 * width * column, 1e-6 * np.nanmax(energy, initial=1e-30))
-    ns_per_rad = 2e9 / C0 * lidar.slant_range * math.tan(lidar.off_nadir)
-    return PixelEchoes(time, error, energy, energy_error, column, ns_per_rad * light.spread, width)
+    return PixelEchoes(time, error, energy, energy_error, column, lidar.surface_ns_per_rad * light.spread, width)
 
 
 def outlines(dataset: xr.Dataset) -> list[list[FloatArray]]:

@@ -9,21 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray
-from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import FWHM_PER_SIGMA
-from mitransient_lidar.physics.lidar.refraction import snell
-from mitransient_lidar.results.geometry import (
-    Attributes,
-    LidarGeometry,
-    LinesOfSight,
-    open_aperture,
-    optional_number,
-    required_number,
-    two_way_efficiency,
-)
+from mitransient_lidar.physics.lidar.refraction import snell, turn_by_slope
+from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_system, optional_number
 
 # Constants from 40 random level seas (1 to 10 mrad, 100 to 400 m, 0 to 30 degrees off nadir, absorption 0.04 to 0.25,
 # scattering 0.02 to 0.6 1/m, 3 to 15 m deep), and of waves from shots at 4, 6 and 9 m/s.
@@ -96,7 +87,7 @@ class DepthErrors:
         slope, variance = mean_slope(attributes, width), _slope_variance(attributes)
         height = (highest - lowest) / _HEIGHTS if math.isfinite(highest - lowest) else 0.0
         n, group = geometry.refractive_index, geometry.group_index
-        gain = _column_gain(attributes, geometry)
+        gain = _column_gain(attributes)
         bin_ns = rendered_bin_ns(attributes)
         return cls(lines, shots, width, pulse_ns, n, group, slope, height, variance, gain, bin_ns)
 
@@ -154,7 +145,7 @@ class DepthErrors:
         cos_air = np.cos(lines.off_nadir)
         water = snell(lines.off_nadir, self.refractive_index)
         scattering = np.sqrt(self.attenuation_times_backscattering(attenuation, level))
-        turned = self.slope * np.tan(water) * (1 - cos_air / (self.refractive_index * np.cos(water)))
+        turned = self.slope * np.tan(water) * turn_by_slope(lines.off_nadir, self.refractive_index)
         by_water = _OF_DELAY * scattering * self.beam_width + _OF_RIPPLES * self.slope_variance
         relative = np.hypot(np.hypot(_LEAST, by_water), turned)
         pulse = self.pulse_ns / FWHM_PER_SIGMA
@@ -239,15 +230,12 @@ def _slope_variance(attributes: Attributes) -> float:
     return _TYPICAL_SLOPE_VARIANCE if variance is None else variance
 
 
-def _column_gain(attributes: Attributes, geometry: LidarGeometry) -> float:
+def _column_gain(attributes: Attributes) -> float:
     """Return the power of the column at the surface per backscattering coefficient [W m], NaN if it is unknown.
 
-    The phase function at 180 degrees is taken as bb/(2 pi b); see `column_retrieval.backscatter_of_level`.
+    The phase function at 180 degrees is taken as bb/(2 pi b).
     """
     try:
-        energy = 1e-3 * required_number(attributes, "pulse_energy_mj") * two_way_efficiency(attributes)
-        aperture = open_aperture(attributes)
-        system = LidarSystem(geometry.height, geometry.off_nadir, energy, aperture, geometry.refractive_index)
+        return lidar_system(attributes).column_gain / (2 * math.pi)
     except UserError:
         return math.nan
-    return float(system.water_gain(0.0, geometry.off_nadir)) * C0 / (2 * geometry.group_index) / (2 * math.pi)

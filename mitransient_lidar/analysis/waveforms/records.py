@@ -19,12 +19,14 @@ from mitransient_lidar.analysis.waveforms.surface_times import LEAST_SHARE
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, positive
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.pulse import Pulse
+from mitransient_lidar.physics.lidar.refraction import surface_time_ns
 from mitransient_lidar.physics.receiver.electronics import LogAmplifier
 from mitransient_lidar.results import netcdf
 from mitransient_lidar.results.dataset import check_axes
 from mitransient_lidar.results.formats import input_format
-from mitransient_lidar.results.geometry import Attributes, LidarGeometry, LinesOfSight, required_number
+from mitransient_lidar.results.geometry import Attributes, LinesOfSight, lidar_geometry, required_number
 
 _MOST_SHOTS, _FEWEST_SHOTS = 200, 20  # shots that the correlation of neighbouring samples is estimated from
 _FEWEST_QUIET = 4  # bins before the surface echo that baseline and noise need
@@ -140,7 +142,7 @@ class Waveforms:
         in_blocks = name == "signal" and {"dark_level", "block_level"} <= set(dataset)
         if not np.isfinite(samples).all() and (not in_blocks or np.isinf(samples).any()):
             raise UserError(f"{name} holds values that are not finite: render or record it again")
-        geometry = LidarGeometry.from_attributes(dataset.attrs)
+        geometry = lidar_geometry(dataset.attrs)
         shape = pulse or _pulse(dataset.attrs)
         step = results.time_axis(dataset).bin_width_ns
         response = float(dataset.attrs.get("response_time_ns", 0.0))
@@ -148,7 +150,7 @@ class Waveforms:
         template = Template.of(shape, step if receiver is None else receiver.bin_ns, response, receiver)
         kernel = shape.kernel(step, response) if receiver is None else template.kernel(step)
         # Two-way time per angle from the axis, in the plane of incidence.
-        ns_per_mrad = 2e6 * geometry.height * math.sin(geometry.off_nadir) / (C0 * math.cos(geometry.off_nadir) ** 2)
+        ns_per_mrad = 1e-3 * geometry.surface_ns_per_rad
         given = None if echo_fwhm_ns is None else positive("echo_fwhm_ns", echo_fwhm_ns)
         width = given or _echo_width(dataset, template, ns_per_mrad)
         echo_shape, focusing = EchoShape.of(template), Focusing.from_attributes(dataset.attrs)
@@ -156,7 +158,7 @@ class Waveforms:
         quiet_until = geometry.surface_time_ns - 2 * width - ns_per_mrad * half_view
         # Crests are earlier than the mean sea level.
         heights = np.atleast_1d(dataset.attrs.get("surface_heights_m", 0.0))
-        of_crest = quiet_until - float(heights[-1]) / (0.5e-9 * C0 * math.cos(geometry.off_nadir))
+        of_crest = quiet_until - float(surface_time_ns(heights[-1], geometry.off_nadir))
         if np.count_nonzero(time < of_crest) >= _FEWEST_QUIET:
             quiet_until = of_crest
         pixels = int(np.prod([dataset.sizes[dim] for dim in dims if dim not in ("shot", "time")]))

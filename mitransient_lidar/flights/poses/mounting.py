@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -15,6 +15,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, finite, fini
 from mitransient_lidar.flights.poses.attitude import rotation_matrices
 from mitransient_lidar.flights.poses.scanner import Scanner
 from mitransient_lidar.flights.poses.trajectory import Trajectory
+from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Step of the angles of pixels about their axis [deg], and sine of the angle from nadir below which they have none.
 _TURN_DEG, _LEVEL = 10.0, 1e-6
@@ -66,18 +67,10 @@ class Mounting:
 
 
 @dataclass(frozen=True)
-class PulsePoses:
-    """Lines of sight of pulses in the frame of the scene, x east, y north and z up.
-
-    The direction of a pixel at tangent-plane angles (angle_x, angle_y) is the unit vector along
-    ``axis + angle_x * far + angle_y * left``.
-    """
+class PulsePoses(Pose):
+    """Poses of the scanner at pulses in the frame of the scene, x east, y north and z up."""
 
     time_s: FloatArray  #: Times [s], shape (shots,).
-    origin: FloatArray  #: Positions of the scanner [m], shape (shots, 3).
-    axis: FloatArray  #: Unit directions of the pulses, shape (shots, 3).
-    far: FloatArray  #: Unit directions of +angle_x, normal to the axis, shape (shots, 3).
-    left: FloatArray  #: Unit directions of +angle_y, far x axis, shape (shots, 3).
     #: Angles of the pulses across the flight from the vertical [deg], positive to the right of the platform's forward
     #: axis, so that a roll counts as in LAS files, shape (shots,).
     scan_angle_deg: FloatArray
@@ -121,17 +114,19 @@ def pulse_poses(trajectory: Trajectory, mounting: Mounting, scanner: Scanner, ti
     )
 
 
-def pixel_turns(axis: FloatArray, far: FloatArray) -> FloatArray:
+def poses_of(column: Callable[[str], FloatArray]) -> Pose:
+    """Return the poses of pulses from columns such as ``origin_x``, by their names."""
+    names = ("origin", "axis", "far", "left")
+    return Pose(*(np.column_stack([column(f"{name}_{axis}") for axis in "xyz"]) for name in names))
+
+
+def pixel_turns(poses: Pose) -> FloatArray:
     """Return the angles [deg] by which pixels are turned about their axis, from far to left, shape (shots,).
 
     They are those to the plane of incidence, rounded to multiples of 10 degrees, -170 to 180; 0 of an axis that is
     vertical.
-
-    Parameters
-    ----------
-    axis, far
-        Unit directions of the pulses and of +angle_x, shape (shots, 3).
     """
+    axis, far = poses.axis, poses.far
     # Left of the plane of incidence is level.
     left = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
     outwards = np.cross(axis, left)

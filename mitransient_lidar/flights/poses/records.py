@@ -14,7 +14,7 @@ from mitransient_lidar.core.validation import FloatArray
 _LARGEST = 1e12
 
 
-class Records(NamedTuple):
+class TrajectoryRecords(NamedTuple):
     """Positions and attitudes of a platform, one for each time."""
 
     time_s: FloatArray  #: Times [s], shape (n,).
@@ -24,7 +24,7 @@ class Records(NamedTuple):
     yaw_deg: FloatArray  #: Yaw [deg], shape (n,).
 
 
-def check_records(records: Records, source: str, place: Callable[[int], str]) -> None:
+def check_records(records: TrajectoryRecords, source: str, place: Callable[[int], str]) -> None:
     """Check that there are 2 records or more, of numbers from -1e12 to 1e12, at times that increase.
 
     Parameters

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.toml_files import check_keys, required, table
 from mitransient_lidar.core.validation import FloatArray, finite, finite_array, in_range, integer, positive, shown
-from mitransient_lidar.flights.poses.records import Records
+from mitransient_lidar.flights.poses.records import TrajectoryRecords
 
 #: Most flight lines, and most records of all of them.
 _MOST_LINES, _MOST_RECORDS = 10_000, 10_000_000
@@ -75,7 +75,7 @@ class AttitudeNoise:
         return np.asarray(deviations * lfilter([1.0], [1.0, -kept], normal, axis=1))
 
 
-def straight_lines(given: Mapping[str, Any]) -> tuple[Records, FloatArray]:
+def straight_lines(given: Mapping[str, Any]) -> tuple[TrajectoryRecords, FloatArray]:
     """Return the records of straight flight lines at constant height and speed, and the times of the lines.
 
     Parameters
@@ -127,7 +127,7 @@ def straight_lines(given: Mapping[str, Any]) -> tuple[Records, FloatArray]:
     return records, np.column_stack([begin, begin + duration])
 
 
-def fixed_platform(given: Mapping[str, Any]) -> Records:
+def fixed_platform(given: Mapping[str, Any]) -> TrajectoryRecords:
     """Return the records of a platform that stays where it is, such as a mast.
 
     Parameters
@@ -158,7 +158,7 @@ def _records(
     first: FloatArray,
     velocity: FloatArray,
     yaw: FloatArray,
-) -> Records:
+) -> TrajectoryRecords:
     """Return the records of lines that begin at times [s] and positions [m], with velocities [m/s] and yaws [deg]."""
     noise = AttitudeNoise.of(given.get("noise", {}))
     still = not (noise.roll_deg or noise.pitch_deg or noise.yaw_deg)
@@ -171,7 +171,7 @@ def _records(
     noises = np.stack([noise.sample(since.size, duration / steps, rng) for _ in begin], axis=1)
     roll, pitch = (finite(name, given.get(name, 0.0)) for name in ("roll_deg", "pitch_deg"))
     position = first[:, None] + velocity[:, None] * since[:, None]
-    return Records(
+    return TrajectoryRecords(
         (begin[:, None] + since).ravel(),
         position.reshape(-1, 3),
         (roll + noises[0]).ravel(),

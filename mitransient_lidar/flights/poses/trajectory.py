@@ -16,7 +16,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.toml_files import check_keys, required
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, positive, shown
 from mitransient_lidar.flights.poses.attitude import check_rotation_spec, rotation_matrices
-from mitransient_lidar.flights.poses.records import Records, check_records
+from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
 from mitransient_lidar.flights.poses.straight_lines import fixed_platform, straight_lines
 from mitransient_lidar.flights.poses.trajectory_files import read_sbet_records, read_text_records
 
@@ -96,7 +96,7 @@ class Trajectory:
         if self.interpolation not in INTERPOLATIONS:
             raise UserError(f"interpolation = {shown(self.interpolation)} must be one of {', '.join(INTERPOLATIONS)}")
         count = self.time_s.size
-        for name in Records._fields:
+        for name in TrajectoryRecords._fields:
             shape, wanted = getattr(self, name).shape, (count, 3) if name == "position" else (count,)
             if shape != wanted:
                 raise UserError(f"{name} has the shape {shape}: it must be {wanted}")
@@ -106,9 +106,9 @@ class Trajectory:
         self._check_lines()
 
     @property
-    def records(self) -> Records:
+    def records(self) -> TrajectoryRecords:
         """Times, positions and attitudes of the records."""
-        return Records(self.time_s, self.position, self.roll_deg, self.pitch_deg, self.yaw_deg)
+        return TrajectoryRecords(self.time_s, self.position, self.roll_deg, self.pitch_deg, self.yaw_deg)
 
     @classmethod
     def of(cls, given: Mapping[str, Any], folder: str | os.PathLike[str] = ".") -> Trajectory:

@@ -12,7 +12,7 @@ import numpy as np
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import FloatArray, integer, is_number
-from mitransient_lidar.flights.poses.records import Records, check_records
+from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
 
 #: Columns of a text file, in the order that holds without a heading, and what a heading may call them.
 _COLUMNS = {
@@ -44,7 +44,7 @@ _METRES_PER_DEGREE = 111_130.0
 _LARGEST_DISTORTION = 0.05
 
 
-def read_text_records(path: str | os.PathLike[str]) -> Records:
+def read_text_records(path: str | os.PathLike[str]) -> TrajectoryRecords:
     """Read a trajectory from a text file as HELIOS++ does.
 
     Each line is a record: time [s], roll, pitch, yaw [deg], x, y, z [m], separated by commas, semicolons, tabs or
@@ -82,7 +82,7 @@ def read_text_records(path: str | os.PathLike[str]) -> Records:
             )
         values[row] = [float(cell) for cell in cells]
     columns = {name: values[:, index] for index, name in enumerate(order)}
-    records = Records(
+    records = TrajectoryRecords(
         columns["t"],
         np.column_stack([columns[name] for name in "xyz"]),
         columns["roll"],
@@ -93,7 +93,7 @@ def read_text_records(path: str | os.PathLike[str]) -> Records:
     return records
 
 
-def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
+def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryRecords:
     """Read a trajectory from an SBET file, and project it into a coordinate system.
 
     A record is 17 little-endian 64-bit numbers: time [s]; latitude and longitude [rad] and ellipsoidal height [m] of
@@ -133,7 +133,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
     time, latitude, longitude, height = data[:, :4].T
     with np.errstate(over="ignore", invalid="ignore"):
         roll, pitch, heading = np.degrees([data[:, 7], data[:, 8], data[:, 9] - data[:, 10]])
-    check_records(Records(time, data[:, [2, 1, 3]], roll, pitch, heading), str(path), place)
+    check_records(TrajectoryRecords(time, data[:, [2, 1, 3]], roll, pitch, heading), str(path), place)
     wrong = (np.abs(latitude) > np.pi / 2) | (np.abs(longitude) > 2 * np.pi)
     for row in np.flatnonzero(wrong)[:1]:
         raise UserError(
@@ -146,7 +146,7 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> Records:
             f"{place(row)}: latitude = {np.degrees(latitude[row]):g} and longitude = {np.degrees(longitude[row]):g} deg"
             f" must lie where a metre is a metre within 5 % in epsg = {epsg}; its scale there is {scale[row]:.3g}"
         )
-    return Records(time.copy(), np.column_stack([x, y, height]), roll, pitch, heading + north)
+    return TrajectoryRecords(time.copy(), np.column_stack([x, y, height]), roll, pitch, heading + north)
 
 
 def _projected(

@@ -20,7 +20,7 @@ import numpy as np
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
-from mitransient_lidar.physics.lidar.refraction import fresnel, snell
+from mitransient_lidar.physics.lidar.refraction import fresnel, snell, surface_time_ns, turn_by_slope
 from mitransient_lidar.physics.water.forward_scattering import LARGEST_ANGLE, scattering_angles
 from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
@@ -64,7 +64,7 @@ class EchoEstimate:
         reflectance, _ = fresnel(0.0, self.system.refractive_index)
         geometry = self.system.aperture_area / (4 * np.cos(theta) ** 3 * self.system.height**2)
         energy = self.system.energy * reflectance * density * geometry / len(beam)
-        return Arrivals(beam[:, 0], beam[:, 1], 2e9 / C0 * self.system.height / np.cos(theta), energy)
+        return Arrivals(beam[:, 0], beam[:, 1], surface_time_ns(self.system.height, theta), energy)
 
     def water_and_bottom(self, beam: FloatArray, steps: int, rng: np.random.Generator) -> tuple[Arrivals, Arrivals]:
         """Return the light of the water, in `steps` of equal depth, and of the bottom, of points of the beam.
@@ -82,9 +82,9 @@ class EchoEstimate:
         ripples = [self._ripples(len(beam), rng)[:, None] for _ in range(2)]
 
         def arrivals(depth: FloatArray, returned: FloatArray) -> Arrivals:
-            in_water = depth / self._cosine
+            in_water = depth / self.system.cos_water
             *shifts, delay, kept = spread.at(in_water)
-            distance = self.system.height / np.cos(self.system.off_nadir) + in_water / self.system.refractive_index
+            distance = self.system.slant_range + in_water / self.system.refractive_index
             down, up = ((shift + tilt * in_water) / distance for shift, tilt in zip(shifts, ripples, strict=True))
             lit = beam[:, :1] + 1j * beam[:, 1:] + down
             to_lit, _ = self._rays(lit.real, lit.imag)
@@ -99,11 +99,6 @@ class EchoEstimate:
 
         water = arrivals(depths, np.asarray(backscatter * thickness / cosine))
         return water, arrivals(np.array([self.bottom_depth]), self.reflectance / np.pi * cosine)
-
-    @property
-    def _cosine(self) -> float:
-        """Cosine of the refracted angle of the axis."""
-        return float(np.cos(snell(self.system.off_nadir, self.system.refractive_index)))
 
     def _rays(self, angle_x: FloatArray, angle_y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return angle from the vertical and azimuth [rad] of points in the tangent plane."""
@@ -120,17 +115,17 @@ class EchoEstimate:
     def _ripples(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return deflections by slopes where light enters or leaves the water [rad], as complex numbers.
 
-        Slopes are Gaussian here. A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)).
+        Slopes are Gaussian here.
         """
         root = np.linalg.cholesky(self.slope_covariance)
         slopes = rng.standard_normal((count, 2)) @ root.T
-        factor = 1 - np.cos(self.system.off_nadir) / (self.system.refractive_index * self._cosine)
-        return np.asarray(factor * (slopes[:, 0] + 1j * slopes[:, 1]))
+        turn = turn_by_slope(self.system.off_nadir, self.system.refractive_index)
+        return np.asarray(turn * (slopes[:, 0] + 1j * slopes[:, 1]))
 
     def _scattered(self, count: int, steps: int, rng: np.random.Generator) -> _Spread:
         """Draw the forward scattering of paths, at slant distances to the bottom, on the way down and up."""
         tops = np.append(self.column.layer_tops, np.inf)
-        edges = np.append(tops[tops < self.bottom_depth], self.bottom_depth) / self._cosine
+        edges = np.append(tops[tops < self.bottom_depth], self.bottom_depth) / self.system.cos_water
         b = self.column.scattering[: edges.size - 1]
         optical = np.append(0.0, np.cumsum(b * np.diff(edges)))
         number = rng.poisson(2 * optical[-1], count)
@@ -150,10 +145,9 @@ class EchoEstimate:
         grid = np.linspace(0, edges[-1], steps + 1)
         cell = path * steps + np.minimum(np.searchsorted(grid, distance, side="right") - 1, steps - 1)
         detour = 1 / np.cos(theta) - 1
-        speed = 1e-9 * C0 / self.system.group_index
         is_down = rng.random(path.size) < 0.5
         turns = [part * leg for leg in (is_down, ~is_down) for part in (turn.real, turn.imag)]
-        weights = *turns, detour / speed, detour * self.column.absorption[layer]
+        weights = *turns, detour / (2 * self.system.metres_per_ns), detour * self.column.absorption[layer]
         return _Spread(cell, distance, weights, end, grid, count)
 
 

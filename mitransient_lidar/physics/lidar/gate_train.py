@@ -12,13 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import (
     FloatArray,
     finite,
-    finite_array,
-    in_range,
     integer,
     non_negative,
     positive,
@@ -217,36 +214,6 @@ class GateTrain:
         return np.asarray(np.diff(within, axis=0) * (self.pulses / axis.bin_width_ns))
 
 
-def time_of_depth(depth_m: npt.ArrayLike, surface_time_ns: float, group_index: float, cos_water: float) -> FloatArray:
-    """Arrival time [ns] of an echo on the depth axis, surface_time + 2 n_g depth / (c0 cos_water).
-
-    Parameters
-    ----------
-    depth_m : array_like
-        Depth below the surface [m]; negative above it, with the scale of the water.
-    surface_time_ns : float
-        Time of the surface echo [ns].
-    group_index : float
-        Group index of the water, 1 to 2.
-    cos_water : float
-        Cosine of the refracted angle of the receiver's axis from the vertical, greater than 0 and at most 1.
-    """
-    delay = finite_array("depth_m", depth_m) / _speed(group_index, cos_water)
-    return np.asarray(finite("surface_time_ns", surface_time_ns) + delay)
-
-
-def depth_of_time(time_ns: npt.ArrayLike, surface_time_ns: float, group_index: float, cos_water: float) -> FloatArray:
-    """Depth [m] on the depth axis of an echo at `time_ns` [ns]; the inverse of `time_of_depth`."""
-    delay = finite_array("time_ns", time_ns) - finite("surface_time_ns", surface_time_ns)
-    return np.asarray(delay * _speed(group_index, cos_water))
-
-
-def _speed(group_index: float, cos_water: float) -> float:
-    """Depth per nanosecond of two-way time [m]."""
-    cosine = in_range("cos_water", positive("cos_water", cos_water), 0, 1)
-    return 0.5e-9 * C0 / in_range("group_index", group_index, 1, 2) * cosine
-
-
 @dataclass(frozen=True)
 class GatePlan:
     """Gates of a scene: a train whose start is replaced by one given in time or in depth."""
@@ -255,10 +222,10 @@ class GatePlan:
     start_ns: float | None = None  #: Time of the half height of the first gate's rising edge [ns].
     start_depth: float | None = None  #: Depth of the echoes that arrive at that time [m], without `start_ns`.
 
-    def placed(self, surface_time_ns: float, group_index: float, cos_water: float) -> GateTrain:
-        """Return the train with its start; the arguments are those of `time_of_depth`."""
+    def placed(self, surface_time_ns: float, depth_per_ns: float) -> GateTrain:
+        """Return the train with its start, from the arrival of the surface echo [ns] and the scale of depth [m/ns]."""
         start = self.start_ns
         if start is None:
             assert self.start_depth is not None
-            start = float(time_of_depth(self.start_depth, surface_time_ns, group_index, cos_water))
+            start = surface_time_ns + self.start_depth / depth_per_ns
         return replace(self.train, start_ns=start)

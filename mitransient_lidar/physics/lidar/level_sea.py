@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, finite_array
-from mitransient_lidar.physics.lidar.refraction import tangent_in_air
+
+#: Steps of Newton's method, and the relative change at which it ends.
+_STEPS, _CHANGE = 60, 4e-16
 
 #: Directions nearer to the horizon than this sine are taken as horizontal.
 _SMALLEST_DESCENT = 1e-9
@@ -25,10 +27,26 @@ class LevelSea:
         Indices relative to air from the top down, at least 1, shape (layers,).
     boundaries
         Depths of the boundaries between the layers [m], increasing, shape (layers - 1,).
+    group_index
+        Group indices of the layers; by default the refractive indices.
     """
 
     refractive_index: tuple[float, ...]
     boundaries: tuple[float, ...] = ()
+    group_index: tuple[float, ...] | None = None
+
+    def lengths(self, depth: npt.ArrayLike, sine: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the optical length of rays from the sea level to depths, and the horizontal one over the sine [m].
+
+        Depths [m] and sines of the angles from the vertical in the air broadcast; lengths to points in the air are 0.
+        """
+        depth, sine = np.asarray(depth, dtype=np.float64), np.asarray(sine, dtype=np.float64)
+        optical = horizontal = np.zeros(np.broadcast_shapes(depth.shape, sine.shape))
+        groups = self.group_index or self.refractive_index
+        for index, group, thickness in zip(self.refractive_index, groups, self._thickness(depth), strict=True):
+            length = thickness / np.sqrt(index**2 - sine**2)
+            optical, horizontal = optical + group * index * length, horizontal + length
+        return optical, horizontal
 
     def at_height(self, origin: FloatArray, directions: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
         """Return where rays from points in the air meet a height, in the air or in the water.
@@ -52,10 +70,7 @@ class LevelSea:
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         sine = np.hypot(rays[..., 0], rays[..., 1])
         down = np.where(rays[..., 2] < -_SMALLEST_DESCENT, -rays[..., 2], np.nan)
-        distance = (origin[..., 2] - np.maximum(level, 0)) / down
-        for index, thickness in zip(self.refractive_index, self._thickness(-level), strict=True):
-            # Horizontal distance over the sine in the air.
-            distance = distance + thickness / np.sqrt(index**2 - sine**2)
+        distance = (origin[..., 2] - np.maximum(level, 0)) / down + self.lengths(-level, sine)[1]
         return np.asarray(origin[..., :2] + rays[..., :2] * distance[..., None])
 
     def crossing(self, origin: FloatArray, points: npt.ArrayLike) -> FloatArray:
@@ -78,11 +93,28 @@ class LevelSea:
         points = finite_array("points", points)
         offset, height = points[..., :2] - origin[:2], float(origin[2])
         target = np.linalg.norm(offset, axis=-1)
-        layers = list(zip(self.refractive_index, self._thickness(-points[..., 2]), strict=True))
-        in_water = height * tangent_in_air(target, height, layers) / np.where(target > 0, target, 1)
+        in_water = height * self._tangents(target, height, -points[..., 2]) / np.where(target > 0, target, 1)
         drop = np.where(points[..., 2] < height, height - points[..., 2], np.nan)
         share = np.where(points[..., 2] > 0, height / drop, np.where(target > 0, in_water, 0))
         return np.asarray(origin[:2] + offset * share[..., None])
+
+    def _tangents(self, distance: FloatArray, height: float, depth: FloatArray) -> FloatArray:
+        """Return the tangents of the angles from the vertical in air of rays between points in air and in the water.
+
+        They are apart by horizontal distances [m]; a height is that above the sea level, positive [m].
+        """
+        # The distance is a concave, increasing function of the tangent: Newton's method from 0 cannot overshoot.
+        t, layers = np.zeros_like(distance), list(zip(self.refractive_index, self._thickness(depth), strict=True))
+        for _ in range(_STEPS):
+            missing, rise = distance - height * t, np.full_like(t, height)
+            for n, thickness in layers:
+                root = np.sqrt(n**2 + (n**2 - 1) * t**2)
+                missing, rise = missing - thickness * t / root, rise + thickness * n**2 / root**3
+            change = missing / rise
+            t = t + change
+            if np.all(np.abs(change) <= _CHANGE * t):
+                break
+        return np.asarray(t)
 
     def _thickness(self, depth: FloatArray) -> list[FloatArray]:
         """Return the thickness of each layer above depths [m]."""

@@ -10,6 +10,8 @@ import numpy as np
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.pose import Pose
 
 #: Level to which light falls in the column before the record ends, and below which a solid counts as invisible.
 COLUMN_LEVEL, SOLID_LEVEL = 1e-6, 1e-12
@@ -46,18 +48,15 @@ class Cone:
 
     Parameters
     ----------
-    origin
-        Position [m], shape (3,), above the sea level.
-    frame
-        Unit vectors of the axis and of the tangent-plane angles, shape (3, 3).
+    pose
+        Position above the sea level, and axis.
     half_angles
         Half angles along the two tangent-plane angles [rad].
     is_round
         Whether the cross-section is an ellipse, or a rectangle.
     """
 
-    origin: FloatArray
-    frame: FloatArray
+    pose: Pose
     half_angles: tuple[float, float]
     is_round: bool = True
 
@@ -68,21 +67,19 @@ class Cone:
         if not self.is_round:
             edge = edge / np.abs(edge).max(axis=1, keepdims=True)
         angles = (np.linspace(0, 1, _CIRCLES + 1)[:, None, None] * edge).reshape(-1, 2) * self.half_angles
-        axis, far, left = self.frame
-        direction = axis + angles[:, :1] * far + angles[:, 1:] * left
+        direction = self.pose.rays(angles)
         sine, down = np.hypot(direction[:, 0], direction[:, 1]), -direction[:, 2]
         with np.errstate(divide="ignore"):
-            distance = np.where(down > 0, (self.origin[2] - z) * sine / np.maximum(down, 0), np.inf)
+            distance = np.where(down > 0, (self.pose.origin[2] - z) * sine / np.maximum(down, 0), np.inf)
         along = np.minimum(distance, reach) / np.where(sine > 0, sine, 1)
-        return np.asarray(self.origin[:2] + direction[:, :2] * along[:, None])
+        return np.asarray(self.pose.origin[:2] + direction[:, :2] * along[:, None])
 
     def holds(self, places: FloatArray, z: float) -> np.ndarray:
         """Return whether places x, y [m] at a height [m] are in the cone."""
-        offset = np.column_stack([places, np.full(len(places), z)]) - self.origin
-        axis, far, left = self.frame
-        ahead = offset @ axis
-        scale = 1 / np.where(ahead > 0, ahead, np.inf)
-        x, y = (np.abs(offset @ side) * scale / half for side, half in zip((far, left), self.half_angles, strict=True))
+        offset = np.column_stack([places, np.full(len(places), z)]) - self.pose.origin
+        ahead = offset @ self.pose.axis
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = np.abs(self.pose.angles_of(offset) / self.half_angles).T
         # The edge of an equal cone is inside, whatever the rounding.
         return np.asarray((ahead > 0) & ((np.hypot(x, y) if self.is_round else np.maximum(x, y)) <= 1 + 1e-9))
 
@@ -125,41 +122,20 @@ class Solid:
 
 
 @dataclass(frozen=True, eq=False)
-class Water:
-    """A level sea in layers, with the decay of its column signal.
+class ColumnDecay:
+    """Decay of the column signal: upper edges of the layers [m], the first one 0, and system attenuation [1/m]."""
 
-    Parameters
-    ----------
-    refractive_index, group_index
-        Indices of the index layers, shape (layers,).
-    boundaries
-        Depths between the index layers [m].
-    tops, attenuation
-        Upper edges of the water layers [m], the first one 0, and their system attenuation [1/m].
-    """
-
-    refractive_index: tuple[float, ...]
-    group_index: tuple[float, ...]
-    boundaries: tuple[float, ...]
     tops: FloatArray
     attenuation: FloatArray
 
-    def path(self, depth: float, sine: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return optical and horizontal length [m] down to a depth [m] of rays with the sine of their angle in air."""
-        edges = [0.0, *self.boundaries, np.inf]
-        thickness = np.clip(depth - np.array(edges[:-1]), 0, np.diff(edges))
-        tilt = sine[:, None] / np.array(self.refractive_index)
-        length = thickness / np.sqrt(1 - tilt**2)
-        return np.asarray(length @ np.array(self.group_index)), np.asarray(np.sum(length * tilt, axis=1))
-
-    def decay(self, depth: float) -> float:
+    def to(self, depth: float) -> float:
         """Return the integral of the attenuation down to a depth [1]."""
         thickness = np.clip(depth - self.tops, 0, np.diff(self.tops, append=np.inf))
         return float(thickness @ self.attenuation)
 
     def depth_of(self, decay: float) -> float:
         """Return the depth [m] at which the integral of the attenuation reaches a value, else that of its end."""
-        edges = np.array([self.decay(top) for top in self.tops])
+        edges = np.array([self.to(top) for top in self.tops])
         layer = int(np.searchsorted(edges, decay, side="right")) - 1
         if self.attenuation[layer] > 0:
             return float(self.tops[layer] + (decay - edges[layer]) / self.attenuation[layer])
@@ -178,33 +154,27 @@ class RecordLimits:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Straight lines from an instrument to places at one height.
+    """Straight lines from an instrument to places x, y [m], shape (n, 2), at one height."""
 
-    Attributes
-    ----------
-    places
-        x, y [m], shape (n, 2).
-    slope
-        Horizontal part of the unit directions, shape (n, 2).
-    length
-        Lengths [m], shape (n,).
-    """
-
+    origin: FloatArray
     places: FloatArray
-    slope: FloatArray
-    length: FloatArray
+    z: float
 
-    @classmethod
-    def between(cls, origin: FloatArray, places: FloatArray, z: float) -> Lines:
-        """Return the lines from a point to places at a height [m]."""
-        offset = places - origin[:2]
-        length = np.sqrt(np.sum(offset**2, axis=1) + (origin[2] - z) ** 2)
-        return cls(places, offset / length[:, None], length)
+    @cached_property
+    def length(self) -> FloatArray:
+        """Lengths [m], shape (n,)."""
+        offset = self.places - self.origin[:2]
+        return np.asarray(np.sqrt(np.sum(offset**2, axis=1) + (self.origin[2] - self.z) ** 2))
 
     @property
     def sine(self) -> FloatArray:
         """Sine of the angle from the vertical."""
-        return np.asarray(np.hypot(*self.slope.T))
+        return np.asarray(np.hypot(*((self.places - self.origin[:2]) / self.length[:, None]).T))
+
+    def below(self, sea: LevelSea, z: float) -> FloatArray:
+        """Return where the lines, refracted by the sea level, meet another height [m], shape (n, 2)."""
+        directions = np.insert(self.places - self.origin[:2], 2, self.z - self.origin[2], axis=1)
+        return sea.at_height(self.origin, directions, z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +185,8 @@ class LidarView:
     ----------
     view, beam
         Field of view with its blur, and beam.
-    water
-        Water below z = 0; by default none.
+    sea, decay
+        Index layers of the water below z = 0, and its signal.
     heights
         Lowest and highest point of the sea [m].
     reach
@@ -227,7 +197,8 @@ class LidarView:
 
     view: Cone
     beam: Cone
-    water: Water
+    sea: LevelSea
+    decay: ColumnDecay
     heights: tuple[float, float]
     reach: float
     column: float | None
@@ -246,11 +217,10 @@ class LidarView:
         (`system_attenuation`), has fallen to 1e-6. Solids where it is below 1e-12 are invisible.
         """
         surface = self._earliest(self.heights[1]), sum(self._latest(self.heights[0]))
-        steepest = float(self._sea[1].sine.min()) / self.water.refractive_index[0]
+        steepest = float(self._at_sea[1].sine.min()) / self.sea.refractive_index[0]
         # Both ways, per vertical metre.
         slant = 2 / np.sqrt(1 - steepest**2)
-        seen = self._footprint(self._sea[1], 0.0)
-        covered = np.zeros(len(seen), dtype=bool)
+        covered = np.zeros(len(self._at_sea[1].places), dtype=bool)
         firsts, lasts = [], []
         for solid in solids:
             limits = self._heights_of(solid)
@@ -259,26 +229,26 @@ class LidarView:
             lowest, highest = limits
             if self.column is None or highest > self.heights[1]:
                 firsts.append(self._earliest(highest))
-            if np.exp(-slant * self.water.decay(-lowest)) >= SOLID_LEVEL:
+            if np.exp(-slant * self.decay.to(-lowest)) >= SOLID_LEVEL:
                 air, in_water = self._latest(lowest)
                 later = min(_SHALLOW * in_water, _LATER_NS + _LATER_SHARE * in_water) + self._crossing_ns
                 later = 0.0 if direct else later
                 lasts.append((air + in_water + later, f"after the echo of shape {solid.name!r}"))
                 low, high = solid.box
-                below = self._footprint(self._sea[1], lowest)
+                below = self._at_sea[1].below(self.sea, min(lowest, 0.0))
                 covered |= np.all((below >= low[:2]) & (below <= high[:2]), axis=1)
         if self.column is not None or not firsts:
             firsts.append(surface[0])
             lasts.append((surface[1], "after the surface echo"))
         if self.column is not None and not direct and np.mean(covered) < _COVERED:
-            depth = max(self.water.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
+            depth = max(self.decay.depth_of(-np.log(COLUMN_LEVEL) / slant), self.column)
             text = f"at a depth of {depth:.3g} m, where the signal of the water has fallen to {COLUMN_LEVEL:g}"
             lasts.append((sum(self._latest(-depth)), text))
         last, end = max(lasts)
         return RecordLimits(min(firsts), last, surface, end)
 
     @cached_property
-    def _sea(self) -> tuple[Lines, Lines]:
+    def _at_sea(self) -> tuple[Lines, Lines]:
         """Lines of laser and receiver to the mean sea level."""
         return self._lines(0.0)[:2]
 
@@ -290,7 +260,8 @@ class LidarView:
         if len(outside) == 0:
             return 0.0
         away = np.linalg.norm(outside[:, None] - beam, axis=-1).min(axis=1)
-        return float(_NS_PER_M * self.water.group_index[0] * min(away.max(), _FARTHEST))
+        index = self.sea.group_index or self.sea.refractive_index
+        return float(_NS_PER_M * index[0] * min(away.max(), _FARTHEST))
 
     def _lines(self, z: float) -> tuple[Lines, Lines, bool]:
         """Return the lines of laser and receiver to a height, and whether they meet in places lit and seen."""
@@ -298,10 +269,10 @@ class LidarView:
         common = np.concatenate([of_view[self.beam.holds(of_view, z)], of_beam[self.view.holds(of_beam, z)]])
         meet = len(common) > 0
         laser, receiver = (common, common) if meet else (of_beam, of_view)
-        return Lines.between(self.beam.origin, laser, z), Lines.between(self.view.origin, receiver, z), meet
+        return Lines(self.beam.pose.origin, laser, z), Lines(self.view.pose.origin, receiver, z), meet
 
     def _below_instruments(self, z: float) -> float:
-        return float(min(z, _HIGHEST * min(self.view.origin[2], self.beam.origin[2])))
+        return float(min(z, _HIGHEST * min(self.view.pose.origin[2], self.beam.pose.origin[2])))
 
     def _earliest(self, z: float) -> float:
         """Return the time of the first light from a height in the air [ns]."""
@@ -313,15 +284,9 @@ class LidarView:
         """Return the times of the last direct light from a height, through the air and in the water [ns]."""
         total = in_water = 0.0
         for lines in self._lines(self._below_instruments(max(z, self.heights[0])))[:2]:
-            optical, _ = self.water.path(-z, lines.sine)
+            optical, _ = self.sea.lengths(-z, lines.sine)
             total, in_water = total + float((lines.length + optical).max()), in_water + float(optical.max())
         return _NS_PER_M * (total - in_water), _NS_PER_M * in_water
-
-    def _footprint(self, lines: Lines, z: float) -> FloatArray:
-        """Return where refracted lines to the sea level meet a height below it [m], shape (n, 2)."""
-        sine = lines.sine
-        _, across = self.water.path(-z, sine)
-        return np.asarray(lines.places + lines.slope * (across / np.where(sine > 0, sine, 1))[:, None])
 
     def _heights_of(self, solid: Solid) -> tuple[float, float] | None:
         """Return limits of the heights of the parts of a solid that may be lit and seen [m], None without such."""
@@ -330,8 +295,8 @@ class LidarView:
         for _ in range(_NARROWINGS):
             corners = []
             for z in heights:
-                lines = self._sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
-                places = np.concatenate([self._footprint(one, min(z, 0.0)) for one in lines])
+                lines = self._at_sea if z <= 0 else self._lines(self._below_instruments(z))[:2]
+                places = np.concatenate([one.below(self.sea, min(z, one.z)) for one in lines])
                 margin = _REACH_PER_DEPTH * max(-z, 0.0)
                 corners += [places.min(axis=0) - margin, places.max(axis=0) + margin]
             narrower = solid.heights_in(np.min(corners, axis=0), np.max(corners, axis=0))

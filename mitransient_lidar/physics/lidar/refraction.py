@@ -5,22 +5,27 @@ Angles are from the vertical, `theta` in air and `phi` in water; n is the index 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
-from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, non_negative_array, positive
-
-#: Steps of Newton's method, and the relative change at which it ends.
-_STEPS, _CHANGE = 60, 4e-16
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
 
 
 def snell(theta: npt.ArrayLike, n: float) -> FloatArray:
     """Angle of refraction [rad] in water of relative index `n` >= 1 for angles `theta` [rad] in air."""
     return np.asarray(np.arcsin(np.sin(finite_array("theta", theta)) / in_range("n", n, 1, np.inf)))
+
+
+def cos_in_water(cosine: npt.ArrayLike, n: float) -> FloatArray:
+    """Return the cosines of angles of refraction in water for those in air, by Snell's law."""
+    return np.asarray(np.sqrt(1 - (1 - np.asarray(cosine, dtype=np.float64) ** 2) / n**2))
+
+
+def turn_by_slope(theta: npt.ArrayLike, n: float) -> FloatArray:
+    """Return the angle by which a slope turns the refracted ray over the slope, 1 - cos(theta)/(n cos(phi))."""
+    angle = np.asarray(theta, dtype=np.float64)
+    return np.asarray(1 - np.cos(angle) / (n * np.sqrt(1 - (np.sin(angle) / n) ** 2)))
 
 
 def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
@@ -37,8 +42,7 @@ def refract(direction: FloatArray, normal: FloatArray, n: float) -> FloatArray:
     """
     unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     cosine = -np.sum(direction * unit, axis=-1, keepdims=True)
-    in_water = np.sqrt(1 - (1 - cosine**2) / n**2)
-    return np.asarray(direction / n + (cosine / n - in_water) * unit)
+    return np.asarray(direction / n + (cosine / n - cos_in_water(cosine, n)) * unit)
 
 
 def refract_level(direction: FloatArray, n: float) -> FloatArray:
@@ -72,65 +76,6 @@ def fresnel(theta: npt.ArrayLike, n: float) -> tuple[FloatArray, FloatArray]:
         p = (n * cos_i - cos_t) / (n * cos_i + cos_t)
     reflectance = np.where(sin_t < 1, 0.5 * (s**2 + p**2), 1.0)
     return reflectance, 1 - reflectance
-
-
-def refracted_path(
-    horizontal: npt.ArrayLike, height: npt.ArrayLike, depth: npt.ArrayLike, n: float
-) -> tuple[FloatArray, FloatArray]:
-    """Angles of the refracted ray between a point in air and a point in the water.
-
-    Parameters
-    ----------
-    horizontal : array_like
-        Horizontal distance rho [m]; the angles have its sign.
-    height : array_like
-        Height of the upper point above the surface [m], positive.
-    depth : array_like
-        Depth of the lower point [m], at least 0.
-    n : float
-        Refractive index of the water, at least 1.
-
-    Returns
-    -------
-    theta, phi : ndarray
-        Angles from the vertical [rad] in air and water that solve H tan(theta) + D tan(phi) = rho.
-    """
-    in_range("n", n, 1, np.inf)
-    rho, h, d = np.broadcast_arrays(
-        finite_array("horizontal", horizontal), finite_array("height", height), non_negative_array("depth", depth)
-    )
-    if np.any(h <= 0):
-        raise UserError(f"height = {h.min():g} must be greater than 0")
-    theta = np.copysign(np.arctan(tangent_in_air(np.abs(rho), h, [(n, d)])), rho)
-    return theta, snell(theta, n)
-
-
-def tangent_in_air(
-    distance: FloatArray, height: FloatArray | float, layers: Sequence[tuple[float, FloatArray]]
-) -> FloatArray:
-    """Return the tangents of the angles from the vertical in air of rays from a point in air to one in the water.
-
-    Parameters
-    ----------
-    distance
-        Horizontal distance of the points [m], at least 0.
-    height
-        Height of the upper point above the surface [m], positive; it broadcasts with the distance.
-    layers
-        Refractive index and thickness [m] of each layer of water above the lower point; thicknesses broadcast, too.
-    """
-    # The distance is a concave, increasing function of the tangent: Newton's method from 0 cannot overshoot.
-    t = np.zeros_like(distance)
-    for _ in range(_STEPS):
-        missing, rise = distance - height * t, height + np.zeros_like(t)
-        for n, thickness in layers:
-            root = np.sqrt(n**2 + (n**2 - 1) * t**2)
-            missing, rise = missing - thickness * t / root, rise + thickness * n**2 / root**3
-        change = missing / rise
-        t = t + change
-        if np.all(np.abs(change) <= _CHANGE * t):
-            break
-    return np.asarray(t)
 
 
 def solid_angle_per_area(height: npt.ArrayLike, depth: npt.ArrayLike, theta: npt.ArrayLike, n: float) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, IntArray, non_negative
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.refraction import snell, turn_by_slope
 
 #: Standard deviations to the limits of 95 % of a normal error, in one dimension and of a circle in two.
 VERTICAL_95, HORIZONTAL_95 = 1.96, 2.45
@@ -86,10 +86,9 @@ def shift_by_slope(off_nadir: float, n: float) -> tuple[float, float]:
     Returns
     -------
     along, across : float
-        Horizontal shift per depth and slope [1], in the line of sight and across it, to first order. A slope s turns
-        the refracted ray by s (1 - cos(theta)/(n cos(theta_w))).
+        Horizontal shift per depth and slope [1], in the line of sight and across it, to first order.
     """
-    turn, cos_water = _turn(off_nadir, n), float(np.cos(snell(off_nadir, n)))
+    turn, cos_water = float(turn_by_slope(off_nadir, n)), float(np.cos(snell(off_nadir, n)))
     return turn / cos_water**2, turn
 
 
@@ -120,8 +119,3 @@ def shift_by_pointing(off_nadir: float, height: float, depth: FloatArray, n: flo
     across = height / cos_air + depth / (n * cos_water)
     up = height * np.tan(off_nadir) + depth * turned * np.tan(water)
     return along, across, up
-
-
-def _turn(off_nadir: float, n: float) -> float:
-    """Return the angle by which a slope turns the refracted ray, over the slope."""
-    return 1 - float(np.cos(off_nadir)) / (n * float(np.cos(snell(off_nadir, n))))

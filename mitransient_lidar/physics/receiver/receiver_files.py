@@ -55,7 +55,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Receiver:
+class ReceiverChannels:
     """Receiver of all channels.
 
     Attributes
@@ -89,7 +89,7 @@ class Receiver:
             if _shape(channel.chain.amplifier) != _shape(self.default.chain.amplifier):
                 raise UserError(f"amplifier of channel {name!r} must have the response of all channels")
 
-    def with_settings(self, gain: Setting | None, optical_density: Setting | None) -> Receiver:
+    def with_settings(self, gain: Setting | None, optical_density: Setting | None) -> ReceiverChannels:
         """Return the receiver with another gain or filter in all channels; None keeps them."""
         changed = {"gain": gain, "optical_density": optical_density}
         given: dict[str, Any] = {key: value for key, value in changed.items() if value is not None}
@@ -101,7 +101,7 @@ class Receiver:
         channels = {name: replace(one, **given) for name, one in self.channels.items()}
         return replace(self, default=replace(self.default, **given), channels=channels)
 
-    def with_channel_settings(self, settings: Mapping[int, tuple[Setting, Setting]]) -> Receiver:
+    def with_channel_settings(self, settings: Mapping[int, tuple[Setting, Setting]]) -> ReceiverChannels:
         """Return the receiver with other gains and filters, by the number of the channel in `all_channels`."""
         changed = self.all_channels
         for number, (gain, density) in settings.items():
@@ -129,7 +129,7 @@ def _shape(amplifier: Amplifier | None) -> tuple[Any, ...] | None:
     return amplifier.bandwidth_mhz, amplifier.response, amplifier.impulse_response
 
 
-def receiver(name: str | os.PathLike[str] | ReceiverChain | Receiver) -> Receiver:
+def receiver(name: str | os.PathLike[str] | ReceiverChain | ReceiverChannels) -> ReceiverChannels:
     """Return a receiver: a preset by name, that of an instrument by name, or one from a TOML file.
 
     Raises
@@ -137,12 +137,12 @@ def receiver(name: str | os.PathLike[str] | ReceiverChain | Receiver) -> Receive
     UserError
         If there is none of that name, or the file is invalid.
     """
-    if isinstance(name, Receiver):
+    if isinstance(name, ReceiverChannels):
         return name
     if isinstance(name, ReceiverChain):
-        return Receiver(Channel(name))
+        return ReceiverChannels(Channel(name))
     if isinstance(name, str) and name in RECEIVERS:
-        return Receiver(Channel(RECEIVERS[name]), name=name)
+        return ReceiverChannels(Channel(RECEIVERS[name]), name=name)
     if isinstance(name, str) and (own := instrument_receiver(name)) is not None:
         return own
     path = Path(name)
@@ -153,7 +153,7 @@ def receiver(name: str | os.PathLike[str] | ReceiverChain | Receiver) -> Receive
     return parse_receiver(read_text(path), str(path), path.parent)
 
 
-def instrument_receiver(instrument: str) -> Receiver | None:
+def instrument_receiver(instrument: str) -> ReceiverChannels | None:
     """Return the receiver of an instrument by its name; None for an unknown one."""
     folder = Path(str(importlib.resources.files("mitransient_lidar.scenes"))) / "instruments"
     path = folder / f"{instrument}.toml"
@@ -162,7 +162,7 @@ def instrument_receiver(instrument: str) -> Receiver | None:
     return replace(parse_receiver(read_text(path), path.name, folder), name=instrument)
 
 
-def parse_receiver(text: str, name: str, folder: Path) -> Receiver:
+def parse_receiver(text: str, name: str, folder: Path) -> ReceiverChannels:
     """Return the receiver that the text of a TOML file describes.
 
     Keys of the file: ``preset`` (a receiver of `presets.RECEIVERS` whose stages count where the file has no others),
@@ -195,7 +195,7 @@ def parse_receiver(text: str, name: str, folder: Path) -> Receiver:
         channels[channel] = _channel(label, own, default, folder, {})
     rate = values.get("pulse_repetition_khz")
     rate = None if rate is None else positive("pulse_repetition_khz", rate)
-    return Receiver(default, channels, rate, name)
+    return ReceiverChannels(default, channels, rate, name)
 
 
 def _channel(

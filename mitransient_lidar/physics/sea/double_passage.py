@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.refraction import turn_by_slope
 from mitransient_lidar.physics.sea.wave_spectrum import WaveSpectrum
 
 #: Shortest wave, a capillary one [m], and longest distances over which slopes differ [m].
@@ -125,12 +126,11 @@ class EnhancementTable:
 def slope_spread(off_nadir: float, refractive_index: float) -> float:
     """Return the displacement of a ray over depth and slope [1], at an angle from the vertical in air [rad].
 
-    A slope turns the refracted ray by it times 1 - cos(theta)/(n cos(phi)), with the refracted angle phi. The point at
-    a depth moves by this factor across the plane of incidence, and by 1/cos^2(phi) of it in the plane: this is the
-    geometric mean.
+    The point at a depth moves by `turn_by_slope` across the plane of incidence, and by 1/cos^2(phi) of it, with the
+    refracted angle phi, in the plane: this is the geometric mean.
     """
     cos_water = np.sqrt(1 - (np.sin(off_nadir) / refractive_index) ** 2)
-    return float((1 - np.cos(off_nadir) / (refractive_index * cos_water)) / cos_water)
+    return float(turn_by_slope(off_nadir, refractive_index) / cos_water)
 
 
 def slope_structures(

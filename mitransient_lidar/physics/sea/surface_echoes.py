@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.validation import FloatArray, in_range
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.refraction import fresnel
 from mitransient_lidar.physics.sea.cox_munk import MAX_WIND_SPEED, cox_munk
 from mitransient_lidar.physics.sea.realization import realise
@@ -84,32 +85,12 @@ def inside_outline(lines: list[FloatArray], x: FloatArray, y: FloatArray) -> Boo
     return odd
 
 
-@dataclass(frozen=True)
-class SeaLidar:
-    """Lidar above a sea, with receiver and transmitter at one place and on one axis.
+@dataclass(frozen=True, kw_only=True)
+class SeaLidar(LidarGeometry):
+    """Lidar above a sea, with receiver and transmitter at one place and on one axis."""
 
-    Attributes
-    ----------
-    height, off_nadir
-        Height above the mean sea level [m], positive, and angle of the axis from the vertical [rad], 0 to below pi/2.
-    beam
-        Standard deviation of the Gaussian beam [rad], positive.
-    pixels
-        Pixels of the receiver.
-    refractive_index
-        That of the water, at least 1.
-    """
-
-    height: float
-    off_nadir: float
-    beam: float
-    pixels: PixelMap
-    refractive_index: float
-
-    @property
-    def slant_range(self) -> float:
-        """Distance to the mean sea level along the axis [m]."""
-        return self.height / math.cos(self.off_nadir)
+    beam: float  #: Standard deviation of the Gaussian beam [rad], positive.
+    pixels: PixelMap  #: Pixels of the receiver.
 
     @property
     def half_angle(self) -> float:

@@ -25,14 +25,14 @@ _ANGLE = Column("angle", ("theta", "scattering angle"), _DEGREES)
 _VALUE = Column("value", ("p", "phase function", "beta", "beta tilde", "vsf", "volume scattering function"))
 
 
-class MeasuredPhase(NamedTuple):
+class PhaseOfFile(NamedTuple):
     """A phase function from a table."""
 
     table: PowerLawTable  #: The phase function, normalised to 1 over the sphere.
     integral: float  #: Integral of the given values over the sphere; 1 if they were normalised in 1/sr.
 
 
-def read_phase_table(path: str | PathLike[str]) -> MeasuredPhase:
+def read_phase_table(path: str | PathLike[str]) -> PhaseOfFile:
     """Read a phase function from a file.
 
     Parameters
@@ -44,7 +44,7 @@ def read_phase_table(path: str | PathLike[str]) -> MeasuredPhase:
 
     Returns
     -------
-    MeasuredPhase
+    PhaseOfFile
         The normalised phase function, and the integral by which the values were divided.
 
     Raises
@@ -64,7 +64,7 @@ def read_phase_table(path: str | PathLike[str]) -> MeasuredPhase:
     theta, value = _read_columns(path)
     raw = _interpolation(path, theta, value)
     table = PowerLawTable.from_function(raw, _COUNT)
-    return MeasuredPhase(table, float(raw(np.pi) / table.value[-1]))
+    return PhaseOfFile(table, float(raw(np.pi) / table.value[-1]))
 
 
 def _interpolation(path: str | PathLike[str], theta: FloatArray, value: FloatArray) -> PhaseFunction:

@@ -8,7 +8,7 @@ import xarray as xr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results.dataset import record_dims, time_axis
 from mitransient_lidar.results.formats import picture_order
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight
+from mitransient_lidar.results.geometry import LinesOfSight, lidar_geometry
 from mitransient_lidar.results.schema import check_attributes, check_coordinates
 
 #: Variables with a record in time, and their errors; of a signal the standard deviation of one record.
@@ -68,7 +68,7 @@ def time_bins(record: xr.Dataset) -> xr.Dataset:
     """
     axis = time_axis(record)
     try:
-        depth = LidarGeometry.from_attributes(record.attrs, surface="measured").depth_of_time(axis.centres_ns)
+        depth = lidar_geometry(record.attrs, surface="measured").depth_of_time(axis.centres_ns)
     except UserError:
         depth = np.full(axis.bin_count, np.nan)
     bins = record.drop_vars(["time", "waveform_stderr"]).rename(waveform="gate_energy", time="gate")

@@ -67,12 +67,14 @@ def system(_renders: Renders) -> Figure:
 
 def mesh(renders: Renders) -> Figure:
     """Draw axes refracted at facets of the sea, and its triangles with the footprints (figure 6)."""
+    from mitransient_lidar.transport.scene_parts import seas_of
+
     numbers, session = System.of(_SCENE), renders.session(_SCENE)
-    sea = next(shape.sea for shape in session.scene.shapes() if hasattr(shape, "sea"))
+    sea = seas_of(session.scene)[0].sea
     figure = drawing.new_figure(None, 9.6, 4.6)
     left, right = figure.subplots(1, 2)
     count = round(_HALF_SIDE / sea.cell_size)
-    lines = np.arange(-count, count + 1) * sea.cell_size
+    lines = np.asarray(np.arange(-count, count + 1) * sea.cell_size, dtype=np.float64)
     heights = sea.heights(lines, lines)
     _draw_section(left, numbers, lines, heights[count])
     reach = 0.55 * numbers.field_of_view * numbers.slant_range / math.cos(numbers.off_nadir)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.loading.catalogue import scene_parameters
-from mitransient_lidar.physics.lidar.refraction import snell
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.sea_map import Shot
 from mitransient_lidar.studies.publication.renders import Renders
 from mitransient_lidar.studies.publication.statements import Statement
@@ -29,30 +29,26 @@ _PUBLISHED_ANGLE = math.degrees(math.asin(math.sin(math.radians(20)) / 1.34))
 _LEAST_FIELD_OF_VIEW = 0.010
 
 
-class System(NamedTuple):
-    """Numbers of the lidar of a scene: angles [rad], height and depth [m]."""
+@dataclass(frozen=True, kw_only=True)
+class System(LidarGeometry):
+    """Lidar of a scene: divergence and field of view [rad], and depth of the bottom [m]."""
 
-    off_nadir: float
-    height: float
     divergence: float
     field_of_view: float
-    refractive_index: float
     bottom_depth: float
 
     @classmethod
     def of(cls, scene: str) -> System:
         """Read the parameters of a scene."""
         values = scene_parameters(scene)
-        divergence, view = (1e-3 * float(values[f"{name}_mrad"]) for name in ("divergence", "field_of_view"))
-        index, depth = float(values["refractive_index"]), float(values["bottom_depth"])
         return cls(
-            math.radians(float(values["off_nadir_deg"])), float(values["altitude"]), divergence, view, index, depth
+            float(values["altitude"]),
+            math.radians(float(values["off_nadir_deg"])),
+            *(float(values[name]) for name in ("refractive_index", "group_index")),
+            divergence=1e-3 * float(values["divergence_mrad"]),
+            field_of_view=1e-3 * float(values["field_of_view_mrad"]),
+            bottom_depth=float(values["bottom_depth"]),
         )
-
-    @property
-    def slant_range(self) -> float:
-        """Distance to the mean sea level along the axis [m]."""
-        return self.height / math.cos(self.off_nadir)
 
 
 def outlines(renders: Renders, scene: str) -> list[list[FloatArray]]:
@@ -78,7 +74,7 @@ def shot_slopes(renders: Renders) -> list[tuple[float, float]]:
 def system_statements(_renders: Renders) -> list[Statement]:
     """Return the statements about the system (figure 5)."""
     system = System.of("fig09_2x2")
-    angle = math.degrees(float(snell(system.off_nadir, system.refractive_index)))
+    angle = math.degrees(system.angle_in_water)
     spot = system.slant_range * system.divergence
     where = "parameters of the scene fig09_2x2, level sea"
     narrow = _LEAST_FIELD_OF_VIEW * system.slant_range

@@ -14,11 +14,12 @@ import xarray as xr
 
 from mitransient_lidar.core.validation import integer, positive
 from mitransient_lidar.loading.catalogue import scene_parameters
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
 from mitransient_lidar.rendering.session import Session, open_scene
 from mitransient_lidar.rendering.shot_series import random_places, render_shots
-from mitransient_lidar.results.geometry import LidarGeometry
+from mitransient_lidar.results.geometry import lidar_geometry
 from mitransient_lidar.studies.publication.measures import Series
 
 _LOG = logging.getLogger(__name__)
@@ -151,7 +152,7 @@ def joined(series: Sequence[Series]) -> Series:
 
 def geometry_of(result: xr.Dataset) -> LidarGeometry:
     """Return the geometry on the axis over a level sea, whose surface is the zero of the depth axis."""
-    return LidarGeometry.from_attributes(result.attrs, surface="level")
+    return lidar_geometry(result.attrs, surface="level")
 
 
 def echo_gate(result: xr.Dataset, depth: float, half_ns: float = 11.0) -> tuple[float, float]:

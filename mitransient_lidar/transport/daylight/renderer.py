@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -149,3 +150,14 @@ class DaylightRenderer:
         record.found = dr.select(light.invalid, dr.nan, record.found)
         dr.eval(record.found, record.sampled, record.edge_loss, record.rays)
         return record
+
+
+@runtime_checkable
+class DaylightIntegrator(Protocol):
+    """The integrator ``passive_volpath``."""
+
+    plugin: str
+    passive: bool
+
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor) -> DaylightRenderer:
+        """Return the renderer of passes of a scene."""

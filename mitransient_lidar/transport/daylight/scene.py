@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.transport.plugin_types import Daylight, Sky, Sun, Transmitter
+from mitransient_lidar.transport.plugin_types import Daylight, SkyEmitter, SunEmitter, Transmitter
 from mitransient_lidar.transport.scene import WaterScene
 from mitransient_lidar.transport.scene_parts import find_receiver, find_water, fit_seas
 
@@ -26,8 +26,8 @@ class DaylightScene(WaterScene):
         The ``sun`` and the ``sky`` plugins, None where there is none; at least one is present.
     """
 
-    sun: Sun | None
-    sky: Sky | None
+    sun: SunEmitter | None
+    sky: SkyEmitter | None
 
     @classmethod
     def from_scene(cls, scene: mi.Scene, sensor: mi.Sensor) -> DaylightScene:
@@ -66,7 +66,7 @@ class DaylightScene(WaterScene):
         return mi.Vector3f(0, 0, 1) if self.sun is None else self.sun.sample(u)
 
 
-def _check_sun(sun: Sun, sky: Sky) -> None:
+def _check_sun(sun: SunEmitter, sky: SkyEmitter) -> None:
     """Refuse a clear sky with another direction of the sun."""
     apart = float(np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(sun.direction - sky.sun))))
     if apart > _SAME_DIRECTION_DEG:

@@ -27,7 +27,7 @@ class BeamSampler:
     def __init__(self, transmitter: mi.Emitter, receiver: Receiver) -> None:
         self.transmitter = transmitter
         spot = receiver.pose.ground_point()
-        self.centre = [opaque(angle) for angle in transmitter.pose.tangent_of_point(spot)]
+        self.centre = [opaque(angle) for angle in transmitter.pose.angles_of(spot - transmitter.pose.origin)]
         ranges = [float(np.linalg.norm(spot - pose.origin)) for pose in (receiver.pose, transmitter.pose)]
         self.view = Sector(_ROOM * 0.5 * receiver.pixels.field_of_view * ranges[0] / ranges[1])
         angle_x, angle_y = transmitter.sample_tangent(unit_points(4096))

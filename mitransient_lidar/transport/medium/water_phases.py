@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -59,7 +59,7 @@ class ScattererPhases:
         self._stack = TabulatedPhase(*tables) if alike and self._single is None else None
         self._numbers: mi.UInt32 | None = None
 
-    def at(self, scatterer: mi.UInt32) -> Any:
+    def at(self, scatterer: mi.UInt32) -> mi.PhaseFunctionPtr | NumberedPhase:
         """Return the phase function of each lane's scatterer, with Mitsuba's ``eval_pdf`` and ``sample``."""
         if self._single is not None:
             return self._single

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +13,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.lidar.refraction import refract_level
 from mitransient_lidar.transport.opaque import aligned, opaque, opaque_index
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, pass_streams, unit_points
 from mitransient_lidar.transport.scene import LidarScene
 from mitransient_lidar.transport.sensor.receiver import SensorSampler
@@ -120,7 +119,7 @@ class Region:
         )
 
 
-def meet_sea(scene: LidarScene, pose: Pose, angles: mi.Point2f) -> FloatArray:
+def meet_sea(scene: LidarScene, pose: KernelPose, angles: mi.Point2f) -> FloatArray:
     """Return where rays from a pose at tangent-plane angles meet the sea, or else its mean level [m], shape (n, 3).
 
     NaN for rays that do not go down.
@@ -148,9 +147,7 @@ def beam_entries(scene: LidarScene, shots: int = 1) -> FloatArray:
     found: FloatArray = offset.reshape(shots, -1, 3).mean(axis=1)
     if scene.transmitter_poses is None:
         return found
-    origin, axis = scene.transmitter_poses.origin, scene.transmitter_poses.axis
-    spots = origin - axis * (origin[:, 2:] / axis[:, 2:])
-    return np.asarray(found + spots - scene.transmitter.pose.ground_point())
+    return np.asarray(found + scene.transmitter_poses.ground_point() - scene.transmitter.pose.ground_point())
 
 
 @dataclass(frozen=True)
@@ -170,7 +167,7 @@ class _Grid:
     """
 
     values: mi.Float
-    kind: Any
+    kind: type[mi.Float] | type[mi.UInt32]
     low: mi.Point2f
     per_metre: mi.Point2f
     cells: int
@@ -187,7 +184,7 @@ class _Grid:
         start = (lanes.shot // copies) * (self.cells * self.cells)
         return replace(self, low=lanes.pick(self.low), start=start)
 
-    def at(self, x: mi.Float, y: mi.Float) -> tuple[Any, mi.Float, mi.Float]:
+    def at(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float | mi.UInt32, mi.Float, mi.Float]:
         """Return values at (x, y) [m], or those of the nearest point; and offsets from the centres of cells [m]."""
         along, across = (x - self.low.x) * self.per_metre.x, (y - self.low.y) * self.per_metre.y
         i, j = (dr.clip(mi.Int32(dr.floor(number)), 0, self.cells - 1) for number in (along, across))

@@ -238,13 +238,12 @@ class MergingLayout:
                 *(region, np.zeros(3), uneven, grid, rings, spacing, reach, depth, *patches, None, segments, segments),
                 widens=not options.cell_size,
             )
-        footprint = scene.transmitter.angular_spread * float(np.linalg.norm(pose.ground_point() - pose.origin))
+        footprint = scene.transmitter.angular_spread * pose.ground_range
         entries = beam_entries(scene)
         rings = BeamRings(pose, footprint, scene.refractive_index, tilt=scene.mean_slopes(1)).of_entries(entries)
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
-        receiver = scene.receiver.pose
-        view = scene.receiver.pixels.field_of_view * float(np.linalg.norm(receiver.ground_point() - receiver.origin))
+        view = scene.receiver.pixels.field_of_view * scene.receiver.pose.ground_range
         widths = _CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet, _CELL_PER_VIEW * view
         width = options.cell_size or min(widths)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())

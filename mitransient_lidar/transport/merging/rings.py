@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import refract as refract_at_facet
 from mitransient_lidar.transport.opaque import aligned, opaque
-from mitransient_lidar.transport.pose import Pose
 from mitransient_lidar.transport.rng import Lanes
 from mitransient_lidar.transport.snell import refract
 

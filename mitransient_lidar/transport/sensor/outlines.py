@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitransient_lidar.transport.sensor.fov_shapes import FovShape
-from mitransient_lidar.transport.sensor.pixels import PixelArray
+from mitransient_lidar.transport.sensor.pixels import PixelArray, ShapedPixels
 
 #: Points along each side of the raster on which a region is traced, bisections that find its outline to 1/1000 of a
 #: cell, and largest distance of simplified lines from the points that they leave out, in cells.
@@ -34,10 +34,9 @@ def enclosed_area(loop: Outline) -> float:
 
 def pixel_outlines(pixels: PixelArray) -> list[list[Outline]]:
     """Return the outlines of each pixel, closed lines (angle_x, angle_y) [rad]; none for very small pixels."""
-    fields = getattr(pixels, "fields", None)
-    if fields is not None:
+    if isinstance(pixels, ShapedPixels):
         # Each by itself: pixels may overlap.
-        return [traced_outlines(_held_by(field), field.bounds()) for field in fields]
+        return [traced_outlines(_held_by(field), field.bounds()) for field in pixels.fields]
 
     def pixel_at(angle_x: NDArray[np.float64], angle_y: NDArray[np.float64]) -> NDArray[np.int64]:
         index, held = pixels.pixel_at(mi.Float(angle_x), mi.Float(angle_y), mi.Float(0.5))

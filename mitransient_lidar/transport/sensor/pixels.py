@@ -53,6 +53,8 @@ class PixelArray(ABC):
         Full angle that contains all pixels [rad]: diameter or side about the axis.
     field_of_view_shape
         ``circle``, ``square``, ``rectangle`` or ``nested``.
+    sides
+        Full angles along angle_x and angle_y [rad] of rows and columns of pixels, else None.
     """
 
     names: list[str]
@@ -61,6 +63,7 @@ class PixelArray(ABC):
     area: float
     field_of_view: float
     field_of_view_shape: str
+    sides: tuple[float, float] | None = None
 
     @property
     def count(self) -> int:
@@ -101,6 +104,8 @@ class LayoutPixels(PixelArray):
         Share of each cell that receives light, 0.01 to 1: a smaller rectangle about the same centre, cut by the circle.
     """
 
+    sides: tuple[float, float]
+
     def __init__(
         self,
         layout: str,
@@ -112,7 +117,6 @@ class LayoutPixels(PixelArray):
         rows, columns = parse_layout(layout)
         if shape not in FIELD_SHAPES:
             raise UserError(f"field_of_view_shape = {shape!r} must be one of {', '.join(FIELD_SHAPES)}")
-        #: Sides along angle_x and angle_y [rad].
         self.sides = field_of_view if isinstance(field_of_view, tuple) else (field_of_view, field_of_view)
         height, width = (0.5 * side for side in self.sides)
         if height != width:

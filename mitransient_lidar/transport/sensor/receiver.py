@@ -11,7 +11,7 @@ import numpy as np
 from mitransient_lidar.core.ranges import ranged
 from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, interleaved_point, pass_streams, stratified_point, unit_points
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
@@ -84,7 +84,7 @@ class Receiver:
     point-spread function `blur`; sharp optics (None) have delta = 0.
     """
 
-    pose: Pose
+    pose: KernelPose
     optics: ReceiverOptics
     pixels: PixelArray
     blur: PointSpread | None = None
@@ -133,7 +133,7 @@ class SensorSample:
     weight: mi.Float
 
     @classmethod
-    def at(cls, pose: Pose, x: mi.Float, y: mi.Float, pixel: mi.UInt32, weight: mi.Float) -> SensorSample:
+    def at(cls, pose: KernelPose, x: mi.Float, y: mi.Float, pixel: mi.UInt32, weight: mi.Float) -> SensorSample:
         """Return samples at tangent-plane angles of a pose."""
         return cls(mi.Point2f(x, y), pose.direction(x, y), pixel, weight)
 
@@ -152,7 +152,7 @@ class SensorSampler:
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
         self.receiver = receiver
         spot, pixels = transmitter.pose.ground_point(), receiver.pixels
-        centre = receiver.pose.tangent_of_point(spot)
+        centre = receiver.pose.angles_of(spot - receiver.pose.origin)
         self.centre = [opaque(angle) for angle in centre]
         ranges = (np.linalg.norm(spot - pose.origin) for pose in (transmitter.pose, receiver.pose))
         spread = transmitter.widest_angular_spread * float(next(ranges)) / float(next(ranges))

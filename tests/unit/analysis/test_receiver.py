@@ -17,7 +17,7 @@ from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.physics.receiver.detectors import LinearDetector, SinglePhotonDetector
 from mitransient_lidar.physics.receiver.electronics import Amplifier, Digitiser
 from mitransient_lidar.physics.receiver.presets import RECEIVERS, ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver
+from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
 from mitransient_lidar.physics.receiver.shot_jitter import ShotJitter
 from mitransient_lidar.results.netcdf import dump
 
@@ -202,7 +202,7 @@ def test_trigger_and_energy_of_channels_with_own_receivers():
     bright = (1e7 * make(bins=60)).assign_attrs(make(bins=60).attrs)
     chain = ReceiverChain(LinearDetector(1.0), jitter=ShotJitter(energy_rms=0.1, trigger_ns=0.3))
     other = replace(chain, detector=LinearDetector(0.5))
-    both = Receiver(Channel(chain), {"green": Channel(other)})
+    both = ReceiverChannels(Channel(chain), {"green": Channel(other)})
     shots = detect_waveforms(bright, both, shots=300, seed=5)
     assert shots.attrs["receiver.jitter.trigger_ns"] == 0.3
     energy = shots["signal"].sum("time")
@@ -213,19 +213,19 @@ def test_trigger_and_energy_of_channels_with_own_receivers():
         assert float(np.abs(values - values.isel(pixel=0)).max()) < 2e-3
         assert abs(float(values.isel(pixel=0).std()) / spread - 1) < largest_z(300) / np.sqrt(600)
     clocks = replace(chain, jitter=ShotJitter(clock_ns=0.3))
-    both = Receiver(Channel(clocks), {"green": Channel(replace(other, jitter=clocks.jitter))})
+    both = ReceiverChannels(Channel(clocks), {"green": Channel(replace(other, jitter=clocks.jitter))})
     shots = detect_waveforms(bright, both, shots=300, seed=5)
     time = (shots["signal"] * shots["time"]).sum("time") / shots["signal"].sum("time")
     assert np.max(np.abs(np.corrcoef(time.T) - np.eye(4))) < largest_z(300, 6) / np.sqrt(300)
     with pytest.raises(UserError, match="jitter of channel 'green' must be that of all channels"):
-        Receiver(Channel(clocks), {"green": Channel(other)})
+        ReceiverChannels(Channel(clocks), {"green": Channel(other)})
 
 
 def test_tails_are_in_the_records_of_every_channel():
     dataset = make(bins=200)
     plain = ReceiverChain(LinearDetector(1.0))
     tailed = replace(plain, detector=LinearDetector(1.0, tail_fractions=(0.1,), tail_decays_ns=(50.0,)))
-    shots = detect_waveforms(dataset, Receiver(Channel(plain), {"black": Channel(tailed)}), shots=2)
+    shots = detect_waveforms(dataset, ReceiverChannels(Channel(plain), {"black": Channel(tailed)}), shots=2)
     behind = shots["signal_mean"].isel(time=slice(60, None))
     # 14 times the width of the echo behind it; 0.1 exp(-t / 50 ns) of its charge is still to come.
     np.testing.assert_allclose(behind.isel(pixel=slice(0, 3)), 0, atol=1e-9)
@@ -368,7 +368,7 @@ def test_invalid_input(call, message):
 
 def two_channels(**of_blue):
     own = Channel(CHAIN, 0.5)
-    return Receiver(own, {"blue": Channel(CHAIN, **of_blue)}, pulse_repetition_khz=10.0, name="two")
+    return ReceiverChannels(own, {"blue": Channel(CHAIN, **of_blue)}, pulse_repetition_khz=10.0, name="two")
 
 
 def test_channels_have_their_own_gain_and_filter():
@@ -390,8 +390,8 @@ def test_channels_have_their_own_gain_and_filter():
 
 def test_a_channel_that_is_named_has_an_automatic_gain_of_its_own():
     strong = make().assign(waveform=make()["waveform"] * 300)
-    both = detect_waveforms(strong, Receiver(Channel(CHAIN, "auto")))
-    apart = detect_waveforms(strong, Receiver(Channel(CHAIN, "auto"), {"red": Channel(CHAIN, "auto")}))
+    both = detect_waveforms(strong, ReceiverChannels(Channel(CHAIN, "auto")))
+    apart = detect_waveforms(strong, ReceiverChannels(Channel(CHAIN, "auto"), {"red": Channel(CHAIN, "auto")}))
     assert not apart["saturated"].any()
     assert apart.attrs["gain"][0] > 2 * both.attrs["gain"]
     assert apart.attrs["gain"][1:] == [both.attrs["gain"]] * 3

@@ -159,7 +159,7 @@ def test_single_scattering_is_that_of_the_oracle(name):
     numbers = single_scattering.numbers
     names = ("altitude", "off_nadir_deg", "refractive_index", "group_index", "divergence_mrad", "field_of_view_mrad")
     height, angle, index, group, beam, view = (float(case[key]) for key in names)
-    system = LidarSystem(height, np.radians(angle), 1.0, 1.0, index, group)
+    system = LidarSystem(height, np.radians(angle), index, group, energy=1.0, aperture_area=1.0)
     layers = [numbers(case[key]) for key in ("layer_tops", "attenuation", "scattering", "backscattering")]
     ratio = layers[3][0] / layers[2][0]
     phase = case["phase_function"] == "hg"

@@ -7,6 +7,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.poses.mounting import Mounting, pixel_turns, pulse_poses
 from mitransient_lidar.flights.poses.scanner import Fixed, Oscillating, Palmer
 from mitransient_lidar.flights.poses.trajectory import Trajectory
+from mitransient_lidar.physics.lidar.pose import Pose
 
 
 def _level(heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height=200.0):
@@ -74,14 +75,16 @@ def test_turns_of_pixels_are_those_to_the_plane_of_incidence():
     trajectory, scan = _level(heading_deg=90), Palmer(nadir_angle_deg=20, rate_hz=1)
     times = np.array([0.0, 0.1, 0.25, 0.5, 0.75])
     poses = pulse_poses(trajectory, Mounting(), scan, times)
-    np.testing.assert_array_equal(pixel_turns(poses.axis, poses.far), 0)
+    np.testing.assert_array_equal(pixel_turns(poses), 0)
     # The scan goes clockwise from above: pixels that stay are turned to the left of it, seen along the pulse.
     poses = pulse_poses(trajectory, Mounting(), replace(scan, pixels="platform"), times)
-    np.testing.assert_array_equal(pixel_turns(poses.axis, poses.far), [0, 40, 90, 180, -90])
+    np.testing.assert_array_equal(pixel_turns(poses), [0, 40, 90, 180, -90])
     # 3 degrees to the left of the scanner's nadir, which the roll turns 5 degrees to the right.
     poses = pulse_poses(_level(roll_deg=-5), Mounting(), Fixed(nadir_angle_deg=3, azimuth_deg=-90), [0.5])
-    np.testing.assert_array_equal(pixel_turns(poses.axis, poses.far), [180])
-    np.testing.assert_array_equal(pixel_turns(np.array([[0, 0, -1.0]]), np.array([[0, 1.0, 0]])), [0])
+    np.testing.assert_array_equal(pixel_turns(poses), [180])
+    np.testing.assert_array_equal(
+        pixel_turns(Pose(*np.array([[[0, 0, 9]], [[0, 0, -1]], [[0, 1, 0]], [[1, 0, 0]]]))), [0]
+    )
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 77.0, 300.0])

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from oracles.refracted_path import refracted_path
 from scipy.spatial.transform import Rotation
 from significance import largest_chi2, largest_z
 from synthetic_shots import DEPTH, THETA, N, result
@@ -15,9 +16,9 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
 from mitransient_lidar.flights.refracted_paths import PoseErrors
-from mitransient_lidar.flights.sea_surface import SeaSurface
+from mitransient_lidar.flights.sea_surface import SurfaceModel
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
-from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.physics.lidar.pose import Pose
 
 GROUP = 1.364
 INDICES = {"refractive_index": N, "group_index": GROUP}
@@ -76,6 +77,11 @@ def echoes(distance, depth, target=None, **errors):
     )
 
 
+def located(made, *, origin, axis, far, left, **options):
+    """Points of pulses whose poses are given by vectors."""
+    return positions(made, Pose(origin, axis, far, left), **options)
+
+
 def found(points, kind):
     """x, y and z of the points of a class."""
     return np.stack([points[name].values[points["kind"].values == kind] for name in "xyz"], axis=-1)
@@ -94,7 +100,7 @@ def test_points_of_a_level_sea_are_those_of_its_solver():
     given = poses(30)
     ray, depth = sights(given), np.random.default_rng(1).uniform(0.5, 30, (30, 4))
     distance = given["origin"][:, 2:] / -ray[..., 2]
-    points = positions(echoes(distance, depth), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
+    points = located(echoes(distance, depth), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
     surface = given["origin"][:, None] + distance[..., None] * ray
     np.testing.assert_allclose(found(points, PointClass.SURFACE), surface.reshape(-1, 3), atol=1e-9)
     bottom = found(points, PointClass.BOTTOM).reshape(30, 4, 3)
@@ -118,7 +124,7 @@ def test_pixels_lie_on_the_side_that_their_angles_name():
     }
     ray = sights(given, np.array([0.01, 0.0, 0.0]), np.array([0.0, 0.01, 0.0]))
     made = echoes(100 / -ray[..., 2], np.full((1, 3), 5.0))
-    points = positions(made, **given, angle_x=[0.01, 0, 0], angle_y=[0, 0.01, 0], **INDICES)
+    points = located(made, **given, angle_x=[0.01, 0, 0], angle_y=[0, 0.01, 0], **INDICES)
     for kind in (PointClass.SURFACE, PointClass.BOTTOM):
         far, left, middle = found(points, kind)
         assert far[1] - middle[1] > 0.9
@@ -142,17 +148,17 @@ def plane_case(slope=(0.07, -0.04), shots=12):
     rng = np.random.default_rng(4)
     spots = np.repeat(place[:, :2], 6, axis=0) + rng.uniform(-0.5, 0.5, (6 * len(place), 2))
     table = np.column_stack([spots, spots @ slope, np.full(len(spots), 1e-7), np.zeros(len(spots))])
-    sea = SeaSurface(0.0, 0.0, 1.0, 0.1, 1.0, table, 0.0)
+    sea = SurfaceModel(0.0, 0.0, 1.0, 0.1, 1.0, table, 0.0)
     return given, made, bottom, sea, length, ray
 
 
 def test_points_under_a_plane_sea_are_exact():
     given, made, bottom, sea, length, ray = plane_case()
     angles = {"angle_x": ANGLE_X, "angle_y": ANGLE_Y, "time_s": np.zeros(12)}
-    exact = positions(made, **given, **angles, **INDICES, surface=sea)
+    exact = located(made, **given, **angles, **INDICES, surface=sea)
     np.testing.assert_allclose(found(exact, PointClass.BOTTOM), bottom, atol=1e-7)
     # As if level, they lie beside by about slope (1 - cos(theta)/(n cos(theta_w))) s.
-    level = positions(made, **given, **angles, **INDICES)
+    level = located(made, **given, **angles, **INDICES)
     beside = np.linalg.norm(found(level, PointClass.BOTTOM) - bottom, axis=1)
     theta, inner = np.arccos(-ray[:, 2]), np.arcsin(np.sin(np.arccos(-ray[:, 2])) / N)
     np.testing.assert_allclose(
@@ -177,15 +183,15 @@ def test_standard_deviations_are_those_of_random_errors(planes):
         **{"surface_ns": noise / per_ns, "place_ns": by_place / per_ns, "time_ns": late / per_ns, "method": method},
     )
     spot = origin + own_range * ray
-    sea = SeaSurface(slope_deviation=prior)
+    sea = SurfaceModel(slope_deviation=prior)
     if planes:
         around = spot[:2] + rng.uniform(-1, 1, (8, 2))
         height = (around - spot[:2]) @ [0.06, 0.03] + 0.2
         table = np.column_stack([around, height, np.full(8, 0.1), np.zeros(8)])
-        sea = SeaSurface(0.0, 0.0, 0.3, prior, 2.0, table, 0.05)
+        sea = SurfaceModel(0.0, 0.0, 0.3, prior, 2.0, table, 0.05)
     height, slope, height_error, slope_error = (values[0] for values in sea.at(spot[None, :2], np.zeros(1)))
     options = {"angle_x": angle_x, "angle_y": angle_y, "forward": forward, "time_s": [0.0], "errors": errors}
-    points = positions(made, **given, **options, **INDICES, surface=sea, view_x=1e-3, view_y=2e-3)
+    points = located(made, **given, **options, **INDICES, surface=sea, view_x=1e-3, view_y=2e-3)
 
     def normal(*shape):
         return rng.normal(size=(draws, *shape))
@@ -246,8 +252,8 @@ def mixed():
 
 def test_waveforms_without_an_echo_keep_a_point_where_they_look():
     given = poses(1)
-    sea = SeaSurface(level=0.4, height_deviation=0.2)
-    points = positions(mixed(), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, surface=sea, errors=NO_ERRORS)
+    sea = SurfaceModel(level=0.4, height_deviation=0.2)
+    points = located(mixed(), **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, surface=sea, errors=NO_ERRORS)
     assert points["kind"].values.tolist() == [41, 43, 40, 40, 41, 45]
     assert points["pixel"].values.tolist() == [0, 0, 0, 1, 2, 3]
     assert points["return_number"].values.tolist() == [1, 2, 3, 1, 1, 1]
@@ -269,10 +275,10 @@ def test_waveforms_without_an_echo_keep_a_point_where_they_look():
 def test_one_echo_of_many_pixels_in_rows_and_columns_is_where_it_is_as_one_of_pixels():
     given, values = poses(3), np.full((3, 4), 6.0)
     made = echoes(given["origin"][:, 2:] / -sights(given)[..., 2], values)
-    expected = positions(made, **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
+    expected = located(made, **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
     grid = made.assign_coords(row=("pixel", [0, 0, 1, 1]), column=("pixel", [0, 1, 0, 1]))
     grid = grid.set_index(pixel=("row", "column")).unstack("pixel")
-    image = positions(grid, **given, angle_x=ANGLE_X.reshape(2, 2), angle_y=ANGLE_Y.reshape(2, 2), **INDICES)
+    image = located(grid, **given, angle_x=ANGLE_X.reshape(2, 2), angle_y=ANGLE_Y.reshape(2, 2), **INDICES)
     xr.testing.assert_identical(image, expected)
 
 
@@ -285,7 +291,7 @@ def test_points_of_measured_waveforms_are_the_true_ones_within_their_errors():
         "left": np.array([[0.0, 1.0, 0.0]]),
     }
     angles = {name: 1e-3 * made[name].values for name in ("angle_x", "angle_y")}
-    points = positions(made.expand_dims("shot"), **given, **angles, refractive_index=N, group_index=N)
+    points = located(made.expand_dims("shot"), **given, **angles, refractive_index=N, group_index=N)
     for kind, height in ((PointClass.SURFACE, 0.0), (PointClass.BOTTOM, -DEPTH)):
         own = points.isel(point=points["kind"].values == kind)
         assert own.sizes["point"] == 4
@@ -300,7 +306,7 @@ def test_the_level_of_the_sea_is_known_within_its_error():
         rng = np.random.default_rng(seed)
         z = 0.35 + 0.1 * rng.normal(size=400) + errors * rng.normal(size=400)
         spots = np.column_stack([rng.uniform(0, 100, (400, 2)), z])
-        levels.append(SeaSurface.fit(spots, errors, np.zeros(400), slope_deviation=0.05, radius=0))
+        levels.append(SurfaceModel.fit(spots, errors, np.zeros(400), slope_deviation=0.05, radius=0))
     z_values = np.array([(one.level - 0.35) / one.level_error for one in levels])
     assert abs(z_values.mean()) < largest_z(10**6) / math.sqrt(60)
     assert (z_values**2).sum() < largest_chi2(60)
@@ -326,7 +332,7 @@ def linear_waves(seed, spacing, error):
 def test_planes_follow_long_waves_and_state_their_errors(spacing, error, largest):
     spots, height, slope = linear_waves(8, spacing, error)
     deviation = slope.std()
-    sea = SeaSurface.fit(spots, np.full(len(spots), error), np.zeros(len(spots)), slope_deviation=deviation)
+    sea = SurfaceModel.fit(spots, np.full(len(spots), error), np.zeros(len(spots)), slope_deviation=deviation)
     middle = np.all((spots[:, :2] > 3) & (spots[:, :2] < 37), axis=1)
     facets = sea.at(spots[middle, :2], np.zeros(middle.sum()))
     wrong = facets.slope - slope[middle]
@@ -350,12 +356,12 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
     # A late surface echo takes from the path in the water.
     made = echoes((300 - height + late)[:, None], (length - late / GROUP)[:, None], surface_ns=noise / (0.5e-9 * C0))
     options = {**given, "angle_x": 0.0, "angle_y": 0.0, **INDICES, "errors": NO_ERRORS, "time_s": np.zeros(count)}
-    first = SeaSurface(slope_deviation=slope.std())
-    sea = fit_surface(positions(made, **options, surface=first), slope.std())
+    first = SurfaceModel(slope_deviation=slope.std())
+    sea = fit_surface(located(made, **options, surface=first), slope.std())
     inner = np.all((spots[:, :2] > 3) & (spots[:, :2] < 37), axis=1)
     wrong = []
     for surface in (first, sea):
-        points = positions(made, **options, surface=surface)
+        points = located(made, **options, surface=surface)
         own = points.isel(point=points["kind"].values == PointClass.BOTTOM).isel(point=inner)
         beside = np.stack([own["x"].values, own["y"].values], axis=-1) - truth[inner, :2]
         wrong.append(np.sqrt((beside**2).sum(axis=1).mean()))
@@ -365,7 +371,7 @@ def test_planes_bring_bottom_points_nearer_and_state_how_near():
 
 def test_planes_forget_waves_of_another_time():
     spots, _, slope = linear_waves(8, 1.0, 0.01)
-    sea = SeaSurface.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
+    sea = SurfaceModel.fit(spots, np.full(len(spots), 0.01), np.zeros(len(spots)), slope_deviation=slope.std())
     later = sea.at(spots[:50, :2], np.full(50, 10.0))
     np.testing.assert_allclose(later.height, sea.level)
     np.testing.assert_allclose(later.slope, 0)
@@ -376,7 +382,7 @@ def test_the_sea_is_fitted_to_surface_points():
     given, waves = poses(200), 0.1 * np.random.default_rng(9).normal(size=(200, 1))
     ray = sights(given)
     made = echoes((given["origin"][:, 2:] - 0.5 - waves) / -ray[..., 2], np.full((200, 4), 9.0))
-    points = positions(made, **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, time_s=0.01 * np.arange(200))
+    points = located(made, **given, angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES, time_s=0.01 * np.arange(200))
     sea = fit_surface(points, 0.05)
     assert sea.points is not None
     assert len(sea.points) == 800
@@ -401,13 +407,13 @@ def test_the_sea_is_fitted_to_surface_points():
         ({"time_s": [0.0, 1.0]}, "must have one time for each of 1 pulses"),
         ({"errors": PoseErrors(roll_deg=0.1)}, "the forward axis of the platform must be given"),
         ({"forward": [0.0, 0.0, 1.0]}, "forward of pulse 0 must not be vertical"),
-        ({"surface": SeaSurface(points=np.zeros((1, 5)), radius=1.0)}, "give time_s"),
+        ({"surface": SurfaceModel(points=np.zeros((1, 5)), radius=1.0)}, "give time_s"),
     ],
 )
 def test_wrong_input_is_refused(changes, message):
     options = {**poses(1), "angle_x": ANGLE_X, "angle_y": ANGLE_Y, **INDICES}
     with pytest.raises(UserError, match=message):
-        positions(mixed(), **{**options, **changes})
+        located(mixed(), **{**options, **changes})
 
 
 @pytest.mark.parametrize(
@@ -424,7 +430,7 @@ def test_wrong_input_is_refused(changes, message):
 )
 def test_other_echoes_are_refused(change, message):
     with pytest.raises(UserError, match=message):
-        positions(change(mixed()), **poses(1), angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
+        located(change(mixed()), **poses(1), angle_x=ANGLE_X, angle_y=ANGLE_Y, **INDICES)
 
 
 def test_standard_deviations_of_poses_are_checked():
@@ -447,4 +453,4 @@ def test_standard_deviations_of_poses_are_checked():
 )
 def test_a_sea_of_wrong_points_is_refused(points, error, options, message):
     with pytest.raises(UserError, match=message):
-        SeaSurface.fit(points, error, np.zeros(3), **{"slope_deviation": 0.1, **options})
+        SurfaceModel.fit(points, error, np.zeros(3), **{"slope_deviation": 0.1, **options})

@@ -11,7 +11,7 @@ from mitransient_lidar.physics.lidar.pulse import Pulse, waveform
 from mitransient_lidar.physics.water.layers import WaterColumn
 
 THETA = np.radians(20)
-SYSTEM = LidarSystem(height=200, off_nadir=THETA, energy=3.645e-3, aperture_area=0.025)
+SYSTEM = LidarSystem(200, THETA, 1.34, 1.34, energy=3.645e-3, aperture_area=0.025)
 WATER = WaterColumn.from_text(0, 0.3, 0.15, 0.006)
 P_BACK = 6.613178e-3
 SLOPES = (0.01836 / 2, 0.01836 / 2)
@@ -167,7 +167,7 @@ def test_waveform_of_the_column(edges, attenuation, power):
 
 
 def test_nadir_beam():
-    system = LidarSystem(height=200, off_nadir=0, energy=1, aperture_area=0.025)
+    system = LidarSystem(200, 0, 1.34, 1.34, energy=1, aperture_area=0.025)
     edges = np.linspace(1334, 1420, 173)
     energy = column_energy_per_bin(edges, system, SIGMA, WATER, P_BACK, 8)
     total = echo_energies(system, SIGMA, WATER, P_BACK, 8, 0.1, SLOPES)

@@ -228,8 +228,11 @@ def test_invalid_results_are_rejected(tmp_path):
     del nowhere.attrs["altitude"]
     with pytest.raises(UserError, match="no altitude and off_nadir_deg among its attributes"):
         plot_layout(nowhere)
-    with pytest.raises(UserError, match="no pixels that look at the sea"):
+    with pytest.raises(UserError, match=r"off_nadir_deg = 100 must lie between 0 and 89\.9"):
         plot_layout(result({"off_nadir_deg": 100.0, "field_of_view_mrad": 30.0}))
+    upwards = {f"{name}_pose": [0.0, 0, 200, 0, 0, 1, 1, 0, 0, 0, -1, 0] for name in ("receiver", "transmitter")}
+    with pytest.raises(UserError, match="no pixels that look at the sea"):
+        plot_layout(result({**upwards, "field_of_view_mrad": 30.0}))
     with pytest.raises(UserError, match=r"must end in \.png, \.pdf or \.svg"):
         plot_layout(result({}), tmp_path / "a.txt")
     results.save(result({}), tmp_path / "a.nc")

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from oracles.refracted_path import refracted_path
 
-from mitransient_lidar.physics.lidar.refraction import refracted_path
 from mitransient_lidar.rendering.describe import axis_on_bottom, describe_layout
 from mitransient_lidar.transport.laser.beam_profiles import enclosed_area
 from mitransient_lidar.transport.scene_parts import find_lidar_scene

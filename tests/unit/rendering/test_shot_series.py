@@ -17,7 +17,7 @@ from mitransient_lidar.rendering import shot_batches, shot_series, shot_truth
 from mitransient_lidar.rendering.render import render_again
 from mitransient_lidar.rendering.shot_poses import ShotPoses
 from mitransient_lidar.rendering.shot_scene import ShotScene
-from mitransient_lidar.transport.pose import Pose
+from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.scene_parts import find_lidar_scene
 
 FLAT = {"spectrum": "flat", "surface_size": 60}
@@ -55,10 +55,10 @@ class Beam:
     widest_angular_spread = 5e-3
 
     def __init__(self, azimuth):
-        pose = Pose.from_angles(200.0, 40.0)
+        pose = KernelPose.from_angles(200.0, 40.0)
         cos, sin = math.cos(azimuth), math.sin(azimuth)
         turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        self.pose = Pose(*(turn @ vector for vector in (pose.origin, pose.axis, pose.far, pose.left)))
+        self.pose = KernelPose(*(turn @ vector for vector in (pose.origin, pose.axis, pose.far, pose.left)))
 
 
 @pytest.mark.parametrize(("k_x", "k_y"), [(0.9, 0.0), (0.3, -0.8), (-0.5, 0.5)])

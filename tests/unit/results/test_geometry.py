@@ -12,7 +12,14 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.results import gate_files, gate_stack
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight, optional_number, share_in_view
+from mitransient_lidar.results.geometry import (
+    LinesOfSight,
+    lidar_geometry,
+    lidar_system,
+    optional_number,
+    share_in_view,
+    spot_diameter,
+)
 
 C0 = 0.299792458  # m/ns
 THETA, N, GROUP = math.radians(20), 1.34, 1.364
@@ -32,7 +39,7 @@ ATTRIBUTES = {
 
 
 def test_times_depths_and_paths():
-    geometry = LidarGeometry.from_attributes({**ATTRIBUTES, "surface_time_ns": 1425.0})
+    geometry = lidar_geometry({**ATTRIBUTES, "surface_time_ns": 1425.0})
     time = 1425.0 + 2 * GROUP * 8.0 / COS_WATER / C0
     assert geometry.time_of_depth(8.0) == pytest.approx(time, abs=1e-9)
     assert geometry.depth_of_time(time) == pytest.approx(8.0, abs=1e-9)
@@ -42,33 +49,33 @@ def test_times_depths_and_paths():
 
 def test_surface_time_of_the_mean_sea_level():
     level = 2 * 200 / math.cos(THETA) / C0
-    assert LidarGeometry.from_attributes(ATTRIBUTES).surface_time_ns == pytest.approx(level)
+    assert lidar_geometry(ATTRIBUTES).surface_time_ns == pytest.approx(level)
     measured = {**ATTRIBUTES, "surface_time_ns": 1425.0}
-    assert LidarGeometry.from_attributes(measured, surface="level").surface_time_ns == pytest.approx(level)
-    assert LidarGeometry.from_attributes(measured, surface="measured").surface_time_ns == 1425.0
+    assert lidar_geometry(measured, surface="level").surface_time_ns == pytest.approx(level)
+    assert lidar_geometry(measured, surface="measured").surface_time_ns == 1425.0
     with pytest.raises(UserError, match="no attribute surface_time_ns"):
-        LidarGeometry.from_attributes(ATTRIBUTES, surface="measured")
+        lidar_geometry(ATTRIBUTES, surface="measured")
 
 
 def test_spreading_at_nadir_is_the_inverse_square():
-    geometry = LidarGeometry.from_attributes({**ATTRIBUTES, "off_nadir_deg": 0.0})
+    geometry = lidar_geometry({**ATTRIBUTES, "off_nadir_deg": 0.0})
     expected = [1.0, 1.0, (N * 200 / (N * 200 + 10)) ** 2]
     assert geometry.spreading([-5.0, 0.0, 10.0]).tolist() == pytest.approx(expected)
 
 
 def test_beam_edge_and_spot():
-    geometry = LidarGeometry.from_attributes(ATTRIBUTES)
+    geometry = lidar_geometry(ATTRIBUTES)
     # The path in water that takes as long as the far edge's longer path in air.
     longer = 200 / math.cos(THETA + 5e-3) - 200 / math.cos(THETA)
     assert geometry.surface_depth(5e-3) == pytest.approx(longer / GROUP * COS_WATER)
-    assert geometry.spot_diameter(ATTRIBUTES) == pytest.approx(0.03 * 200 / math.cos(THETA))
+    assert spot_diameter(ATTRIBUTES) == pytest.approx(0.03 * 200 / math.cos(THETA))
 
 
 def test_system_of_the_lidar_equation():
-    system = LidarGeometry.from_attributes(ATTRIBUTES).lidar_system(ATTRIBUTES)
+    system = lidar_system(ATTRIBUTES)
     assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.9**2 * 0.8), 0.025)
     obscured = {**ATTRIBUTES, "obscuration": 0.3}
-    system = LidarGeometry.from_attributes(obscured).lidar_system(obscured, efficiency=0.5)
+    system = lidar_system(obscured, efficiency=0.5)
     assert (system.energy, system.aperture_area) == (pytest.approx(5e-3 * 0.5), pytest.approx(0.7 * 0.025))
 
 
@@ -88,12 +95,12 @@ def test_share_of_the_beam_in_view():
 def test_numbers_that_are_missing_or_invalid():
     missing = {name: value for name, value in ATTRIBUTES.items() if name != "refractive_index"}
     with pytest.raises(UserError, match="the dataset has no attribute refractive_index"):
-        LidarGeometry.from_attributes(missing)
+        lidar_geometry(missing)
     with pytest.raises(UserError, match="altitude = -1 is under water: this needs a lidar above the sea"):
-        LidarGeometry.from_attributes({**ATTRIBUTES, "altitude": -1.0})
+        lidar_geometry({**ATTRIBUTES, "altitude": -1.0})
     for value in ("high", float("nan")):
         with pytest.raises(UserError, match=r"the attribute altitude = .* must be a number of at least 0"):
-            LidarGeometry.from_attributes({**ATTRIBUTES, "altitude": value})
+            lidar_geometry({**ATTRIBUTES, "altitude": value})
     assert optional_number({"a": "x", "b": 3}, "a") is None
     assert optional_number({"a": "x", "b": -3}, "b") == -3.0
 

@@ -12,7 +12,7 @@ from PIL import Image
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.receiver.detectors import LinearDetector
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
-from mitransient_lidar.physics.receiver.receiver_files import Channel, Receiver
+from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels
 from mitransient_lidar.plots.studies.bounds import plot_bounds
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.studies import bounds as study
@@ -159,7 +159,7 @@ def test_parameters_of_a_design_that_is_not_determined_are_said(rendered):
 
 def test_receivers_are_compared_on_the_same_renders(rendered):
     """A detector of a quantum efficiency of 0.7 without other noise knows counts to 1/sqrt(0.7) times the error."""
-    weak = Receiver(Channel(ReceiverChain(LinearDetector(0.7))), name="weak")
+    weak = ReceiverChannels(Channel(ReceiverChain(LinearDetector(0.7))), name="weak")
     options = {"free": ["attenuation"], "over": {"layout": ["1x1", "2x2"]}, "renders": 2}
     found = study.bounds("table1", SMALL, receiver=["ideal", weak], **options)
     assert len(rendered) == 2 * 2

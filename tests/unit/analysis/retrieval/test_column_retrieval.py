@@ -7,7 +7,6 @@ import pytest
 from oracles.lidar_equation import bottom_energy, column_power, cos_water
 
 from mitransient_lidar.analysis.retrieval.column_retrieval import (
-    backscatter_of_level,
     bottom_class,
     bottom_reflectance,
     water_of_column,
@@ -18,7 +17,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.water_types import water_of
 
 THETA = math.radians(20)
-SYSTEM = LidarSystem(200, THETA, 3.645e-3, 0.025, 1.34, 1.364)
+SYSTEM = LidarSystem(200, THETA, 1.34, 1.364, energy=3.645e-3, aperture_area=0.025)
 A, BB = np.array([0.05, 0.15, 0.4]), np.array([0.002, 0.006, 0.03])
 KD = A + 4.18 * (1 - 0.52 * np.exp(-10.8 * A)) * BB  # Lee, Du and Arnone (2005)
 
@@ -26,8 +25,7 @@ KD = A + 4.18 * (1 - 0.52 * np.exp(-10.8 * A)) * BB  # Lee, Du and Arnone (2005)
 def test_level_of_the_lidar_equation():
     water = WaterColumn([0], [0.3], [0.15], [0.006])
     power = column_power(SYSTEM, water, 1.7e-3, 0.0, THETA)
-    gain = SYSTEM.water_gain(0.0, THETA)
-    assert backscatter_of_level(power, gain, 1.364) == pytest.approx(0.15 * 1.7e-3, rel=1e-12)
+    assert power / SYSTEM.column_gain == pytest.approx(0.15 * 1.7e-3, rel=1e-12)
 
 
 @pytest.mark.parametrize(("spot", "decay"), [(11.0, A + BB), (6.4, KD), (8.5, 0.5 * (A + BB + KD))])
@@ -89,8 +87,3 @@ def test_classes():
 def test_classes_out_of_order(edges):
     with pytest.raises(ValueError, match="must have lower edges that increase from 0"):
         bottom_class(0.1, 0.01, edges)
-
-
-def test_gain_is_checked():
-    with pytest.raises(ValueError, match="gain = 0 must be greater than 0"):
-        backscatter_of_level(1.0, 0.0, 1.34)

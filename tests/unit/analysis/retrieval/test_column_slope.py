@@ -11,8 +11,8 @@ from significance import largest_z
 from mitransient_lidar import results
 from mitransient_lidar.analysis.retrieval.column_slope import ColumnBins, effective_attenuation
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.results.geometry import LidarGeometry
 from mitransient_lidar.studies.fov_sweep import fov_sweep, slope_and_error
 
 C0 = 0.299792458  # m/ns
@@ -54,7 +54,7 @@ def test_standard_error_is_the_scatter_of_the_slope():
 
 def test_jackknife_sees_correlated_bins():
     """Passes with bins correlated in blocks of eight: eight times the variance of independent bins."""
-    geometry = LidarGeometry.level(HEIGHT, 0.0, INDEX, GROUP)
+    geometry = LidarGeometry(HEIGHT, 0.0, INDEX, GROUP)
     time = TimeAxis(2 * HEIGHT / C0 - 0.25, 0.5, 100)
     column = ColumnBins.between(geometry, 1e-3, time, 0.5, 5.0)
     bins, rng = column.inside.size, np.random.default_rng(3)

@@ -35,7 +35,7 @@ def test_refraction_keeps_the_tangential_part(along, across):
 def test_level_sea_is_the_lidar_equations():
     level = SlopeRefraction.of(0, 0, THETA, N)
     assert level.cos_vertical == pytest.approx(np.cos(snell(THETA, N)), abs=1e-12)
-    system = LidarSystem(200, THETA, 1.0, 1.0, N, N)
+    system = LidarSystem(200, THETA, N, N, energy=1.0, aperture_area=1.0)
     expected = system.water_gain(8.0, THETA) * cos_water(system, THETA)
     assert bottom_gain(RANGE, 8 / level.cos_vertical, N, level) == pytest.approx(float(expected), rel=1e-12)
 

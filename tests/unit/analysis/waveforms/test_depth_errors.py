@@ -9,7 +9,8 @@ import pytest
 import mitransient_lidar
 from mitransient_lidar.analysis.waveforms import depth_errors, echo_table
 from mitransient_lidar.analysis.waveforms.depth_errors import DepthErrors
-from mitransient_lidar.results.geometry import LidarGeometry, LinesOfSight
+from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
+from mitransient_lidar.results.geometry import LinesOfSight
 
 N, GROUP, C0 = 1.34, 1.364, 0.299792458
 ANGLE = math.radians(20)
@@ -26,7 +27,7 @@ def errors(**attributes):
     per_ns = C0 / (2 * GROUP) * math.cos(water(ANGLE))
     zero, half = np.zeros(2), np.full(2, 0.5)
     lines = LinesOfSight(zero, zero, zero + ANGLE, zero + 1420, zero, zero + per_ns, half)
-    geometry = LidarGeometry.level(200.0, ANGLE, N, GROUP)
+    geometry = LidarGeometry(200.0, ANGLE, N, GROUP)
     known = {**ATTRIBUTES, "surface_heights_m": (0.0, 0.0), **attributes}
     return DepthErrors.of(known, lines, 1, geometry, 5.0)
 
@@ -90,7 +91,8 @@ def test_surface_times_of_waves_and_of_lost_echoes_are_less_certain():
 
 def test_backscattering_of_the_column_is_that_of_its_level():
     """The lidar equation just below the surface, of pixels of unequal light; without the level, 0.05 of the column."""
-    one = errors(pulse_energy_mj=5.0, aperture_area=0.025, two_way_efficiency=0.7)
+    place = {"altitude": 200.0, "off_nadir_deg": math.degrees(ANGLE), "refractive_index": N, "group_index": GROUP}
+    one = errors(pulse_energy_mj=5.0, aperture_area=0.025, two_way_efficiency=0.7, **place)
     below = water(ANGLE)
     reflected = [math.sin(ANGLE - below) / math.sin(ANGLE + below), math.tan(ANGLE - below) / math.tan(ANGLE + below)]
     passed = 1 - sum(part**2 for part in reflected) / 2

@@ -12,7 +12,7 @@ from mitransient_lidar.physics.water.layers import WaterColumn
 from mitransient_lidar.physics.water.phase import henyey_greenstein
 from mitransient_lidar.physics.water.phase_table import PowerLawTable
 
-SYSTEM = LidarSystem(200.0, np.radians(20), 3e-3, 0.02, 1.34, 1.364)
+SYSTEM = LidarSystem(200.0, np.radians(20), 1.34, 1.364, energy=3e-3, aperture_area=0.02)
 SIGMA, EDGES = 5e-3, 1380 + 4.0 * np.arange(36)
 LAYERS = WaterColumn([0.0, 3.0], [0.2, 0.1], [1e-9, 2e-9], [1e-11, 4e-11])
 PHASES = [PowerLawTable.from_function(lambda theta, g=g: henyey_greenstein(theta, g)) for g in (0.7, 0.5)]
@@ -70,7 +70,7 @@ def test_levels_and_times_without_scattering(kind):
 def test_scattering_shifts_and_delays_by_its_moments():
     """Straight down, on both ways: mean square of the shift 2 b <tan^2> z^3/3, mean delay b <1/cos - 1> z^2/v."""
     b, a, depth = 0.2, 0.05, 10.0
-    system = LidarSystem(1e6, 0.0, 1.0, 1.0, 1.34, 1.364)
+    system = LidarSystem(1e6, 0.0, 1.34, 1.364, energy=1.0, aperture_area=1.0)
     phase = PowerLawTable.from_function(lambda theta: henyey_greenstein(theta, 0.99))
     model = EchoEstimate(system, WaterColumn([0.0], [a + b], [b], [1e-4]), [phase], FLAT, depth, 0.1)
     theta = np.linspace(0, np.radians(80), 200_001)
@@ -95,7 +95,7 @@ def test_shifts_on_the_way_up_change_no_time():
     rng = np.random.default_rng(3 + significance.seed_shift)
     column = WaterColumn([0.0], [0.3], [0.25], [1e-4])
     phase = PowerLawTable.from_function(lambda theta: henyey_greenstein(theta, 0.95))
-    system = LidarSystem(200.0, np.radians(60), 1.0, 1.0, 1.34, 1.34)
+    system = LidarSystem(200.0, np.radians(60), 1.34, 1.34, energy=1.0, aperture_area=1.0)
     model = EchoEstimate(system, column, [phase], FLAT, 8.0, 0.1)
     bottom = model.water_and_bottom(np.zeros((2**14, 2)), 16, rng)[1]
     x, time = bottom.angle_x.ravel(), bottom.time_ns.ravel()

@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 
 from mitransient_lidar.physics.lidar.gate_shape import GateShape
-from mitransient_lidar.physics.lidar.gate_train import GateTrain, depth_of_time, time_of_depth
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import Pulse
 
 PROFILE = GateShape.sampled([100, 101, 103, 104, 107], [0, 0.8, 0.8, 0.4, 0])
@@ -195,17 +195,3 @@ def test_response_takes_a_step_but_not_too_many():
         train.response_weights(Pulse.gaussian(5.0), step_ns=1e-6)
     # A long response of a short pulse chooses a step that fits.
     assert train.response_weights(Pulse.gaussian(0.01), 50.0).values.size <= 2**18
-
-
-def test_depth_and_time():
-    # 8 m of water under n_g = 1.364, axis at 14.8 degrees in the water: 2 * 1.364 * 8 / cos / c0 = 75.29 ns.
-    cosine = np.cos(np.radians(14.8))
-    assert float(time_of_depth(8.0, 1420.0, 1.364, cosine)) == pytest.approx(1420 + 75.295, abs=2e-3)
-    depths = np.array([-1.0, 0, 3, 20])
-    np.testing.assert_allclose(
-        depth_of_time(time_of_depth(depths, 1420, 1.34, 0.9), 1420, 1.34, 0.9), depths, atol=1e-9
-    )
-    with pytest.raises(ValueError, match="cos_water = 0 must be greater than 0"):
-        time_of_depth(1.0, 1420, 1.34, 0.0)
-    with pytest.raises(ValueError, match=r"group_index = 0\.9 must lie between 1 and 2"):
-        time_of_depth(1.0, 1420, 0.9, 1.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.physics.lidar.refraction import snell
@@ -36,6 +37,36 @@ def test_index_layers_refract_in_turn():
 def test_rays_above_the_horizon_meet_nothing():
     assert np.isnan(LAYERED.at_height(ORIGIN, [[1.0, 0, 0], [1, 0, 0.1]], -1.0)).all()
     assert np.isnan(LAYERED.crossing(ORIGIN, [[1.0, 0, HEIGHT]])).all()
+
+
+def test_crossing_closes_over_all_scales():
+    """With the tangents of Snell's angles on both sides of the crossing, and with that of bisection."""
+    rng = np.random.default_rng(3)
+    for rho, height, depth in 10 ** rng.uniform(-6, 4, (500, 3)):
+        x, y = LevelSea((N,)).crossing(np.array([0, 0, height]), [rho, 0, -depth])
+        theta = np.arctan2(x, height)
+        assert height * np.tan(theta) + depth * np.tan(snell(theta, N)) == pytest.approx(rho, rel=1e-6)
+        assert (theta, y) == (pytest.approx(refracted_path(rho, height, depth, N)[0], abs=1e-12), 0)
+
+
+def test_crossing_of_the_reference_geometry():
+    theta = np.radians(20)
+    rho = HEIGHT * np.tan(theta) + 2.1119
+    x, _ = LevelSea((N,)).crossing(np.array([0, 0, HEIGHT]), [rho, 0, -8.0])
+    assert np.arctan(x / HEIGHT) == pytest.approx(theta, abs=2e-7)
+    # An index of 1 is a straight line.
+    assert LevelSea((1.0,)).crossing(np.array([0.0, 0, 4]), [3.0, 0, -5])[0] == pytest.approx(3 * 4 / 9)
+
+
+def test_lengths_are_those_of_the_legs():
+    sine, depth = np.sin(np.radians(40)), np.array([-1.0, 1.0, 4.0, 9.0])
+    sea = LevelSea((1.33, 1.34, 1.36), (2.0, 5.0), (1.35, 1.36, 1.38))
+    optical, horizontal = sea.lengths(depth, sine)
+    legs = {(1.33, 1.35): [0, 1, 2, 2], (1.34, 1.36): [0, 0, 2, 3], (1.36, 1.38): [0, 0, 0, 4]}
+    angles = {one: snell(np.radians(40), one[0]) for one in legs}
+    np.testing.assert_allclose(optical, sum(one[1] * np.array(d) / np.cos(angles[one]) for one, d in legs.items()))
+    expected = sum(np.array(d) * np.tan(angles[one]) for one, d in legs.items())
+    np.testing.assert_allclose(sine * horizontal, expected, rtol=1e-12)
 
 
 def test_lines_obey_snell_at_the_sea_level():

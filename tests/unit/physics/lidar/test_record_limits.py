@@ -4,11 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from oracles.refracted_path import refracted_path
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.physics.lidar.record_limits import Cone, LidarView, Solid, Water
-from mitransient_lidar.physics.lidar.refraction import refracted_path
+from mitransient_lidar.physics.lidar.level_sea import LevelSea
+from mitransient_lidar.physics.lidar.pose import Pose
+from mitransient_lidar.physics.lidar.record_limits import ColumnDecay, Cone, LidarView, Solid
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 NS = 1e9 / C0
@@ -19,14 +21,14 @@ def cone(off_nadir_deg=20.0, half_mrad=15.0, altitude=200.0, x=0.0, is_round=Tru
     """A cone towards +x whose axis meets the sea level at `aim`, moved by x."""
     angle = math.radians(off_nadir_deg)
     sin, cos = math.sin(angle), math.cos(angle)
-    frame = np.array([[sin, 0, -cos], [cos, 0, sin], [0, 1, 0]])
-    origin = np.array([aim - altitude * sin / cos + x, 0.0, altitude])
-    return Cone(origin, frame, (1e-3 * half_mrad, 1e-3 * half_mrad), is_round)
+    axes = np.array([[sin, 0, -cos], [cos, 0, sin], [0, 1, 0]])
+    pose = Pose(np.array([aim - altitude * sin / cos + x, 0.0, altitude]), *axes)
+    return Cone(pose, (1e-3 * half_mrad, 1e-3 * half_mrad), is_round)
 
 
 def water(attenuation=0.1, boundaries=(), indices=(N,), group=(GROUP,), tops=(0.0,)):
     values = np.broadcast_to(attenuation, len(tops)).astype(np.float64)
-    return Water(tuple(indices), tuple(group), tuple(boundaries), np.array(tops), values)
+    return LevelSea(tuple(indices), tuple(boundaries), tuple(group)), ColumnDecay(np.array(tops), values)
 
 
 def plane(depth, slope=0.0, size=5000.0, name="bottom"):
@@ -37,7 +39,7 @@ def plane(depth, slope=0.0, size=5000.0, name="bottom"):
 
 
 def lidar(view=None, beam=None, sea=None, heights=(0.0, 0.0), reach=5000.0, column=0.0):
-    return LidarView(view or cone(), beam or cone(half_mrad=25.0), sea or water(), heights, reach, column)
+    return LidarView(view or cone(), beam or cone(half_mrad=25.0), *(sea or water()), heights, reach, column)
 
 
 @pytest.mark.parametrize("off_nadir_deg", [0.0, 20.0, 60.0, 85.0])
@@ -80,12 +82,13 @@ def test_a_receiver_beside_the_laser():
     found = lidar(view, beam).limits([plane(10.0)], direct=True)
     places = np.concatenate([one.places(-0.0, 1000.0) for one in (view, beam)])
     both = places[view.holds(places, 0.0) & beam.holds(places, 0.0)]
-    ranges = [np.linalg.norm(np.column_stack([both, np.zeros(len(both))]) - one.origin, axis=1) for one in (view, beam)]
+    points = np.column_stack([both, np.zeros(len(both))])
+    ranges = [np.linalg.norm(points - one.pose.origin, axis=1) for one in (view, beam)]
     assert found.surface_ns[0] == pytest.approx(NS * (ranges[0] + ranges[1]).min(), abs=0.05)
     far = both[np.argmax(both[:, 0])]
     lengths = []
     for one, height in ((view, 200.0), (beam, 150.0)):
-        theta, phi = refracted_path(float(np.hypot(*(far - one.origin[:2]))), height, 10.0, N)
+        theta, phi = refracted_path(float(np.hypot(*(far - one.pose.origin[:2]))), height, 10.0, N)
         lengths.append(float(height / np.cos(theta) + GROUP * 10.0 / np.cos(phi)))
     # That point lies above the bottom of the far edge; the record may be longer, not shorter.
     assert NS * sum(lengths) - 0.5 < found.last_ns < NS * sum(lengths) + 25
@@ -137,12 +140,12 @@ def test_a_target_without_a_bottom_does_not_end_the_record():
 
 def test_the_column_falls_through_layers():
     """exp(-2 K s) over 4 m of 0.5 and 10 m of 0.3 /m is 1e-3 of 1e-6 away; the rest is below."""
-    layers = water((0.5, 0.3, 0.1), tops=(0.0, 4.0, 14.0))
+    _, layers = water((0.5, 0.3, 0.1), tops=(0.0, 4.0, 14.0))
     depth = 14 + (0.5 * math.log(1e6) - 5.0) / 0.1
     assert layers.depth_of(0.5 * math.log(1e6)) == pytest.approx(depth)
-    assert layers.decay(depth) == pytest.approx(0.5 * math.log(1e6))
-    assert water((0.5, 0.0), tops=(0.0, 4.0)).depth_of(10.0) == 4.0
-    assert water(0.0).depth_of(10.0) == 0.0
+    assert layers.to(depth) == pytest.approx(0.5 * math.log(1e6))
+    assert water((0.5, 0.0), tops=(0.0, 4.0))[1].depth_of(10.0) == 4.0
+    assert water(0.0)[1].depth_of(10.0) == 0.0
 
 
 @pytest.mark.parametrize(("attenuation", "is_seen"), [(0.2, True), (0.5, False)])

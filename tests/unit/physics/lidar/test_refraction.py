@@ -8,7 +8,6 @@ from mitransient_lidar.physics.lidar.refraction import (
     fresnel,
     refract,
     refract_level,
-    refracted_path,
     snell,
     solid_angle_per_area,
     surface_time_ns,
@@ -52,27 +51,6 @@ def test_fresnel_from_below():
     inside = snell(THETA, N)
     assert fresnel(inside, 1 / N)[0] == pytest.approx(fresnel(THETA, N)[0], rel=1e-12)
     np.testing.assert_array_equal(fresnel(np.arcsin(1 / N) + np.array([1e-6, 0.3]), 1 / N)[0], [1, 1])
-
-
-def test_refracted_path_of_the_reference_geometry():
-    theta, phi = refracted_path(HEIGHT * np.tan(THETA) + 2.1119, HEIGHT, 8, N)
-    assert theta == pytest.approx(THETA, abs=2e-7)
-    assert np.degrees(phi) == pytest.approx(14.78774, abs=1e-5)
-
-
-def test_refracted_path_closes_over_all_scales():
-    rng = np.random.default_rng(3)
-    rho, height, depth = rng.choice([-1, 1], 2000) * 10 ** rng.uniform(-6, 4, (3, 2000))
-    theta, phi = refracted_path(rho, np.abs(height), np.abs(depth), N)
-    # Hand check of tan, without cancellation at grazing incidence where tan(theta) is huge
-    np.testing.assert_allclose(np.abs(height) * np.tan(theta) + np.abs(depth) * np.tan(phi), rho, rtol=1e-6)
-    np.testing.assert_allclose(np.sin(theta), N * np.sin(phi), rtol=1e-12)
-
-
-def test_refracted_path_edges():
-    assert refracted_path(0, 200, 8, N)[0] == 0
-    assert refracted_path(100, 100, 0, N)[0] == pytest.approx(np.pi / 4)
-    assert refracted_path(3, 4, 5, 1.0)[0] == pytest.approx(np.arctan(3 / 9))
 
 
 def test_solid_angle():
@@ -131,8 +109,6 @@ def test_layers_add_up():
     [
         (lambda: snell(0.1, 0.9), "n = 0.9 must be at least 1"),
         (lambda: snell(np.nan, N), "theta holds nan"),
-        (lambda: refracted_path(1, 0, 1, N), "height = 0 must be greater than 0"),
-        (lambda: refracted_path(1, 1, -1, N), "depth = -1 must not be negative"),
     ],
 )
 def test_bad_parameters_are_rejected(call, message):

@@ -21,7 +21,7 @@ REFLECTANCE = ((N - 1) / (N + 1)) ** 2
 
 
 def lidar(*outlines, beam=BEAM):
-    return SeaLidar(HEIGHT, THETA, beam, PixelMap.of_outlines([list(one) for one in outlines]), N)
+    return SeaLidar(HEIGHT, THETA, N, N, beam=beam, pixels=PixelMap.of_outlines([list(one) for one in outlines]))
 
 
 @pytest.mark.parametrize(("along", "across", "wind"), [(0, 0, 0), (0.15, 0, 0), (-0.1, 0.2, 0), (0.1, -0.1, 0.7)])

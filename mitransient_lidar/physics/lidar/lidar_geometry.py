@@ -1,0 +1,102 @@
+"""Co-located lidar over a level sea: ranges, depths and times along its axis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from mitransient_lidar.core.constants import C0
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.validation import FloatArray, finite_array, in_range, positive
+from mitransient_lidar.physics.lidar import refraction
+from mitransient_lidar.physics.lidar.pose import Pose
+
+
+@dataclass(frozen=True)
+class LidarGeometry:
+    """Co-located transmitter and receiver over a level sea, along their axis.
+
+    Values out of range raise UserError.
+    """
+
+    height: float  #: Height above the mean sea level [m], positive.
+    off_nadir: float  #: Angle of the axis from the vertical [rad], 0 to below pi/2.
+    refractive_index: float  #: Refractive index of the water, at least 1, which refracts rays.
+    group_index: float  #: Group index of the water, at least 1, which determines travel times.
+    #: Arrival of the surface echo [ns], the zero of depths; by default (NaN) from the mean sea level along the axis.
+    surface_time_ns: float = field(default=math.nan, kw_only=True)
+
+    def __post_init__(self) -> None:
+        positive("height", self.height)
+        if not 0 <= self.off_nadir < np.pi / 2:
+            raise UserError(f"off_nadir = {self.off_nadir:g} must be at least 0 and below pi/2")
+        for name in ("refractive_index", "group_index"):
+            in_range(name, getattr(self, name), 1, np.inf)
+        if math.isnan(self.surface_time_ns):
+            level = float(refraction.surface_time_ns(self.height, self.off_nadir))
+            object.__setattr__(self, "surface_time_ns", level)
+
+    @classmethod
+    def of_pose(cls, pose: Pose, refractive_index: float, group_index: float) -> LidarGeometry:
+        """Return the geometry of a lidar with a pose above water of these indices."""
+        pose.require_above_sea()
+        return LidarGeometry(float(pose.origin[2]), math.radians(pose.off_nadir_deg), refractive_index, group_index)
+
+    @property
+    def angle_in_water(self) -> float:
+        """Angle of the axis from the vertical in the water [rad]."""
+        return float(refraction.snell(self.off_nadir, self.refractive_index))
+
+    @property
+    def cos_water(self) -> float:
+        """Cosine of the axis's angle from the vertical in the water."""
+        return float(np.cos(self.angle_in_water))
+
+    @property
+    def slant_range(self) -> float:
+        """Distance to the mean sea level along the axis [m]."""
+        return self.height / math.cos(self.off_nadir)
+
+    @property
+    def surface_ns_per_rad(self) -> float:
+        """Change of the arrival from the mean sea level with the angle from the vertical [ns/rad]."""
+        return 2e9 / C0 * self.slant_range * math.tan(self.off_nadir)
+
+    @property
+    def metres_per_ns(self) -> float:
+        """One-way path in the water per nanosecond of delay [m/ns]."""
+        return 0.5e-9 * C0 / self.group_index
+
+    @property
+    def depth_per_ns(self) -> float:
+        """Depth per nanosecond of delay [m/ns]: c0 cos(theta_water)/(2 n_g)."""
+        return self.metres_per_ns * self.cos_water
+
+    def path_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
+        """Return the one-way path in the water [m] of echoes at times [ns]."""
+        return np.asarray(self.metres_per_ns * (finite_array("time_ns", time_ns) - self.surface_time_ns))
+
+    def depth_of_time(self, time_ns: npt.ArrayLike) -> FloatArray:
+        """Return the depth [m] of echoes at times [ns]."""
+        return np.asarray((finite_array("time_ns", time_ns) - self.surface_time_ns) * self.depth_per_ns)
+
+    def time_of_depth(self, depth: npt.ArrayLike) -> FloatArray:
+        """Return the arrival times [ns] of echoes from depths [m]."""
+        return np.asarray(self.surface_time_ns + finite_array("depth", depth) / self.depth_per_ns)
+
+    def solid_angle_per_area(self, path: npt.ArrayLike) -> FloatArray:
+        """Return the solid angle of the aperture per area [sr/m^2] at one-way paths in the water [m]."""
+        depth = np.asarray(path, dtype=np.float64) * self.cos_water
+        return refraction.solid_angle_per_area(self.height, depth, self.off_nadir, self.refractive_index)
+
+    def spreading(self, path: npt.ArrayLike) -> FloatArray:
+        """Return the solid angle of the aperture at paths in the water [m] over that at the surface; 1 above it."""
+        return np.asarray(self.solid_angle_per_area(np.maximum(path, 0)) / self.solid_angle_per_area(0.0))
+
+    def surface_depth(self, edge: float) -> float:
+        """Return the depth [m] on the axis that is simultaneous with the far surface echo of a half angle [rad]."""
+        farthest = self.height / math.cos(min(self.off_nadir + edge, 0.5 * math.pi - 1e-3))
+        return (farthest - self.slant_range) / self.group_index * self.cos_water
