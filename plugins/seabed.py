@@ -306,6 +306,12 @@ class Seabed(mi.Mesh):
         fine = {"cell_size": bottom.cell_size, "refined_size": bottom.refined_size}
         return fine if math.isfinite(bottom.cell_size) else {}
 
+    @property
+    def uniform_reflectance(self) -> float | None:
+        """Reflectance of bottom and patches, None where they differ."""
+        values = {self.bottom.reflectance, *(patch.reflectance for patch in self.bottom.patches)}
+        return float(values.pop()) if len(values) == 1 else None
+
     def to_string(self) -> str:
         """Return a description."""
         bottom = self.bottom

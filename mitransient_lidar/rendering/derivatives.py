@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -189,15 +189,15 @@ def _reflectance(name: str, solid: mi.Shape) -> Parameter:
     return Parameter(name, value, "1", Perturbation(solids=((solid, 1 / value),)))
 
 
-def _uniform_reflectance(solid: Any) -> float | None:
+def _uniform_reflectance(solid: mi.Shape) -> float | None:
     """Return the reflectance of a diffuse solid, None for others."""
     import mitsuba as mi
 
-    bottom = getattr(solid, "bottom", None)
-    if bottom is not None and "reflectance.scale" in mi.traverse(solid.bsdf()):
-        values = np.unique([bottom.reflectance, *(patch.reflectance for patch in bottom.patches)])
-        return float(values[0]) if values.size == 1 else None
+    from mitransient_lidar.transport.plugin_types import SeabedShape
+
     kept = mi.traverse(solid.bsdf())
+    if isinstance(solid, SeabedShape) and "reflectance.scale" in kept:
+        return solid.uniform_reflectance
     names = list(kept.keys())
     # A diffuse BSDF shows its reflectance alone, also within one for two sides.
     if names not in (["reflectance.value"], ["brdf_0.reflectance.value"]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passe
 from mitransient_lidar.rendering.session import Session, open_scene
 
 if TYPE_CHECKING:
-    from mitransient_lidar.transport.passes import PassRenderer
+    from mitransient_lidar.transport.passes import LidarIntegrator, PassRenderer
 
 #: Shift of an echo by a step of a depth, over the pulse's full width at half maximum; of the edges of layers, which
 #: change the record little, the step is longer by a factor.
@@ -107,7 +107,7 @@ class Differences:
     def __init__(
         self,
         session: Session,
-        integrator: Any,
+        integrator: LidarIntegrator,
         names: Sequence[str],
         *,
         steps: Mapping[str, float] | None = None,
@@ -202,7 +202,7 @@ class Differences:
 
 def differences(
     session: Session,
-    integrator: Any,
+    integrator: LidarIntegrator,
     names: Sequence[str],
     *,
     steps: Mapping[str, float] | None = None,

@@ -21,6 +21,7 @@ import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.physics.water.phase_table import DEFAULT_COUNT, DEFAULT_LOG_S0
+from mitransient_lidar.transport.laser.beam_profiles import BeamProfile, GaussianBeam
 from mitransient_lidar.transport.medium.tabulated_phase import half_angle
 from mitransient_lidar.transport.opaque import aligned, opaque
 
@@ -252,8 +253,10 @@ class Perturbations:
             found.append(total)
         return found
 
-    def at_laser(self, sums: Sums, profile: Any, angle_x: mi.Float, angle_y: mi.Float) -> Sums:
+    def at_laser(self, sums: Sums, profile: BeamProfile, angle_x: mi.Float, angle_y: mi.Float) -> Sums:
         """Return sums of paths that leave the laser, of a beam profile, at tangent-plane angles [rad]."""
+        if not isinstance(profile, GaussianBeam):
+            return sums
         return [
             total if one.beam is None else total + profile.width_slope(angle_x, angle_y) * opaque(one.beam)
             for total, one in zip(sums, self.perturbations, strict=True)

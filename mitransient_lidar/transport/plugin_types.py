@@ -138,6 +138,15 @@ class SeaShape(Protocol):
 
 
 @runtime_checkable
+class SeabedShape(Protocol):
+    """The shape ``seabed``."""
+
+    @property
+    def uniform_reflectance(self) -> float | None:
+        """Reflectance of bottom and patches, None where they differ."""
+
+
+@runtime_checkable
 class GatedFilm(Protocol):
     """The film ``time_gated_film``."""
 
