@@ -5,6 +5,7 @@ import pytest
 import significance
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering.derivatives import path_parameters
 from mitransient_lidar.rendering.reweighting import cases
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -77,6 +78,24 @@ def test_attenuation_follows_from_the_time_of_arrival(lidar, integrator):
     assert changes[0, 0][early].any()
 
 
+def test_attenuation_of_light_that_is_carried_on_within_cells(lidar):
+    """Bins of 2 cm below the surface have the lengths of their times, with the way of merged light within its cell.
+
+    A narrow beam at nadir: ways in the air are 400 m, and less than 3 mm more where light leaves the water 1 m away.
+    """
+    film = {"time_start_ns": 1334.2, "bin_width_ns": 0.1, "bin_count": 60}
+    renderer, _ = lidar("lidar_merging", ["attenuation"], tx={"divergence_mrad": 1.0}, film=film)
+    energy, changes = one_pass(renderer.by_origin())
+    # Of the water.
+    water, change = energy[1], changes[0, 1]
+    lit = water > 1e-3 * water.max()
+    length = -change[lit] / water[lit]
+    edges = renderer.scene.axis.edges_ns * 1e-9 * C0
+    assert lit.sum() > 50
+    assert np.all(length > (edges[:-1][lit] - 400.003) / INDEX - 1e-4)
+    assert np.all(length < (edges[1:][lit] - 400.0) / INDEX + 1e-4)
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_attenuation_about_a_lidar_under_water(lidar, integrator):
     """All of the way is in water: ln E falls by c0 t / n."""
@@ -102,6 +121,25 @@ def test_scattering_follows_from_the_number_of_events(lidar, integrator):
         found = changes[:, :, n][lit] / energy[:, :, n][lit]
         np.testing.assert_allclose(found, n / FIXED["scattering"], rtol=1e-4, atol=1e-6)
     assert (energy.sum(axis=(0, 1, 3)) > 0).all()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_light_scattered_once_follows_from_the_phase_function(lidar, integrator):
+    """E of one event is in proportion to b p(180 degrees), and bb/b decides the Fournier-Forand function p.
+
+    By b, ln E grows by 1 / b less what p loses as bb/b falls; by bb it grows with p alone. A beam of 1 mrad in a view of
+    30 mrad, both at nadir, is scattered within 30 mrad of straight back, where p is level.
+    """
+    names = "scattering", "backscattering"
+    b, bb = (NATURAL[name] for name in names)
+    renderer, _ = lidar(integrator, names, PathClasses(orders=2), water=NATURAL, tx={"divergence_mrad": 1.0})
+    # One event and one reversal, before the echo of the bottom at 1406 ns.
+    energy, changes = (values.reshape(-1, 2, 3, 160)[:, 0, 1, :80].sum(axis=1) for values in one_pass(renderer))
+    ratio, step = bb / b, 1e-3 * bb / b
+    sides = [np.log(fournier_forand(np.pi, *fournier_forand_parameters(ratio + sign * step))) for sign in (1, -1)]
+    by_ratio = (sides[0] - sides[1]) / (2 * step)
+    wanted = [1 / b - by_ratio * ratio / b, by_ratio / b]
+    np.testing.assert_allclose(changes / energy, wanted, rtol=3e-3)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
