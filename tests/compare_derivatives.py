@@ -50,7 +50,7 @@ CASES = {
     "under water": ("table1", {**LEVEL, "altitude": -1, "bottom_depth": 6}),
 }
 #: Passes, and paths of a pass, of both integrators.
-SAMPLES = {"lidar_merging": (24, 2**13), "lidar_volpath": (24, 2**16)}
+SAMPLES = {"lidar_merging": (16, 2**13), "lidar_volpath": (24, 2**16)}
 #: Smaller one of two steps over the value, by the end of a parameter's name, and that by attenuation where free flights
 #: follow from it.
 STEPS = {
@@ -163,8 +163,8 @@ def _scale_ripples(scene, factor):
 def compare(samples):
     """Return by parameter the differences in standard errors, as normal numbers, and the pooled ratio with its error.
 
-    The ratio is that of sums over bins, which are weighted by the mean difference of the passes of other parity, so
-    that bins in which the derivative is negative count, and its noise does not.
+    The ratio is that of sums over bins with the weights of least variance: the derivative, from differences of the
+    passes of other parity, whose noise is independent, over the variance of what is compared.
     """
     passes = len(samples.energy)
     mean, error = samples.energy.mean(axis=0), samples.energy.std(axis=0, ddof=1) / np.sqrt(passes)
@@ -181,15 +181,14 @@ def compare(samples):
         own = (score - slope).std(axis=0, ddof=1) / np.sqrt(passes)
         far = excess / own
         z = np.copysign(norm.isf(t.sf(np.abs(far), passes - 1)), far)
-        rows[name] = z, *_ratio(score, slope)
+        rows[name] = z, *_ratio(score, slope, np.hypot(own, ROUNDING * slope.mean(axis=0)))
     return rows
 
 
-def _ratio(score, slope):
-    """Return the ratio of sums over bins and its standard error."""
-    weights = np.where(
-        (np.arange(len(slope)) % 2 == 0)[:, None], slope[1::2].mean(axis=0), slope[::2].mean(axis=0)
-    )
+def _ratio(score, slope, error):
+    """Return the ratio of sums over bins and its standard error; `error` is that of each bin."""
+    even = np.arange(len(slope)) % 2 == 0
+    weights = np.where(even[:, None], slope[1::2].mean(axis=0), slope[::2].mean(axis=0)) / error**2
     a, b = (weights * score).sum(axis=1), (weights * slope).sum(axis=1)
     ratio = a.mean() / b.mean()
     return ratio, (a - ratio * b).std(ddof=1) / np.sqrt(len(a)) / abs(b.mean())

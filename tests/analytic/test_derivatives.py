@@ -167,6 +167,19 @@ def test_ripple_variance_of_an_echo_at_nadir(lidar, integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_ripple_variance_of_an_echo_off_nadir(lidar, integrator):
+    """Gaussian slopes of variance v in all, seen at 20 degrees: d ln E / d ln v = tan(20 degrees)^2 / v - 1.
+
+    The beam of 0.1 mrad changes the angle by 5e-5, and that by the law of slopes at most by 2e-6 in the mean.
+    """
+    options = {"pose": {"off_nadir_deg": 20.0}, "tx": {"divergence_mrad": 0.1}, "sea": {"slope_variance": "0.01"}}
+    renderer, (parameter,) = lidar(integrator, ["ripple_variance"], **options)
+    energy, changes = (values.reshape(3, 160)[0].sum() for values in one_pass(renderer.by_origin()))
+    found, wanted = parameter.value * changes / energy, np.tan(np.deg2rad(20)) ** 2 / 0.01 - 1
+    assert found == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_divergence_of_a_beam_that_overfills_the_view(lidar, integrator):
     """Of a bottom in water that only absorbs, E is in proportion to 1 - exp(-R^2 / (2 sigma^2)).
 
