@@ -1,10 +1,10 @@
 """Derivatives from paths against central differences on common random numbers, in the bins of all pixels.
 
-Run by hand: ``python tests/compare_derivatives.py ``. A pass renders each scene with the derivatives by all
-parameters of which paths have sums, and with the same random numbers beside the value of each parameter, at four
-values from which a difference of fourth order follows: its bias is below the standard errors. The mean over the passes
-of derivative less difference is compared with its own standard error. Bins are those in which the passes know the
-energy to a tenth, so that their means are near normal.
+Run by hand: ``python tests/compare_derivatives.py --case turbid --integrator lidar_merging``. A pass renders the scene
+with the derivatives by all parameters of which paths have sums, and, with the same random numbers, at four values
+beside that of each parameter, from which a difference of fourth order follows: its bias is below the standard errors.
+The mean over the passes of derivative less difference is compared with its own standard error. Bins are those in which
+the passes know the energy to a tenth, so that their means are near normal.
 """
 
 import mitransient_lidar  # noqa: F401, I001
@@ -51,10 +51,9 @@ CASES = {
 }
 #: Passes, and paths of a pass, of both integrators.
 SAMPLES = {"lidar_merging": (16, 2**13), "lidar_volpath": (24, 2**16)}
-#: Smaller one of two steps over the value, by the end of a parameter's name, and that by attenuation where free flights
-#: follow from it.
+#: Smaller one of two steps over the value, by parameter; those of all reflectances are alike.
 STEPS = {
-    "attenuation": 0.01,
+    "attenuation": 0.004,
     "scattering": 0.04,
     "backscattering": 0.1,
     "phase_g": 0.05,
@@ -62,18 +61,21 @@ STEPS = {
     "ripple_variance": 0.05,
     "reflectance": 0.2,
 }
-FLIGHT_STEP = 0.04
-#: Largest relative standard error of the energy of a bin, and relative error of differences by single precision, which
-#: shows where both renders have the same paths.
-KNOWN, ROUNDING = 0.1, 1e-5
+#: Longer ones where the difference is noisy: free flights follow from the attenuation, and other cells from the beam.
+LONG_STEPS = {("lidar_volpath", "attenuation"): 0.04, ("lidar_merging", "divergence_mrad"): 0.1}
+#: Places of renders, in steps, and their weights in a difference of fourth order.
+FOURTH_ORDER = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
+#: Largest relative standard error of the energy of a bin.
+KNOWN = 0.1
+#: Relative error of differences by single precision, which shows where all renders have the same paths.
+ROUNDING = 2e-5
 
 
 def step_of(name, value, integrator):
     """Return the smaller step of a parameter: of a mean cosine it is relative to what it lacks to 1."""
     known = parameter_of(name)
-    relative = next(step for end, step in STEPS.items() if known.endswith(end) and (end != "scattering" or known == end))
-    if known == "attenuation" and integrator == "lidar_volpath":
-        relative = FLIGHT_STEP
+    end = "reflectance" if known.endswith("reflectance") else known
+    relative = LONG_STEPS.get((integrator, end), STEPS[end])
     return relative * (1 - value if known == "phase_g" else value)
 
 
@@ -105,7 +107,7 @@ def sample(case, integrator, passes, paths, seed=0, only=None):
     beside = []
     for one in parameters:
         step = step_of(one.name, one.value, integrator)
-        beside.append([(_moved(session, chosen, base, one, k * step), w / step) for k, w in _FOURTH_ORDER])
+        beside.append([(_moved(session, chosen, base, one, k * step), w / step) for k, w in FOURTH_ORDER])
     shape = (base.scene.receiver.pixels.count, -1)
     rows = []
     for number in range(passes):
@@ -120,10 +122,6 @@ def sample(case, integrator, passes, paths, seed=0, only=None):
     energy, scores, differences = (np.array(values) for values in zip(*rows, strict=True))
     values = np.array([one.value for one in parameters])
     return Samples([one.name for one in parameters], values, energy, scores, differences)
-
-
-#: Steps and weights of the derivative of fourth order.
-_FOURTH_ORDER = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
 
 
 def _parameter(base, name):
@@ -163,8 +161,8 @@ def _scale_ripples(scene, factor):
 def compare(samples):
     """Return by parameter the differences in standard errors, as normal numbers, and the pooled ratio with its error.
 
-    The ratio is that of sums over bins with the weights of least variance: the derivative, from differences of the
-    passes of other parity, whose noise is independent, over the variance of what is compared.
+    The ratio is that of sums over bins, weighted by the derivative over the variance of the energy: the former from
+    differences of the passes of other parity, whose noise is independent, the latter known better than their variance.
     """
     passes = len(samples.energy)
     mean, error = samples.energy.mean(axis=0), samples.energy.std(axis=0, ddof=1) / np.sqrt(passes)
@@ -181,12 +179,12 @@ def compare(samples):
         own = (score - slope).std(axis=0, ddof=1) / np.sqrt(passes)
         far = excess / own
         z = np.copysign(norm.isf(t.sf(np.abs(far), passes - 1)), far)
-        rows[name] = z, *_ratio(score, slope, np.hypot(own, ROUNDING * slope.mean(axis=0)))
+        rows[name] = z, *_ratio(score, slope, error[known][lit])
     return rows
 
 
 def _ratio(score, slope, error):
-    """Return the ratio of sums over bins and its standard error; `error` is that of each bin."""
+    """Return the ratio of sums over bins and its standard error; `error` is that of the energy."""
     even = np.arange(len(slope)) % 2 == 0
     weights = np.where(even[:, None], slope[1::2].mean(axis=0), slope[::2].mean(axis=0)) / error**2
     a, b = (weights * score).sum(axis=1), (weights * slope).sum(axis=1)

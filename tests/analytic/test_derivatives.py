@@ -128,8 +128,8 @@ def test_scattering_follows_from_the_number_of_events(lidar, integrator):
 def test_light_scattered_once_follows_from_the_phase_function(lidar, integrator):
     """E of one event is in proportion to b p(180 degrees), and bb/b decides the Fournier-Forand function p.
 
-    By b, ln E grows by 1 / b less what p loses as bb/b falls; by bb it grows with p alone. A beam of 1 mrad in a view of
-    30 mrad, both at nadir, is scattered within 30 mrad of straight back, where p is level.
+    By b, ln E grows by 1 / b less what p loses as bb/b falls; by bb it grows with p alone. A beam of 1 mrad in a view
+    of 30 mrad, both at nadir, is scattered within 30 mrad of straight back, where p is level.
     """
     names = "scattering", "backscattering"
     b, bb = (NATURAL[name] for name in names)
