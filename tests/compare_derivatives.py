@@ -50,7 +50,7 @@ CASES = {
     "under water": ("table1", {**LEVEL, "altitude": -1, "bottom_depth": 6}),
 }
 #: Passes, and paths of a pass, of both integrators.
-SAMPLES = {"lidar_merging": (16, 2**13), "lidar_volpath": (24, 2**16)}
+SAMPLES = {"lidar_merging": (16, 2**13), "lidar_volpath": (16, 2**16)}
 #: Smaller one of two steps over the value, by parameter; those of all reflectances are alike.
 STEPS = {
     "attenuation": 0.004,
