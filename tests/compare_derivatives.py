@@ -4,7 +4,7 @@ Run by hand: ``python tests/compare_derivatives.py --case turbid --integrator li
 with the derivatives by all parameters of which paths have sums, and, with the same random numbers, at four values
 beside that of each parameter, from which a difference of fourth order follows: its bias is below the standard errors.
 The mean over the passes of derivative less difference is compared with its own standard error. Bins are those in which
-the passes know the energy to a tenth, so that their means are near normal.
+the passes know the energy to 5 %, so that their means are near normal.
 """
 
 import mitransient_lidar  # noqa: F401, I001
@@ -47,7 +47,11 @@ CASES = {
     "target": ("fig13_2x2", {**LEVEL, "layout": "2x2", "bottom_depth": 9, "target_depth": 5}),
     "narrow": ("table1", {**LEVEL, "divergence_mrad": 0.5, "field_of_view_mrad": 10}),
     "imager": ("table1", {**LEVEL, "layout": "16x16", "bin_width_ns": 5}),
-    "under water": ("table1", {**LEVEL, "altitude": -1, "bottom_depth": 6}),
+    "under water": (
+        "table1",
+        {**LEVEL, "altitude": -1, "bottom_depth": 6},
+        ["attenuation", "scattering", "backscattering", "divergence_mrad", "bottom_reflectance"],
+    ),
 }
 #: Passes, and paths of a pass, of both integrators.
 SAMPLES = {"lidar_merging": (12, 2**13), "lidar_volpath": (16, 2**16)}
@@ -65,8 +69,9 @@ STEPS = {
 LONG_STEPS = {("lidar_volpath", "attenuation"): 0.04, ("lidar_merging", "divergence_mrad"): 0.1}
 #: Places of renders, in steps, and their weights in a difference of fourth order.
 FOURTH_ORDER = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
-#: Largest relative standard error of the energy of a bin.
-KNOWN = 0.1
+#: Largest relative standard error of the energy of a bin. Bins with larger ones lack bright paths where they seem to be
+#: known: up to 10 %, the derivatives of 256 pixels by the reference were 4 % too small, as are the energies.
+KNOWN = 0.05
 #: Relative error of differences by their steps, which shows where all renders have the same paths: 0.09 % by the
 #: variance of ripples, where few facets return light.
 TOLERANCE = 1e-3
