@@ -38,7 +38,7 @@ DIFFERENCES = "central differences"
 DIVERGENCE = "divergence_mrad"
 
 #: Slope variance of the ripples, and the relative step of its numerical derivative.
-RIPPLES, _RIPPLE_STEP = "ripple_variance", 0.02
+RIPPLES, _RIPPLE_STEP = "ripple_variance", 0.005
 
 _NAME = re.compile(r"(?P<stem>\w+?)(\[(?P<layer>\d+)\])?\Z")
 _REFLECTANCE = "_reflectance"

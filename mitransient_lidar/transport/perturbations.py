@@ -125,12 +125,19 @@ class _Layer:
         first, second = (dr.clip((edge - depth) / slope, 0, length) for edge in (self._top, self._bottom))
         return self._per_metre * dr.abs(second - first)
 
+    def about(self, depth: mi.Float, length: mi.Float) -> mi.Float:
+        """Return the addition of lengths [m] about depths [m], negative on the way back, all of it in one layer."""
+        return self._within(depth, self._per_metre * length)
+
     def at_event(self, depth: mi.Float, by_angle: Sequence[mi.Float]) -> mi.Float:
         """Return the addition of scattering events: depth [m], and values of the tables there."""
-        found = self._per_event if self.tables is None else self._per_event + by_angle[self.tables]
+        return self._within(depth, self._per_event if self.tables is None else self._per_event + by_angle[self.tables])
+
+    def _within(self, depth: mi.Float, addition: mi.Float) -> mi.Float:
+        """Return an addition where depths [m] are in the layer, else 0."""
         if self._limits == (-np.inf, np.inf):
-            return found
-        return dr.select(self.contains(depth), found, 0)
+            return addition
+        return dr.select(self.contains(depth), addition, 0)
 
     def contains(self, depth: mi.Float) -> mi.Bool:
         """Return whether depths [m] are in the layer."""
@@ -210,6 +217,16 @@ class Perturbations:
                 if layer.travels:
                     before = before + dr.select(mi.Bool(active), layer.along(depth, downward, length), 0)
             found.append(before)
+        return found
+
+    def about(self, sums: Sums, depth: mi.Float, length: mi.Float) -> Sums:
+        """Return sums of light that is carried on about depths [m] by small lengths [m], negative on the way back."""
+        found = []
+        for total, layers in zip(sums, self._layers, strict=True):
+            for layer in layers:
+                if layer.travels:
+                    total = total + layer.about(depth, length)
+            found.append(total)
         return found
 
     def at_event(

@@ -1,10 +1,12 @@
 """Derivatives and reweighted light: against arrival times, orders of scattering, and scenes with other values."""
 
+import compare_derivatives
 import numpy as np
 import pytest
 import significance
 
 from mitransient_lidar.core.constants import C0
+from mitransient_lidar.physics.water.phase import fournier_forand, fournier_forand_parameters
 from mitransient_lidar.rendering.derivatives import path_parameters
 from mitransient_lidar.rendering.reweighting import cases
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -77,6 +79,24 @@ def test_attenuation_follows_from_the_time_of_arrival(lidar, integrator):
     assert changes[0, 0][early].any()
 
 
+def test_attenuation_of_light_that_is_carried_on_within_cells(lidar):
+    """Bins of 2 cm below the surface have the lengths of their times, with the way of merged light within its cell.
+
+    A narrow beam at nadir: ways in the air are 400 m, and less than 3 mm more where light leaves the water 1 m away.
+    """
+    film = {"time_start_ns": 1334.2, "bin_width_ns": 0.1, "bin_count": 60}
+    renderer, _ = lidar("lidar_merging", ["attenuation"], tx={"divergence_mrad": 1.0}, film=film)
+    energy, changes = one_pass(renderer.by_origin())
+    # Of the water.
+    water, change = energy[1], changes[0, 1]
+    lit = water > 1e-3 * water.max()
+    length = -change[lit] / water[lit]
+    edges = renderer.scene.axis.edges_ns * 1e-9 * C0
+    assert lit.sum() > 50
+    assert np.all(length > (edges[:-1][lit] - 400.003) / INDEX - 1e-4)
+    assert np.all(length < (edges[1:][lit] - 400.0) / INDEX + 1e-4)
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_attenuation_about_a_lidar_under_water(lidar, integrator):
     """All of the way is in water: ln E falls by c0 t / n."""
@@ -105,6 +125,25 @@ def test_scattering_follows_from_the_number_of_events(lidar, integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_light_scattered_once_follows_from_the_phase_function(lidar, integrator):
+    """E of one event is in proportion to b p(180 degrees), and bb/b decides the Fournier-Forand function p.
+
+    By b, ln E grows by 1 / b less what p loses as bb/b falls; by bb it grows with p alone. A beam of 1 mrad in a view
+    of 30 mrad, both at nadir, is scattered within 30 mrad of straight back, where p is level.
+    """
+    names = "scattering", "backscattering"
+    b, bb = (NATURAL[name] for name in names)
+    renderer, _ = lidar(integrator, names, PathClasses(orders=2), water=NATURAL, tx={"divergence_mrad": 1.0})
+    # One event and one reversal, before the echo of the bottom at 1406 ns.
+    energy, changes = (values.reshape(-1, 2, 3, 160)[:, 0, 1, :80].sum(axis=1) for values in one_pass(renderer))
+    ratio, step = bb / b, 1e-3 * bb / b
+    sides = [np.log(fournier_forand(np.pi, *fournier_forand_parameters(ratio + sign * step))) for sign in (1, -1)]
+    by_ratio = (sides[0] - sides[1]) / (2 * step)
+    wanted = [1 / b - by_ratio * ratio / b, by_ratio / b]
+    np.testing.assert_allclose(changes / energy, wanted, rtol=3e-3)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_reflectance_follows_from_the_number_of_reflections(lidar, integrator):
     """Light that has not met the bottom does not change; nearly all other light has met it once."""
     renderer, _ = lidar(integrator, ["bottom_reflectance"], rho=0.3)
@@ -125,6 +164,19 @@ def test_ripple_variance_of_an_echo_at_nadir(lidar, integrator):
     assert parameter.value == pytest.approx(0.01)
     energy, changes = (values.reshape(3, 160)[0].sum() for values in one_pass(renderer.by_origin()))
     assert -1 - 1e-3 < parameter.value * changes / energy < -0.95
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_ripple_variance_of_an_echo_off_nadir(lidar, integrator):
+    """Gaussian slopes of variance v in all, seen at 20 degrees: d ln E / d ln v = tan(20 degrees)^2 / v - 1.
+
+    The beam of 0.1 mrad changes the angle by 5e-5, and that by the law of slopes at most by 2e-6 in the mean.
+    """
+    options = {"pose": {"off_nadir_deg": 20.0}, "tx": {"divergence_mrad": 0.1}, "sea": {"slope_variance": "0.01"}}
+    renderer, (parameter,) = lidar(integrator, ["ripple_variance"], **options)
+    energy, changes = (values.reshape(3, 160)[0].sum() for values in one_pass(renderer.by_origin()))
+    found, wanted = parameter.value * changes / energy, np.tan(np.deg2rad(20)) ** 2 / 0.01 - 1
+    assert found == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -185,6 +237,46 @@ def test_reweighted_light_is_that_of_the_other_scene(lidar, integrator, changed)
     wanted = np.array([one_pass(other, 1000 + seed)[0] for seed in range(passes)])
     in_bins = (values.reshape(passes, 1, -1, 8).sum(axis=3)[:, :, :13] for values in (found, wanted))
     significance.assert_same(*in_bins, error=0.1 if integrator == "lidar_volpath" else 0.03, bias=0.003)
+
+
+@pytest.mark.parametrize(
+    ("case", "integrator", "names"),
+    [
+        ("target", "lidar_merging", ["target_reflectance"]),
+        ("layered", "lidar_volpath", ["backscattering[0]", "ripple_variance"]),
+    ],
+)
+def test_paths_against_differences(case, integrator, names):
+    """Bins and sums over them, against central differences on common random numbers (`compare_derivatives`)."""
+    passes, paths = 10, 2**12 if integrator == "lidar_merging" else 2**14
+    samples = compare_derivatives.sample(case, integrator, passes, paths, only=names)
+    for z, ratio, error in compare_derivatives.compare(samples).values():
+        assert z.size > 20
+        assert np.abs(z).max() < significance.largest_z(10**6, z.size)
+        assert error < 0.2
+        assert abs(ratio - 1) < 1e-3 + significance.largest_z(passes) * error, ratio
+
+
+def test_comparison_finds_a_derivative_that_is_off():
+    """Made passes, 2 % of noise: 1 % is found in the sums, also of derivatives of both signs, and 30 % in one bin."""
+    passes, bins = 32, 40
+    rng = np.random.default_rng(5)
+    slope = np.concatenate([np.full(bins // 2, 2.0), np.full(bins // 2, -1.0)])
+    light = rng.normal(1, 0.02, (2, passes, 1, 1, bins)) * slope
+    energy = rng.normal(1, 0.02, (passes, 1, bins))
+
+    def compared(factor):
+        made = compare_derivatives.Samples(["c"], np.ones(1), energy, factor * light[0], light[1])
+        return compare_derivatives.compare(made)["c"]
+
+    z, ratio, error = compared(np.ones(bins))
+    assert np.abs(z).max() < significance.largest_z(10**6, bins)
+    assert error < 2e-3
+    assert abs(ratio - 1) < significance.largest_z(passes) * error
+    _, ratio, error = compared(np.full(bins, 1.01))
+    assert abs(1.01 * ratio - 1) < significance.largest_z(passes) * error
+    z, _, _ = compared(np.where(np.arange(bins) == 30, 1.3, 1.0))
+    assert np.argmax(np.abs(z)) == 30
 
 
 @pytest.mark.long

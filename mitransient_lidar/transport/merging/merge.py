@@ -108,7 +108,7 @@ def merge_in_water(
         length = points.length + photon.length + beyond * group
         by_water = None if len(scatterers) == 1 else shares[0] / shared
         depth, light = -points.point.z, -photon.direction
-        sums = joined(sums_before, photon.contribution.sums)
+        sums = perturbations.about(joined(sums_before, photon.contribution.sums), depth, beyond)
         sums = perturbations.at_event(sums, depth, points.direction, light, by_water)
         subpath.add(record, photon, 1, length, energy, active, sums)
         return (index + 1,)
