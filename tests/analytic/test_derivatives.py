@@ -253,7 +253,7 @@ def test_paths_against_differences(case, integrator, names):
     for z, ratio, error in compare_derivatives.compare(samples).values():
         assert z.size > 20
         assert np.abs(z).max() < significance.largest_z(10**6, z.size)
-        assert error < 0.2
+        assert error < significance.largest_error(passes, 0.05)
         assert abs(ratio - 1) < 1e-3 + significance.largest_z(passes) * error, ratio
 
 
@@ -271,7 +271,7 @@ def test_comparison_finds_a_derivative_that_is_off():
 
     z, ratio, error = compared(np.ones(bins))
     assert np.abs(z).max() < significance.largest_z(10**6, bins)
-    assert error < 2e-3
+    assert error < significance.largest_error(passes, 9e-4)
     assert abs(ratio - 1) < significance.largest_z(passes) * error
     _, ratio, error = compared(np.full(bins, 1.01))
     assert abs(1.01 * ratio - 1) < significance.largest_z(passes) * error
