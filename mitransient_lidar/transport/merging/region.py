@@ -213,12 +213,6 @@ class SurfaceHeights:
         self._surface = self._look_down(scene, region, moves, solids=False)
         self._bed = self._look_down(scene, region.below(scene, depth), moves, solids=True)
 
-    def with_surface_of(self, scene: LidarScene, region: Region) -> SurfaceHeights:
-        """Return the heights of the sea surface of another scene, with the same solids below."""
-        heights = copy.copy(self)
-        heights._surface = self._look_down(scene, region, np.zeros((1, 2)), solids=False)
-        return heights
-
     def repeated(self, copies: int) -> SurfaceHeights:
         """Return the heights of each shot several times in turn, which share them."""
         heights = copy.copy(self)

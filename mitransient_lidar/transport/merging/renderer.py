@@ -198,14 +198,14 @@ class MergingLayout:
     def of_scene_alike(self, scene: LidarScene) -> MergingLayout:
         """Return the same points and cells for a scene that differs a little, whose solids may be other objects.
 
-        Cells go with the beam, as the sea refracts it, and with the sea surface: with the same random numbers most
-        light stays in its cell.
+        Cells go with the beam, as the sea refracts it, with the sea surface and with the solids where they end: most
+        light of the same random numbers stays in its cell, and light near a surface that moves is right.
         """
         uneven, grid = solids_of_several_levels(scene, self.region), self.grid
         if not isinstance(grid, WaterGrid):
             return replace(self, uneven=uneven)
         rings = grid.rings.alike(scene.transmitter.pose, beam_entries(scene), scene.mean_slopes(1))
-        heights = grid.heights.with_surface_of(scene, self.region)
+        heights = SurfaceHeights(scene, self.region, self.depth)
         return replace(self, uneven=uneven, grid=grid.moved(heights, rings), rings=rings)
 
     @classmethod

@@ -159,13 +159,22 @@ def test_the_cells_of_a_changed_scene_are_the_same_and_know_its_solids():
     assert layout.uneven[0] in moved.scene.shapes()
 
 
-def test_cells_go_with_the_surface_and_the_beam_that_it_refracts():
-    """A mean slope s along the beam turns it by the angles of Snell's law about the normal of the inclined sea."""
+def test_cells_go_with_the_surfaces_and_the_beam_that_is_refracted():
+    """A mean slope along the beam turns it by the angles of Snell's law about the normal of the inclined sea.
+
+    Cells begin at the inclined sea and end at the bottom that has moved: in others, the derivative by the slope of the
+    sea was up to 8 % too small in the first 10 ns of one pixel of `table1` and 18 % too large in the next.
+    """
     session = open_scene("table1", {"spectrum": "flat", "surface_size": 1000})
     integrator = choose_integrator(session.scene, FEW)
     base = integrator.prepare(session.scene, session.sensor)
-    moved = open_scene(session.record, {"surface_slope_x_deg": 2}, model=session.scene)
-    rings = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout.grid.rings
+    moved = open_scene(session.record, {"surface_slope_x_deg": 2, "bottom_depth": 8.5}, model=session.scene)
+    grid = integrator.prepare(moved.scene, moved.sensor, layout_of=base).layout.grid
+    rings, x, y = grid.rings, mi.Float(-1.5, 0.2, 2), mi.Float(0.5, 0, -1)
+    height, slope = grid.heights.surface_at(x, y)
+    assert np.array(height) == pytest.approx(np.tan(np.deg2rad(2)) * np.array(x), abs=1e-4)
+    assert np.array(slope.x) == pytest.approx(np.full(3, np.tan(np.deg2rad(2))), abs=1e-4)
+    assert np.array(grid.heights.bed_at(x, y)) == pytest.approx(np.full(3, -8.5), abs=1e-4)
     tilt = np.deg2rad(2)
     # The normal turns towards the lidar, which is at -x.
     in_water = np.arcsin(np.sin(np.deg2rad(20) - tilt) / 1.34) + tilt
