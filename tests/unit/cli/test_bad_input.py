@@ -34,9 +34,8 @@ def rows(scene, table):
 LASER = "pulse_energy_mj pulse_fwhm_ns divergence_mrad wavelength_nm optical_efficiency"
 RECEIVER = "field_of_view_mrad aperture_area two_way_atmospheric_transmittance response_time_ns"
 POSE = "altitude off_nadir_deg aim_x aim_y"
-RECORD = "time_start_ns bin_width_ns"
 SEA = "wind_speed wind_direction_deg surface_time surface_size phase_g"
-NUMBERS = f"{LASER} {RECEIVER} {POSE} {RECORD} {SEA} bottom_depth bottom_reflectance"
+NUMBERS = f"{LASER} {RECEIVER} {POSE} {SEA} time_start_ns bin_width_ns bottom_depth bottom_reflectance"
 LISTS = "layer_tops attenuation scattering backscattering water_scattering chi_p refractive_index group_index"
 
 TABLE1 = {
