@@ -122,7 +122,7 @@ class Renders:
         self, scene: str, params: Mapping[str, float], places: Sequence[Any], goal: Mapping[str, Any]
     ) -> xr.Dataset:
         """Return a result, rendered at its first use; raise KeyboardInterrupt where the render was interrupted."""
-        key = (scene, *sorted(params.items()), len(places), *sorted(goal))
+        key = (scene, *sorted(params.items()), tuple(map(tuple, places)), *sorted(goal.items()))
         if key not in self._results:
             _LOG.info("%s: %d renders", ", ".join([scene, *(f"{k}={v:g}" for k, v in params.items())]), len(places))
             options: dict[str, Any] = {"pass_share": _SHARE, "first_seed": _SEED_STEP * self.seed, **goal}
