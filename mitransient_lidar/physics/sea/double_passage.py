@@ -64,16 +64,16 @@ class SlopeStructure:
         displacement
             Displacement of the two ways against each other [m]; broadcast with `spread`.
         """
-        spread, apart = np.broadcast_arrays(np.asarray(spread, np.float64), np.asarray(displacement, np.float64))
-        found = np.ones(spread.shape)
-        near = apart**2 <= _FAR_APART**2 * spread**2 * np.interp(apart, self.distance, self.across)
-        spread, apart = (one[near][:, None, None] for one in (spread, apart))
+        spreads, apart = np.broadcast_arrays(np.asarray(spread, np.float64), np.asarray(displacement, np.float64))
+        found = np.ones(spreads.shape)
+        near = apart**2 <= _FAR_APART**2 * spreads**2 * np.interp(apart, self.distance, self.across)
+        spreads, apart = (one[near][:, None, None] for one in (spreads, apart))
         nodes, weights = np.polynomial.legendre.leggauss(_ANGLES)
         # Denser about the direction of the displacement.
         angle = np.pi * (0.5 * (nodes + 1)) ** 2
         weight = weights * 0.5 * (nodes + 1) * np.pi
         d = self.distance[:, None]
-        along, across = (spread**2 * one[:, None] for one in (self.along, self.across))
+        along, across = (spreads**2 * one[:, None] for one in (self.along, self.across))
         exponent = -0.5 * ((d - apart * np.cos(angle)) ** 2 / along + (apart * np.sin(angle)) ** 2 / across)
         density = np.exp(exponent) / (np.pi * np.sqrt(along * across))
         # At both ends of the distances nothing is left.
