@@ -29,6 +29,9 @@ from mitransient_lidar.transport.sensor.receiver import Receiver
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
 
+#: Difference of wavelengths that no water tells apart [nm].
+_SAME_NM = 1.0
+
 #: Vertical component of an axis under water above which it looks up.
 _SMALLEST_RISE = 0.1
 
@@ -63,6 +66,7 @@ def find_lidar_scene(
             "allowed is exactly one lidar_transmitter, besides sun and sky"
         )
     water, surfaces, variance = find_water(scene)
+    _check_wavelength(water, transmitters[0])
     parts = WaterScene(scene, receiver, water, surfaces, variance)
     submerged = _check_place(parts, transmitters[0])
     if not submerged:
@@ -165,6 +169,16 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
         _check_layers(scene, surfaces, water)
     variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
+
+
+def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
+    """Refuse a water by name or profile of another wavelength than the laser's."""
+    laser = transmitter.wavelength_nm
+    if water is not None and water.wavelength_nm is not None and abs(water.wavelength_nm - laser) > _SAME_NM:
+        raise UserError(
+            f"wavelength_nm = {water.wavelength_nm:g} of the water must be that of the lidar_transmitter, {laser:g}: "
+            "give both the same, or the water's coefficients as numbers"
+        )
 
 
 def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:
