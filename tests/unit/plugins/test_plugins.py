@@ -142,7 +142,13 @@ REFUSED = [
     ({"type": "layered_water", "scattering": 0.4}, "scattering = 0.4 must not exceed attenuation = 0.3"),
     ({"type": "layered_water", "backscattering": 0.2}, "backscattering = 0.2 must not exceed scattering = 0.15"),
     (
-        {"type": "layered_water", "phase_function": "hg", "scattering": "0.1, 0.2", "backscattering": "0, 0, 0"},
+        {
+            "type": "layered_water",
+            "phase_function": "hg",
+            "layer_tops": "0, 2",
+            "scattering": "0.1, 0.2",
+            "backscattering": "0, 0, 0",
+        },
         "backscattering has 3 values",
     ),
     ({"type": "layered_water", "layer_tops": "0, 4, 3"}, "layers out of order"),
