@@ -126,6 +126,25 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
 
 
 @pytest.mark.slow
+def test_textures_give_the_same_bits(tmp_path):
+    """A bitmap on the seabed and a turned pattern on a target, from the file of the result."""
+    picture = tmp_path / "grey.png"
+    mi.Bitmap(np.tile(np.uint8([[40, 200], [200, 40]]), (4, 4))[:, :, None]).write(str(picture))
+    scene = scene_dict(tmp_path)
+    turned = mi.ScalarTransform3d().rotate(30).scale([4, 6])
+    scene["target"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": turned}}
+    bitmap = {"type": "bitmap", "filename": str(picture)}
+    scene["bottom"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap}
+    result = mitransient_lidar.render(scene, passes=2)
+    results.save(result, tmp_path / "result.nc")
+    assert_same_bits(render_again(tmp_path / "result.nc"), result)
+    assert json.loads(result.attrs["scene_files"])[1]["path"] == str(picture.resolve())
+    picture.write_bytes(picture.read_bytes() + b" ")
+    with pytest.raises(UserError, match=r"grey.png has changed"):
+        render_again(tmp_path / "result.nc")
+
+
+@pytest.mark.slow
 def test_files_of_an_xml_scene_are_found_from_another_folder(tmp_path, monkeypatch):
     """A mesh is named relative to the scene, a profile to the working folder; both are recorded by their paths."""
     home, other = tmp_path / "home", tmp_path / "other"
