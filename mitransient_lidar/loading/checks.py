@@ -133,7 +133,7 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                     _check_range(label, key, number)
                 if _SHARE.search(key):
                     _check_shares(label, value)
-            elif hasattr(value, "matrix"):
+            elif is_transform(value):
                 _check_matrix(label, matrix_of(value.matrix))
 
 
@@ -215,6 +215,11 @@ def _check_range(label: str, name: str, number: float) -> None:
 def _check_shares(label: str, values: Any) -> None:
     for value in values if isinstance(values, (list, tuple)) else [values]:
         in_range(label, value, 0, 1)
+
+
+def is_transform(value: object) -> bool:
+    """Return whether a value is a transform; arrays of Dr.Jit have a `matrix`, too."""
+    return hasattr(value, "matrix") and hasattr(value, "inverse_transpose")
 
 
 def matrix_of(matrix: Any) -> FloatArray:

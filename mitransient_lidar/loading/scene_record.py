@@ -33,7 +33,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.checks import matrix_of
+from mitransient_lidar.loading.checks import is_transform, matrix_of
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
 
@@ -242,7 +242,7 @@ def _plain(value: Any) -> Any:
     """Return the value of a parameter in types of JSON: a number, a text, or a list; a transform as its matrix."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    if hasattr(value, "matrix"):
+    if is_transform(value):
         return matrix_of(value.matrix).tolist()
     try:
         array = np.array(value)
@@ -265,7 +265,7 @@ def _to_json(value: Any) -> Any:
         return str(value)
     if isinstance(value, (list, tuple)):
         return [_to_json(item) for item in value]
-    if hasattr(value, "matrix") and hasattr(value, "inverse_transpose"):
+    if is_transform(value):
         return {name: matrix_of(getattr(value, name)).tolist() for name in ("matrix", "inverse_transpose")}
     array = np.array(value)
     if array.shape == (3,) and array.dtype.kind in "fiu":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -25,6 +26,8 @@ from mitransient_lidar.transport.plugin_types import (
 from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
+
+logger = logging.getLogger(__name__)
 
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
@@ -77,6 +80,25 @@ def find_lidar_scene(
         found = (own, transmitters[0], film)
         film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
     return LidarScene(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
+
+
+def lidar_sensor(scene: mi.Scene) -> mi.Sensor:
+    """Return the receiver among the sensors of a scene, wherever cameras stand beside it; of several, the first.
+
+    Raises
+    ------
+    UserError
+        If the scene has none.
+    """
+    sensors = scene.sensors()
+    receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
+    if not receivers:
+        found = f"has only {', '.join(sensor.class_name() for sensor in sensors)}" if sensors else "has none"
+        raise UserError(f"sensor: the scene {found}; add a multipixel_receiver or pixel_fov")
+    if len(receivers) > 1:
+        names = ", ".join(repr(sensor.id()) for sensor in sensors if sensor in receivers)
+        logger.warning("the scene has %d receivers, %s: the first one is used", len(receivers), names)
+    return receivers[0]
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:

@@ -126,6 +126,23 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("place", ["first", "last"])
+def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
+    """Before the receiver it was taken for it, and its film could not be recorded."""
+    looking = mi.ScalarTransform4f().look_at([0, 0, 90], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 6, "pixel_format": "luminance"}
+    camera = {"camera": {"type": "perspective", "to_world": looking, "film": film}}
+    scene = scene_dict(tmp_path)
+    scene = {**camera, **scene} if place == "first" else {**scene, **camera}
+    result = mitransient_lidar.render(scene, passes=2, seed=own.attrs["seed"])
+    np.testing.assert_array_equal(result["waveform"], own["waveform"])
+    described = json.loads(result.attrs["plugin_parameters"])["camera"]
+    np.testing.assert_allclose(described["to_world"], looking.matrix, atol=1e-6)
+    assert described["film"]["size"] == [8, 6]
+    assert_same_bits(render_again(result), result)
+
+
+@pytest.mark.slow
 def test_textures_give_the_same_bits(tmp_path):
     """A bitmap on the seabed and a turned pattern on a target, from the file of the result."""
     picture = tmp_path / "grey.png"
