@@ -151,11 +151,16 @@ def _channels(
     receiver = receiver_of_result(dataset, chain, gain, optical_density)
     dims = tuple(dim for dim in _waveform(dataset)[0][:-1] if dim != "shot")
     sky = _background(dataset, background_power, dims)
+    pixels = [str(name) for name in dataset["pixel"].values] if dims == ("pixel",) else []
+    # Shipped receivers go with other layouts and with some pixels alone; a file is of the lidar that it is given for.
+    if receiver.name.endswith(".toml") and (absent := [name for name in receiver.channels if name not in pixels]):
+        known = f"has the pixels {', '.join(pixels)}" if pixels else "is an image without named pixels"
+        raise UserError(f"{receiver.name}: channels.{absent[0]} is for no pixel: the result {known}")
     if dims != ("pixel",):
         return receiver, [(receiver.default, list(range(math.prod(dataset.sizes[dim] for dim in dims))))], sky
     groups: dict[int, tuple[Channel, list[int]]] = {}
-    for number, name in enumerate(dataset["pixel"].values):
-        channel = receiver.of(str(name))
+    for number, name in enumerate(pixels):
+        channel = receiver.of(name)
         groups.setdefault(id(channel), (channel, []))[1].append(number)
     return receiver, list(groups.values()), sky
 

@@ -46,6 +46,17 @@ def non_negative(name: str, value: object) -> float:
     return number
 
 
+def relative_error(name: str, value: object) -> float:
+    """Return `value`, a share and not a percentage, as a float above 0, at most 1."""
+    number = positive(name, value)
+    if number > 1:
+        raise UserError(
+            f"{name} = {number:g} is an error of {100 * number:g} % but must be at most 1: did you mean "
+            f"{number / 100:g}, which is {number:g} %?"
+        )
+    return number
+
+
 def in_range(name: str, value: object, low: float, high: float) -> float:
     """Return `value` as a float in the closed interval [`low`, `high`]; `high` may be infinite."""
     number = finite(name, value)

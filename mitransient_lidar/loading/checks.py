@@ -13,7 +13,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import limits
-from mitransient_lidar.core.validation import finite, in_range, integer, is_number, shown
+from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, is_number, shown
 from mitransient_lidar.loading.document import DEEPEST_NESTING, SceneDocument, Setting
 
 #: Largest coordinate [m] and scale of a transform: 32-bit coordinates are accurate to 6 cm there.
@@ -133,8 +133,8 @@ def check_dict(scene: Mapping[str, Any]) -> None:
                     _check_range(label, key, number)
                 if _SHARE.search(key):
                     _check_shares(label, value)
-            elif hasattr(value, "matrix"):
-                _check_matrix(label, np.array(value.matrix, dtype=np.float64))
+            elif is_transform(value):
+                _check_matrix(label, matrix_of(value.matrix))
 
 
 @dataclass(frozen=True)
@@ -215,6 +215,18 @@ def _check_range(label: str, name: str, number: float) -> None:
 def _check_shares(label: str, values: Any) -> None:
     for value in values if isinstance(values, (list, tuple)) else [values]:
         in_range(label, value, 0, 1)
+
+
+def is_transform(value: object) -> bool:
+    """Return whether a value is a transform; arrays of Dr.Jit have a `matrix`, too."""
+    return hasattr(value, "matrix") and hasattr(value, "inverse_transpose")
+
+
+def matrix_of(matrix: Any) -> FloatArray:
+    """Return a matrix of Dr.Jit as an array: 4x4 of transforms, 3x3 of those of textures."""
+    # Dr.Jit pads the rows of a 3x3 matrix of plain numbers, and NumPy would take the padding for numbers.
+    size = range(len(matrix))
+    return np.array([[np.array(matrix[row, column]).item() for column in size] for row in size], dtype=np.float64)
 
 
 def _check_matrix(label: str, matrix: Any) -> None:

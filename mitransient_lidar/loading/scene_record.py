@@ -33,6 +33,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
+from mitransient_lidar.loading.checks import is_transform, matrix_of
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
 from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
 
@@ -241,8 +242,8 @@ def _plain(value: Any) -> Any:
     """Return the value of a parameter in types of JSON: a number, a text, or a list; a transform as its matrix."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    if hasattr(value, "matrix"):
-        return np.array(value.matrix, dtype=np.float64).reshape(4, 4).tolist()
+    if is_transform(value):
+        return matrix_of(value.matrix).tolist()
     try:
         array = np.array(value)
     except (RuntimeError, TypeError, ValueError):
@@ -264,9 +265,8 @@ def _to_json(value: Any) -> Any:
         return str(value)
     if isinstance(value, (list, tuple)):
         return [_to_json(item) for item in value]
-    if hasattr(value, "matrix") and hasattr(value, "inverse_transpose"):
-        parts = {name: np.array(getattr(value, name), dtype=np.float64) for name in ("matrix", "inverse_transpose")}
-        return {name: part.reshape(4, 4).tolist() for name, part in parts.items()}
+    if is_transform(value):
+        return {name: matrix_of(getattr(value, name)).tolist() for name in ("matrix", "inverse_transpose")}
     array = np.array(value)
     if array.shape == (3,) and array.dtype.kind in "fiu":
         return array.tolist()
@@ -283,7 +283,9 @@ def _from_json(value: Any) -> Any:
         import drjit.scalar as ds
         import mitsuba as mi
 
-        return mi.ScalarTransform4d(*(ds.Matrix4f64(value[name]) for name in ("matrix", "inverse_transpose")))
+        of_texture = len(value["matrix"]) == 3
+        kind, matrix = (mi.ScalarTransform3d, ds.Matrix3f64) if of_texture else (mi.ScalarTransform4d, ds.Matrix4f64)
+        return kind(*(matrix(value[name]) for name in ("matrix", "inverse_transpose")))
     return {key: _from_json(item) for key, item in value.items()}
 
 

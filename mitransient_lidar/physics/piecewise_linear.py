@@ -1,4 +1,4 @@
-"""Integrals of functions that are linear between nodes."""
+"""Integrals and crossings of functions that are linear between nodes."""
 
 from __future__ import annotations
 
@@ -25,3 +25,11 @@ def integral(nodes: FloatArray, values: FloatArray, t: FloatArray) -> FloatArray
     i, x = locate(nodes, t)
     slope = np.diff(values) / np.diff(nodes)
     return np.asarray(node_integrals(nodes, values)[i] + x * (values[i] + 0.5 * slope[i] * x))
+
+
+def first_crossing(t: FloatArray, values: FloatArray, level: float) -> float:
+    """First time at which linear interpolation of the samples reaches a level; `t[0]` if they start above it."""
+    i = int(np.argmax(values >= level))
+    if i == 0:
+        return float(t[0])
+    return float(t[i - 1] + (level - values[i - 1]) / (values[i] - values[i - 1]) * (t[i] - t[i - 1]))

@@ -118,7 +118,8 @@ def known_names(scene: LidarScene) -> list[str]:
         names += ["phase_g"] if layers.kind == "hg" and not layers.nested else []
     names += [DIVERGENCE] if _is_gaussian(scene.transmitter) else []
     names += [RIPPLES] if _rippled(scene) else []
-    return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in scene.solids)]
+    diffuse = [solid for solid in scene.solids if _uniform_reflectance(solid) is not None]
+    return [*names, *(f"{solid.id()}{_REFLECTANCE}" for solid in diffuse)]
 
 
 def _parameters(renderer: PassRenderer, name: str, option: str, others: Mapping[str, str]) -> list[Parameter]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import in_range, integer, positive
+from mitransient_lidar.core.validation import in_range, integer, positive, relative_error
 
 #: Largest number of passes that can be asked for.
 MOST_PASSES = 10**9
@@ -37,7 +37,7 @@ class RenderOptions:
     target_error: float | None = _option(
         "Stop when 95 % of the bins of lit pixels, from the surface echo to the end of the bottom echo, have reached "
         "this relative standard error, e.g. 0.03; of gates, 95 % of them; of images, 95 % of the lit pixels",
-        "greater than 0",
+        "greater than 0, at most 1",
     )
     target_quantile: float | None = _option(
         "Share that must reach the target error instead of 0.95; 0.5 is the median", "0.01 to 1", 0.01, 1
@@ -75,8 +75,10 @@ class RenderOptions:
             value, low, high = getattr(self, one.name), one.metadata["low"], one.metadata["high"]
             if value is None or not one.metadata["allowed"]:
                 continue
-            if low is None:
-                number: float = positive(one.name, value)
+            if one.name == "target_error":
+                number: float = relative_error(one.name, value)
+            elif low is None:
+                number = positive(one.name, value)
             else:
                 number = (integer if isinstance(low, int) else in_range)(one.name, value, low, high)
             object.__setattr__(self, one.name, number)

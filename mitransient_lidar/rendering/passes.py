@@ -95,7 +95,7 @@ class Goal:
 
     def is_accurate(self, error: float | None) -> bool:
         """Return whether the quantile of the errors is at most the requested error."""
-        return self.target_error is not None and (error or np.inf) <= self.target_error
+        return self.target_error is not None and error is not None and error <= self.target_error
 
     def needed_passes(self, done: int, error: float | None) -> int | None:
         """Estimate the passes still needed for the requested error, which falls with the square root of the passes."""

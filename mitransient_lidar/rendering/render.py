@@ -74,9 +74,9 @@ def render(
     integrator
         Name or dict of an integrator plugin, or an integrator; by default that of the scene.
     target_error
-        Relative standard error, greater than 0, that ends the render (after at least 8 passes) when 95 % of the bins of
-        lit pixels from the surface echo to the end of the bottom echo have reached it; with gates, 95 % of the gates,
-        in the median over their lit pixels.
+        Relative standard error, greater than 0, at most 1, that ends the render (after at least 8 passes) when 95 % of
+        the bins of lit pixels from the surface echo to the end of the bottom echo have reached it; with gates, 95 % of
+        the gates, in the median over their lit pixels.
     target_quantile
         Share of these bins or gates that must reach the error, 0.01 to 1, instead of 0.95; 0.5 requests the median.
     max_time

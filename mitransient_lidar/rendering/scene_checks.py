@@ -39,6 +39,9 @@ _NEAREST_RANGE = 0.05
 #: Heights at which the distance of the axes is compared.
 _HEIGHTS = 64
 
+#: Sum of the areas of a mesh over their absolute values, below which it is closed.
+_CLOSED = 1e-3
+
 #: Widths of the pulse and of the receiver's response that an echo lasts at most.
 _PULSES = 5.0
 
@@ -120,6 +123,7 @@ def check_scene(scene: LidarScene, sampler: SensorSampler, probe: EchoProbe) -> 
     _warn_of_axes(scene, view, beam)
     for solid in scene.solids:
         _warn_of_place(solid, view, beam)
+        _warn_of_inside_out(solid)
     for echo in probe.solids:
         _warn_of_time(scene, probe, echo)
 
@@ -318,6 +322,28 @@ def _warn_of_place(solid: mi.Shape, view: _Rays, beam: _Rays) -> None:
             z,
         )
         return
+
+
+def _warn_of_inside_out(solid: mi.Shape) -> None:
+    """Warn of a closed mesh that reflects on one side only, the inside."""
+    if not isinstance(solid, mi.Mesh) or int(solid.bsdf().flags()) & mi.BSDFFlags.BackSide.value:
+        return
+    buffers = mi.traverse(solid)
+    if "vertex_positions" not in buffers:
+        return
+    vertices, faces = (np.array(buffers[name]).reshape(-1, 3) for name in ("vertex_positions", "faces"))
+    corners = (vertices[faces] - vertices.mean(axis=0)).astype(np.float64)
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # The areas of a closed surface cancel.
+    if np.linalg.norm(areas.sum(axis=0)) > _CLOSED * np.linalg.norm(areas, axis=1).sum():
+        return
+    volume = float(np.einsum("ij,ij->", corners[:, 0], areas))
+    if (volume < 0) != solid.has_flipped_normals():
+        logger.warning(
+            "the faces of shape %r point inwards and its BSDF reflects on their front alone: it returns no light; turn "
+            "the faces, set flip_normals, or nest the BSDF in a twosided",
+            solid.id(),
+        )
 
 
 def _warn_of_time(scene: LidarScene, probe: EchoProbe, echo: SolidEcho) -> None:

@@ -122,11 +122,11 @@ class SeaMap:
 
 
 def transmitter_of(scene: mi.Scene) -> Transmitter:
-    """Return the transmitter of a scene; raise UserError without one, or without a receiver."""
+    """Return the transmitter of a scene; raise UserError without one."""
     from mitransient_lidar.transport.plugin_types import Transmitter
 
     transmitter = next((emitter for emitter in scene.emitters() if isinstance(emitter, Transmitter)), None)
-    if transmitter is None or not scene.sensors():
+    if transmitter is None:
         raise UserError("the scene needs a lidar_transmitter and a multipixel_receiver to find shots for")
     return transmitter
 

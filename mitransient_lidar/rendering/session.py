@@ -30,7 +30,7 @@ TOLERATED_LOSS = 1e-3
 
 @dataclass(frozen=True)
 class Session:
-    """A loaded scene with its first sensor, its name, and the parameters of an XML scene with their values as text.
+    """A loaded scene with its receiver, its name, and the parameters of an XML scene with their values as text.
 
     The record, None for a scene from loaded objects, loads the scene again.
     """
@@ -94,11 +94,10 @@ def open_scene(
     if isinstance(scene, Session) and not params:
         return scene
     variants.set_variant(variant)
+    from mitransient_lidar.transport.scene_parts import lidar_sensor
+
     loaded = load(scene, params, instrument, model)
-    sensors = loaded.scene.sensors()
-    if not sensors:
-        raise UserError("sensor: the scene has none; add a multipixel_receiver or pixel_fov")
-    return Session(loaded.scene, sensors[0], loaded.name, loaded.parameters, loaded.record)
+    return Session(loaded.scene, lidar_sensor(loaded.scene), loaded.name, loaded.parameters, loaded.record)
 
 
 @overload

@@ -99,8 +99,8 @@ def render_shots(
     passes
         Passes of each shot, 2 to 10 000; by default 8. With a `target_error`, the most, by default 400.
     target_error
-        Relative standard error, greater than 0, that ends the passes of a batch of shots when the median of the bins of
-        lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
+        Relative standard error, greater than 0, at most 1, that ends the passes of a batch when the median of the bins
+        of lit pixels from the surface echo to the end of the bottom echo has reached it, after at least 4 passes.
     max_time
         Longest time for the passes of all shots [s], greater than 0. It is shared among the batches, which end with
         fewer passes, at least two. Where these take longer, too, the result holds the batches begun by then.

@@ -169,6 +169,7 @@ def measure(
     """
     from mitransient_lidar.rendering.render import render
     from mitransient_lidar.rendering.session import choose_integrator
+    from mitransient_lidar.transport.scene_parts import lidar_sensor
 
     marks: list[tuple[float, float]] = []
     loaded = _load(case)
@@ -182,7 +183,7 @@ def measure(
         progress=lambda _: marks.append((time.perf_counter(), time.process_time())),
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    renderer = choose_integrator(loaded, integrator).prepare(loaded, loaded.sensors()[0])
+    renderer = choose_integrator(loaded, integrator).prepare(loaded, lidar_sensor(loaded))
     steps = np.diff(np.array(marks)[:, 0])
     wall, cpu = (float(last - first) for first, last in zip(marks[0], marks[-1], strict=True))
     rays = float(renderer.render_pass(0).rays[0]) * len(steps)

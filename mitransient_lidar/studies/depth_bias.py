@@ -19,7 +19,7 @@ from mitransient_lidar.analysis.waveforms.depth_correction import AXES, correct_
 from mitransient_lidar.analysis.waveforms.echo_detection import BoolArray, has_echo
 from mitransient_lidar.analysis.waveforms.echo_table import ESTIMATORS, extract
 from mitransient_lidar.core.errors import DryBottomError, UserError
-from mitransient_lidar.core.validation import FloatArray, finite_array, integer, positive
+from mitransient_lidar.core.validation import FloatArray, finite_array, integer, relative_error
 from mitransient_lidar.loading.instruments import read_instrument
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
@@ -172,7 +172,7 @@ def depth_bias(
         raise UserError(f"depth = {axes['depth'].tolist()} must be numbers above 0 that ascend")
     shots, records = integer("shots", shots, 2, 10_000), integer("records", records, 1, 10_000)
     seed = integer("seed", seed, 0, 2**31)
-    target_error = positive("target_error", target_error)
+    target_error = relative_error("target_error", target_error)
     limit = RenderOptions(max_time=max_time).max_time or math.inf
     cells: dict[tuple[int, ...], dict[str, Any]] = {}
     began, total = time.perf_counter(), math.prod(values.size for values in axes.values())

@@ -16,10 +16,10 @@ from mitransient_lidar.rendering.session import open_scene
 from mitransient_lidar.rendering.shot_series import render_shots
 
 if TYPE_CHECKING:
-    import mitsuba as mi
     import xarray as xr
 
     from mitransient_lidar.physics.lidar.pose import Pose
+    from mitransient_lidar.transport.sensor.receiver import Receiver
 
 #: Largest number of pixels whose footprints are mapped.
 _MOST_MAPPED_PIXELS = 64
@@ -125,16 +125,15 @@ def render_found_shots(
         series = render_shots(scene, params, positions=places, passes=_PASSES, max_time=max_time, progress=progress)
         results = [series.isel(shot=number) for number in range(series.sizes["shot"])]
     azimuth, along, across = footprint(transmitter_of(loaded))
-    lines, pixel_map = _pixel_map(loaded)
-    count = loaded.sensors()[0].receiver.pixels.count
+    lines, pixel_map = _pixel_map(session.sensor.receiver)
+    count = session.sensor.receiver.pixels.count
     return RenderedShots(session.name, tuple(shots), results, sea, azimuth, (along, across), lines, pixel_map, count)
 
 
-def _pixel_map(scene: mi.Scene) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def _pixel_map(receiver: Receiver) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Return `pixel_lines` and `pixel_map` of `RenderedShots`."""
     import mitsuba as mi
 
-    receiver = scene.sensors()[0].receiver
     pose: Pose = receiver.pose
     centre = pose.ground_point()
     reach = 0.6 * receiver.pixels.field_of_view * pose.ground_range / -float(pose.axis[2])

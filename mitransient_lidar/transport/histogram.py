@@ -18,7 +18,7 @@ from mitransient_lidar.transport.perturbations import Perturbations, Sums
 #: Largest number of sums: more do not fit the memory of a laptop.
 _LARGEST = 2**28
 
-#: Weights of a gate below this are neglected: beyond 5 standard deviations of a Gaussian pulse.
+#: Share of the largest weight of a gate below which others are neglected: 5 standard deviations of a Gaussian pulse.
 _SMALLEST_WEIGHT = 1e-7
 
 #: Bits of the coarse sums below the emitted energy, of the fine sums below those, and number of coarse units below
@@ -36,7 +36,7 @@ class GateWeights:
 
     def __init__(self, train: GateTrain, table: ResponseTable, reference_length: float = 0.0) -> None:
         self.count = train.count
-        kept = np.flatnonzero(table.values > _SMALLEST_WEIGHT)
+        kept = np.flatnonzero(table.values > _SMALLEST_WEIGHT * table.values.max())
         first, last = max(int(kept[0]) - 1, 0), min(int(kept[-1]) + 2, table.values.size)
         # Zero at both ends, so that linear interpolation never leaves the table.
         values = np.append(table.values[first:last], 0.0)

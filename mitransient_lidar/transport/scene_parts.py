@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -26,8 +27,13 @@ from mitransient_lidar.transport.records import fitted_record, submerged_record
 from mitransient_lidar.transport.scene import LidarScene, WaterScene, solids_of
 from mitransient_lidar.transport.sensor.receiver import Receiver
 
+logger = logging.getLogger(__name__)
+
 #: Total slope variance assumed for a surface without a known one: a broad distribution covers any sea.
 _UNKNOWN_SLOPE_VARIANCE = 0.04
+
+#: Difference of wavelengths that no water tells apart [nm].
+_SAME_NM = 1.0
 
 #: Vertical component of an axis under water above which it looks up.
 _SMALLEST_RISE = 0.1
@@ -63,6 +69,7 @@ def find_lidar_scene(
             "allowed is exactly one lidar_transmitter, besides sun and sky"
         )
     water, surfaces, variance = find_water(scene)
+    _check_wavelength(water, transmitters[0])
     parts = WaterScene(scene, receiver, water, surfaces, variance)
     submerged = _check_place(parts, transmitters[0])
     if not submerged:
@@ -73,6 +80,25 @@ def find_lidar_scene(
         found = (own, transmitters[0], film)
         film.fit(*(submerged_record(*found) if submerged else fitted_record(*found, shifts)))
     return LidarScene(scene, receiver, water, surfaces, variance, transmitters[0], axis or film.axis, film.gates)
+
+
+def lidar_sensor(scene: mi.Scene) -> mi.Sensor:
+    """Return the receiver among the sensors of a scene, wherever cameras stand beside it; of several, the first.
+
+    Raises
+    ------
+    UserError
+        If the scene has none.
+    """
+    sensors = scene.sensors()
+    receivers = [sensor for sensor in sensors if isinstance(sensor, LidarSensor)]
+    if not receivers:
+        found = f"has only {', '.join(sensor.class_name() for sensor in sensors)}" if sensors else "has none"
+        raise UserError(f"sensor: the scene {found}; add a multipixel_receiver or pixel_fov")
+    if len(receivers) > 1:
+        names = ", ".join(repr(sensor.id()) for sensor in sensors if sensor in receivers)
+        logger.warning("the scene has %d receivers, %s: the first one is used", len(receivers), names)
+    return receivers[0]
 
 
 def find_receiver(sensor: mi.Sensor) -> Receiver:
@@ -165,6 +191,16 @@ def find_water(scene: mi.Scene) -> tuple[Water | None, list[mi.Shape], float]:
         _check_layers(scene, surfaces, water)
     variances = [sea.slope_variance for sea in surfaces if isinstance(sea, SeaShape) and sea.has_ripples]
     return (waters[0] if waters else None), surfaces, float(max(variances, default=_UNKNOWN_SLOPE_VARIANCE))
+
+
+def _check_wavelength(water: Water | None, transmitter: Transmitter) -> None:
+    """Refuse a water by name or profile of another wavelength than the laser's."""
+    laser = transmitter.wavelength_nm
+    if water is not None and water.wavelength_nm is not None and abs(water.wavelength_nm - laser) > _SAME_NM:
+        raise UserError(
+            f"wavelength_nm = {water.wavelength_nm:g} of the water must be that of the lidar_transmitter, {laser:g}: "
+            "give both the same, or the water's coefficients as numbers"
+        )
 
 
 def _check_place(scene: WaterScene, transmitter: Transmitter) -> bool:

@@ -18,11 +18,14 @@ from mitransient_lidar.transport.ripple_focusing import RippleFocusing
 #: Coefficients by which light is differentiated, each with the other two held fixed [1/m].
 COEFFICIENTS = ("attenuation", "scattering", "backscattering")
 
-#: Relative step of the numerical derivatives of phase functions by their parameters.
+#: Relative step of the numerical derivatives of phase functions by their parameters; by a mean cosine g it is absolute.
 _STEP = 1e-4
 
 #: That of the factors of ripples, which are means of samples.
 _FOCUSING_STEP = 0.02
+
+#: Longest step of a mean cosine g over 1 - |g|.
+_COSINE_SHARE = 0.25
 
 #: Largest derivative of ln p by the logarithm of a parameter that counts as none: rounding of tables.
 _NEGLIGIBLE = 1e-6
@@ -107,7 +110,7 @@ def mean_cosine_derivative(water: Water, focusing: RippleFocusing | None = None)
         changes.append(LayerChange(top, bottom, by_angle=_log_derivative(layers, layer, "phase_g", value)))
     if focusing is None:
         return Perturbation(tuple(changes))
-    step = _FOCUSING_STEP * abs(value)
+    step = min(_FOCUSING_STEP, _COSINE_SHARE * (1 - abs(value)))
     low, high = (
         focusing.factors_of(
             *_changed_water(layers, {layer: {"phase_g": value + sign * step} for layer in range(count)})
@@ -125,12 +128,13 @@ def _limits(tops: FloatArray, layer: int) -> tuple[float, float]:
 
 def _log_derivative(layers: LayerPhases, layer: int, name: str, value: float) -> FloatArray | None:
     """Return the derivative of ln p by a parameter at the nodes of `LayerChange`; None where it is 0."""
-    step = _STEP * abs(value)
+    scale = 1.0 if name == "phase_g" else abs(value)
+    step = min(_STEP, _COSINE_SHARE * (1 - abs(value))) if name == "phase_g" else _STEP * scale
     if step == 0:
         return None
     low, high = (_logarithm(layers.table(layer, **{name: value + sign * step})) for sign in (-1, 1))
     found = np.asarray((high - low) / (2 * step))
-    return found if np.abs(found).max() * abs(value) > _NEGLIGIBLE else None
+    return found if np.abs(found).max() * scale > _NEGLIGIBLE else None
 
 
 def _changed_water(

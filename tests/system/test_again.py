@@ -126,6 +126,42 @@ def test_scenes_of_python_give_the_same_bits_with_their_files_alone(own, folder)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("place", ["first", "last"])
+def test_a_camera_beside_the_receiver_is_left_alone(own, tmp_path, place):
+    """Before the receiver it was taken for it, and its film could not be recorded."""
+    looking = mi.ScalarTransform4f().look_at([0, 0, 90], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 6, "pixel_format": "luminance"}
+    camera = {"camera": {"type": "perspective", "to_world": looking, "film": film}}
+    scene = scene_dict(tmp_path)
+    scene = {**camera, **scene} if place == "first" else {**scene, **camera}
+    result = mitransient_lidar.render(scene, passes=2, seed=own.attrs["seed"])
+    np.testing.assert_array_equal(result["waveform"], own["waveform"])
+    described = json.loads(result.attrs["plugin_parameters"])["camera"]
+    np.testing.assert_allclose(described["to_world"], looking.matrix, atol=1e-6)
+    assert described["film"]["size"] == [8, 6]
+    assert_same_bits(render_again(result), result)
+
+
+@pytest.mark.slow
+def test_textures_give_the_same_bits(tmp_path):
+    """A bitmap on the seabed and a turned pattern on a target, from the file of the result."""
+    picture = tmp_path / "grey.png"
+    mi.Bitmap(np.tile(np.uint8([[40, 200], [200, 40]]), (4, 4))[:, :, None]).write(str(picture))
+    scene = scene_dict(tmp_path)
+    turned = mi.ScalarTransform3d().rotate(30).scale([4, 6])
+    scene["target"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": turned}}
+    bitmap = {"type": "bitmap", "filename": str(picture)}
+    scene["bottom"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap}
+    result = mitransient_lidar.render(scene, passes=2)
+    results.save(result, tmp_path / "result.nc")
+    assert_same_bits(render_again(tmp_path / "result.nc"), result)
+    assert json.loads(result.attrs["scene_files"])[1]["path"] == str(picture.resolve())
+    picture.write_bytes(picture.read_bytes() + b" ")
+    with pytest.raises(UserError, match=r"grey.png has changed"):
+        render_again(tmp_path / "result.nc")
+
+
+@pytest.mark.slow
 def test_files_of_an_xml_scene_are_found_from_another_folder(tmp_path, monkeypatch):
     """A mesh is named relative to the scene, a profile to the working folder; both are recorded by their paths."""
     home, other = tmp_path / "home", tmp_path / "other"

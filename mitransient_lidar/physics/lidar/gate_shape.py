@@ -12,7 +12,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.headings import UNITLESS, Column
 from mitransient_lidar.core.text_tables import read_time_samples
 from mitransient_lidar.core.validation import FloatArray, in_range, non_negative, positive, time_samples
-from mitransient_lidar.physics.piecewise_linear import integral
+from mitransient_lidar.physics.piecewise_linear import first_crossing, integral
 
 #: Full length of a raised-cosine edge over its 10-90 % time: sin^2 passes 0.1 and 0.9 at 0.2048 and 0.7952 of it.
 _EDGE_PER_RISE = float(np.pi / (np.pi - 2 * np.arccos(0.8)))
@@ -92,11 +92,11 @@ class GateShape:
         if g.max() == 0:
             raise UserError("transmission must be greater than 0 somewhere")
         half = g.max() / 2
-        opens, closes = _first_crossing(t, g, half), -_first_crossing(-t[::-1], g[::-1], half)
+        opens, closes = first_crossing(t, g, half), -first_crossing(-t[::-1], g[::-1], half)
         if closes <= opens:
             raise UserError("transmission must stay above half its maximum for some time")
-        rise = _first_crossing(t, g, 1.8 * half) - _first_crossing(t, g, 0.2 * half)
-        fall = _first_crossing(-t[::-1], g[::-1], 1.8 * half) - _first_crossing(-t[::-1], g[::-1], 0.2 * half)
+        rise = first_crossing(t, g, 1.8 * half) - first_crossing(t, g, 0.2 * half)
+        fall = first_crossing(-t[::-1], g[::-1], 1.8 * half) - first_crossing(-t[::-1], g[::-1], 0.2 * half)
         return cls(float(closes - opens), float(rise), float(fall), t - opens, g)
 
     @classmethod
@@ -144,11 +144,3 @@ def _edge_integral(t: FloatArray, rise: float) -> FloatArray:
         return np.maximum(t, 0)
     u = np.clip(t / length + 0.5, 0, 1)
     return np.asarray(0.5 * length * (u - np.sin(np.pi * u) / np.pi) + np.maximum(t - 0.5 * length, 0))
-
-
-def _first_crossing(t: FloatArray, g: FloatArray, level: float) -> float:
-    """First time at which linear interpolation of the samples reaches a level; `t[0]` if they start above it."""
-    i = int(np.argmax(g >= level))
-    if i == 0:
-        return float(t[0])
-    return float(t[i - 1] + (level - g[i - 1]) / (g[i] - g[i - 1]) * (t[i] - t[i - 1]))

@@ -15,7 +15,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.text_tables import read_time_samples
 from mitransient_lidar.core.validation import FloatArray, non_negative, positive, time_samples
-from mitransient_lidar.physics.piecewise_linear import integral, locate, node_integrals
+from mitransient_lidar.physics.piecewise_linear import first_crossing, integral, locate, node_integrals
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,8 @@ class Pulse:
     shape : {'gaussian', 'sampled'}
         Selects which of the fields below apply.
     fwhm_ns : float
-        Full width at half maximum [ns]; of a sampled pulse, the time from the first to the last sample above half.
+        Full width at half maximum [ns]; of a sampled pulse, the time between its first and its last crossing of half
+        of its largest sample.
     times_ns : ndarray, shape (S,)
         Times of the samples [ns] with the largest sample at 0.
     power : ndarray, shape (S,)
@@ -79,8 +80,9 @@ class Pulse:
         area = np.sum(np.diff(t) * (p[1:] + p[:-1]) / 2)
         if area <= 0:
             raise UserError("power must be greater than 0 somewhere")
-        half = np.flatnonzero(p >= p.max() / 2)
-        return cls("sampled", float(t[half[-1]] - t[half[0]]), t - t[np.argmax(p)], p / area)
+        half = 0.5 * p.max()
+        fwhm_ns = -first_crossing(-t[::-1], p[::-1], half) - first_crossing(t, p, half)
+        return cls("sampled", fwhm_ns, t - t[np.argmax(p)], p / area)
 
     @classmethod
     def from_file(cls, path: str | PathLike[str]) -> Pulse:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.physics.receiver.dead_time import DeadBins
+from mitransient_lidar.physics.receiver.dead_time import DeadBins, further_bins
 
 _LAST = 1e-9  # share of the afterpulses that is left out
 
@@ -63,11 +63,14 @@ def moments(events: FloatArray, dead: DeadBins, chances: FloatArray, lags: int) 
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
     length = len(hit)
+    first, second = further_bins(np.moveaxis(events, -1, 0), dead)
+    # Shares of the channels that are live again a number of bins after a count.
+    ends = list(enumerate((1 - first, first - second, second), dead.bins))
     state = np.zeros((chances.size, *hit.shape[1:]))
     state[-1] = 1.0  # as if live for long
     fired = np.zeros_like(hit)
     for k in range(length):
-        state[0] += _recovered(fired, k, dead)
+        state[0] += sum(share[k - ago] * fired[k - ago] for ago, share in ends if k >= ago)
         fired[k], state = _step(state, hit[k], chances)
     covariances = [fired * (1 - fired)]
     # Probabilities of another count after one in each bin, by the lag.
@@ -77,19 +80,10 @@ def moments(events: FloatArray, dead: DeadBins, chances: FloatArray, lags: int) 
     for lag in range(1, min(lags, length)):
         kept = length - lag
         state = state[:, :kept]
-        state[0] += _recovered(again, lag, dead)[:kept]
+        state[0] += sum(share[lag - ago : length - ago] * again[lag - ago, :kept] for ago, share in ends if lag >= ago)
         again[lag, :kept], state = _step(state, hit[lag:], chances)
         covariances.append(fired[:kept] * (again[lag, :kept] - fired[lag:]))
     return np.moveaxis(fired, 0, -1), [np.moveaxis(one, 0, -1) for one in covariances]
-
-
-def _recovered(fired: FloatArray, k: int, dead: DeadBins) -> FloatArray:
-    """Return the probability that a channel is live again from the bin `k` on."""
-    found = np.zeros_like(fired[0])
-    for bins, share in ((dead.bins, 1 - dead.fraction), (dead.bins + 1, dead.fraction)):
-        if k >= bins:
-            found = found + share * fired[k - bins]
-    return np.asarray(found)
 
 
 def _step(state: FloatArray, hit: FloatArray, chances: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,9 +1,10 @@
 """Counting with dead time in time bins: probabilities of counts, their covariances, and random realisations.
 
-A cell that fires in a bin is dead for the rest of that bin and for the dead time tau after it. In bins of width dt this
-makes tau/dt + 1/2 bins, the firing bin included: on average the event is in the middle of its bin. The fractional part
-of this number is the probability of one more dead bin. This is the model of Coates (1968) with a dead time shorter than
-the record; the count rate of steady light is correct to second order in the events per bin.
+A cell that fires in a bin is dead for the rest of that bin and for the dead time tau after it. Counted from the firing
+bin, this makes tau/dt + u bins of the width dt, with the mean place u of the event in its bin: 1/2 in weak light, and
+less in strong light, whose first event is early. What exceeds the whole part of tau/dt is the probability of further
+dead bins. This is the model of Coates (1968) with a dead time shorter than the record. With this u the count rate in
+steady light is exact (W. Feller 1948, "On probability problems in the theory of counters").
 
 Arrays `events` hold the mean number of events per bin that a live cell would detect, shape (..., time), and
 probabilities have the same shape. All cells are live at the first bin.
@@ -20,14 +21,14 @@ from mitransient_lidar.core.validation import FloatArray, IntArray, positive
 
 
 class DeadBins(NamedTuple):
-    """Bins for which a cell is dead, the firing bin included: `bins`, and one more with probability `fraction`."""
+    """Dead time in bins: its whole part, for which a cell is dead in any case, and the rest, below 1."""
 
     bins: int
-    fraction: float
+    rest: float
 
 
 def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
-    """Return the number of bins for which a cell is dead, dead_time_ns / bin_width_ns + 1/2 on average.
+    """Return a dead time in bins.
 
     Parameters
     ----------
@@ -39,8 +40,24 @@ def dead_bins(dead_time_ns: float, bin_width_ns: float) -> DeadBins:
     tau, width = positive("dead_time_ns", dead_time_ns), positive("bin_width_ns", bin_width_ns)
     if tau < width:
         raise UserError(f"dead_time_ns = {tau:g} must be at least the bin width, {width:g} ns: use narrower bins")
-    mean = tau / width + 0.5
-    return DeadBins(int(mean), mean - int(mean))
+    bins = int(tau / width)
+    return DeadBins(bins, tau / width - bins)
+
+
+def further_bins(events: FloatArray, dead: DeadBins, paralyzable: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Return the probabilities that a cell that fires is dead in the first bin beyond `dead.bins`, and in the second.
+
+    Their sum for a non-paralyzable dead time is the rest and the mean place of the first event in its bin,
+    1/x - 1/(exp(x) - 1) for x events. For a paralyzable one they make the probability of a count x exp(-x tau/dt).
+    """
+    x = np.maximum(events, 1e-6)
+    hit = -np.expm1(-x)
+    if not paralyzable:
+        place = np.where(x < 1e-3, 0.5 - x / 12, 1 + 1 / x - 1 / hit)
+        return np.minimum(dead.rest + place, 1.0), np.maximum(dead.rest + place - 1, 0.0)
+    # The exact probability of a count over that without further bins.
+    quiet = x * np.exp(-(1 + dead.rest) * x) / hit
+    return np.minimum((1 - quiet) / hit, 1.0), np.maximum((1 - quiet * np.exp(x)) / hit, 0.0)
 
 
 def firing_probability(events: FloatArray, dead: DeadBins) -> tuple[FloatArray, FloatArray]:
@@ -53,12 +70,14 @@ def firing_probability(events: FloatArray, dead: DeadBins) -> tuple[FloatArray, 
     P. B. Coates, J. Phys. E 1, 878 (1968), doi:10.1088/0022-3735/1/8/437, for a dead time up to the end of the record.
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
+    further = further_bins(np.moveaxis(events, -1, 0), dead)
     fired, live = np.empty_like(hit), np.empty_like(hit)
     sums = np.zeros((len(hit) + 1, *hit.shape[1:]))
     for k in range(len(hit)):
         live[k] = 1 - (sums[k] - sums[max(0, k - dead.bins + 1)])
-        if k >= dead.bins:
-            live[k] -= dead.fraction * fired[k - dead.bins]
+        for ago, share in enumerate(further, dead.bins):
+            if k >= ago:
+                live[k] -= share[k - ago] * fired[k - ago]
         fired[k] = live[k] * hit[k]
         sums[k + 1] = sums[k] + fired[k]
     return np.moveaxis(fired, 0, -1), np.moveaxis(live, 0, -1)
@@ -73,7 +92,8 @@ def firing_probability_paralyzable(events: FloatArray, dead: DeadBins) -> FloatA
     total = np.concatenate((np.zeros((1, *mean.shape[1:])), np.cumsum(mean, axis=0)))
     k = np.arange(len(mean))
     quiet = np.exp(total[np.maximum(k - dead.bins + 1, 0)] - total[k])
-    quiet[dead.bins :] *= 1 + dead.fraction * np.expm1(-mean[: max(len(mean) - dead.bins, 0)])
+    for ago, share in enumerate(further_bins(mean, dead, paralyzable=True), dead.bins):
+        quiet[ago:] *= 1 + (share * np.expm1(-mean))[: max(len(mean) - ago, 0)]
     return np.asarray(np.moveaxis(-np.expm1(-mean) * quiet, 0, -1))
 
 
@@ -103,6 +123,7 @@ def pair_covariances(
     """
     hit, q = -np.expm1(-np.moveaxis(events, -1, 0)), np.moveaxis(fired, -1, 0)
     length = len(q)
+    first, second = further = further_bins(np.moveaxis(events, -1, 0), dead, paralyzable)
     result = [q * (1 - q)]
     again = [np.ones_like(q)]  # probability of a count at the lag, given one at lag 0
     sums = [np.zeros_like(q), np.ones_like(q)]  # sums[l]: over the lags below l
@@ -110,14 +131,19 @@ def pair_covariances(
         kept = length - lag
         if paralyzable:
             # No second count within the dead bins; beyond them the counts are independent.
-            free = q[lag:] * (lag > dead.bins)
+            free = q[lag:] * (lag >= dead.bins)
             if lag == dead.bins:
-                free = q[lag:] * (1 - dead.fraction) / (1 - dead.fraction * hit[:kept])
+                free *= (1 - first[:kept]) / (1 - first[:kept] * hit[:kept])
+                # A count leaves no event in the bin before it.
+                free[1:] /= 1 - second[: kept - 1] * hit[: kept - 1]
+            elif lag == dead.bins + 1:
+                free *= (1 - second[:kept]) / (1 - second[:kept] * hit[:kept])
             result.append(q[:kept] * (free - q[lag:]))
             continue
         live = 1 - (sums[lag][:kept] - sums[max(0, lag - dead.bins + 1)][:kept])
-        if lag >= dead.bins:
-            live = live - dead.fraction * again[lag - dead.bins][:kept]
+        for ago, share in enumerate(further, dead.bins):
+            if lag >= ago:
+                live = live - share[lag - ago : length - ago] * again[lag - ago][:kept]
         again.append(live * hit[lag:])
         sums.append(sums[lag][:kept] + again[lag])
         result.append(q[:kept] * (again[lag] - q[lag:]))
@@ -127,15 +153,20 @@ def pair_covariances(
 def sample_cells(events: FloatArray, cells: int, dead: DeadBins, shots: int, random: np.random.Generator) -> IntArray:
     """Draw the number of firing `cells`, each with the mean `events`, in `shots` records, shape (shots, ..., time)."""
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
+    first, second = further_bins(np.moveaxis(events, -1, 0), dead)
     fired = np.zeros((len(hit), shots, *hit.shape[1:]), dtype=np.int64)
     live = np.full(fired.shape[1:], cells, dtype=np.int64)
-    late = np.zeros_like(live)
+    late = later = np.zeros_like(live)
     for k in range(len(hit)):
+        live += later
+        if k > dead.bins:
+            again = second[k - dead.bins - 1] / first[k - dead.bins - 1]
+            later = random.binomial(late, again) if np.any(again) else np.zeros_like(late)
+            live += late - later
         if k >= dead.bins:
             recovered = fired[k - dead.bins]
-            stays = random.binomial(recovered, dead.fraction) if dead.fraction > 0 else np.zeros_like(late)
-            live += recovered - stays + late
-            late = stays
+            late = random.binomial(recovered, first[k - dead.bins])
+            live += recovered - late
         fired[k] = random.binomial(live, hit[k])
         live -= fired[k]
     return np.ascontiguousarray(np.moveaxis(fired, 0, -1))
@@ -155,6 +186,7 @@ def sample_counter(
     `afterpulses.hazard`; None for no afterpulses.
     """
     hit = -np.expm1(-np.moveaxis(events, -1, 0))
+    first, second = further_bins(np.moveaxis(events, -1, 0), dead, paralyzable)
     fired = np.zeros((len(hit), shots, *hit.shape[1:]), dtype=np.int64)
     free_from = np.zeros(fired.shape[1:], dtype=np.int64)
     if hazard is not None:
@@ -169,7 +201,9 @@ def sample_counter(
         counted = detected & (free_from <= k)
         fired[k] = counted
         restarts = np.flatnonzero(detected if paralyzable else counted)
-        until = k + dead.bins + (random.random(restarts.size) < dead.fraction)
+        chance = random.random(restarts.size)
+        further = (np.broadcast_to(share[k], free_from.shape).reshape(-1)[restarts] for share in (first, second))
+        until = k + dead.bins + sum((chance < share).astype(np.int64) for share in further)
         flat = free_from.reshape(-1)
         flat[restarts] = np.maximum(flat[restarts], until)
     return np.ascontiguousarray(np.moveaxis(fired, 0, -1))

@@ -162,19 +162,15 @@ class LinearDetector(SignalTail):
         tail_delays_ns: tuple[float, ...] = (),
     ) -> LinearDetector:
         """Photomultiplier tube, its gain and excess noise from the gains of its dynodes (`dynode_excess_noise`)."""
-        gains, noise = tuple(float(gain) for gain in dynode_gains), dynode_excess_noise(dynode_gains)
-        return cls(
+        tube = cls(
             quantum_efficiency,
-            float(np.prod(gains)),
-            noise,
-            dark_current_na,
-            0.0,
-            gains,
-            largest_current_ma,
+            dark_current_na=dark_current_na,
+            largest_current_ma=largest_current_ma,
             tail_fractions=tail_fractions,
             tail_decays_ns=tail_decays_ns,
             tail_delays_ns=tail_delays_ns,
         )
+        return tube.with_dynodes(dynode_gains)
 
     @property
     def charge_spread(self) -> float:
@@ -194,8 +190,12 @@ class LinearDetector(SignalTail):
         if min(gains) <= 1:
             least = min(self.dynode_gains) ** -len(self.dynode_gains)
             raise UserError(f"gain = {factor:g} must be above {least:.3g}, for gains of all dynodes above 1")
-        changed = self.photomultiplier(self.quantum_efficiency, gains)
-        return replace(self, gain=changed.gain, excess_noise=changed.excess_noise, dynode_gains=changed.dynode_gains)
+        return self.with_dynodes(gains)
+
+    def with_dynodes(self, dynode_gains: Sequence[float]) -> LinearDetector:
+        """Return the detector with other gains of its dynodes; gain and excess noise follow from them."""
+        gains, noise = tuple(float(gain) for gain in dynode_gains), dynode_excess_noise(dynode_gains)
+        return replace(self, gain=float(np.prod(gains)), excess_noise=noise, dynode_gains=gains)
 
     def event_means(self, photons: FloatArray, bin_width_ns: float) -> FloatArray:
         """Mean events per bin for a mean number of photons per bin, of the same shape."""

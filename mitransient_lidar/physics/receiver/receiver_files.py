@@ -207,7 +207,7 @@ def _channel(
     if own:
         kind = own.pop("type", None)
         if kind is None and base is not None:
-            stages["detector"] = _changed(f"{name}: detector", base.chain.detector, own)
+            stages["detector"] = _changed_detector(f"{name}: detector", base.chain.detector, own)
         elif kind not in _DETECTORS:
             raise UserError(f"{name}: detector.type = {shown(kind)} must be one of {', '.join(_DETECTORS)}")
         else:
@@ -276,6 +276,16 @@ def _changed(name: str, stage: Any, values: Mapping[str, Any]) -> Any:
     assert not isinstance(stage, type)
     _check_keys(name, values, tuple(one.name for one in fields(stage)))
     return _tried(name, lambda: replace(stage, **_checked(name, values)))
+
+
+def _changed_detector(name: str, detector: Any, values: Mapping[str, Any]) -> Any:
+    """Return a detector with other parameters; dynodes give a photomultiplier its gain and excess noise."""
+    changed = _changed(name, detector, values)
+    if not getattr(changed, "dynode_gains", ()):
+        return changed
+    if derived := [key for key in ("gain", "excess_noise") if key in values]:
+        raise UserError(f"{name}: {derived[0]} = {shown(values[derived[0]])} follows from dynode_gains: give these")
+    return _tried(name, lambda: changed.with_dynodes(changed.dynode_gains))
 
 
 def _checked(name: str, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -31,8 +31,8 @@ LEAST_DEPTH = 0.5
 #: Nodes of wavenumber, of distance, and of the angle between distance and displacement.
 _WAVENUMBERS, _DISTANCES, _ANGLES = 400, 120, 16
 
-#: Displacements of a table [m], besides 0.
-_DISPLACEMENTS = np.geomspace(3e-4, 3.0, 17)
+#: Displacements of a table [m]: the enhancement falls with their logarithm, below the first one by 0.2 % at most.
+_DISPLACEMENTS = np.geomspace(1e-6, 3.0, 40)
 
 #: Ways whose displacement is so many times what slopes do are independent.
 _FAR_APART = 8.0
@@ -64,20 +64,22 @@ class SlopeStructure:
         displacement
             Displacement of the two ways against each other [m]; broadcast with `spread`.
         """
-        spread, apart = (np.asarray(one, dtype=np.float64)[..., None, None] for one in (spread, displacement))
+        spreads, apart = np.broadcast_arrays(np.asarray(spread, np.float64), np.asarray(displacement, np.float64))
+        found = np.ones(spreads.shape)
+        near = apart**2 <= _FAR_APART**2 * spreads**2 * np.interp(apart, self.distance, self.across)
+        spreads, apart = (one[near][:, None, None] for one in (spreads, apart))
         nodes, weights = np.polynomial.legendre.leggauss(_ANGLES)
         # Denser about the direction of the displacement.
         angle = np.pi * (0.5 * (nodes + 1)) ** 2
         weight = weights * 0.5 * (nodes + 1) * np.pi
         d = self.distance[:, None]
-        along, across = (spread**2 * one[:, None] for one in (self.along, self.across))
+        along, across = (spreads**2 * one[:, None] for one in (self.along, self.across))
         exponent = -0.5 * ((d - apart * np.cos(angle)) ** 2 / along + (apart * np.sin(angle)) ** 2 / across)
         density = np.exp(exponent) / (np.pi * np.sqrt(along * across))
         # At both ends of the distances nothing is left.
         step = np.log(self.distance[1] / self.distance[0])
-        found = step * np.sum(np.sum(density * weight, axis=-1) * self.distance**2, axis=-1)
-        moved = spread[..., 0, 0] ** 2 * np.interp(apart[..., 0, 0], self.distance, self.across)
-        return np.asarray(np.where(moved * _FAR_APART**2 < apart[..., 0, 0] ** 2, 1.0, found))
+        found[near] = step * (density @ weight @ self.distance**2)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +101,19 @@ class EnhancementTable:
     def of(cls, structure: SlopeStructure, depths: FloatArray, spread_per_depth: float) -> EnhancementTable:
         """Return the table of a sea; `spread_per_depth` is the displacement of a ray over depth and slope [1]."""
         spreads = spread_per_depth * depths[:, None]
-        return cls(depths, structure.enhancement(spreads, np.append(0.0, _DISPLACEMENTS)))
+        return cls(depths, structure.enhancement(spreads, _DISPLACEMENTS))
 
     def at(self, depth: npt.ArrayLike, displacement: npt.ArrayLike) -> FloatArray:
         """Return enhancements at depths and displacements [m], arrays that broadcast.
 
-        They are linear in the logarithm of the depth and in the displacement, and those of the ends beyond the table.
-        Above its first depth they fall to 1 at the surface.
+        They are linear in the logarithms of depth and displacement, and those of the ends beyond the table. Above its
+        first depth they fall to 1 at the surface.
         """
         z, apart = np.broadcast_arrays(np.asarray(depth, np.float64), np.asarray(displacement, np.float64))
-        place = np.interp(np.log(np.maximum(z, self.depths[0])), np.log(self.depths), np.arange(self.depths.size))
-        nodes = np.append(0.0, _DISPLACEMENTS)
-        other = np.interp(apart, nodes, np.arange(nodes.size))
+        place, other = (
+            np.interp(np.log(np.maximum(one, nodes[0])), np.log(nodes), np.arange(nodes.size))
+            for one, nodes in ((z, self.depths), (apart, _DISPLACEMENTS))
+        )
         low, left = (
             np.minimum(one.astype(np.intp), size - 2)
             for one, size in zip((place, other), self.values.shape, strict=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mitransient_lidar.core.validation import integer, positive
+from mitransient_lidar.core.validation import integer, relative_error
 from mitransient_lidar.loading.catalogue import scene_parameters
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
@@ -70,7 +70,7 @@ class Renders:
     _seas: dict[tuple[str, int], SeaMap] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.target_error = positive("target_error", self.target_error)
+        self.target_error = relative_error("target_error", self.target_error)
         self.seed = integer("seed", self.seed, 0, 10**6)
 
     def shot(self, scene: str, **params: float) -> xr.Dataset:
@@ -122,7 +122,7 @@ class Renders:
         self, scene: str, params: Mapping[str, float], places: Sequence[Any], goal: Mapping[str, Any]
     ) -> xr.Dataset:
         """Return a result, rendered at its first use; raise KeyboardInterrupt where the render was interrupted."""
-        key = (scene, *sorted(params.items()), len(places), *sorted(goal))
+        key = (scene, *sorted(params.items()), tuple(map(tuple, places)), *sorted(goal.items()))
         if key not in self._results:
             _LOG.info("%s: %d renders", ", ".join([scene, *(f"{k}={v:g}" for k, v in params.items())]), len(places))
             options: dict[str, Any] = {"pass_share": _SHARE, "first_seed": _SEED_STEP * self.seed, **goal}

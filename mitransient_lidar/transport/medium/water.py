@@ -36,6 +36,8 @@ class Water:
         Bubbles, or None.
     from_profile
         Whether the layers approximate a profile from a file.
+    wavelength_nm
+        Wavelength of a water by name or of a profile's column [nm]; None where coefficients are given as numbers.
     flight, scattering_flight, absorption_flight
         Free flights by attenuation, scattering and absorption.
     """
@@ -47,6 +49,7 @@ class Water:
     water_scattering: np.ndarray
     plume: BubblePlume | BubbleLayer | None = None
     from_profile: bool = False
+    wavelength_nm: float | None = None
     flight: LayeredFlight = field(init=False)
     scattering_flight: LayeredFlight = field(init=False)
     absorption_flight: LayeredFlight = field(init=False)

@@ -56,13 +56,13 @@ def read_water(
     UserError
         When a value is not allowed, or two parameters describe the same.
     """
-    column, molecules = _column(props)
+    kind = props.get("phase_function", "fournier_forand")
+    column, molecules, wavelength = _column(props, bool(nested) or kind != "fournier_forand")
     indices = []
     for name, default, low in (("refractive_index", 1.34, 1.0001), ("group_index", 1.364, 1.0)):
         indices.append(_per_layer(name, props.get(name, default), column.count))
         for value in indices[-1]:
             in_range(name, value, low, 2.0)
-    kind = props.get("phase_function", "fournier_forand")
     phase_g = in_range("phase_g", props.get("phase_g", 0.924), -0.999, 0.999)
     if kind not in PHASE_FUNCTIONS:
         raise UserError(f"phase_function = {kind!r} must be one of {', '.join(PHASE_FUNCTIONS)}")
@@ -89,13 +89,16 @@ def read_water(
         molecules[kept],
         plume,
         _is_given(props, "profile"),
+        wavelength,
     )
 
 
-def _column(props: mi.Properties) -> tuple[WaterColumn, np.ndarray]:
-    """Return the layers of the parameters, of a water by name, or of a profile, and scattering by molecules [1/m].
+def _column(props: mi.Properties, is_of_phase: bool) -> tuple[WaterColumn, np.ndarray, float | None]:
+    """Return the layers of the parameters, of a water by name, or of a profile, and what belongs to them.
 
-    That is one value a layer, or one for all; 0 where it is not known.
+    That is the scattering by molecules [1/m], one value a layer or one for all, 0 where it is not known; and the
+    wavelength [nm], None of coefficients as numbers. `is_of_phase` says that backscattering follows from a phase
+    function: the parameter then counts up to the scattering.
     """
     tolerance = props.get("profile_tolerance", 0.01)
     wavelength = positive("wavelength_nm", props["wavelength_nm"]) if "wavelength_nm" in props else None
@@ -103,13 +106,17 @@ def _column(props: mi.Properties) -> tuple[WaterColumn, np.ndarray]:
     own = [name for name in ("layer_tops", *_DEFAULTS) if name in props]
     if not ways:
         values = {name: props.get(name, default) for name, default in _DEFAULTS.items()}
-        return WaterColumn.from_text(props.get("layer_tops", "0"), **values), np.zeros(1)
+        if is_of_phase:
+            back = number_list("backscattering", values["backscattering"])
+            scattering = number_list("scattering", values["scattering"])
+            values["backscattering"] = np.minimum(back, scattering) if 1 in (back.size, scattering.size) else back
+        return WaterColumn.from_text(props.get("layer_tops", "0"), **values), np.zeros(1), None
     way = ways[0]
     excluded = [*ways[1:], *(name for name in own if name != "layer_tops" or way == "profile")]
     if excluded:
         raise UserError(f"{way} = {props[way]!r} describes the same as {', '.join(excluded)}: give one of them")
     if way == "profile":
-        return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1)
+        return read_profile(props[way], wavelength).layers(tolerance), np.zeros(1), wavelength
     tops = number_list("layer_tops", props.get("layer_tops", "0"))
     wavelength = wavelength or props.get("wavelength_nm", 532.0)
     texts = str(props[way]).replace(",", " ").split()
@@ -121,7 +128,7 @@ def _column(props: mi.Properties) -> tuple[WaterColumn, np.ndarray]:
         raise UserError(f"{way} = {props[way]!r}: {error}") from error
     rows = [[water.attenuation, water.scattering, water.backscattering, water.water_scattering] for water in found]
     *coefficients, molecules = np.transpose(rows)
-    return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules
+    return WaterColumn(tops, *np.broadcast_to(coefficients, (3, tops.size))), molecules, wavelength
 
 
 def _bubbles(props: mi.Properties) -> tuple[BubblePlume | BubbleLayer | None, float]:

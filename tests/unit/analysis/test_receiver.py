@@ -371,6 +371,15 @@ def two_channels(**of_blue):
     return ReceiverChannels(own, {"blue": Channel(CHAIN, **of_blue)}, pulse_repetition_khz=10.0, name="two")
 
 
+def test_file_with_a_channel_of_no_pixel_is_refused(tmp_path):
+    own = tmp_path / "own.toml"
+    own.write_text('preset = "apd"\n[channels.deep]\ngain = 2\n')
+    with pytest.raises(UserError, match=r"own.toml: channels.deep is for no pixel: the result has the pixels red, "):
+        detect_waveforms(make(), str(own))
+    own.write_text('preset = "apd"\n[channels.red]\ngain = 2\n')
+    assert "receiver.channels.red.amplifier.transimpedance_ohm" in detect_waveforms(make(), str(own)).attrs
+
+
 def test_channels_have_their_own_gain_and_filter():
     recorded = detect_waveforms(make(), two_channels(gain=1.0, optical_density=1.0), shots=3, seed=4)
     assert recorded["pixel"].values.tolist() == ["red", "green", "blue", "black"]

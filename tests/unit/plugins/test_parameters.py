@@ -5,6 +5,7 @@ import json
 import re
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from mitransient_lidar.loading.plugin_pages import plugin_parameters
@@ -142,3 +143,25 @@ def test_unknown_parameters_are_still_refused():
     with pytest.raises(RuntimeError, match="unreferenced property"):
         mi.load_dict({"type": "layered_water", "attenuaton": 0.5})
     assert mi.load_dict({"type": "layered_water", "secchi": "", "attenuation": ""}).parameters["attenuation"] == 0.3
+
+
+def test_textures_of_every_kind_are_recorded(tmp_path):
+    """Transforms of textures are 3x3: a scene with one ended in an error after its render."""
+    mi.Bitmap(np.full((4, 4, 3), 128, dtype=np.uint8)).write(str(tmp_path / "grey.png"))
+    turned = mi.ScalarTransform3d().rotate(30).scale([2, 3])
+    bitmap = {"type": "bitmap", "filename": str(tmp_path / "grey.png"), "to_uv": turned}
+    diffuse = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": turned}}
+    for bsdf in (
+        diffuse,
+        {"type": "diffuse", "reflectance": bitmap},
+        {"type": "mask", "opacity": {**bitmap, "raw": True}, "nested": diffuse},
+        {"type": "bumpmap", "texture": {**bitmap, "raw": True}, "nested": diffuse},
+        {"type": "normalmap", "normalmap": {**bitmap, "raw": True}, "nested": diffuse},
+        {"type": "blendbsdf", "weight": {**bitmap, "raw": True}, "one": diffuse, "two": {"type": "diffuse"}},
+    ):
+        scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", "bsdf": bsdf}}, parallel=False)
+        recorded = plugin_values(scene)
+        matrices = [json.loads(found) for found in re.findall(r'to_uv": (\[\[.*?\]\])', recorded)]
+        assert matrices, bsdf["type"]
+        for matrix in matrices:
+            np.testing.assert_allclose(matrix, [[3**0.5, -1.5, 0], [1, 1.5 * 3**0.5, 0], [0, 0, 1]], atol=1e-6)

@@ -141,6 +141,16 @@ REFUSED = [
     ({"type": "layered_water", "scattering": float("nan")}, "scattering"),
     ({"type": "layered_water", "scattering": 0.4}, "scattering = 0.4 must not exceed attenuation = 0.3"),
     ({"type": "layered_water", "backscattering": 0.2}, "backscattering = 0.2 must not exceed scattering = 0.15"),
+    (
+        {
+            "type": "layered_water",
+            "phase_function": "hg",
+            "layer_tops": "0, 2",
+            "scattering": "0.1, 0.2",
+            "backscattering": "0, 0, 0",
+        },
+        "backscattering has 3 values",
+    ),
     ({"type": "layered_water", "layer_tops": "0, 4, 3"}, "layers out of order"),
     ({"type": "layered_water", "layer_tops": "1, 2"}, "first layer must start at 0"),
     ({"type": "layered_water", "attenuation": "0.3, 0.4, 0.5", "layer_tops": "0, 1"}, "attenuation has 3 values"),
@@ -351,3 +361,12 @@ def test_a_pixel_alone_is_a_receiver():
     assert energy.shape[0] == 1
     assert energy.sum() > 0
     assert mitransient_lidar.render(alone, passes=2).pixel.values.tolist() == ["pixel"]
+
+
+@pytest.mark.parametrize("scattering", [0.004, "0.004, 0.1", 0.0])
+def test_water_of_a_phase_function_needs_no_backscattering(scattering):
+    """It follows from the function: neither its default of 0.006 nor a given value refuses little scattering."""
+    layers = {"layer_tops": "0, 3"} if isinstance(scattering, str) else {}
+    for phase in ({"phase_function": "hg"}, {"phase_function": "petzold"}, {"own": {"type": "hg", "g": 0.9}}):
+        for back in ({}, {"backscattering": 0.01}):
+            mi.load_dict({"type": "layered_water", "scattering": scattering, **layers, **phase, **back})

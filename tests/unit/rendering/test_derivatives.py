@@ -72,6 +72,26 @@ def test_backscattering_without_influence_is_refused(lidar_scene, water):
         path_parameters(renderer, ["backscattering"])
 
 
+@pytest.mark.parametrize("phase_g", [0.0, 0.02, -0.3])
+def test_derivative_by_a_mean_cosine_near_zero(lidar_scene, phase_g):
+    """That of ln (1 - g^2) - 1.5 ln(1 + g^2 - 2 g cos), 3 cos at g = 0, where a step relative to g would be 0."""
+    scene = lidar_scene(integrator=FEW, water={"phase_function": "hg", "phase_g": phase_g, "backscattering": 0.05})
+    (parameter,) = path_parameters(scene.integrator().prepare(scene, scene.sensors()[0]), ["phase_g"])
+    cosine = 1 - 2 * np.exp(DEFAULT_LOG_S0 * np.linspace(1, 0, DEFAULT_COUNT))
+    expected = -2 * phase_g / (1 - phase_g**2) - 3 * (phase_g - cosine) / (1 + phase_g**2 - 2 * phase_g * cosine)
+    np.testing.assert_allclose(parameter.perturbation.layers[0].by_angle, expected, atol=4e-3)
+    assert parameter.perturbation.focusing is None or np.isfinite(parameter.perturbation.focusing).all()
+
+
+def test_reflectance_of_a_bottom_that_is_not_diffuse_is_left_to_differences():
+    session = open_scene("table1", {"bottom_model": "hapke", "spectrum": "flat"})
+    renderer = choose_integrator(session.scene, FEW).prepare(session.scene, session.sensor)
+    (parameter,) = path_parameters(renderer, ["bottom_reflectance"], others=session.parameters)
+    assert (parameter.value, parameter.method) == (0.1, "central differences")
+    with pytest.raises(UserError, match="bottom_reflectance must be of a solid that is diffuse"):
+        path_parameters(renderer, ["bottom_reflectance"])
+
+
 def test_phase_functions_stay_normalised(renderer):
     """The mean of d ln p over the function is 0, to the linear interpolation of the tables, and its spread is not."""
     (parameter,) = path_parameters(renderer, ["backscattering[0]"])

@@ -40,6 +40,11 @@ def test_commands_show_meaning_and_range():
     ("name", "value", "sentence"),
     [
         ("target_error", 0, "target_error = 0 must be greater than 0"),
+        (
+            "target_error",
+            3,
+            "target_error = 3 is an error of 300 % but must be at most 1: did you mean 0.03, which is 3 %?",
+        ),
         ("target_quantile", 2, "target_quantile = 2 must lie between 0.01 and 1"),
         ("max_time", -1, "max_time = -1 must be greater than 0"),
         ("passes", 1, f"passes = 1 must lie between 2 and {MOST_PASSES}"),

@@ -38,6 +38,12 @@ def test_the_quantile_of_the_errors_ends_the_render(monkeypatch, quantile, expec
     assert log.needed_s == 0
 
 
+def test_no_error_is_an_accuracy():
+    assert Goal(target_error=0.1).is_accurate(0.0)
+    assert not Goal(target_error=0.1).is_accurate(None)
+    assert not Goal(target_error=0.1).is_accurate(np.inf)
+
+
 def test_the_time_ends_no_render_before_the_passes_that_it_needs(monkeypatch, caplog):
     clock = Clock(monkeypatch, 1.0)
     assert run_passes(clock.render_pass, Goal(passes=64, max_time=3.5), seed=0, smallest=16).count == 16

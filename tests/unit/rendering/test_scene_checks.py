@@ -210,3 +210,38 @@ def test_command_refuses_before_it_writes(tmp_path):
     assert done.exit_code == 2
     assert "time_start_ns = 2000 starts the record after every echo" in done.output
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("flips", [False, True])
+@pytest.mark.parametrize("inwards", [False, True])
+def test_closed_mesh_with_faces_inwards_is_told(lidar_scene, caplog, tmp_path, inwards, flips):
+    mesh = mi.load_dict({"type": "cube"})
+    buffers = mi.traverse(mesh)
+    faces = np.array(buffers["faces"]).reshape(-1, 3)
+    buffers["faces"] = mi.UInt32((faces[:, ::-1] if inwards else faces).ravel())
+    buffers.update()
+    mesh.write_ply(str(tmp_path / "box.ply"))
+    box = {"type": "ply", "id": "box", "filename": str(tmp_path / "box.ply"), "flip_normals": flips}
+    box |= {"to_world": TO_WORLD.translate([on_axis(-5.0), 0, -5]), "face_normals": True}
+    warnings = check(lidar_scene(extra={"box": {**box, "bsdf": {"type": "diffuse"}}}), caplog)
+    assert ["faces of shape 'box' point inwards" in one for one in warnings] == [True] * (inwards != flips)
+    caplog.clear()
+    twosided = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    assert check(lidar_scene(extra={"box": {**box, "bsdf": twosided}}), caplog) == []
+
+
+@pytest.mark.parametrize(("water", "laser", "fits"), [(532, 515, False), (515, 515, True), (532, 532.1, True)])
+def test_water_by_name_has_the_wavelength_of_the_laser(lidar_scene, water, laser, fits):
+    of_water = {"chlorophyll": 0.5, "wavelength_nm": water}
+    scene = lidar_scene(integrator={"type": "lidar_merging"}, tx={"wavelength_nm": laser}, water=of_water)
+    if fits:
+        scene.integrator().prepare(scene, scene.sensors()[0])
+        return
+    sentence = "wavelength_nm = 532 of the water must be that of the lidar_transmitter, 515"
+    with pytest.raises(UserError, match=sentence):
+        scene.integrator().prepare(scene, scene.sensors()[0])
+
+
+def test_coefficients_as_numbers_hold_for_any_laser(lidar_scene):
+    scene = lidar_scene(integrator={"type": "lidar_merging"}, tx={"wavelength_nm": 515})
+    assert scene.integrator().prepare(scene, scene.sensors()[0]).scene.water.wavelength_nm is None

@@ -6,6 +6,7 @@ import math
 import matplotlib.image
 import numpy as np
 import pytest
+import xarray as xr
 from command_line import assert_refused, run
 from scipy.special import erf
 
@@ -13,9 +14,9 @@ import mitransient_lidar
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.plots.publication import figures as publication
 from mitransient_lidar.rendering.sea_map import SeaMap
-from mitransient_lidar.studies.publication import echoes, layers, measures, targets
+from mitransient_lidar.studies.publication import echoes, layers, measures, renders, targets
 from mitransient_lidar.studies.publication.measures import Series, Waveform
-from mitransient_lidar.studies.publication.renders import joined
+from mitransient_lidar.studies.publication.renders import Renders, joined
 from mitransient_lidar.studies.publication.statements import COLUMNS, Statement, write_statements
 
 TIME = np.arange(0.125, 120, 0.25)
@@ -94,6 +95,22 @@ def test_series_of_other_bins_are_joined_on_common_ones():
     both = joined([early, late])
     np.testing.assert_array_equal(both.time, np.arange(2.5, 10))
     np.testing.assert_array_equal(both.power[0], both.power[1])
+
+
+def test_renders_are_kept_by_places_and_values_of_options(monkeypatch):
+    made = []
+
+    def render_shots(scene, params, **options):
+        made.append(options)
+        return xr.Dataset(attrs={"interrupted": 0})
+
+    monkeypatch.setattr(renders, "render_shots", render_shots)
+    own = Renders()
+    first = own._rendered("table1", {}, [(0, 0)], {"passes": 4})
+    assert own._rendered("table1", {}, [[0.0, 0.0]], {"passes": 4}) is first
+    for places, goal in (([(0, 0)], {"passes": 8}), ([(1, 0)], {"passes": 4}), ([(0, 0)], {"passes": 4, "seed": 1})):
+        assert own._rendered("table1", {}, places, goal) is not first
+    assert len(made) == 4
 
 
 def test_places_of_given_slopes_are_the_nearest_ones_apart():

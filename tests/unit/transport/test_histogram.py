@@ -7,8 +7,10 @@ import pytest
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.physics.lidar.gate_train import GateTrain
+from mitransient_lidar.physics.lidar.pulse import Pulse
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
-from mitransient_lidar.transport.histogram import TransientHistogram
+from mitransient_lidar.transport.histogram import GateWeights, TransientHistogram
 
 #: Path length of light that arrives in the first bin [m].
 FIRST = mi.Float(1390.1e-9 * C0)
@@ -30,6 +32,17 @@ def test_bins_are_half_open():
     assert axis.path_end == pytest.approx(8)
     sums.clear()
     assert not sums.energy().any()
+
+
+@pytest.mark.parametrize("width_ns", [1e-9, 1e-3, 1.0])
+def test_weight_of_a_gate_of_any_width(width_ns):
+    """A gate that is short against the pulse collects its width times the peak power, 0.939 / FWHM."""
+    train, pulse = GateTrain(1400.0, width_ns, 10.0, 2), Pulse.gaussian(5.0)
+    gates = GateWeights(train, train.response_weights(pulse))
+    sums = TransientHistogram(TimeAxis(1390.0, 0.5, 40), (1,), 1.0, gates)
+    sums.add(mi.UInt32(0), mi.Float((1400.0 + 0.5 * width_ns) * 1e-9 * C0), mi.Float(1.0), mi.Bool(True))
+    peak = np.diff(pulse.cumulative([-0.5 * width_ns, 0.5 * width_ns]))[0] if width_ns > 1e-6 else width_ns * 0.187874
+    assert sums.energy()[0, 0] == pytest.approx(peak, rel=1e-3)
 
 
 def test_inactive_paths_leave_no_trace():

@@ -30,6 +30,15 @@ def test_sampled_pulse_is_shifted_and_normalised():
     assert pulse.cumulative(1.5) == pytest.approx(0.25 + 1.5 * 0.375)
 
 
+@pytest.mark.parametrize(
+    ("times", "power", "width"),
+    [([10, 11, 14], [0, 6, 0], 2.0), ([0, 4], [1, 1], 4.0), ([0, 4], [0, 1], 2.0), ([0, 1, 3, 4], [0, 1, 1, 0], 3.0)],
+)
+def test_width_of_few_samples(times, power, width):
+    """Half of the maximum is crossed between samples: samples above it alone would give 0 and 2 ns."""
+    assert Pulse.sampled(times, power).fwhm_ns == pytest.approx(width)
+
+
 def test_pulse_file(tmp_path):
     path = tmp_path / "pulse.csv"
     path.write_text("# time, power\n0, 0\n1 2\n\n3,0 # tail\n")

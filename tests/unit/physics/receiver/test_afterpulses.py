@@ -9,7 +9,8 @@ from mitransient_lidar.physics.receiver import afterpulses, dead_time
 from mitransient_lidar.physics.receiver.detectors import SinglePhotonDetector
 
 # Dead for the rest of its bin and 9.5 bins of 1 ns: 10 bins.
-COUNTER = SinglePhotonDetector(0.5, 9.5, afterpulse_probability=0.2, afterpulse_decay_ns=15.0)
+#: Dead for ten bins after a flash, whose first event is a fiftieth of a bin late.
+COUNTER = SinglePhotonDetector(0.5, 9.98, afterpulse_probability=0.2, afterpulse_decay_ns=15.0)
 
 
 def flash(bins):

@@ -66,6 +66,16 @@ def test_a_preset_keeps_what_a_file_leaves_out():
     assert own.amplifier == Amplifier(10e3, noise_pa_per_rthz=3.0, bandwidth_mhz=100)
 
 
+def test_dynodes_of_a_preset_are_replaced_with_gain_and_excess_noise():
+    tube = RECEIVERS["pmt"].detector
+    own = parse('preset = "pmt"\n[detector]\ndynode_gains = [5, 4, 4]\n').default.chain.detector
+    assert (own.gain, own.dynode_gains) == (80, (5, 4, 4))
+    assert own.excess_noise == LinearDetector.photomultiplier(0.2, (5, 4, 4)).excess_noise
+    assert own == tube.with_dynodes((5, 4, 4))
+    with pytest.raises(UserError, match="detector: gain = 80 follows from dynode_gains: give these"):
+        parse('preset = "pmt"\n[detector]\ngain = 80\n')
+
+
 def test_tails_jitter_and_overload_from_a_file():
     text = WHOLE.replace(
         "dynode_gains = [5, 4, 4]",
