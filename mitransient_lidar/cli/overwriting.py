@@ -5,6 +5,7 @@ Every file that a command writes gets a mark (`core.marks`) with the command, it
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import inspect
@@ -191,7 +192,7 @@ class _Running:
             reason = self.objection(path)
             settled.append((temporary, _free_name(path) if reason else path))
             if reason:
-                typer.echo(f"{path} is kept, since {reason}: the new file is {settled[-1][1]}.", err=True)
+                _tell(f"{path} is kept, since {reason}: the new file is {settled[-1][1]}.")
         self._announce([path for _, path in settled])
         mark = {**self.mark, "elapsed_s": time.perf_counter() - self._began}
         marked = [path for _, path in settled if holds_mark(path)]
@@ -217,7 +218,7 @@ class _Running:
         reasons = {path: self._objection(path, mark) for path, mark in former.items()}
         first = next(filter(reasons.get, replaced), replaced[0])
         more = f" and {len(replaced) - 1} more" if len(replaced) > 1 else ""
-        typer.echo(f"replaces {first}{more}: {reasons[first] or self._differences(former[first])}", err=True)
+        _tell(f"replaces {first}{more}: {reasons[first] or self._differences(former[first])}")
 
     def _differences(self, former: Mapping[str, Any] | None) -> str:
         """Return the parameters and options that differ from those of a former file."""
@@ -231,6 +232,12 @@ class _Running:
         if len(found) > _MOST_DIFFERENCES:
             found = [*found[:_MOST_DIFFERENCES], f"{len(found) - _MOST_DIFFERENCES} more"]
         return ", ".join(found) or "no option differs"
+
+
+def _tell(text: str) -> None:
+    """Print a line on stderr, unless that is closed: files are written nevertheless."""
+    with contextlib.suppress(OSError):
+        typer.echo(text, err=True)
 
 
 def _subject_of_file(path: Path) -> dict[str, str | Path]:

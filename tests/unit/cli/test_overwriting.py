@@ -221,6 +221,7 @@ def small_figures(monkeypatch):
         drawing.save(drawing.new_figure(path, 1, 1), path)
 
     monkeypatch.setattr(waveforms, "plot_components", draw)
+    monkeypatch.setattr(overwriting, "_LONG_S", 1e9)  # on a busy machine
 
 
 @pytest.mark.usefixtures("small_figures")
@@ -228,8 +229,8 @@ def test_line_names_what_differs():
     first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
     assert line(run(*first)) == []
     assert line(run(*first)) == ["replaces d/a.nc and 1 more: no option differs"]
-    done = run(*first[:2], "-D", "wind_speed=6", "-o", "d/a.png")
-    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, paths 64 -> 8192"]
+    done = run(*first[:2], "-D", "wind_speed=6", "--paths", 128, "-o", "d/a.png")
+    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, paths 64 -> 128"]
     assert_refused(run("estimate", "fig09_2x2", "-o", "d/a.png"), "since its scene is table1")
     mounted = ["estimate", "table1", "--instrument", "riegl_vq840g", "-o", "d/a.png"]
     assert_refused(run(*mounted), "since its instrument is another one")
@@ -303,3 +304,27 @@ def test_library_writes_what_it_is_told(folder):
     results.save(results.open("shot.nc"), "d/a.nc")
     assert read_mark(folder / "d/a.nc") is None
     assert results.open("d/a.nc").sizes["time"] == 5
+
+
+def test_flight_goes_on_in_its_own_folder(folder):
+    """Beside the store, files whose headers name the software are those of the flight; `fly` checks the store."""
+    las = b"LASF" + bytes(54) + b"mitransient-lidar 1.0"
+    for name in ("points.laz", "waveforms.las", "waveforms.wdp"):
+        (folder / "d" / name).write_bytes(las)
+    assert_refused(command("fly"), "d/points.laz is kept, since it does not tell what has written it")
+    (folder / "d/flight.zarr").mkdir()
+    assert "is kept" not in command("fly").stderr
+    (folder / "d/waveforms.las").write_bytes(b"LASF" + bytes(54) + b"another")
+    assert_refused(command("fly"), "d/waveforms.las is kept", "--overwrite", "-o")
+
+
+def test_store_of_a_stranger_is_kept(folder):
+    design = '[design]\nkind = "sobol"\ncount = 4\n'
+    (folder / "c.toml").write_text(
+        f'scene = "table1"\n[parameters]\nbottom_depth = {{ low = 2.0, high = 20.0 }}\n{design}'
+    )
+    (folder / "c.zarr").mkdir()
+    (folder / "c.zarr/zarr.json").write_text("mine")
+    for more in ([], ["--overwrite"]):
+        assert_refused(run("sweep", "c.toml", *more, "-q"), "c.zarr is no store of a campaign or a flight")
+    assert (folder / "c.zarr/zarr.json").read_text() == "mine"
