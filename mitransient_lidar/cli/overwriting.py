@@ -90,8 +90,9 @@ def replace_freely(targets: Iterable[Path]) -> None:
 
 def draws_again(file: Path) -> None:
     """State that the running command draws the result in a file, so that it may replace drawings by ``render``."""
-    if (running := _running.get()) is not None and (mark := read_mark(file)) and mark.get("command") == "render":
-        running.mark |= {name: mark.get(name) for name in ("command", "result", "parameters", "options")}
+    running, mark = _running.get(), _mark_of_result(file) or {}
+    if running is not None and mark.get("command") == "render" and "result" in mark:
+        running.mark |= {name: mark[name] for name in ("command", "result", "parameters", "options")}
 
 
 class _Running:

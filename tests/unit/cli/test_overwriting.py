@@ -319,10 +319,8 @@ def test_flight_goes_on_in_its_own_folder(folder):
 
 
 def test_store_of_a_stranger_is_kept(folder):
-    design = '[design]\nkind = "sobol"\ncount = 4\n'
-    (folder / "c.toml").write_text(
-        f'scene = "table1"\n[parameters]\nbottom_depth = {{ low = 2.0, high = 20.0 }}\n{design}'
-    )
+    campaign = 'scene = "table1"\n[parameters]\nbottom_depth = [2, 3]\n[design]\nkind = "grid"\n'
+    (folder / "c.toml").write_text(campaign)
     (folder / "c.zarr").mkdir()
     (folder / "c.zarr/zarr.json").write_text("mine")
     for more in ([], ["--overwrite"]):
