@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_figure, check_writable, write_netcdf
+from mitransient_lidar.cli.files import announced, check_figure, write_netcdf
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import OUTPUT, RECEIVERS, Define, Quiet, Scene, Seed, number_or_auto, parameters
 from mitransient_lidar.core.errors import UserError
@@ -81,9 +81,7 @@ def bounds(
     unknown = [name.strip() for name in free.split(",")]
     if not all(unknown):
         raise UserError(f"--free = {free!r} has an empty entry: it must be names separated by commas")
-    table = output.with_suffix(".csv")
-    check_figure(output)
-    check_writable(table.parent, [table])
+    check_figure(output, ".nc", ".csv")
     designs = dict(_values(one) for one in over or [])
     if len(designs) < len(over or []):
         raise UserError("--over names a parameter twice: give all its values in one option")
@@ -115,7 +113,7 @@ def bounds(
     with announced():
         plot_bounds(found, output)
         write_netcdf(found, output.with_suffix(".nc"))
-        study.write_table(found, table)
+        study.write_table(found, output.with_suffix(".csv"))
     typer.echo("\n".join(study.describe_bounds(found)))
 
 

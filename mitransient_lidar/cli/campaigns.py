@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_figure, check_suffix, check_writable
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_writable
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.core.errors import UserError
@@ -97,8 +97,8 @@ def _render_row(campaign: Path, row: int, path: Path, quiet: bool) -> None:
     with reporting(quiet) as progress:
         series = render_row(campaign, row, progress=progress)
     path.parent.mkdir(parents=True, exist_ok=True)
-    results.save(series, path)
-    typer.echo(path)
+    with announced():
+        results.save(series, path)
     exit_if_interrupted(series)
 
 
@@ -110,7 +110,6 @@ def _show(store: Path, path: Path) -> None:
 
     dataset = open_campaign(store)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with reporting_damage(store):
+    with announced(), reporting_damage(store):
         plot_campaign(dataset, path)
-    typer.echo(path)
     typer.echo("\n".join(describe_campaign(store)))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import glob
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import announced, check_suffix, check_targets, check_writable, write_netcdf
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_targets, write_netcdf
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import OUTPUT, RECEIVERS, Define, Quiet, numbers, parameters
 from mitransient_lidar.core.errors import UserError
@@ -68,11 +69,7 @@ def depth_bias(
     target = output or OUTPUT / f"{instrument}_depths.nc"
     check_suffix("--output", target, ".nc")
     check_targets(target.parent, [target], scene)
-    if figure is not None:
-        from mitransient_lidar.plots.drawing import check_format
-
-        check_format(figure)
-        check_writable(figure.parent, [figure])
+    check_figure(figure, option="--figure")
     named = _waters(waters)
     lists: dict[str, Any] = {"winds": numbers("--winds", winds), "depths": numbers("--depths", depths)}
     if angles is not None:
@@ -163,7 +160,7 @@ def tpu(
 
     read_instrument(instrument)
     target = output / f"{instrument}_tpu.nc"
-    check_targets(output, [target], scene)
+    check_targets(output, [target, *sorted(output.glob(f"{glob.escape(instrument)}_*m_*deg_*"))], scene)
     lists: dict[str, Any] = {"winds": numbers("--winds", winds), "depths": numbers("--depths", depths)}
     if angles is not None:
         lists["angles_deg"] = numbers("--angles", angles)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from mitransient_lidar.cli.overwriting import check_kept
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, replacing, together
 
@@ -18,7 +20,16 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def check_writable(folder: Path, targets: list[Path]) -> None:
+def check_writable(folder: Path, targets: list[Path], option: str = "-o") -> None:
+    """Check that files can be written into a folder, without creating it, and replace none that must be kept.
+
+    `option` chooses another place.
+    """
+    _check_places(folder, targets)
+    check_kept(targets, option)
+
+
+def _check_places(folder: Path, targets: list[Path]) -> None:
     """Check that files can be written into a folder, without creating it."""
     for path in (folder, *targets):
         check_encodable(path)
@@ -51,28 +62,29 @@ def scene_of(scene: str, command: str) -> tuple[str, str, dict[str, Any]]:
 
 
 def check_targets(output: Path, targets: list[Path], scene: str) -> None:
-    """Check that files can be written, and that none of them is the result that is rendered again."""
-    check_writable(output, targets)
+    """Check that files can be written, and that none of them is kept or the result that is rendered again."""
+    _check_places(output, targets)
     for target in targets:
         if target.exists() and Path(scene).exists() and target.samefile(scene):
             raise UserError(f"{scene} would be overwritten with its repetition: choose another place with -o")
+    check_kept(targets)
 
 
-def check_figure(path: Path | None) -> None:
-    """Check that a figure, and the NetCDF file of its data, can be written."""
+def check_figure(path: Path | None, *suffixes: str, option: str = "-o") -> None:
+    """Check that a figure can be written, and files of its data beside it, of other suffixes."""
     if path is None:
         return
     from mitransient_lidar.plots.drawing import check_format
 
-    check_writable(path.parent, [path, path.with_suffix(".nc")])
     check_format(path)
+    check_writable(path.parent, [path, *map(path.with_suffix, suffixes)], option)
 
 
 def check_suffix(option: str, path: Path, suffix: str) -> None:
     """Check that a file can be written and that its name ends with a suffix."""
     if path.suffix.lower() != suffix:
         raise UserError(f"{option} {path} must end in {suffix}.")
-    check_writable(path.parent, [path])
+    check_writable(path.parent, [path], "-o" if option == "--output" else option)
 
 
 @contextlib.contextmanager
@@ -117,6 +129,12 @@ class GateFiles:
     def of(cls, folder: Path, stem: str, **wanted: bool) -> GateFiles:
         """Return the files of a gate stack, given the options for the kinds of file."""
         return cls(folder, stem, frozenset(kind for kind, on in wanted.items() if on))
+
+    def check(self) -> None:
+        """Check that the files can be written."""
+        numbered = f"{glob.escape(self.stem)}_gate[0-9]*.exr"
+        sequence = sorted(self.folder.glob(numbered)) if "sequence" in self.wanted else []
+        check_writable(self.folder, [*self.names(), *sequence])
 
     def names(self) -> list[Path]:
         """Return the paths of the files, without those of a sequence."""

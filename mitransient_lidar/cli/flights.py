@@ -10,6 +10,8 @@ import typer
 from mitransient_lidar.cli.files import check_writable
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import OUTPUT, Quiet
+from mitransient_lidar.cli.overwriting import replace_freely
+from mitransient_lidar.core.marks import read_mark
 
 
 def fly(
@@ -42,13 +44,16 @@ def fly(
     docs/guide/flights.md describes the file.
     """
     folder = output or OUTPUT / Path(flight).stem
-    check_writable(folder, [])
     from mitransient_lidar.campaigns.store import Store
     from mitransient_lidar.flights.fly import STORE
     from mitransient_lidar.flights.fly import fly as render_flight
     from mitransient_lidar.flights.products import Flown, describe_points
     from mitransient_lidar.plots.point_clouds import plot_flight
 
+    files = [folder / name for name in ("points.laz", "waveforms.las", "waveforms.wdp", "flight.png", "profile.png")]
+    if (folder / STORE).is_dir():  # which goes on only if it is of this flight
+        replace_freely(path for path in files if _is_of_a_flight(path))
+    check_writable(folder, files)
     with reporting(quiet) as progress:
         points = render_flight(
             flight, folder, workers=workers, scheduler=scheduler, shard_size=shard_size, progress=progress
@@ -59,3 +64,10 @@ def fly(
     for path in plot_flight(flown, points, folder):
         typer.echo(path)
     typer.echo("\n".join(describe_points(points)))
+
+
+def _is_of_a_flight(path: Path) -> bool:
+    """Return whether a command has written a file of points, waveforms or pictures of a flight."""
+    from mitransient_lidar.flights.las_header import is_simulated
+
+    return (read_mark(path) or {}).get("command") == "fly" or is_simulated(path)

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitransient_lidar.cli.files import GateFiles, check_writable
+from mitransient_lidar.cli.files import GateFiles
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import Quiet
+from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -53,19 +54,25 @@ def gates(
 ) -> None:
     """Cut gates from a result.
 
-    Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths. Without a start, the gates that STACK
-    already has are written and drawn.
+    Writes DIR/<stack>_gates.exr, _gates.png and _depth.png, and prints the paths; <stack>_cut_gates.exr and so on of a
+    STACK that has gates already. Without a start, the gates that it has are written and drawn.
     """
-    folder, stem = output or stack.parent, stack.stem.removesuffix("_gates")
-    files = GateFiles.of(folder, stem, drawings=plot, sequence=sequence, gif=gif, mp4=mp4, html=html)
-    check_writable(folder, files.names())
     from mitransient_lidar.analysis.gates import cut as gating
     from mitransient_lidar.results import gate_stack
 
     given = {"--width-ns": width_ns, "--step-ns": step_ns, "--count": None if count == 1 else count}
     with reporting(quiet):
         result = _open(stack)
-        if "gate_energy" in result and start_ns is None and start_depth is None:
+        has_gates = "gate_energy" in result
+        is_cut = not has_gates or start_ns is not None or start_depth is not None
+        stem = stack.stem.removesuffix("_gates") + ("_cut" if has_gates and is_cut else "")
+        files = GateFiles.of(
+            output or stack.parent, stem, drawings=plot, sequence=sequence, gif=gif, mp4=mp4, html=html
+        )
+        if not is_cut:
+            draws_again(stack)
+        files.check()
+        if not is_cut:
             if named := [f"{option} {value:g}" for option, value in given.items() if value is not None]:
                 raise UserError(f"{named[0]} needs --start-ns or --start-depth, where the first gate begins.")
             files.write(result, result, quiet)

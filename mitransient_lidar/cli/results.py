@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_suffix, write_netcdf
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
 from mitransient_lidar.cli.messages import reporting
 from mitransient_lidar.cli.options import RECEIVERS, DrawingOnly, Quiet, Seed, number_or_auto
+from mitransient_lidar.cli.overwriting import draws_again
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,6 +45,9 @@ def plot(
         raise UserError("--layout does not go with --log or --linear: a layout has no power axis.")
     if components and (log or linear or layout):
         raise UserError("--components does not go with --log, --linear or --layout: its drawing has both scales.")
+    target = output or file.with_name(f"{file.stem}{'_layout' if layout else '_components' if components else ''}.png")
+    draws_again(file)
+    check_figure(target)
     from mitransient_lidar.analysis.waveforms.records import open_waveforms
     from mitransient_lidar.plots.layout import axis_points, plot_layout
     from mitransient_lidar.plots.waveforms import plot_components, plot_waveforms
@@ -52,18 +56,15 @@ def plot(
     if shot is not None:
         dataset = _shot(dataset, shot, file)
     if layout:
-        target = output or file.with_name(f"{file.stem}_layout.png")
-        plot_layout(dataset, target)
-        typer.echo("\n".join([str(target), *axis_points(dataset)]))
-        return
-    if components:
-        target = output or file.with_name(f"{file.stem}_components.png")
-        plot_components(dataset, target)
-        typer.echo(target)
-        return
-    target = output or file.with_suffix(".png")
-    plot_waveforms(dataset, target, "both" if log == linear else "log" if log else "linear")
-    typer.echo(target)
+        with announced():
+            plot_layout(dataset, target)
+        typer.echo("\n".join(axis_points(dataset)))
+    elif components:
+        with announced():
+            plot_components(dataset, target)
+    else:
+        with announced():
+            plot_waveforms(dataset, target, "both" if log == linear else "log" if log else "linear")
 
 
 def view(
@@ -92,8 +93,8 @@ def view(
         page = page_of(dataset if shot is None else _shot(dataset, shot, file), limit_mb=_PAGE_MB)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
-    path = page.save(output)
-    typer.echo(path)
+    with announced():
+        path = page.save(output)
     if browser and not webbrowser.open(path.resolve().as_uri()):
         typer.echo("no browser was found: open the page in one.", err=True)
 
@@ -188,10 +189,11 @@ def compare(
     from mitransient_lidar.plots.comparison import plot_comparison
 
     target = output or second.with_name(f"{first.stem}_{second.stem}.png")
+    check_figure(target)
     datasets = results.open(first), results.open(second)
     outcome = comparison.compare(*datasets)
-    plot_comparison(*datasets, outcome, target)
-    typer.echo(target)
+    with announced():
+        plot_comparison(*datasets, outcome, target)
     typer.echo(
         f"{'agree' if outcome.agrees else 'differ'}: {outcome.bin_count} bins, rms {outcome.rms:.2f} and largest "
         f"{outcome.largest:.1f} standard errors (chance explains {outcome.limit:.1f}); energy x "

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_figure, check_suffix, write_netcdf
+from mitransient_lidar.cli.files import announced, check_figure, check_suffix, write_netcdf
 from mitransient_lidar.cli.options import pair
 from mitransient_lidar.core.errors import UserError
 
@@ -51,7 +51,7 @@ def retrieve(
     deviations = None if slope_deviation is None else pair("--slope-deviation", slope_deviation)
     if output is not None:
         check_suffix("--output", output, ".nc")
-    check_figure(figure)
+    check_figure(figure, option="--figure")
     from mitransient_lidar import results
     from mitransient_lidar.analysis.retrieval.retrieve import retrieve as retrieve_from
 
@@ -73,8 +73,8 @@ def retrieve(
         from mitransient_lidar.plots.retrieval import plot_retrieval
 
         figure.parent.mkdir(parents=True, exist_ok=True)
-        plot_retrieval(found, figure)
-        typer.echo(figure)
+        with announced():
+            plot_retrieval(found, figure)
 
 
 def _table(found: Any) -> list[str]:

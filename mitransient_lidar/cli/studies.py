@@ -8,7 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_figure, check_suffix, check_targets, scene_of, write_figure
+from mitransient_lidar.cli.files import (
+    announced,
+    check_figure,
+    check_suffix,
+    check_targets,
+    scene_of,
+    write_figure,
+)
 from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import (
     OUTPUT,
@@ -72,8 +79,8 @@ def find_shots(
         along, across = (math.degrees(math.atan(slope)) for slope in (shot.along, shot.across))
         typer.echo(f"{shot.kind:<10}{shot.x:>10.2f}{shot.y:>10.2f}{along:>13.2f}{across:>14.2f}")
     output.parent.mkdir(parents=True, exist_ok=True)
-    plot_found_shots(rendered, output)
-    typer.echo(output)
+    with announced():
+        plot_found_shots(rendered, output)
     for result in rendered.results[:1]:
         exit_if_interrupted(result)
 
@@ -133,8 +140,8 @@ def shots(
         with reporting(quiet) as progress:
             series = render(scene, params=parameters(define), progress=progress, **{**default, **where}, **options)
         output.parent.mkdir(parents=True, exist_ok=True)
-        results.save(series, output)
-        typer.echo(output)
+        with announced():
+            results.save(series, output)
     if not quiet:
         _print(study.describe_shots(series))
     exit_if_interrupted(series)
@@ -152,7 +159,7 @@ def shot_statistics(
     quiet: Quiet = False,
 ) -> None:
     """Correlate the echoes of random shots with the sea's slopes."""
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.studies.shot_statistics import plot_shot_statistics
     from mitransient_lidar.studies import shot_statistics as study
 
@@ -190,7 +197,7 @@ def target_signal(
     Renders the scene with and without the target on the same random numbers, and combines the pixels.
     """
     params = parameters(define)
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.studies.target_signal import plot_target_map, plot_target_signal
     from mitransient_lidar.studies import target_signal as study
 
@@ -245,7 +252,7 @@ def detect(
     Compares one pixel, the sum and the best combination of pixels.
     """
     places = numbers("--depths", depths) if depths else []
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.studies.detection import plot_detection
     from mitransient_lidar.studies import detection as study
 
@@ -288,7 +295,7 @@ def beam_spread(
     Horizontal spread, delays, and share of the light within the field of view.
     """
     wanted = numbers("--depths", depths)
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.studies.beam_spread import plot_beam_spread
     from mitransient_lidar.studies import beam_spread as study
 
@@ -312,7 +319,7 @@ def estimate(
 
     Lidar equation with sampled forward scattering: a first look, and a second opinion on a render.
     """
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.waveforms import plot_components
     from mitransient_lidar.studies import estimate as study
 
@@ -349,7 +356,7 @@ def fov_sweep(
 ) -> None:
     """Measure the water's attenuation for several fields of view."""
     wanted = numbers("--fov-mrad", fov_mrad)
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.studies.fov_sweep import plot_fov_sweep
     from mitransient_lidar.studies import fov_sweep as study
 
@@ -375,7 +382,7 @@ def scattering_orders(
 
     Each order is also separated by the number of reversals of the vertical direction: one, or several.
     """
-    check_figure(output)
+    check_figure(output, ".nc")
     from mitransient_lidar.plots.studies.scattering_orders import plot_scattering_orders
     from mitransient_lidar.studies import scattering_orders as study
 
@@ -412,11 +419,11 @@ def water(
     from mitransient_lidar.plots.water import plot_water
     from mitransient_lidar.studies import water_report as study
 
-    lines = study.describe_water(kind, value, wavelength, temperature, salinity, tolerance)
+    check_figure(output)
+    _print(study.describe_water(kind, value, wavelength, temperature, salinity, tolerance))
     if output is not None:
-        plot_water(kind, value, wavelength, temperature, salinity, tolerance, output)
-        lines.append(str(output))
-    _print(lines)
+        with announced():
+            plot_water(kind, value, wavelength, temperature, salinity, tolerance, output)
 
 
 def _print(lines: list[str]) -> None:

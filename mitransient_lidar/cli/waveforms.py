@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitransient_lidar.cli.files import check_suffix
+from mitransient_lidar.cli.files import announced, check_suffix
 from mitransient_lidar.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -88,8 +88,8 @@ def waveforms(
         _print(found)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
-        csv_tables.save_csv(found, output)
-        typer.echo(output)
+        with announced():
+            csv_tables.save_csv(found, output)
 
 
 def _print(found: xr.Dataset) -> None:

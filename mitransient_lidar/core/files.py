@@ -9,7 +9,7 @@ import platform
 import re
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
@@ -23,6 +23,11 @@ _TEMPORARY = re.compile(re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<process>\d+)\.[
 
 #: Temporary files and their destinations, within the context `together`.
 _moves: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("moves", default=None)
+
+Moves = list[tuple[Path, Path]]
+
+#: Called with complete temporary files and their destinations, before they are moved; returns the destinations to use.
+before_moving: ContextVar[Callable[[Moves], Moves] | None] = ContextVar("before_moving", default=None)
 
 
 def check_encodable(path: Path) -> None:
@@ -79,7 +84,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         try:
             yield temporary
             if moves is None:
-                os.replace(temporary, path)
+                os.replace(temporary, _destinations([(temporary, path)])[0][1])
             else:
                 moves.append((temporary, path))
         except (OSError, RuntimeError) as error:
@@ -116,15 +121,22 @@ def together() -> Iterator[list[Path]]:
     with DeferredInterrupt():
         try:
             yield written
-            _move(moves)
-            written += [path for _, path in moves]
+            settled = _destinations(moves)
+            _move(settled)
+            written += [path for _, path in settled]
         finally:
             _moves.reset(outer)
             for temporary, _ in moves:
                 _remove(temporary)
 
 
-def _move(moves: list[tuple[Path, Path]]) -> None:
+def _destinations(moves: Moves) -> Moves:
+    """Return temporary files and their destinations as `before_moving` changes them."""
+    settle = before_moving.get()
+    return moves if settle is None else settle(moves)
+
+
+def _move(moves: Moves) -> None:
     """Replace files by their temporary ones; on a failure, restore those that were replaced."""
     moved: list[tuple[Path, Path | None]] = []
     path = Path()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from mitransient_lidar._version import __version__
@@ -21,6 +22,7 @@ SCENE_WKT = (
 )
 
 _DESCRIPTOR = struct.Struct("<2xBB32s4xd16x8x16x8x16x8x16x8x16x32s")
+_SOFTWARE = "mitransient-lidar"
 _NO_DATA = 1  # bit of the options: the value for missing data is relevant
 
 
@@ -94,7 +96,7 @@ def las_header(
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=point_format)
-    header.generating_software = f"mitransient-lidar {__version__}"[:32]
+    header.generating_software = f"{_SOFTWARE} {__version__}"[:32]
     header.system_identifier = "SIMULATION"
     header.scales = [SCALE_M] * 3
     header.offsets = [*(1000.0 * math.floor(value / 1000) for value in first), 0.0]
@@ -113,6 +115,17 @@ def las_header(
         records.append(("LASF_Spec", 100, "Waveform packet descriptor", descriptor))
     header.vlrs.extend(laspy.VLR(*record) for record in records)
     return header
+
+
+def is_simulated(path: Path) -> bool:
+    """Return whether a LAS or LAZ file, or that of a file of waveforms, has a header of `las_header`."""
+    points = path.with_suffix(".las") if path.suffix == ".wdp" else path
+    if not points.is_file():
+        return False
+    # The generating software is 58 bytes behind the start.
+    with points.open("rb") as file:
+        header = file.read(90)
+    return header.startswith(b"LASF") and header[58:].startswith(_SOFTWARE.encode())
 
 
 def _descriptor(extra: ExtraBytes) -> bytes:

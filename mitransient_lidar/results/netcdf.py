@@ -16,6 +16,7 @@ from xarray.backends import H5NetCDFStore
 
 from mitransient_lidar.core.array_files import check_size, damaged_file, largest_result
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.results.formats import attribute, picture_order
 
 _CHECKSUM = b"mitransient-lidar sha256 "  # what the SHA-256 of a file follows at its end
@@ -58,19 +59,19 @@ def dump(dataset: xr.Dataset, path: str | os.PathLike[str], encoding: Mapping[st
         output.write(_CHECKSUM + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
 
 
-def check_sum(path: str | os.PathLike[str]) -> None:
-    """Raise `UserError` if a file ends in a checksum that is not its own, before HDF5, which may hang, reads it.
+def check_sum(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file ends in its checksum; raise `UserError` if in another one, before HDF5, which may hang.
 
-    `dump` appends it to the HDF5 data. HDF5 does not read it, and removes it when another program changes the file.
+    `dump` appends it to the HDF5 data, and commands a mark (`core.marks`). HDF5 does not read them, and removes them
+    when another program changes the file.
     """
     length = len(_CHECKSUM) + 2 * hashlib.sha256().digest_size
     with open(path, "rb") as file:
-        if (size := file.seek(0, os.SEEK_END) - length) <= 0:
-            return
-        file.seek(size)
-        known = file.read()
-        if _CHECKSUM not in known:
-            return
+        start = file.seek(max(file.seek(0, os.SEEK_END) - length - LONGEST_TAIL, 0))
+        tail = file.read()
+        if (place := tail.rfind(_CHECKSUM)) < 0:
+            return False
+        size, known = start + place, tail[place : place + length]
         file.seek(0)
         found = hashlib.sha256()
         while size and (block := file.read(min(size, 2**20))):
@@ -78,6 +79,7 @@ def check_sum(path: str | os.PathLike[str]) -> None:
             size -= len(block)
     if known != _CHECKSUM + found.hexdigest().encode():
         raise UserError(f"{path} is damaged or truncated: its SHA-256 is another one than when it was written.")
+    return True
 
 
 def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:

@@ -65,8 +65,8 @@ def start(script, *arguments, **options):
     return subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], text=True, **options)
 
 
-def render(script, folder, *, passes=2, before=(), **options):
-    arguments = [*before, *RENDER, "--passes", passes, "-o", folder]
+def render(script, folder, *, passes=2, before=(), overwrite=False, **options):
+    arguments = [*before, *RENDER, "--passes", passes, "-o", folder, *["--overwrite"] * overwrite]
     process = start(script, *arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
     return process, *process.communicate(timeout=240)
 
@@ -114,12 +114,12 @@ def test_a_closed_terminal_keeps_the_passes(tmp_path):
 @pytest.mark.long
 def test_files_of_a_killed_command_do_not_appear_and_the_next_one_sweeps_them(tmp_path):
     (tmp_path / "table1.exr").write_text("old")
-    process, stdout, _ = render(KILLED, tmp_path)
+    process, stdout, _ = render(KILLED, tmp_path, overwrite=True)
     assert (process.returncode, stdout) == (-signal.SIGKILL, "")
     assert (tmp_path / "table1.exr").read_text() == "old"
     assert [name for name in names(tmp_path) if not name.startswith(".")] == ["table1.exr"]
     assert len(names(tmp_path)) == 4  # three files were written
-    process, _, stderr = render("from mitransient_lidar.cli import app; app.main()", tmp_path)
+    process, _, stderr = render("from mitransient_lidar.cli import app; app.main()", tmp_path, overwrite=True)
     assert process.returncode == 0, stderr
     assert names(tmp_path) == FILES
 
@@ -130,7 +130,7 @@ def test_files_of_a_killed_command_do_not_appear_and_the_next_one_sweeps_them(tm
 def test_a_full_disk_leaves_the_former_files(tmp_path, limit, file):
     """Limits in bytes, between the sizes of the files: EXR 80 000, NetCDF 86 000, drawing more than 150 000."""
     (tmp_path / "table1.exr").write_text("old")
-    process, stdout, stderr = render(DISK_FULL, tmp_path, before=[limit])
+    process, stdout, stderr = render(DISK_FULL, tmp_path, before=[limit], overwrite=True)
     assert (process.returncode, stdout) == (2, ""), stderr
     sentence = stderr.splitlines()[-1]
     assert sentence.startswith(f"cannot write {tmp_path / file}: ")

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from mitransient_lidar.core.errors import UserError, is_interruption
+from mitransient_lidar.core.files import together
 from mitransient_lidar.core.validation import positive
 from mitransient_lidar.plots import drawing
 from mitransient_lidar.plots.publication import drawings, waveforms
@@ -125,11 +126,12 @@ def figures(
             figure = _FIGURES[name]
             stated = figure.statements(renders) if figure.statements else []
             path = folder / f"{name}.png"
-            drawing.save(figure.draw(renders), path)
+            # The table holds the statements of the figures that are there, even if the process is killed.
+            with together():
+                drawing.save(figure.draw(renders), path)
+                write_statements([*found, *stated], folder / TABLE)
             files.append(path)
             found += stated
-            # The table holds the statements of the figures that are there, even if the process is killed.
-            write_statements(found, folder / TABLE)
     except (KeyboardInterrupt, RuntimeError) as error:
         if not is_interruption(error):
             raise

@@ -156,7 +156,8 @@ def test_a_disk_without_space_for_the_last_picture_leaves_the_former_files(scene
 
     monkeypatch.setattr("mitransient_lidar.plots.layout.plot_layout", full)
     (tmp_path / "fig09_layout.png").write_text("old")
-    assert_refused(run("render", scene, "-o", tmp_path, "--quiet"), "fig09_layout.png: No space left on device")
+    full_disk = run("render", scene, "-o", tmp_path, "--quiet", "--overwrite")
+    assert_refused(full_disk, "fig09_layout.png: No space left on device")
     assert [(path.name, path.read_text()) for path in tmp_path.glob("fig09*")] == [("fig09_layout.png", "old")]
 
 

@@ -1,0 +1,318 @@
+"""Which existing files each command replaces, and which it keeps before it renders."""
+
+import inspect
+import os
+import shutil
+
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+
+from mitransient_lidar import results
+from mitransient_lidar.cli import files, overwriting
+from mitransient_lidar.cli.app import app
+from mitransient_lidar.core.marks import holds_mark, read_mark, write_mark
+from mitransient_lidar.physics.lidar.time_axis import TimeAxis
+
+#: Wrong options, found after the check of the files and before the render.
+WRONG = ["-D", "no_such_parameter=1"]
+OTHER = {"scene": "fig09_2x2"}
+
+#: For each command: its arguments, which fail once the files may be written; its files; what another subject is.
+CASES = {
+    "render": (
+        ["table1", *WRONG, "-o", "d"],
+        ["d/table1.exr", "d/table1.nc", "d/table1.png", "d/table1_layout.png"],
+        OTHER,
+    ),
+    "render gates": (
+        ["gated_mine", "--gif", "--html", "--components", *WRONG, "-o", "d"],
+        [
+            f"d/gated_mine_{name}"
+            for name in ("gates.exr", "gates.png", "depth.png", "gates.gif", "gates.html", "components.png")
+        ],
+        OTHER,
+    ),
+    "render instrument": (
+        ["table1", "--instrument", "riegl_vq840g", *WRONG, "-o", "d"],
+        ["d/table1.nc"],
+        {"instrument": ""},
+    ),
+    "passive": (
+        ["passive_sea", *WRONG, "-o", "d"],
+        [f"d/passive_sea_passive{end}" for end in (".nc", ".exr", ".png")],
+        OTHER,
+    ),
+    "shots": (["table1", *WRONG, "-o", "d/s.nc"], ["d/s.nc"], OTHER),
+    "find-shots": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png"], OTHER),
+    "shot-statistics": (["table1", *WRONG, "-o", "d/f.svg"], ["d/f.svg", "d/f.nc"], OTHER),
+    "target-signal": (["fig13_2x2", *WRONG, "-o", "d/f.pdf"], ["d/f.pdf", "d/f.nc"], OTHER),
+    "detect": (["fig13_2x2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "estimate": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "depth-bias": (
+        ["riegl_vq840g", *WRONG, "-o", "d/t.nc", "--figure", "d/t.png"],
+        ["d/t.nc", "d/t.png"],
+        {"instrument": "other"},
+    ),
+    "tpu": (
+        ["riegl_vq840g", *WRONG, "-o", "d"],
+        ["d/riegl_vq840g_tpu.nc", "d/riegl_vq840g_150m_20deg_tvu.csv", "d/riegl_vq840g_150m_20deg_orders.png"],
+        {"instrument": "other"},
+    ),
+    "bounds": (["table1", "--free", "bottom_depth", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc", "d/f.csv"], OTHER),
+    "beam-spread": (["table1", "--depths", "2", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "fov-sweep": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "scattering-orders": (["table1", *WRONG, "-o", "d/f.png"], ["d/f.png", "d/f.nc"], OTHER),
+    "water": (["jerlov", "no_such_type", "-o", "d/f.png"], ["d/f.png"], {"kind": "petzold"}),
+    "figures": (["fig09", "--target-error", "-1", "-o", "d"], ["d/fig09.png", "d/statements.csv"], None),
+    "view": (["damaged.nc", "-o", "d/v.html", "--no-browser"], ["d/v.html"], OTHER),
+    "plot": (["damaged.nc"], ["damaged.png"], OTHER),
+    "plot layout": (["damaged.nc", "--layout"], ["damaged_layout.png"], OTHER),
+    "compare": (["damaged.nc", "damaged.exr", "-o", "d/c.png"], ["d/c.png"], {"second_scene": "fig09_2x2"}),
+    "record": (["damaged.nc"], ["damaged_recorded.nc"], OTHER),
+    "waveforms": (["damaged.nc", "--csv", "d/e.csv"], ["d/e.csv"], None),
+    "retrieve": (["damaged.nc", "-o", "d/r.nc", "--figure", "d/r.png"], ["d/r.nc", "d/r.png"], OTHER),
+    "gates": (
+        ["shot.nc", "--start-ns", "1", "--width-ns", "-1", "--sequence", "--html", "-o", "d"],
+        ["d/shot_gates.exr", "d/shot_gates.png", "d/shot_depth.png", "d/shot_gates.html", "d/shot_gate000.exr"],
+        OTHER,
+    ),
+    "fit": (
+        ["damaged.nc", "--scene", "table1", "--free", "bottom_depth", *WRONG, "-o", "d"],
+        ["d/fit.nc", "d/fit.csv", "d/fit.png"],
+        OTHER,
+    ),
+    "sweep row": (["missing.toml", "--row", "1", "-o", "d/r.nc"], ["d/r.nc"], {"campaign": "other"}),
+    "sweep show": (["missing.zarr", "--show", "-o", "d/r.png"], ["d/r.png"], {"campaign": "other"}),
+    "fly": (
+        ["missing.toml", "-o", "d"],
+        [f"d/{name}" for name in ("points.laz", "waveforms.las", "waveforms.wdp", "flight.png", "profile.png")],
+        {"flight": "other"},
+    ),
+}
+FILES = [(name, file) for name, (_, targets, _) in CASES.items() for file in targets]
+
+
+def command(name, *more):
+    return run(name.split()[0], *CASES[name][0], *more)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch, small_result):
+    """A working folder with a result, damaged ones, and a folder for files."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "d").mkdir()
+    shutil.copy(small_result, tmp_path / "shot.nc")
+    for name in ("damaged.nc", "damaged.exr"):
+        (tmp_path / name).write_text("no result")
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def small_result(tmp_path_factory):
+    """A result of two pixels, as a script saves it."""
+    path = tmp_path_factory.mktemp("result") / "shot.nc"
+    dataset = results.build(
+        *np.ones((4, 2, 5)),
+        time=TimeAxis(0.0, 1e-9, 5),
+        pixel_names=["a", "b"],
+        pixel_centres_mrad=np.zeros((2, 2)),
+        attributes={"scene": "table1"},
+    )
+    results.save(dataset, path)
+    return path
+
+
+@pytest.fixture
+def write_before(monkeypatch):
+    """Return a function that writes the files of a command, of any contents, with the marks that it gives them."""
+
+    def write(name, *options):
+        checked = []
+
+        def settle(targets, option="-o"):
+            running = overwriting._running.get()
+            running.prepare()
+            checked.append(running)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(files, "check_kept", settle)
+            command(name, *options)
+        moves = []
+        for target in CASES[name][1]:
+            temporary = files.Path(target).with_name(f"temporary_{files.Path(target).name}")
+            temporary.write_bytes(b"contents \0\0\0\0IEND startxref ;")
+            moves.append((temporary, files.Path(target)))
+        for temporary, target in checked[-1].settle(moves):
+            os.replace(temporary, target)
+
+    return write
+
+
+def change_mark(path, **values):
+    """Write a file anew with another mark."""
+    mark = {**read_mark(path), **values}
+    path.write_bytes(b"contents \0\0\0\0IEND startxref ;")
+    write_mark(path, mark)
+
+
+@pytest.mark.parametrize(("name", "file"), FILES)
+def test_file_of_a_stranger_is_kept(name, file, folder):
+    (folder / file).write_text("mine")
+    assert_refused(command(name), f"{file} is kept, since ", "--overwrite", "-csv" if name == "waveforms" else "-")
+    assert (folder / file).read_text() == "mine"
+    if file == CASES[name][1][0]:
+        assert "is kept" not in command(name, "--overwrite").stderr
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ("waveforms", "fly")])
+def test_files_of_the_same_command_and_scene_may_be_replaced(name, write_before, folder):
+    """Not those of another command, scene or instrument, and those that took long."""
+    write_before(name)
+    done = command(name)
+    assert done.exit_code == 2
+    assert "is kept" not in done.stderr
+    path = folder / next(file for file in CASES[name][1] if holds_mark(folder / file))
+    mark, other = read_mark(path), CASES[name][2]
+    change_mark(path, elapsed_s=75.0)
+    assert_refused(command(name), "since it took 75 s to make", "--overwrite", "-")
+    change_mark(path, **{**mark, "command": "another"})
+    assert_refused(command(name), "since the command another has written it", "--overwrite", "-")
+    if other:
+        change_mark(path, **{**mark, "subject": {**mark["subject"], **other}})
+        assert_refused(command(name), f"since its {next(iter(other)).replace('_', ' ')} is ", "--overwrite", "-o")
+
+
+@pytest.mark.parametrize("name", ["tpu", "bounds", "figures", "fit"])
+def test_table_that_was_edited_is_kept(name, write_before, folder):
+    """The files beside it tell its SHA-256."""
+    write_before(name)
+    table = next(folder / file for file in CASES[name][1] if file.endswith(".csv"))
+    table.write_text(table.read_text() + "edited")
+    assert_refused(command(name), f"{table.name} is kept, since it does not tell what has written it")
+
+
+def test_every_command_with_an_output_is_tested():
+    callbacks = {one.name or one.callback.__name__.replace("_", "-"): one.callback for one in app.registered_commands}
+    with_output = {name for name, one in callbacks.items() if "overwrite" in inspect.signature(one).parameters}
+    assert {name.split()[0] for name in CASES} == with_output
+    assert set(callbacks) - with_output == {"info", "instruments", "bench"}
+
+
+def line(done):
+    return [text for text in done.stderr.splitlines() if text.startswith("replaces ")]
+
+
+@pytest.fixture
+def small_figures(monkeypatch):
+    """Draw empty figures for estimates, which takes a hundredth of the time."""
+    from mitransient_lidar.plots import drawing, waveforms
+
+    def draw(_, path):
+        drawing.save(drawing.new_figure(path, 1, 1), path)
+
+    monkeypatch.setattr(waveforms, "plot_components", draw)
+    monkeypatch.setattr(overwriting, "_LONG_S", 1e9)  # on a busy machine
+
+
+@pytest.mark.usefixtures("small_figures")
+def test_line_names_what_differs():
+    first = ["estimate", "table1", "--paths", 64, "-o", "d/a.png"]
+    assert line(run(*first)) == []
+    done = run(*first[:2], "-D", "wind_speed=6", "--paths", 128, "-o", "d/a.png")
+    assert line(done) == ["replaces d/a.nc and 1 more: wind_speed 3 -> 6, paths 64 -> 128"]
+    assert_refused(run("estimate", "fig09_2x2", "-o", "d/a.png"), "since its scene is table1")
+    mounted = ["estimate", "table1", "--instrument", "riegl_vq840g", "-o", "d/a.png"]
+    assert_refused(run(*mounted), "since its instrument is another one")
+    assert_refused(run("plot", "d/a.nc"), "d/a.png is kept, since the command estimate has written it", "-o")
+    done = run("estimate", "fig09_2x2", "--paths", 64, "-o", "d/a.png", "--overwrite")
+    assert line(done) == ["replaces d/a.nc and 1 more: its scene is table1"]
+    assert done.exit_code == 0
+
+
+def test_result_of_an_earlier_release_counts_by_its_attributes(folder):
+    """It has no mark, and the SHA-256 at its end."""
+    held = {"scene": "table1", "pass_share": 1.0, "elapsed_s": 3.0, "scene.wind_speed": "5"}
+    saved = results.open("shot.nc").assign_attrs(held)
+    results.save(saved, "d/table1.nc")
+    former = overwriting._mark_of_result(folder / "d/table1.nc")
+    assert (former["command"], former["subject"]["scene"]) == ("render", "table1")
+    assert "is kept" not in command("render").stderr
+    results.save(saved.assign_attrs(elapsed_s=61.0), "d/table1.nc")
+    assert_refused(command("render"), "since it took 61 s to make")
+    results.save(saved.assign_attrs(scene="fig09_2x2"), "d/table1.nc")
+    assert_refused(command("render"), "since its scene is fig09_2x2")
+    saved.to_netcdf("d/table1.nc", engine="h5netcdf")
+    assert_refused(command("render"), "since no command has written it as it is")
+
+
+def test_drawing_of_the_same_result_may_be_replaced(folder, write_before):
+    """Whatever time the render took."""
+    write_before("render")
+    shutil.copy("shot.nc", "d/table1.nc")
+    mark = {**read_mark(folder / "d/table1.png"), "elapsed_s": 1000.0}
+    write_mark(folder / "d/table1.nc", mark)
+    change_mark(folder / "d/table1.png", elapsed_s=1000.0)
+    assert_refused(command("render"), "took 1000 s")
+    assert line(run("plot", "d/table1.nc")) == ["replaces d/table1.png: no option differs"]
+    assert read_mark(folder / "d/table1.png")["result"] == mark["result"]
+    change_mark(folder / "d/table1.png", elapsed_s=1000.0, result="another")
+    assert_refused(run("plot", "d/table1.nc"), "took 1000 s")
+
+
+@pytest.mark.usefixtures("small_figures")
+def test_scene_files_of_one_name_in_two_folders_are_two_scenes(folder):
+    for name in ("a", "b"):
+        (folder / name).mkdir()
+        run("scenes", "copy", "table1", f"{name}/lab.xml")
+    estimate = ["estimate", "--paths", 64, "-o", "d/f.png"]
+    assert run(*estimate, "a/lab.xml").exit_code == 0
+    assert_refused(run(*estimate, "b/lab.xml"), "since its scene file is ../a/lab.xml")
+    assert run(*estimate, folder / "a/lab.xml").exit_code == 0
+
+
+@pytest.mark.usefixtures("small_figures")
+def test_file_made_meanwhile_keeps_its_name(folder, monkeypatch):
+    """The new one gets another, so that no render is lost."""
+    from mitransient_lidar.studies import estimate
+
+    def slow(*arguments, **options):
+        (folder / "d/f.nc").write_text("mine")
+        return found(*arguments, **options)
+
+    found = estimate.estimate
+    monkeypatch.setattr(estimate, "estimate", slow)
+    done = run("estimate", "table1", "--paths", 64, "-o", "d/f.png")
+    assert done.exit_code == 0
+    assert "d/f.nc is kept, since no command has written it as it is: the new file is d/f_2.nc." in done.stderr
+    assert (folder / "d/f.nc").read_text() == "mine"
+    assert done.stdout.splitlines()[:2] == ["d/f.png", "d/f_2.nc"]
+
+
+def test_library_writes_what_it_is_told(folder):
+    (folder / "d/a.nc").write_text("mine")
+    results.save(results.open("shot.nc"), "d/a.nc")
+    assert read_mark(folder / "d/a.nc") is None
+    assert results.open("d/a.nc").sizes["time"] == 5
+
+
+def test_flight_goes_on_in_its_own_folder(folder):
+    """Beside the store, files whose headers name the software are those of the flight; `fly` checks the store."""
+    las = b"LASF" + bytes(54) + b"mitransient-lidar 1.0"
+    for name in ("points.laz", "waveforms.las", "waveforms.wdp"):
+        (folder / "d" / name).write_bytes(las)
+    assert_refused(command("fly"), "d/points.laz is kept, since it does not tell what has written it")
+    (folder / "d/flight.zarr").mkdir()
+    assert "is kept" not in command("fly").stderr
+    (folder / "d/waveforms.las").write_bytes(b"LASF" + bytes(54) + b"another")
+    assert_refused(command("fly"), "d/waveforms.las is kept", "--overwrite", "-o")
+
+
+def test_store_of_a_stranger_is_kept(folder):
+    campaign = 'scene = "table1"\n[parameters]\nbottom_depth = [2, 3]\n[design]\nkind = "grid"\n'
+    (folder / "c.toml").write_text(campaign)
+    (folder / "c.zarr").mkdir()
+    (folder / "c.zarr/zarr.json").write_text("mine")
+    for more in ([], ["--overwrite"]):
+        assert_refused(run("sweep", "c.toml", *more, "-q"), "c.zarr is no store of a campaign or a flight")
+    assert (folder / "c.zarr/zarr.json").read_text() == "mine"
