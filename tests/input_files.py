@@ -119,6 +119,63 @@ def load(path: Path) -> None:
     find_lidar_scene(session.scene, session.sensor)
 
 
+def scene_parts(folder: Path) -> Path:
+    """Write a scene of three files in a folder, of which one includes the next."""
+    parts = folder / "parts"
+    parts.mkdir()
+    scene(parts)
+    text = (parts / "scene.xml").read_text()
+    first, last = text.index("<sensor"), text.index("</sensor>") + len("</sensor>")
+    (parts / "scene.xml").write_text(f'{text[:first]}<include filename="sensor.xml"/>{text[last:]}')
+    (parts / "sensor.xml").write_text('<scene version="3.0.0"><include filename="receiver.xml"/></scene>')
+    (parts / "receiver.xml").write_text(f'<scene version="3.0.0">{text[first:last]}</scene>')
+    return parts
+
+
+def mesh(name: str) -> Callable[[Path], Path]:
+    """Return what writes the mesh of a square, as PLY of text or binary records, or as OBJ."""
+    corners = np.array([(-1, -1, -3), (1, -1, -3), (1, 1, -3), (-1, 1, -3)], dtype="<f4")
+    faces = [(0, 1, 2), (0, 2, 3)]
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        if path.suffix == ".obj":
+            lines = [f"v {x:g} {y:g} {z:g}" for x, y, z in corners] + [
+                f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces
+            ]
+            path.write_text("\n".join(lines) + "\n")
+            return path
+        binary = "binary" in name
+        head = ["ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0", "element vertex 4"]
+        head += [f"property float {axis}" for axis in "xyz"]
+        head += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+        rows = [f"{x:g} {y:g} {z:g}" for x, y, z in corners] + [f"3 {a} {b} {c}" for a, b, c in faces]
+        records = b"".join(b"\x03" + np.array(face, dtype="<i4").tobytes() for face in faces)
+        body = corners.tobytes() + records if binary else ("\n".join(rows) + "\n").encode()
+        path.write_bytes(("\n".join(head) + "\n").encode() + body)
+        return path
+
+    return make
+
+
+def load_part(kind: str, **parameters: Any) -> Callable[[Path], None]:
+    """Return what loads an object of Mitsuba's in a scene, whose parameters may be FILE."""
+
+    def read(path: Path) -> None:
+        from mitransient_lidar.loading import scenes
+
+        def filled(part: dict[str, Any]) -> dict[str, Any]:
+            values = {name: filled(one) if isinstance(one, dict) else one for name, one in part.items()}
+            return {name: str(path) if value == "FILE" else value for name, value in values.items()}
+
+        scenes.load({"type": "scene", "part": filled({"type": kind, **parameters})})
+
+    return read
+
+
+_SPECTRUM = "".join(f"{wavelength} {0.1 + wavelength / 1e4:.4f}\n" for wavelength in range(400, 700, 20))
+
+
 def gates(name: str) -> Callable[[Path], Path]:
     """Return what writes a gate stack."""
 
@@ -399,6 +456,16 @@ _PHASE = "angle (deg),phase function\n" + "".join(f"{i},{1 / (1 + i):.6f}\n" for
 
 KINDS = {
     "scene": Kind(scene, load, "text"),
+    "scene_parts": Kind(scene_parts, lambda path: load(path / "scene.xml"), "text"),
+    "mesh.ply": Kind(mesh("a.ply"), load_part("ply", filename="FILE"), "text"),
+    "mesh_binary.ply": Kind(mesh("a_binary.ply"), load_part("ply", filename="FILE")),
+    "mesh.obj": Kind(mesh("a.obj"), load_part("obj", filename="FILE"), "text"),
+    "texture": Kind(image(".png"), load_part("diffuse", reflectance={"type": "bitmap", "filename": "FILE"})),
+    "spectrum": Kind(
+        written("a.spd", _SPECTRUM),
+        load_part("diffuse", reflectance={"type": "spectrum", "filename": "FILE"}),
+        "text",
+    ),
     "result_nc": Kind(saved(shot, "a.nc"), analyse),
     "result_exr": Kind(saved(shot, "a.exr"), analyse),
     "result_attributes": Kind(saved(shot, "a.nc"), analyse, "attributes"),

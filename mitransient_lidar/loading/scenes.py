@@ -96,7 +96,9 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
 
     given = scene.scene_dict() if isinstance(scene, SceneRecord) else scene
     check_dict(given)
-    record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
+    # Of a record, too: its files are those that it names, not those that it lists.
+    found = SceneRecord.of_dict(given)
+    record = scene if isinstance(scene, SceneRecord) else found
     with as_user_error(), _own_file_resolver():
         loaded = _instantiate(lambda config: mi.parser.parse_dict(config, {"type": "scene", **given}))
     return LoadedScene(loaded, "scene", {}, record)
@@ -120,8 +122,6 @@ def _load_xml(
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
         loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
-    if not isinstance(loaded, mi.Scene):
-        raise UserError(f"scene {document.name} holds a {type(loaded).__name__}: its root element must be <scene>")
     if unused := [name for name in document.parameters if name not in document.used]:
         _tell_missing_part(loaded, unused)
     return LoadedScene(loaded, document.name, dict(document.parameters), record)
