@@ -43,7 +43,9 @@ def parse_json(text: Any, name: str) -> Any:
     """Return the value of a text of JSON; raise `UserError` for another text, or one that is nested too deeply."""
     try:
         value = json.loads(text)
-    except (TypeError, ValueError, RecursionError) as error:
+    except RecursionError as error:
+        raise too_deep(name) from error
+    except (TypeError, ValueError) as error:
         raise UserError(f"{name} is damaged: it must be a text of JSON") from error
     check_nesting(value, name)
     return value
@@ -57,4 +59,9 @@ def check_nesting(value: Any, name: object) -> None:
         level = [one for part in lists for one in part]
         if not level:
             return
-    raise UserError(f"{name} is nested more than {_DEEPEST} deep, which is the limit")
+    raise too_deep(name)
+
+
+def too_deep(name: object) -> UserError:
+    """Return the error of a document whose lists and tables are nested too deeply."""
+    return UserError(f"{name} is nested more than {_DEEPEST} deep, which is the limit")

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from mitransient_lidar.core.documents import check_nesting
+from mitransient_lidar.core.documents import check_nesting, too_deep
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 
@@ -20,8 +20,10 @@ def parse_toml(text: str, name: object) -> dict[str, Any]:
     """Return the contents of a TOML file; raise `UserError`, with the name of the file, for another text."""
     try:
         given = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except tomllib.TOMLDecodeError as error:
         raise UserError(f"{name} is not a TOML file: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise too_deep(name) from error
     check_nesting(given, name)
     return given
 

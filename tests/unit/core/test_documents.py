@@ -37,9 +37,9 @@ def test_plain_xml_is_let_through():
 @pytest.mark.parametrize("depth", [120, 300, 480, 600, 5000])
 def test_deep_documents_are_refused(depth):
     nested = "[" * depth + "]" * depth
-    with pytest.raises(UserError, match=r"nested more than 100 deep|must be a text of JSON"):
+    with pytest.raises(UserError, match="a text is nested more than 100 deep"):
         parse_json(nested, "a text")
-    with pytest.raises(UserError, match=r"nested more than 100 deep|is not a TOML file"):
+    with pytest.raises(UserError, match="a file is nested more than 100 deep"):
         parse_toml(f"a = {nested}", "a file")
 
 

@@ -52,7 +52,7 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
         ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
         ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
         ({"scene_xml": "<scene>"}, "is not well-formed XML"),
-        ({"scene_dict": "[" * 10**5}, "the scene of the result is damaged: it must be a text of JSON"),
+        ({"scene_dict": "[" * 10**5}, "the scene of the result is nested more than 100 deep"),
         ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
         ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
         ({}, "does not hold its scene"),
