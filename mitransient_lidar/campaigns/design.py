@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml
 from mitransient_lidar.core.validation import (
     FloatArray,
@@ -408,7 +408,7 @@ def _section(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 def _resolved(name: str, folder: Path) -> str:
     """Return the absolute path of a file beside that of the campaign, any other name as it is."""
     path = folder / name
-    return str(path.resolve()) if path.suffix and path.is_file() else name
+    return str(path.resolve()) if path.suffix and is_there(path) else name
 
 
 def _plain(value: Any) -> Any:

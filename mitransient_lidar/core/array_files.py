@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import check_regular, open_file, read_text
+from mitransient_lidar.core.files import check_regular, is_there, open_file, read_text
 from mitransient_lidar.core.validation import integer, positive
 
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
@@ -213,7 +213,7 @@ def read_ascii_grid(path: Path) -> Grid:
     if values.size != columns * rows:
         raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}.")
     system = path.with_suffix(".prj")
-    if system.exists() and read_text(system).lstrip().startswith("GEOG"):
+    if is_there(system) and _beginning(system).lstrip().startswith(b"GEOG"):
         raise UserError(f"{path} has coordinates in degrees according to {system}: they must be projected, in metres.")
     cell = _entry(path, header, "dx", "cellsize"), _entry(path, header, "dy", "cellsize")
     positive(f"{path}: cellsize", min(cell))
@@ -225,6 +225,12 @@ def read_ascii_grid(path: Path) -> Grid:
     ]
     values[values == header.get("nodata_value", -9999.0)] = np.nan
     return Grid(values.reshape(rows, columns)[::-1], (first[0], first[1]), cell)
+
+
+def _beginning(path: Path) -> bytes:
+    """Return the first bytes of a file."""
+    with open_file(path) as file:
+        return file.read(2**12)
 
 
 def _entry(path: Path, header: dict[str, float], *names: str) -> float:

@@ -26,7 +26,7 @@ def check_xml(text: str | bytes, name: object) -> None:
     parser.ProcessingInstructionHandler = _refusing(name, "a processing instruction")
     try:
         parser.Parse(text, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, UnicodeEncodeError) as error:
         raise UserError(f"{name} is not well-formed XML: {error}.") from error
 
 

@@ -15,7 +15,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.array_files import damaged_file
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.validation import FloatArray
 
@@ -82,7 +82,11 @@ def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
     """Return the byte order of a file, empty for text, and its elements; raise ValueError or KeyError for others."""
     order, elements = "", list[_Element]()
     while file.tell() < _LONGEST_HEADER:
-        match file.readline(_LONGEST_LINE).decode("utf-8", "replace").split():
+        line = file.readline(_LONGEST_LINE).decode("utf-8", "replace").rstrip("\r\n")
+        # Mitsuba prints names that it does not know.
+        if printable(line, kept="\t") != line:
+            raise ValueError(line)
+        match line.split():
             case ["format", name, "1.0"]:
                 order = _FORMATS[name]
             case ["element", name, count]:

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitransient_lidar.core.documents import parse_json
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.errors import UserError, printable
 from mitransient_lidar.core.files import check_regular, is_file_name, is_there, open_file
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.checks import resource_folders
@@ -320,7 +320,7 @@ def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> di
     """Return path and SHA-256 of the files that exist, relative to the working folder.
 
     Files of Mitsuba's plugins are looked for in the folders of the scene before, and in those of its file resolver.
-    Raises UserError if one of the files is no regular one, or a damaged mesh.
+    Raises UserError if one of the files is no regular one, has control characters in its name, or is a damaged mesh.
     """
     import mitsuba as mi
 
@@ -332,13 +332,18 @@ def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> di
         if path is not None:
             path = path.resolve()
             files[plugin, name] = str(path), (digest := _sha256(path))
-            _check_mesh(plugin, path, digest)
+            _check_file(plugin, path, digest)
     return files
 
 
 @functools.lru_cache(maxsize=64)
-def _check_mesh(plugin: str, path: Path, _digest: str) -> None:
-    """Raise UserError if a mesh is damaged; one with the same SHA-256 is checked once for a series of renders."""
+def _check_file(plugin: str, path: Path, _digest: str) -> None:
+    """Raise UserError if the name of a file has control characters, which Mitsuba would print, or a mesh is damaged.
+
+    A file with the same SHA-256 is checked once for a series of renders.
+    """
+    if printable(str(path)) != str(path):
+        raise UserError(f"cannot read {path}: its name must have no control characters")
     if plugin in PLY_PLUGINS:
         check_ply(path)
 
@@ -352,7 +357,7 @@ def _unchanged(plugin: str, path: str, digest: str) -> str:
             f"{path} has changed since the result was rendered (its SHA-256 is not {digest[:12]}...): restore it, or "
             "render the scene anew"
         )
-    _check_mesh(plugin, Path(path), digest)
+    _check_file(plugin, Path(path), digest)
     return path
 
 

@@ -167,10 +167,20 @@ def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
         (tmp_path / "a.xml").write_text(text)
         with pytest.raises(UserError, match=f"pipe{folder}: it is a named pipe"):
             load_scene(tmp_path / "a.xml")
-    for given in ({"type": "scene", "mesh": {"type": "ply", "filename": "pipehere"}},):
-        for one in (given, SceneRecord.from_attributes({"scene_dict": json.dumps(given)})):
-            with pytest.raises(UserError, match="pipehere: it is a named pipe"):
-                load_scene(one)
+    given = {"type": "scene", "mesh": {"type": "ply", "filename": "pipehere"}}
+    for one in (given, SceneRecord.from_attributes({"scene_dict": json.dumps(given)})):
+        with pytest.raises(UserError, match="pipehere: it is a named pipe"):
+            load_scene(one)
+    with pytest.raises(UserError, match="pipehere: it is a named pipe"):
+        choose_integrator(load_scene({"type": "scene"})[0], {**given, "type": "lidar_merging"})
+
+
+def test_names_of_files_that_mitsuba_would_print_are_refused(tmp_path):
+    path = tmp_path / "a\x1b]0;title\x07.ply"
+    path.write_text("ply\n")
+    with pytest.raises(UserError, match="its name must have no control characters") as caught:
+        load_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
+    assert str(caught.value).isprintable()
 
 
 def test_types_are_checked_with_parameters_in_place(tmp_path):

@@ -74,6 +74,7 @@ def test_the_mesh_of_a_result_is_checked(square):
         (b"property list uchar int vertex_indices", b"property list uchar none vertex_indices"),
         (b"end_header", b"end_of_header"),
         (b"ply\n", b"ply\ncomment " + b"x" * 5000 + b"\n"),
+        (b"element face 2", b"element \x1b]0;title\x07 0\nelement face 2"),
     ],
 )
 def test_headers_that_lie_are_refused(square, old, new):
