@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -31,10 +31,19 @@ class _PrintableStream:
         self.unfiltered = stream
 
     def write(self, text: str) -> int:
-        """Write a text."""
-        return int(self.unfiltered.write(printable(text, kept=LINES)))
+        """Write a text, with escapes for what the encoding of the stream does not have."""
+        encoding = self.unfiltered.encoding or "utf-8"
+        shown = printable(text, kept=LINES).encode(encoding, "backslashreplace").decode(encoding)
+        return int(self.unfiltered.write(shown))
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write texts."""
+        self.write("".join(lines))
 
     def __getattr__(self, name: str) -> Any:
+        if name == "buffer":
+            # Click would write to it where the encoding is ASCII.
+            raise AttributeError(name)
         return getattr(self.unfiltered, name)
 
 

@@ -353,7 +353,8 @@ def test_progress_on_a_terminal_holds_only_its_own_control_characters(monkeypatc
 def test_output_of_lines_is_as_before(capsys):
     with messages.printable_streams():
         print("a\tb\nc", flush=True)
-        print("d\x1b[2J", file=sys.stderr)
+        sys.stderr.writelines(["d\x1b", "[2J\n"])
+        assert not hasattr(sys.stdout, "buffer")
         assert sys.stdout.isatty() is False
     assert capsys.readouterr() == ("a\tb\nc\n", "d\\x1b[2J\n")
 
