@@ -179,16 +179,17 @@ def as_user_error(document: SceneDocument | None = None) -> Iterator[None]:
     """Convert a ``RuntimeError`` of Mitsuba's parser to a `UserError` of one sentence.
 
     Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError`` or
-    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. Where a message names a parameter
+    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. A message that quotes bytes of a
+    file which are no UTF-8 comes as a ``UnicodeDecodeError``. Where a message names a parameter
     of a plugin that a given parameter of the document sets under another name, that name is added.
     """
     try:
         yield
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:
         if is_interruption(error):
             raise KeyboardInterrupt from error
         raise_if_out_of_memory(error)
-        text = str(error)
+        text = error.object.decode("utf-8", "replace") if isinstance(error, UnicodeDecodeError) else str(error)
         if wrapped := re.findall(r"UserError: (.*)", text):
             message = " ".join(wrapped[-1].split())
             raise UserError(message + _set_by(message, document)) from error

@@ -6,7 +6,7 @@ import os
 import h5py
 import numpy as np
 import pytest
-from input_files import write_bag
+from array_inputs import write_bag
 
 from mitransient_lidar.core import survey_files
 from mitransient_lidar.core.errors import UserError

@@ -6,7 +6,7 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
-from input_files import mesh
+from array_inputs import mesh
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.mesh_files import check_ply
@@ -81,6 +81,15 @@ def test_headers_that_lie_are_refused(square, old, new):
     change(square, old, new)
     with pytest.raises(UserError, match=r"is damaged, or is not a PLY file of triangles|has a face with the vertex"):
         check_ply(square)
+
+
+def test_a_message_that_quotes_other_bytes_than_text_is_a_sentence(tmp_path):
+    """Python's binding cannot decode what Mitsuba says of the line, and raised UnicodeDecodeError."""
+    path = mesh("a.obj")(tmp_path)
+    path.write_bytes(path.read_bytes() + b"v 1 \xf6 2\n")
+    with pytest.raises(UserError, match="could not parse line") as caught:
+        load({"type": "scene", "mesh": {"type": "obj", "filename": str(path)}})
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
