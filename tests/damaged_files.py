@@ -4,6 +4,10 @@ Run by hand, in the environment that the package is developed in::
 
     .venv/bin/python tests/damaged_files.py --count 1000               # of every kind of file
     .venv/bin/python tests/damaged_files.py result_attributes --count 100 --first 40
+    .venv/bin/python tests/damaged_files.py --others --count 200      # something else in place of the file
+
+In place of a file, of one that it includes, or of one in its folder stand a named pipe, a device, a socket, a folder, a
+link to one of these or to itself, or nothing; an HDF5 file has its values in one of these, or a link to it.
 
 A file must be read, or refused with one sentence (`UserError`), within half a minute. Everything else is a finding:
 another exception, the end of the process by a signal, and a read that takes longer. Findings go to stderr, each with
@@ -14,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import io
 import json
 import logging
@@ -22,6 +27,7 @@ import random
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -36,6 +42,9 @@ import numpy as np
 from input_files import KINDS
 
 LIMIT_S = 30
+
+#: Kinds of files with something else in their place have this behind their names.
+OTHERS = " (others)"
 
 #: What numbers and texts are replaced by.
 _ODD_TEXTS = (
@@ -65,7 +74,7 @@ _ODD_VALUES: tuple[Any, ...] = (
 def damage_bytes(path: Path, rng: random.Random) -> None:
     """Damage the bytes of a file, or of one file of a folder."""
     if path.is_dir():
-        path = rng.choice(sorted(one for one in path.rglob("*") if one.is_file()))
+        path = _one_of(path, rng)
         if rng.random() < 0.2:
             path.unlink()
             return
@@ -92,6 +101,7 @@ def damage_bytes(path: Path, rng: random.Random) -> None:
 
 def damage_text(path: Path, rng: random.Random) -> None:
     """Replace a number or a text of a file by an odd one, or change its lines or bytes."""
+    path = _one_of(path, rng) if path.is_dir() else path
     text = path.read_text("utf-8")
     lines = text.splitlines(keepends=True)
     place = rng.randrange(len(lines))
@@ -145,6 +155,61 @@ def damage_attributes(path: Path, rng: random.Random) -> None:
     dataset.to_netcdf(path, engine="h5netcdf")
 
 
+def _one_of(folder: Path, rng: random.Random) -> Path:
+    """Return a file of a folder."""
+    return rng.choice(sorted(one for one in folder.rglob("*") if one.is_file()))
+
+
+def put_another(path: Path, rng: random.Random) -> None:
+    """Put something that is not a regular file in the place of a file, or of one file of a folder, or into it."""
+    hdf5 = path.suffix in (".nc", ".bag")
+    place = rng.choice((path, _one_of(path, rng))) if path.is_dir() else path
+    other = place.with_name("other")
+    match rng.choice(("fifo", "device", "socket", "folder", "nothing", "loop")):
+        case "fifo":
+            os.mkfifo(other)
+        case "device":
+            other = Path(rng.choice(("/dev/zero", "/dev/full", "/dev/null", "/dev/random", "/dev/tty")))
+        case "socket":
+            # Names of sockets have at most 107 bytes, and a relative one is shorter.
+            with contextlib.chdir(other.parent), socket.socket(socket.AF_UNIX) as server:
+                server.bind(other.name)
+        case "folder":
+            other.mkdir()
+        case "loop":
+            other.symlink_to(other.name)
+    if hdf5 and rng.random() < 0.5:
+        _refer(path, other, rng)
+        return
+    shutil.rmtree(place) if place.is_dir() else place.unlink()
+    if other.parent == Path("/dev") or rng.random() < 0.5:
+        place.symlink_to(other)
+    elif os.path.lexists(other):
+        other.rename(place)
+
+
+def _refer(path: Path, other: Path, rng: random.Random) -> None:
+    """Replace a dataset of an HDF5 file by one whose values another file holds, or by a link into that file."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        names: list[str] = []
+        file.visititems(lambda name, part: names.append(name) if isinstance(part, h5py.Dataset) else None)
+        name = rng.choice(names)
+        shape, kind = file[name].shape, file[name].dtype
+        del file[name]
+        match rng.randrange(3):
+            case 0:
+                external = [(str(other), 0, h5py.h5f.UNLIMITED)]
+                file.create_dataset(name, shape, "f8" if kind.kind == "O" else kind, external=external)
+            case 1:
+                file[name] = h5py.ExternalLink(str(other), "/a")
+            case 2:
+                layout = h5py.VirtualLayout(shape or (1,), "f8")
+                layout[:] = h5py.VirtualSource(str(other), "a", shape or (1,))
+                file.create_virtual_dataset(name, layout)
+
+
 DAMAGE = {"bytes": damage_bytes, "text": damage_text, "attributes": damage_attributes}
 
 
@@ -155,23 +220,28 @@ def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tupl
     warnings.simplefilter("ignore")
     logging.disable()
     signal.signal(signal.SIGALRM, _too_long)
-    KINDS[name].read(original)
+    kind = KINDS[name.removesuffix(OTHERS)]
+    damage = put_another if name.endswith(OTHERS) else DAMAGE[kind.format]
+    kind.read(original)
     for number in range(first, first + count):
         rng = random.Random(f"{name} {number}")
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / original.name
+            path = Path(folder) / "in" / original.name
+            path.parent.mkdir()
             (shutil.copytree if original.is_dir() else shutil.copy)(original, path)
             try:
-                DAMAGE[KINDS[name].format](path, rng)
+                damage(path, rng)
             except Exception:
                 yield number, "not damaged", ""
                 continue
             # A damaged file may end the process; its number is told before.
             yield number, "began", ""
             signal.alarm(LIMIT_S)
+            # A read in a library may not come back to Python; the process ends then, and the next one goes on.
+            faulthandler.dump_traceback_later(2 * LIMIT_S, exit=True)
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
-                    KINDS[name].read(path)
+                    kind.read(path)
                 result, cause = "read", ""
             except UserError as error:
                 result, cause = ("refused", "") if "\n" not in str(error) else ("traceback", f"two lines: {error}")
@@ -180,6 +250,7 @@ def attempts(name: str, first: int, count: int, original: Path) -> Iterator[tupl
             except BaseException as error:
                 result, cause = "traceback", f"{type(error).__name__}: {error} {_place(error)}"
             signal.alarm(0)
+            faulthandler.cancel_dump_traceback_later()
             yield number, result, " ".join(cause.split())[-400:]
 
 
@@ -220,7 +291,7 @@ def measure(name: str, first: int, count: int, folder: Path) -> Counter[str]:
         if process.returncode != 0 and at == began:
             raise SystemExit(f"{name}: the file is not read without damage: {' '.join(order)}")
         if process.returncode != 0:
-            results["process ended"] += 1
+            results["too long" if process.returncode == 1 else "process ended"] += 1
             print(f"{name} {at - 1}: the process ended with {process.returncode}", file=sys.stderr, flush=True)
     return results
 
@@ -231,11 +302,12 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="KIND", help=f"kinds of files; default: all of {', '.join(KINDS)}")
     parser.add_argument("--count", type=int, default=0, help="number of damaged files of each kind")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--others", action="store_true", help="put something else in the place of files")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child and not given.count:
-        KINDS[given.child].make(given.folder)
+        KINDS[given.child.removesuffix(OTHERS)].make(given.folder)
         return
     if given.child:
         # Mitsuba writes to standard output, too.
@@ -249,7 +321,7 @@ def main() -> None:
     columns = ("read", "refused", "traceback", "too long", "process ended")
     print("| file |", " | ".join(columns), "|\n|---|", "---|" * len(columns), sep="", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        for name in given.names or KINDS:
+        for name in [f"{one}{OTHERS}" if given.others else one for one in given.names or KINDS]:
             results = measure(name, given.first, given.count or 100, Path(folder))
             print(f"| {name} |", " | ".join(str(results[one]) for one in columns), "|", flush=True)
 

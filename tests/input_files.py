@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from array_inputs import height_map, image, load_map, mesh, read_image
 
 
 class Kind(NamedTuple):
@@ -117,6 +119,37 @@ def load(path: Path) -> None:
 
     session = open_scene(path, None)
     find_lidar_scene(session.scene, session.sensor)
+
+
+def scene_parts(folder: Path) -> Path:
+    """Write a scene of three files in a folder, of which one includes the next."""
+    parts = folder / "parts"
+    parts.mkdir()
+    scene(parts)
+    text = (parts / "scene.xml").read_text()
+    first, last = text.index("<sensor"), text.index("</sensor>") + len("</sensor>")
+    (parts / "scene.xml").write_text(f'{text[:first]}<include filename="sensor.xml"/>{text[last:]}')
+    (parts / "sensor.xml").write_text('<scene version="3.0.0"><include filename="receiver.xml"/></scene>')
+    (parts / "receiver.xml").write_text(f'<scene version="3.0.0">{text[first:last]}</scene>')
+    return parts
+
+
+def load_part(kind: str, **parameters: Any) -> Callable[[Path], None]:
+    """Return what loads an object of Mitsuba's in a scene, whose parameters may be FILE."""
+
+    def read(path: Path) -> None:
+        from mitransient_lidar.loading import scenes
+
+        def filled(part: dict[str, Any]) -> dict[str, Any]:
+            values = {name: filled(one) if isinstance(one, dict) else one for name, one in part.items()}
+            return {name: str(path) if value == "FILE" else value for name, value in values.items()}
+
+        scenes.load({"type": "scene", "part": filled({"type": kind, **parameters})})
+
+    return read
+
+
+_SPECTRUM = "".join(f"{wavelength} {0.1 + wavelength / 1e4:.4f}\n" for wavelength in range(400, 700, 20))
 
 
 def gates(name: str) -> Callable[[Path], Path]:
@@ -276,76 +309,6 @@ _TRAJECTORY = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n' + "".join(
     f"{0.5 * i}, {i % 3}, 2.5, {10 * i}, {30 * i}, 20, 300\n" for i in range(12)
 )
 
-_HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
-
-
-def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[float, float], **changes: Any) -> Path:
-    """Write a Bathymetric Attributed Grid from its south-western cell on; `changes` are parts of its metadata."""
-    import h5py
-
-    rows, columns = np.shape(heights)
-    last = (first[0] + (columns - 1) * cell[0], first[1] + (rows - 1) * cell[1])
-    corners = changes.get("corners", f"{first[0]!r},{first[1]!r} {last[0]!r},{last[1]!r}")
-    axes = "".join(
-        f'<gmd:MD_Dimension><gmd:dimensionName><gmd:MD_DimensionNameTypeCode codeListValue="{name}"/>'
-        f'</gmd:dimensionName><gmd:resolution><gco:Measure uom="m">{size!r}</gco:Measure></gmd:resolution>'
-        "</gmd:MD_Dimension>"
-        for name, size in (("row", cell[1]), ("column", cell[0]))
-    )
-    text = (
-        f'<gmi:MI_Metadata xmlns:gmi="gmi" xmlns:gmd="gmd" xmlns:gco="gco" xmlns:gml="gml">{axes}'
-        f"<gmd:cornerPoints><gml:Point><gml:coordinates>{corners}</gml:coordinates></gml:Point></gmd:cornerPoints>"
-        f"<system>{changes.get('system', 'PROJCS[GEOGCS[]]')}</system></gmi:MI_Metadata>"
-    )
-    text = changes.get("head", "") + text
-    with h5py.File(path, "w") as file:
-        root = file.create_group("BAG_root")
-        root["elevation"] = np.asarray(heights, dtype=np.float32)
-        root["metadata"] = np.array([one.encode() for one in text], dtype="S1")
-    return path
-
-
-def height_map(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a height map."""
-
-    def make(folder: Path) -> Path:
-        import OpenEXR
-        import xarray as xr
-
-        path = folder / f"map{suffix}"
-        positions = {"x": np.arange(20.0), "y": np.arange(24.0)}
-        if suffix == ".npy":
-            np.save(path, _HEIGHTS)
-        elif suffix == ".npz":
-            np.savez(path, heights=_HEIGHTS, **positions)
-        elif suffix == ".exr":
-            kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-            with OpenEXR.File(kind, {"Y": _HEIGHTS.astype(np.float32)}) as file:
-                file.write(str(path))
-        elif suffix == ".nc":
-            xr.Dataset({"height": (("y", "x"), _HEIGHTS)}, positions).to_netcdf(path, engine="h5netcdf")
-        elif suffix == ".bag":
-            write_bag(path, _HEIGHTS, (500000.0, 6000000.0), (1.0, 1.0))
-        elif suffix == ".xyz":
-            places = np.random.default_rng(0).uniform(0, 20, (200, 2))
-            rows = (f"{x:.2f} {y:.2f} {0.1 * np.sin(y):.3f}" for x, y in places)
-            path.write_text("\n".join(("x y z", *rows)))
-        else:
-            head = "ncols 20\nnrows 24\nxllcorner 0\nyllcorner 0\ncellsize 1\nnodata_value -9999\n"
-            path.write_text(head + "\n".join(" ".join(f"{one:.4f}" for one in row) for row in _HEIGHTS))
-        return path
-
-    return make
-
-
-def load_map(path: Path) -> None:
-    """Read a height map."""
-    from mitransient_lidar.physics.sea.height_maps import read_height_map
-
-    holes = "fill" if path.suffix == ".xyz" else "refuse"
-    read_height_map(path, size=20.0 if path.suffix in (".npy", ".exr") else None, holes=holes)
-
-
 _PROFILE = """depth (m),attenuation (1/m),scattering (1/m)
 0,0.2,0.1
 2,0.25,0.12
@@ -370,35 +333,61 @@ def load_plugin(**parameters: str) -> Callable[[Path], None]:
     return read
 
 
-def image(suffix: str) -> Callable[[Path], Path]:
-    """Return what writes a grey image."""
+def shipped(name: str) -> Callable[[Path], Path]:
+    """Return what copies a file of an instrument."""
 
     def make(folder: Path) -> Path:
-        import mitsuba as mi
+        from mitransient_lidar.loading.catalogue import folder_of_scenes
 
-        path = folder / f"image{suffix}"
-        values = np.arange(1, 64, dtype=np.uint8).reshape(7, 9)
-        if suffix == ".npy":
-            np.save(path, values)
-        else:
-            mi.Bitmap(values[..., None] if suffix == ".png" else values[..., None].astype(np.float32)).write(str(path))
-        return path
+        return Path(shutil.copy(folder_of_scenes() / "instruments" / name, folder / name))
 
     return make
 
 
-def read_image(path: Path) -> None:
-    """Read a grey image."""
-    from mitransient_lidar.transport.sensor.image_sampling import read_image as read
+def read_receiver(path: Path) -> None:
+    """Read a receiver."""
+    from mitransient_lidar.physics.receiver.receiver_files import receiver
 
-    read("pixel_map", str(path))
+    receiver(str(path))
 
 
+def read_corrections(path: Path) -> None:
+    """Read a table of corrections."""
+    from mitransient_lidar.analysis.waveforms.depth_correction import read_corrections as read
+
+    read(path)
+
+
+def read_measured(path: Path) -> None:
+    """Read measured waveforms."""
+    from mitransient_lidar.analysis.information.measured import measured
+
+    measured(path)
+
+
+def wave_spectrum(folder: Path) -> Path:
+    """Write a table of a wave spectrum."""
+    k = np.linspace(-2.0, 2.0, 21)
+    np.savez(folder / "a.npz", kx=k, ky=k, density=k**2 * np.exp(-(k[:, None] ** 2) - k**2) * 1e-3)
+    return folder / "a.npz"
+
+
+_MEASURED = "time_ns,red,red_stderr\n" + "".join(f"{i},{1 + i % 5},{0.1 + 0.01 * i:.2f}\n" for i in range(30))
 _PULSE = "time_ns,power\n" + "".join(f"{0.5 * i},{np.exp(-((i - 10) ** 2) / 20):.5f}\n" for i in range(21))
 _PHASE = "angle (deg),phase function\n" + "".join(f"{i},{1 / (1 + i):.6f}\n" for i in range(0, 181, 5))
 
 KINDS = {
     "scene": Kind(scene, load, "text"),
+    "scene_parts": Kind(scene_parts, lambda path: load(path / "scene.xml"), "text"),
+    "mesh.ply": Kind(mesh("a.ply"), load_part("ply", filename="FILE"), "text"),
+    "mesh_binary.ply": Kind(mesh("a_binary.ply"), load_part("ply", filename="FILE")),
+    "mesh.obj": Kind(mesh("a.obj"), load_part("obj", filename="FILE"), "text"),
+    "texture": Kind(image(".png"), load_part("diffuse", reflectance={"type": "bitmap", "filename": "FILE"})),
+    "spectrum": Kind(
+        written("a.spd", _SPECTRUM),
+        load_part("diffuse", reflectance={"type": "spectrum", "filename": "FILE"}),
+        "text",
+    ),
     "result_nc": Kind(saved(shot, "a.nc"), analyse),
     "result_exr": Kind(saved(shot, "a.exr"), analyse),
     "result_attributes": Kind(saved(shot, "a.nc"), analyse, "attributes"),
@@ -422,5 +411,9 @@ KINDS = {
         load_plugin(type="lidar_transmitter", pulse_file="FILE"),
         "text",
     ),
+    "receiver": Kind(shipped("leica_hawkeye4x_deep.toml"), read_receiver, "text"),
+    "corrections": Kind(shipped("leica_hawkeye4x_deep_depths.nc"), read_corrections),
+    "measured": Kind(written("a.csv", _MEASURED), read_measured, "text"),
+    "wave_spectrum": Kind(wave_spectrum, load_part("ocean_surface", spectrum="table", filename="FILE", size=20.0)),
     **{f"image{suffix}": Kind(image(suffix), read_image) for suffix in (".png", ".npy", ".exr")},
 }

@@ -10,14 +10,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Union
 
 import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.campaigns.expressions import Expression
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.toml_files import check_keys, parse_toml
 from mitransient_lidar.core.validation import (
     FloatArray,
@@ -39,10 +39,16 @@ KEPT = ("waveform", "stderr", "components", "echoes", "truth")
 #: Most runs of a campaign, and most shots of a run.
 MOST_RUNS, MOST_SHOTS = 10**7, 10_000
 
-#: Largest table of runs [bytes], a million rows of ten numbers.
+#: Most values of all parameters of all runs, and of a table that is a file, a million rows of ten numbers.
+_MOST_VALUES, _MOST_CELLS = 10**8, 2 * 10**7
+
+#: Largest table of runs [bytes].
 _LARGEST_TABLE = 2**27
 
 Column = npt.NDArray[Any]
+
+#: What a parameter of a design may take: a range, or values.
+_Free = Union["Range", tuple[Any, ...]]
 
 
 @dataclass(frozen=True)
@@ -166,7 +172,7 @@ class Campaign:
             raise UserError(f"parameter {twice[0]!r} is in [fixed] and in [parameters]: leave out one of them")
         try:
             text = json.dumps(_plain(given))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RecursionError):
             raise UserError("the campaign must hold numbers, texts, lists and tables only") from None
         campaign = cls(
             scene=_resolved(str(scene), folder),
@@ -205,9 +211,14 @@ class Campaign:
         """Return the parameters that vary, by name, one value a run; raise `UserError` for an impossible design."""
         free = {name: one for name, one in self.parameters.items() if not isinstance(one, Expression)}
         design = self.design
-        columns = self._from_file() if design.kind == "table" else _designed(free, design)
-        if not 1 <= (count := len(next(iter(columns.values()), ()))) <= MOST_RUNS:
-            raise UserError(f"the design has {count} runs: it must have 1 to {MOST_RUNS}")
+        if design.kind == "table":
+            columns = self._from_file()
+            _check_size(len(next(iter(columns.values()), ())), len(columns) + len(self.parameters))
+        else:
+            if not free:
+                raise UserError("the campaign has no parameters to vary: add a range or a list to [parameters]")
+            _check_size(_run_count(free, design), len(self.parameters))
+            columns = _designed(free, design)
         return self._with_expressions(columns)
 
     def _from_file(self) -> dict[str, Column]:
@@ -216,7 +227,10 @@ class Campaign:
         path = Path(_resolved(self.design.file, self.folder))
         if free := [name for name, one in self.parameters.items() if not isinstance(one, Expression)]:
             raise UserError(f"parameters.{free[0]}: the table gives the values; only expressions may be added to it")
-        lines = io.StringIO(read_text(path, _LARGEST_TABLE), newline="")
+        text = read_text(path, _LARGEST_TABLE)
+        if (values := text.count(",") + text.count("\n")) > _MOST_CELLS:
+            raise UserError(f"{path} has {values} values: a table of runs may have {_MOST_CELLS}")
+        lines = io.StringIO(text, newline="")
         try:
             rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(map(str.strip, row))]
         except csv.Error as error:
@@ -265,14 +279,31 @@ class Campaign:
         return {name: found[name] for name in dict.fromkeys([*first, *self.parameters])}
 
 
-def _designed(free: Mapping[str, Range | tuple[Any, ...] | Expression], design: Design) -> dict[str, Column]:
+def _run_count(free: Mapping[str, _Free], design: Design) -> int:
+    """Return the number of runs of a design other than a table."""
+    if design.kind != "grid":
+        assert design.count is not None
+        return design.count
+    lengths = []
+    for name, one in free.items():
+        if isinstance(one, Range) and one.steps is None:
+            raise UserError(f"{name}.steps is missing: the range of a grid needs the number of its values, or a list")
+        lengths.append(one.steps or 0 if isinstance(one, Range) else len(one))
+    return math.prod(lengths)
+
+
+def _check_size(count: int, parameters: int) -> None:
+    """Raise `UserError` for a number of runs that is impossible, or whose table needs too much memory."""
+    if not 1 <= count <= MOST_RUNS:
+        raise UserError(f"the design has {count} runs: it must have 1 to {MOST_RUNS}")
+    if count * parameters > _MOST_VALUES:
+        raise UserError(f"the design has {count} runs of {parameters} parameters: it may have {_MOST_VALUES} values")
+
+
+def _designed(free: Mapping[str, _Free], design: Design) -> dict[str, Column]:
     """Return the columns of a design other than a table."""
-    if not free:
-        raise UserError("the campaign has no parameters to vary: add a range or a list to [parameters]")
     if design.kind == "grid":
-        axes = [_grid_axis(name, one) for name, one in free.items()]
-        if math.prod(map(len, axes)) > MOST_RUNS:
-            raise UserError(f"the design has {math.prod(map(len, axes))} runs: it must have 1 to {MOST_RUNS}")
+        axes = [_grid_axis(one) for one in free.values()]
         grid = np.meshgrid(*[np.arange(len(axis)) for axis in axes], indexing="ij")
         return {name: axis[index.ravel()] for name, axis, index in zip(free, axes, grid, strict=True)}
     assert design.count is not None
@@ -282,7 +313,6 @@ def _designed(free: Mapping[str, Range | tuple[Any, ...] | Expression], design: 
         if isinstance(one, Range):
             columns[name] = one.at(share)
         else:
-            assert isinstance(one, tuple)
             columns[name] = np.array(one)[np.minimum((share * len(one)).astype(int), len(one) - 1)]
     return columns
 
@@ -301,13 +331,11 @@ def _shares(kind: str, count: int, dimensions: int, seed: int) -> FloatArray:
     return np.asarray(sampler.random_base2(max(count - 1, 0).bit_length())[:count])
 
 
-def _grid_axis(name: str, one: Range | tuple[Any, ...] | Expression) -> Column:
-    """Return the values of a parameter in a grid."""
-    if isinstance(one, tuple):
+def _grid_axis(one: _Free) -> Column:
+    """Return the values of a parameter in a grid, which has steps."""
+    if not isinstance(one, Range):
         return np.array(one)
-    assert isinstance(one, Range)
-    if one.steps is None:
-        raise UserError(f"{name}.steps is missing: the range of a grid needs the number of its values, or a list")
+    assert one.steps is not None
     return one.at(np.linspace(0, 1, one.steps))
 
 
@@ -380,7 +408,7 @@ def _section(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 def _resolved(name: str, folder: Path) -> str:
     """Return the absolute path of a file beside that of the campaign, any other name as it is."""
     path = folder / name
-    return str(path.resolve()) if path.suffix and path.is_file() else name
+    return str(path.resolve()) if path.suffix and is_there(path) else name
 
 
 def _plain(value: Any) -> Any:

@@ -15,6 +15,9 @@ import xarray as xr
 from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.loading.catalogue import scene_path
+from mitransient_lidar.loading.document import read_document
+from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
@@ -326,7 +329,15 @@ def record_of(campaign: Campaign) -> SceneRecord:
     return record
 
 
-def _check_parameters(campaign: Campaign, columns: Mapping[str, Column], known: Collection[str]) -> None:
+def check_names(campaign: Campaign) -> None:
+    """Raise `UserError` for a parameter of a campaign that its scene does not have, before the table of its runs."""
+    document = read_document(scene_path(campaign.scene))
+    if campaign.instrument is not None:
+        document = mount(campaign.instrument, document)
+    _check_parameters(campaign, campaign.parameters, document.parameters)
+
+
+def _check_parameters(campaign: Campaign, columns: Collection[str], known: Collection[str]) -> None:
     """Raise `UserError` for parameters that the scene does not have, or that may not vary."""
     for name in itertools.chain(campaign.fixed, columns):
         if name not in known:

@@ -10,6 +10,7 @@ A log beside the store, ``NAME.zarr.log``, holds the messages of processes that 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -27,7 +28,8 @@ import numpy.typing as npt
 
 from mitransient_lidar.campaigns.runs import Array, Renderer
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
-from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
+from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
+from mitransient_lidar.core.files import open_log
 
 #: Time between two writes of a shard that is not finished [s].
 _INTERVAL_S = 60.0
@@ -116,13 +118,9 @@ def log_path(store: str | os.PathLike[str]) -> Path:
 
 
 def _log(store: str, shard: int, text: str) -> None:
-    """Add what a process has told to the log of its store."""
-    try:
-        with log_path(store).open("a", encoding="utf-8") as file:
-            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} shard {shard}\n{text.rstrip()}\n\n")
-    except OSError:
-        # The run tells its reason without it.
-        pass
+    """Add what a process has told to the log of its store, which must not be a link; the run has its reason anyway."""
+    with contextlib.suppress(OSError, UserError), open_log(log_path(store)) as file:
+        file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} shard {shard}\n{printable(text.rstrip(), kept=LINES)}\n\n")
 
 
 def _one_process(order: dict[str, Any], report: Report | None) -> Outcome | _End:

@@ -27,7 +27,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from mitransient_lidar.campaigns.design import MOST_RUNS, Column
 from mitransient_lidar.campaigns.runs import Array, Renderer
 from mitransient_lidar.core.errors import UserError, WriteError
-from mitransient_lidar.core.files import check_encodable, sweep, temporary_beside
+from mitransient_lidar.core.files import check_encodable, check_tree, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.variants import versions
@@ -96,11 +96,14 @@ class Store:
     Raises
     ------
     UserError
-        If there is no such store.
+        If there is no such store, or a link is in it.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        # A link may lead to any file of whoever opens the store, and be written to.
+        if self.path.is_dir():
+            check_tree(self.path)
         try:
             with zarr.config.set(_WRITING):
                 self._group = zarr.open_group(str(path), mode="r+", zarr_format=3)

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
-from mitransient_lidar.campaigns.runs import RunRenderer, record_of
+from mitransient_lidar.campaigns.runs import RunRenderer, check_names, record_of
 from mitransient_lidar.campaigns.shard import Outcome, log_path, render_in_process
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.core.errors import UserError
@@ -125,6 +125,7 @@ def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], 
         values = {name: column[0].item() for name, column in store.inputs(slice(row, row + 1)).items()}
     else:
         plan = _campaign(campaign)
+        check_names(plan)
         table = plan.table()
         row = integer("row", row, 0, len(next(iter(table.values()))) - 1)
         renderer = RunRenderer.of(plan, table)
@@ -142,6 +143,8 @@ def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> C
 
 def _prepare(campaign: Campaign, path: Path, shard_size: int | None) -> Store:
     """Return the store of a campaign, a new one if there is none."""
+    if not path.exists():
+        check_names(campaign)
     columns = campaign.table()
     if path.exists():
         store = Store(path)

@@ -31,7 +31,7 @@ from mitransient_lidar.cli import (
     studies,
     waveforms,
 )
-from mitransient_lidar.cli.messages import exit_on_error
+from mitransient_lidar.cli.messages import exit_on_error, printable_streams
 from mitransient_lidar.cli.overwriting import keeping
 from mitransient_lidar.core.errors import UserError
 
@@ -73,6 +73,11 @@ _UsageError: Any = typer.BadParameter.__base__
 
 class _GroupedCommands(TyperGroup):
     """A command whose help lists the subcommands under headings, and whose usage errors are one sentence."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run the command line, whose output holds no control characters."""
+        with printable_streams():
+            return super().main(*args, **kwargs)
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         """Parse the options before the subcommand."""

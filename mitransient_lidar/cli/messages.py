@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import logging
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mitransient_lidar.core.errors import UserError, raise_if_out_of_memory
+from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.interruption import TerminationAsInterrupt
 
 if TYPE_CHECKING:
@@ -20,6 +22,48 @@ if TYPE_CHECKING:
 _INVALID_INPUT = 2  # exit code
 _MOST_PIXELS = 12  # listed in the summary
 _REPORT_S = 15.0  # between two lines of progress
+
+
+class _PrintableStream:
+    """Text stream that writes only what is `printable`, and lines; `unfiltered` is the stream behind it."""
+
+    def __init__(self, stream: Any) -> None:
+        self.unfiltered = stream
+
+    def write(self, text: str) -> int:
+        """Write a text, with escapes for what the encoding of the stream does not have."""
+        encoding = self.unfiltered.encoding or "utf-8"
+        shown = printable(text, kept=LINES).encode(encoding, "backslashreplace").decode(encoding)
+        return int(self.unfiltered.write(shown))
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write texts."""
+        self.write("".join(lines))
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "buffer":
+            # Click would write to it where the encoding is ASCII.
+            raise AttributeError(name)
+        return getattr(self.unfiltered, name)
+
+
+@contextlib.contextmanager
+def printable_streams() -> Iterator[None]:
+    """Write no control characters to standard output and error: names in files may steer a terminal.
+
+    Rich alone, which draws with them, writes to the streams behind, and is given `printable` texts.
+    """
+    out, err = (stream and _PrintableStream(stream) for stream in (sys.stdout, sys.stderr))
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        yield
+
+
+class _PrintableLog(logging.Formatter):
+    """Format of log messages without control characters."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the message of a record."""
+        return printable(super().format(record), kept=LINES)
 
 
 @contextlib.contextmanager
@@ -63,8 +107,6 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
     On a terminal it is a bar; elsewhere, as in a pipe or a log, a line every 15 s.
     """
-    import logging
-
     logger = logging.getLogger("mitransient_lidar")
     if quiet:
         logger.addHandler(logging.NullHandler())
@@ -78,6 +120,7 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
 
     console = _console()
     handler = RichHandler(console=console, show_path=False, show_time=False)
+    handler.setFormatter(_PrintableLog("%(message)s"))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
@@ -87,12 +130,15 @@ def reporting(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
             with _lines_of_progress() as show_line:
                 yield show_line
             return
-        with ProgressBar(*columns, console=console, transient=True) as bar:
+        # Rich would write what others print, with its control characters.
+        bar = ProgressBar(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
+        with bar:
             task = bar.add_task("preparing", total=None)
 
             def show(state: Progress) -> None:
                 expected = state.planned or (None if state.needed_passes is None else state.done + state.needed_passes)
-                bar.update(task, description=progress_line(state), completed=state.done, total=expected)
+                text = printable(progress_line(state))
+                bar.update(task, description=text, completed=state.done, total=expected)
 
             yield show
     finally:
@@ -167,7 +213,7 @@ def summarise(dataset: xr.Dataset) -> None:
         peaks = dataset["waveform"].max("time")
         if "pixel" in peaks.dims and peaks.size <= _MOST_PIXELS:
             for name, peak in zip(peaks["pixel"].values, peaks.values, strict=True):
-                table.add_row(f"peak power, {name} (W)", f"{peak:.4g}")
+                table.add_row(printable(f"peak power, {name} (W)"), f"{peak:.4g}")
         else:
             table.add_row("highest peak power (W)", f"{float(peaks.max()):.4g}")
     _console().print(table, markup=False)
@@ -176,4 +222,4 @@ def summarise(dataset: xr.Dataset) -> None:
 def _console() -> Console:
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, file=getattr(sys.stderr, "unfiltered", None), highlight=False)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import check_regular, is_there, open_file, read_text
 from mitransient_lidar.core.validation import integer, positive
 
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
@@ -55,21 +55,18 @@ def readable_suffix(path: Path, suffixes: Collection[str], kind: str) -> str:
     Raises
     ------
     UserError
-        If the suffix is not one of `suffixes`, or the file cannot be opened.
+        If the suffix is not one of `suffixes`, or the file cannot be opened, or is no regular one.
     """
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         raise UserError(f"cannot read {path}: the name of a {kind} must end in {', '.join(suffixes)}.")
-    try:
-        path.open("rb").close()
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    open_file(path).close()
     return suffix
 
 
 def read_npy(path: Path) -> Array:
     """Read an array in NumPy's format; pickled objects are rejected."""
-    with damaged_file(f"{path} is damaged, or is not one array of numbers in NumPy's format."), path.open("rb") as file:
+    with damaged_file(f"{path} is damaged, or is not one array of numbers in NumPy's format."), open_file(path) as file:
         return _read_array(path, file)
 
 
@@ -78,7 +75,8 @@ def read_npz(path: Path, names: Collection[str]) -> dict[str, Array]:
     found = {}
     with (
         damaged_file(f"{path} is damaged, or is not an archive of arrays in NumPy's format."),
-        zipfile.ZipFile(path) as archive,
+        open_file(path) as opened,
+        zipfile.ZipFile(opened) as archive,
     ):
         held = archive.namelist()
         for name in [name for name in names if f"{name}.npy" in held]:
@@ -127,7 +125,7 @@ def read_exr(path: Path) -> dict[str, Array]:
     import OpenEXR
 
     damaged = f"{path} is damaged, or is not an OpenEXR file: its image cannot be read."
-    with path.open("rb") as file:
+    with open_file(path) as file:
         # OpenEXR prints its own message for a file of another format.
         if file.read(len(EXR_SIGNATURE)) != EXR_SIGNATURE:
             raise UserError(damaged)
@@ -140,18 +138,48 @@ def check_exr(path: str | os.PathLike[str], damaged: str, most: int) -> None:
     """Raise `UserError` if an OpenEXR file is damaged, or has more bytes of pixels than allowed by its headers."""
     import OpenEXR
 
+    check_regular(path)
     with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), header_only=True) as file:
         for part in file.parts:
             first, last = (np.asarray(end, dtype=np.float64) for end in part.header["dataWindow"])
             check_size(path, 4.0 * float(np.prod(last - first + 1)) * max(len(part.header["channels"]), 1), most)
 
 
+def check_hdf5(path: str | os.PathLike[str]) -> None:
+    """Raise `UserError` if an HDF5 file takes values or groups from other files, before any of them is read.
+
+    A dataset may have its values in other files ("external storage", which may be a device), or in datasets of other
+    files ("virtual"), and a link may lead into another file.
+    """
+    import h5py
+
+    check_regular(path)
+    groups, seen = [h5py.File(path, "r")], set()
+    with groups[0]:
+        while groups:
+            group = groups.pop()
+            for name in group:
+                link = group.get(name, getlink=True)
+                if isinstance(link, h5py.ExternalLink):
+                    raise UserError(f"{path} holds a link {name!r} into another file: it must hold all that it needs.")
+                part = group[name] if isinstance(link, h5py.HardLink) else None
+                if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
+                    raise UserError(f"{path} has {name!r} in other files: it must hold all values that it needs.")
+                # Links may lead back to a group above.
+                if isinstance(part, h5py.Group) and (at := h5py.h5o.get_info(part.id).addr) not in seen:
+                    seen.add(at)
+                    groups.append(part)
+
+
 def read_netcdf(path: Path) -> dict[str, Variable]:
     """Read the variables of a NetCDF-4 file, coordinates included; times are not decoded."""
     import xarray as xr
 
+    damaged = f"{path} is damaged, or is not a NetCDF-4 file."
+    with damaged_file(damaged):
+        check_hdf5(path)
     with (
-        damaged_file(f"{path} is damaged, or is not a NetCDF-4 file."),
+        damaged_file(damaged),
         xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,
     ):
         check_size(path, file.nbytes)
@@ -185,7 +213,7 @@ def read_ascii_grid(path: Path) -> Grid:
     if values.size != columns * rows:
         raise UserError(f"{path} has {values.size} values but must have ncols = {columns} times nrows = {rows}.")
     system = path.with_suffix(".prj")
-    if system.is_file() and system.read_text("utf-8", "replace").lstrip().startswith("GEOG"):
+    if is_there(system) and _beginning(system).lstrip().startswith(b"GEOG"):
         raise UserError(f"{path} has coordinates in degrees according to {system}: they must be projected, in metres.")
     cell = _entry(path, header, "dx", "cellsize"), _entry(path, header, "dy", "cellsize")
     positive(f"{path}: cellsize", min(cell))
@@ -197,6 +225,12 @@ def read_ascii_grid(path: Path) -> Grid:
     ]
     values[values == header.get("nodata_value", -9999.0)] = np.nan
     return Grid(values.reshape(rows, columns)[::-1], (first[0], first[1]), cell)
+
+
+def _beginning(path: Path) -> bytes:
+    """Return the first bytes of a file."""
+    with open_file(path) as file:
+        return file.read(2**12)
 
 
 def _entry(path: Path, header: dict[str, float], *names: str) -> float:
@@ -215,6 +249,10 @@ def read_geotiff(path: Path) -> Grid:
         raise UserError(
             f"cannot read {path}: GeoTIFF needs the extra geo, pip install 'mitransient-lidar[geo]'."
         ) from error
+    # GDAL reads files beside it of the same name, such as .tfw and .tif.aux.xml.
+    for beside in path.parent.iterdir():
+        if beside.name.startswith(f"{path.stem}."):
+            check_regular(beside)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)

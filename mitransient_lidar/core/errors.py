@@ -1,14 +1,34 @@
-"""The error for invalid user input, and recognition of interruptions and of exhausted memory."""
+"""The error for invalid user input, text for terminals, and recognition of interruptions and exhausted memory."""
 
 import re
+
+#: Characters that steer a terminal or change the order of what it shows: C0 and C1 controls, DEL, marks of writing
+#: direction, separators of lines; and lone surrogates, which stand for bytes of file names that are no text.
+_CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+#: Controls that a text of several lines keeps.
+LINES = "\n\t"
+
+#: Longest message, and the parts at its ends that are kept of a longer one, in characters.
+_LONGEST, _BEGINNING, _END = 2000, 1500, 400
+
+
+def printable(text: str, kept: str = "") -> str:
+    r"""Return a text whose control characters, but those `kept`, are written as ``\x1b`` or ``\u202e``."""
+    return _CONTROLS.sub(lambda one: one[0] if one[0] in kept else ascii(one[0])[1:-1], text)
 
 
 class UserError(ValueError):
     """Invalid user input: a wrong name, value or file.
 
-    Its message is one sentence that names the parameter or path, its value, and the allowed values. The command line
-    prints it without a traceback and exits with code 2.
+    Its message is one sentence that names the parameter or path, its value, and the allowed values; it is `printable`,
+    and its middle is left out beyond 2000 characters. The command line prints it without a traceback and exits with
+    code 2.
     """
+
+    def __init__(self, message: str = "") -> None:
+        text = printable(message)
+        super().__init__(text if len(text) <= _LONGEST else f"{text[:_BEGINNING]} ... {text[-_END:]}")
 
 
 class DryBottomError(UserError):

@@ -1,4 +1,4 @@
-"""Atomic writing of files, one alone or several together."""
+"""Opening of files that others name, and atomic writing of files, one alone or several together."""
 
 from __future__ import annotations
 
@@ -8,18 +8,27 @@ import os
 import platform
 import re
 import shutil
+import stat
 import uuid
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from io import BufferedReader
 from pathlib import Path
+from typing import TextIO
 
-from mitransient_lidar.core.errors import UserError, WriteError
+from mitransient_lidar.core.errors import UserError, WriteError, printable
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
 #: Beginning of the names of temporary files and folders; host, process and a unique number follow, which tell leftovers
 #: of processes that were killed from files of running ones.
 _PREFIX = ".mitransient-lidar."
 _TEMPORARY = re.compile(re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<process>\d+)\.[0-9a-f]{32}(?P<suffix>\..*)?")
+
+#: What is not read, besides folders: its end may never come.
+_OTHERS = {stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
+
+#: Longest name of a file [bytes], which leaves room for endings.
+_LONGEST_NAME = 200
 
 #: Temporary files and their destinations, within the context `together`.
 _moves: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("moves", default=None)
@@ -31,7 +40,7 @@ before_moving: ContextVar[Callable[[Moves], Moves] | None] = ContextVar("before_
 
 
 def check_encodable(path: Path) -> None:
-    """Raise `UserError` if the name of a file is not text that can be encoded in UTF-8, or contains NUL."""
+    """Raise `UserError` if the name of a file is not text that can be encoded in UTF-8, or has control characters."""
     text = str(path)
     try:
         text.encode()
@@ -39,6 +48,98 @@ def check_encodable(path: Path) -> None:
         raise UserError(f"cannot write {text!a}: its name is not valid UTF-8.") from error
     if "\0" in text:
         raise UserError(f"cannot write {text!a}: its name contains the character NUL.")
+    if printable(text) != text:
+        raise UserError(f"cannot write {text!a}: its name must have no control characters, such as a line break.")
+
+
+def is_file_name(name: object) -> bool:
+    """Return whether a text may be the name of a file: no folder, printable, and 1 to 200 bytes long."""
+    plain = isinstance(name, str) and printable(name) == name and not any(one in name for one in "/\\")
+    return plain and name not in ("", ".", "..") and len(str(name).encode()) <= _LONGEST_NAME
+
+
+def open_file(path: str | os.PathLike[str]) -> BufferedReader:
+    """Open a regular file for reading; a link to one, too.
+
+    Every reader of a file that a user or another file names opens it here, or gives a library that takes a path one of
+    `check_regular`: a named pipe or a device would wait for ever, or never end.
+
+    Raises
+    ------
+    UserError
+        If there is no such file, or it cannot be opened, or is a folder, a named pipe, a device or a socket.
+    """
+    # Before it is opened, which may act on a device; and again, since another file may have come in its place.
+    check_regular(path)
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    try:
+        _check_mode(path, os.fstat(descriptor).st_mode)
+        os.set_blocking(descriptor, True)
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Raise `UserError` if a path is not that of a regular file, or of a link to one."""
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    except ValueError as error:
+        raise UserError(f"cannot read {os.fspath(path)!a}: its name contains the character NUL.") from error
+    _check_mode(path, mode)
+
+
+def is_there(path: Path) -> bool:
+    """Return whether a path is that of anything but a folder, which may not be a regular file."""
+    try:
+        return path.exists() and not path.is_dir()
+    except (OSError, ValueError):  # of a text that is too long for a name, or contains NUL
+        return False
+
+
+def check_tree(folder: str | os.PathLike[str]) -> None:
+    """Raise `UserError` if a folder holds anything but folders and regular files: a link would lead out of it."""
+    folders = [os.fspath(folder)]
+    while folders:
+        try:
+            with os.scandir(folders.pop()) as found:
+                entries = list(found)
+        except OSError as error:
+            raise UserError(f"cannot read {error.filename}: {error.strerror}.") from error
+        for entry in entries:
+            if entry.is_symlink():
+                raise UserError(f"cannot read {folder}: {entry.path} is a link, and no link in it is followed.")
+            if entry.is_dir():
+                folders.append(entry.path)
+            elif not entry.is_file():
+                _check_mode(entry.path, entry.stat().st_mode)
+
+
+def open_log(path: Path) -> TextIO:
+    """Open a file to add lines to it; raise UserError, or OSError for a link, if it is no regular file."""
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+    file = os.fdopen(os.open(path, flags, 0o666), "w", encoding="utf-8")
+    try:
+        _check_mode(path, os.fstat(file.fileno()).st_mode)
+    except UserError:
+        file.close()
+        raise
+    return file
+
+
+def _check_mode(path: str | os.PathLike[str], mode: int) -> None:
+    """Raise `UserError` for the mode of something that is not a regular file."""
+    kind = stat.S_IFMT(mode)
+    if kind == stat.S_IFDIR:
+        raise UserError(f"cannot read {path}: {os.strerror(errno.EISDIR)}.")
+    if kind in _OTHERS:
+        raise UserError(f"cannot read {path}: it is {_OTHERS[kind]}, and only regular files are read.")
 
 
 def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
@@ -50,7 +151,7 @@ def read_text(path: str | os.PathLike[str], most_bytes: int = 2**24) -> str:
         If the file cannot be read, is not such a text, or is larger than `most_bytes`.
     """
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             data = file.read(most_bytes + 1)
         if len(data) <= most_bytes:
             return data.decode("utf-8-sig")

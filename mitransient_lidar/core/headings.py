@@ -82,7 +82,8 @@ class Heading(NamedTuple):
 def parse_heading(text: str, columns: Sequence[Column]) -> Heading | None:
     """Return the meaning of a heading, None if it names none of the columns."""
     words = _words(text)
-    for count in range(len(words), 0, -1):
+    longest = max(len(name.split()) for column in columns for name in (column.name.replace("_", " "), *column.aliases))
+    for count in range(min(len(words), longest), 0, -1):
         heading = _named(" ".join(words[:count]), words[count:], columns)
         if heading is not None:
             return heading
@@ -135,7 +136,8 @@ def read_headings(
 def _is_one_of(name: str, others: Collection[str]) -> bool:
     """Return whether a heading begins with one of the names, as ``temperature [degC]`` does."""
     words = _words(name)
-    return any(" ".join(words[:count]) in others for count in range(1, len(words) + 1))
+    longest = max((len(other.split()) for other in others), default=0)
+    return any(" ".join(words[:count]) in others for count in range(1, min(len(words), longest) + 1))
 
 
 def _at_wavelength(
@@ -201,7 +203,8 @@ def _with_wavelength(column: Column, wavelength: str, rest: Sequence[str]) -> He
 
 def _words(text: str) -> list[str]:
     """Split a heading at blanks, underscores and brackets, and a name from its unit at the first slash."""
-    plain = re.sub(r"\s*/\s*", "/", text.strip().lower().translate(_SPELLINGS))
+    # Not by a pattern with blanks on both sides, whose time grows with the square of the number of blanks.
+    plain = "/".join(part.strip() for part in text.lower().translate(_SPELLINGS).split("/"))
     words = [word.rstrip("/") for word in re.split(r"[\s_()\[\]{}\"',]+", plain)]
     words = [word for word in words if word not in ("", "in")]
     if words and "/" in words[0][1:] and words[0] not in ("1/m", "bb/b", "b/c", *PER_METRE):

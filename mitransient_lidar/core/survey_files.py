@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from pathlib import Path
@@ -10,8 +11,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from mitransient_lidar.core.array_files import Grid, check_size, damaged_file
+from mitransient_lidar.core.array_files import Grid, check_hdf5, check_size, damaged_file
+from mitransient_lidar.core.documents import check_xml
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.validation import FloatArray, positive
 
 #: Largest table of points [bytes], and most points in it.
@@ -54,11 +57,11 @@ def read_points(path: Path) -> FloatArray:
         If the file is larger than 512 MiB, has more than 10^7 points, fewer than three columns, or entries that are not
         numbers; its columns are angles; or a position is not finite.
     """
-    if (size := path.stat().st_size) > _LARGEST_TABLE:
-        raise UserError(
-            f"{path} has {size / 2**20:.4g} MiB: a table of points may have {_LARGEST_TABLE / 2**20:g} MiB."
-        )
-    with path.open("rb") as file:
+    with open_file(path) as file:
+        if (size := os.fstat(file.fileno()).st_size) > _LARGEST_TABLE:
+            raise UserError(
+                f"{path} has {size / 2**20:.4g} MiB: a table of points may have {_LARGEST_TABLE / 2**20:g} MiB."
+            )
         head = file.read(_HEAD).decode("utf-8-sig", "replace").splitlines()
     columns, skipped, separator = _layout(path, head)
     try:
@@ -141,6 +144,8 @@ def read_bag(path: Path) -> Grid:
     import h5py
 
     damaged = f"{path} is damaged, or is not a Bathymetric Attributed Grid."
+    with damaged_file(damaged):
+        check_hdf5(path)
     with damaged_file(damaged), h5py.File(path, "r") as file:
         root = file["BAG_root"]
         if "varres_refinements" in root:
@@ -171,11 +176,11 @@ def read_bag(path: Path) -> Grid:
 
 def _placement(path: Path, text: bytes) -> tuple[list[tuple[float, float]], tuple[float, float]]:
     """Return the corners (x, y) [m] in south-west and north-east, and the resolution along x and y [m]."""
-    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise UserError(f"{path} has metadata with a document type: a BAG has none.")
     if b"GEOGCS" in text and b"PROJCS" not in text:
         raise UserError(f"{path} has coordinates in degrees: they must be projected, in metres.")
-    tree = ElementTree.fromstring(text.rstrip(b"\0"))
+    text = text.rstrip(b"\0")
+    check_xml(text, f"{path}: its metadata")
+    tree = ElementTree.fromstring(text)
     words = "".join(_first(tree, "cornerPoints").itertext()).split()
     corners = [(float(x), float(y)) for x, y in (word.split(",")[:2] for word in words)]
     sizes = [_dimension(one) for one in tree.iter() if _name(one) == "MD_Dimension"]

@@ -37,6 +37,9 @@ _MOST_LINES = 10**6
 #: Lines in which the number of columns shows.
 _LINES_FOR_WIDTH = 10_000
 
+#: Characters of the lines above the first row in which the heading is looked for.
+_LONGEST_HEAD = 2**16
+
 #: Times [ns] without a unit that span less are probably seconds.
 _SHORTEST_RECORD = 1e-3
 
@@ -210,7 +213,10 @@ def _find_heading(
     lines: Sequence[_Line], comments: Sequence[_Line], start: int, width: int, columns: Sequence[Column]
 ) -> tuple[list[str], int]:
     """Return the names of the heading and the index of the line below it; no names and `start` if there is none."""
+    searched = 0
     for i, line in enumerate(lines[:start]):
+        if (searched := searched + len(line.text)) > _LONGEST_HEAD:
+            break
         names = line.heading(width)
         known = sum(parse_heading(name, columns) is not None for name in names)
         if known > 1 and (len(names) in (width, known) or not width) and not any(map(_is_number, filter(None, names))):

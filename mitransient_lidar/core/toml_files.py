@@ -6,6 +6,7 @@ import sys
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from mitransient_lidar.core.documents import check_nesting, too_deep
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 
@@ -18,9 +19,13 @@ else:
 def parse_toml(text: str, name: object) -> dict[str, Any]:
     """Return the contents of a TOML file; raise `UserError`, with the name of the file, for another text."""
     try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        given = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
         raise UserError(f"{name} is not a TOML file: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise too_deep(name) from error
+    check_nesting(given, name)
+    return given
 
 
 def check_keys(where: str, given: Mapping[str, Any], known: Collection[str]) -> None:

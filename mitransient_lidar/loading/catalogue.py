@@ -9,15 +9,12 @@ from __future__ import annotations
 import difflib
 import importlib.resources
 import os
-import re
 import shutil
 from pathlib import Path
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import check_regular, read_text
 from mitransient_lidar.loading.document import read_document
-
-_COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
 
 
 def scene_names() -> list[str]:
@@ -37,10 +34,11 @@ def scene_path(name_or_path: str | os.PathLike[str]) -> Path:
     if str(name_or_path) in names:
         return folder_of_scenes() / f"{name_or_path}.xml"
     path = Path(name_or_path)
-    if path.is_file():
-        return path
     if path.is_dir():
         raise UserError(f"scene {str(name_or_path)!r} is a folder; give an XML file or the name of a shipped scene.")
+    if path.exists():
+        check_regular(path)
+        return path
     close = difflib.get_close_matches(path.stem, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(close)}" if close else f"shipped scenes are {', '.join(names) or 'none'}"
     raise UserError(f"scene {str(name_or_path)!r} is neither a file nor a shipped scene; {hint}.")
@@ -56,9 +54,8 @@ def scene_text(name: str | os.PathLike[str]) -> str:
 
 def scene_summary(name: str | os.PathLike[str]) -> str:
     """Return the first line of a scene's first comment, empty without a comment; name and errors as in `scene_path`."""
-    comment = _COMMENT.search(read_text(scene_path(name)))
-    lines = comment[1].strip().splitlines() if comment else []
-    return lines[0].strip() if lines else ""
+    comment, end, _ = read_text(scene_path(name)).partition("<!--")[2].partition("-->")
+    return comment.strip().partition("\n")[0].strip() if end else ""
 
 
 def scene_parameters(name: str | os.PathLike[str]) -> dict[str, str]:

@@ -22,6 +22,12 @@ LARGEST_COORDINATE = 1e6
 #: Name of a plugin, and endings of the libraries of plugins.
 _TYPE, _LIBRARIES = re.compile(r"[A-Za-z0-9_]+"), (".so", ".dylib", ".dll")
 
+#: Plugins of Mitsuba that trust what they are given, and why they are refused.
+_TRUSTING = {
+    "blender": "it reads places of the memory",
+    "serialized": "its indices are not checked; convert the mesh to PLY or OBJ",
+}
+
 _COORDINATES = ("x", "y", "z", "value")
 #: Attributes that hold one number or several, by the tag of the element.
 _NUMBERS = {
@@ -46,17 +52,18 @@ def check(document: SceneDocument) -> None:
     Raises
     ------
     UserError
-        If a type is not the name of a plugin; a library of plugins lies where `check_libraries` forbids it, in the
-        scene's folder or in one that its ``<path>`` names; a number is not finite or not a number, a share of light is
-        not within 0 to 1, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
+        If the root is no scene; a type is not the name of a plugin; a library of plugins lies where `check_libraries`
+        forbids it, in a folder of `document.folders`; a number is not finite or not a number, a share of light is not
+        within 0 to 1, a size is not positive, a coordinate exceeds `LARGEST_COORDINATE`, or a sensor has no film.
     """
-    folders = [document.folder]
+    root = document.root
+    if root.tagName != "scene" or root.getAttribute("type") not in ("", "scene"):
+        what = f"<{root.tagName}>" if root.tagName != "scene" else f"of type {root.getAttribute('type')!r}"
+        raise UserError(f"scene {document.name} has a root element {what}: it must be <scene>")
     for setting in document.settings:
         if setting.attribute == "type":
             check_type(setting.value)
-        elif setting.element.tagName == "path":
-            folders.append(document.folder / setting.value)
-    check_libraries(*folders)
+    check_libraries(*document.folders)
     for element in document.root.getElementsByTagName("sensor"):
         if element.parentNode is document.root and not element.getElementsByTagName("film"):
             raise UserError(f"film: sensor {element.getAttribute('id')!r} has none; add a time_gated_film inside it")
@@ -86,6 +93,8 @@ def check_type(plugin: object) -> None:
     """Raise `UserError` if the type of an object is not the name of a plugin: Mitsuba loads any path as a library."""
     if not isinstance(plugin, str) or not _TYPE.fullmatch(plugin):
         raise UserError(f"type = {shown(plugin)} must be the name of a plugin, of letters, digits and underscores")
+    if plugin in _TRUSTING:
+        raise UserError(f"type = {plugin!r} is not loaded: {_TRUSTING[plugin]}")
 
 
 def check_libraries(*folders: Path) -> None:
@@ -97,7 +106,7 @@ def check_libraries(*folders: Path) -> None:
     import mitsuba as mi
 
     own = Path(mi.__file__).parent.resolve()
-    for folder in (*folders, *(Path(str(path)) for path in mi.file_resolver())):
+    for folder in (*folders, Path(), *(Path(str(path)) for path in mi.file_resolver())):
         place = folder.resolve() / "plugins"
         if place.parent == own or not place.is_dir():
             continue
@@ -106,9 +115,24 @@ def check_libraries(*folders: Path) -> None:
                 raise UserError(f"{library} would run as a plugin of Mitsuba; remove it, or work in another folder")
 
 
+def resource_folders(scene: Mapping[str, Any]) -> list[Path]:
+    """Return the folders that objects of the type ``resources`` name in a dict, the one that Mitsuba looks in first.
+
+    Raises UserError if one is no folder: Mitsuba would look for it in the others, too.
+    """
+    found: list[Path] = []
+    for value in scene.values():
+        if isinstance(value, Mapping) and value.get("type") == "resources":
+            path = value.get("path")
+            if not isinstance(path, str) or not Path(path).is_dir():
+                raise UserError(f"path = {shown(path)} of resources must be a folder")
+            found.insert(0, Path(path))
+    return found
+
+
 def check_dict(scene: Mapping[str, Any]) -> None:
     """Check the values of a scene given as a dict; same rules and errors as `check`."""
-    check_libraries()
+    check_libraries(*resource_folders(scene))
     pending: list[tuple[str, Mapping[str, Any], int]] = [("", scene, 1)]
     while pending:
         path, part, depth = pending.pop()

@@ -13,11 +13,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 from xml.dom import minidom
-from xml.parsers.expat import ExpatError
 from xml.sax.saxutils import quoteattr
 
+from mitransient_lidar.core.documents import check_xml
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.validation import shown
 
 #: Most files that a scene and its parts include.
@@ -96,6 +96,26 @@ class SceneDocument:
         return found
 
     @cached_property
+    def paths(self) -> dict[int, Path]:
+        """Folders of the elements ``<path>``, absolute, by the ids of their settings; raise UserError without one.
+
+        Mitsuba would look for a relative one in those before, too.
+        """
+        found = {}
+        for setting in self.settings:
+            if setting.element.tagName == "path" and setting.attribute == "value":
+                places = (self.folder / setting.value, Path(setting.value))
+                if not (folders := [place.resolve() for place in places if place.is_dir()]):
+                    raise UserError(f"path = {setting.value!r} is no folder in {self.folder}")
+                found[id(setting)] = folders[0]
+        return found
+
+    @property
+    def folders(self) -> list[Path]:
+        """Folders in which Mitsuba finds files and plugins of the scene, in its order."""
+        return [*reversed(self.paths.values()), self.folder]
+
+    @cached_property
     def used(self) -> set[str]:
         """Names of the parameters that an attribute refers to."""
         return {name for setting in self.settings for name in setting.referred}
@@ -103,8 +123,10 @@ class SceneDocument:
     def filled(self, replaced: Callable[[Setting], str]) -> str:
         """Return the XML of the scene without parameters and comments, with the attributes that a function returns.
 
-        Elements stay on their lines.
+        Elements stay on their lines. Mitsuba gets this text alone: an ``<include>``, whose file no check has seen, is
+        refused.
         """
+        _refuse_includes(self.root, self.name)
         values: dict[int, list[str]] = {}
         for setting in self.settings:
             pair = f" {setting.attribute}={quoteattr(replaced(setting))}"
@@ -144,15 +166,23 @@ def read_document(path: Path) -> SceneDocument:
         If a file is missing, unreadable, not well-formed XML, or includes itself, or there are more than 256.
     """
     text = read_text(path)
-    if "<include" in text:
+    if parse_part(text, path).getElementsByTagName("include"):
         text = text_of(_expanded(path))
     return parse_document(path.stem, text, path)
 
 
 def parse_document(name: str, text: str, path: Path | None = None) -> SceneDocument:
-    """Return the document of a text without includes; raise UserError if it is malformed or nested too deeply."""
-    root = _parsed(text, path or name)
+    """Return the document of a text; raise UserError if it is malformed, nested too deeply, or includes a file."""
+    root = parse_part(text, path or name)
+    _refuse_includes(root, path or name)
     return SceneDocument(name, root, path.parent if path else Path(), parameters_of(root), source=text)
+
+
+def _refuse_includes(root: minidom.Element, place: Path | str) -> None:
+    """Raise `UserError` if an element within a root includes a file, or the root does."""
+    for include in [root] if root.tagName == "include" else root.getElementsByTagName("include"):
+        name = include.getAttribute("filename")
+        raise UserError(f"scene {place} includes {name!r}: only the file of a scene may include others.")
 
 
 def parameters_of(root: minidom.Element) -> dict[str, str]:
@@ -180,12 +210,10 @@ def _resolved(text: str, parameters: Mapping[str, str]) -> tuple[str, list[str]]
     return text, referred
 
 
-def _parsed(text: str, place: Path | str) -> minidom.Element:
-    """Return the root element of a scene's text."""
-    try:
-        root = minidom.parseString(text).documentElement
-    except ExpatError as error:
-        raise UserError(f"scene {place} is not well-formed XML: {error}.") from error
+def parse_part(text: str, place: Path | str) -> minidom.Element:
+    """Return the root element of the text of a scene or of a part; raise UserError as `parse_document`."""
+    check_xml(text, f"scene {place}")
+    root = minidom.parseString(text).documentElement
     assert root is not None
     level, depth = [root], 0
     while level:
@@ -215,12 +243,12 @@ def _expanded(path: Path, includers: tuple[Path, ...] = (), count: list[int] | N
 
     `count` holds the number of files that are included so far.
     """
-    root = _parsed(read_text(path), path)
+    root = parse_part(read_text(path), path)
     count = [0] if count is None else count
     files = (path.resolve(), *includers)
     for include in root.getElementsByTagName("include"):
         name = include.getAttribute("filename")
-        part = next((found for file in files if (found := file.parent / name).is_file()), None)
+        part = next((found for file in files if is_there(found := file.parent / name)), None)
         if part is None:
             raise UserError(f"scene {path} includes {name!r}, which is not found in {path.parent}.")
         if part.resolve() in files:

@@ -18,7 +18,7 @@ from xml.dom import minidom
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.document import SceneDocument, parameters_of, parse_document, read_document, text_of
+from mitransient_lidar.loading.document import SceneDocument, parameters_of, parse_part, read_document, text_of
 from mitransient_lidar.loading.parameters import without_alternatives
 
 #: Parameters of a scene that fit its own lidar: the place of the record in time, and the resolution of the sea.
@@ -62,7 +62,7 @@ def instrument_names() -> list[str]:
 def read_instrument(name: str) -> Instrument:
     """Return an instrument by its name; raise UserError if there is none."""
     path = _path(name)
-    root = _own_document(path).root
+    root = _own_part(path)
     title, _, description = _head(root).data.strip().partition("\n")
     parameters = tuple(_parameters(root))
     pixels = [tag for tag in root.getElementsByTagName("sensor") if tag.getAttribute("type") == "pixel_fov"]
@@ -106,7 +106,7 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
         If there is no such instrument.
     """
     path = _path(name)
-    own, part = _own_document(path).root, read_document(path).root
+    own, part = _own_part(path), read_document(path).root
     assert scene.root.ownerDocument is not None
     copied = scene.root.ownerDocument.cloneNode(True)
     assert isinstance(copied, minidom.Document)
@@ -145,9 +145,9 @@ def mount(name: str, scene: SceneDocument) -> SceneDocument:
     return replace(scene, root=root, parameters=without_alternatives(known, values), instrument=name, source=None)
 
 
-def _own_document(path: Path) -> SceneDocument:
-    """Return the document of an instrument's file without what it includes."""
-    return parse_document(path.stem, read_text(path))
+def _own_part(path: Path) -> minidom.Element:
+    """Return the root of an instrument's file without what it includes."""
+    return parse_part(read_text(path), path)
 
 
 def _keep_film(film: minidom.Element, own: minidom.Element) -> None:

@@ -24,17 +24,20 @@ import itertools
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.documents import parse_json
+from mitransient_lidar.core.errors import UserError, printable
+from mitransient_lidar.core.files import check_regular, is_file_name, is_there, open_file
 from mitransient_lidar.core.validation import shown
-from mitransient_lidar.loading.checks import is_transform, matrix_of
+from mitransient_lidar.loading.checks import is_transform, matrix_of, resource_folders
 from mitransient_lidar.loading.document import SceneDocument, Setting, parse_document
+from mitransient_lidar.loading.mesh_files import PLY_PLUGINS, check_ply
 from mitransient_lidar.loading.plugin_pages import is_own_plugin, plugin_parameters
 
 if TYPE_CHECKING:
@@ -78,21 +81,25 @@ class SceneRecord:
     def of_document(cls, document: SceneDocument, former: SceneRecord | None = None) -> SceneRecord:
         """Return the record of an XML scene, with the files of the record that it was read from.
 
-        Files that given parameters name are found as in any scene.
+        Files that given parameters name are found as in any scene. Raises UserError for a file that is no regular one,
+        or a damaged mesh.
         """
-        files = _found(((plugin, setting.value) for plugin, setting in _files_of(document)), document.folder)
+        files = _found(((plugin, setting.value) for plugin, setting in _files_of(document)), document.folders)
         if former is not None:
             files |= {file: found for file, found in former.files.items() if file[1] not in document.given.values()}
         return cls(document.name, document.text, True, dict(document.parameters), files, document.instrument)
 
     @classmethod
     def of_dict(cls, scene: Mapping[str, Any]) -> SceneRecord | None:
-        """Return the record of a scene given as a dict, None if it holds loaded objects or other unknown values."""
+        """Return the record of a scene given as a dict, None if it holds loaded objects or other unknown values.
+
+        Raises UserError as `of_document`.
+        """
+        files = _found(_files_of_dict(scene), resource_folders(scene))
         try:
-            text = json.dumps(_to_json(scene))
+            return cls("scene", json.dumps(_to_json(scene)), False, {}, files)
         except (RuntimeError, TypeError, ValueError):
             return None
-        return cls("scene", text, False, {}, _found(_files_of_dict(json.loads(text)), Path()))
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any]) -> SceneRecord:
@@ -101,7 +108,7 @@ class SceneRecord:
         Raises
         ------
         UserError
-            If the attributes hold no scene, or are damaged.
+            If the attributes hold no scene, or are damaged, or the name of the scene is not that of a file.
         """
         kinds = [kind for kind in ("xml", "dict") if f"scene_{kind}" in attributes]
         if not kinds:
@@ -120,8 +127,14 @@ class SceneRecord:
             files = {(row["plugin"], row["name"]): (str(row["path"]), str(row["sha256"])) for row in rows}
         except (KeyError, TypeError) as error:
             raise UserError("the attribute scene_files of the result is damaged: it must be a list of files") from error
-        name, instrument = (str(attributes.get(key, "")) for key in ("scene", "instrument"))
-        return cls(name or "scene", attributes[kind], kinds[0] == "xml", parameters, files, instrument)
+        name, instrument = attributes.get("scene", "scene"), str(attributes.get("instrument", ""))
+        # Names of outputs begin with it.
+        if not is_file_name(name):
+            raise UserError(
+                f"the attribute scene = {shown(name)} of the result is damaged: it must be the name of a file, without "
+                "folders and control characters"
+            )
+        return cls(name, attributes[kind], kinds[0] == "xml", parameters, files, instrument)
 
     def attributes(self) -> dict[str, str]:
         """Return the attributes of a result from which `from_attributes` returns this record."""
@@ -151,11 +164,10 @@ class SceneRecord:
         UserError
             If a file is missing or has changed.
         """
-        paths = {
-            id(setting): _unchanged(*self.files[plugin, setting.value])
-            for plugin, setting in _files_of(document)
-            if (plugin, setting.value) in self.files
-        }
+        paths = {id(setting): str(folder) for setting, folder in document.paths.items()}
+        for plugin, setting in _files_of(document):
+            if (plugin, setting.value) in self.files:
+                paths[id(setting)] = _unchanged(plugin, *self.files[plugin, setting.value])
         return document.filled(lambda setting: paths.get(id(setting), setting.value))
 
     def scene_dict(self) -> dict[str, Any]:
@@ -167,14 +179,14 @@ class SceneRecord:
                 file = (str(part.get("type", "")), value)
                 is_file = key in FILE_PARAMETERS and isinstance(value, str) and file in self.files
                 nested = placed(value) if isinstance(value, dict) else value
-                found[key] = _unchanged(*self.files[file]) if is_file else nested
+                found[key] = _unchanged(file[0], *self.files[file]) if is_file else nested
             return found
 
         try:
-            restored: dict[str, Any] = _from_json(placed(json.loads(self.text)))
+            restored: dict[str, Any] = _from_json(placed(parse_json(self.text, "the scene of the result")))
         except UserError:
             raise
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, RuntimeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
             raise UserError("the scene of the result is damaged: its text must be JSON of a scene") from error
         return restored
 
@@ -183,10 +195,7 @@ def json_attribute(attributes: Mapping[str, Any], name: str) -> Any:
     """Return the value of an attribute of JSON; raise UserError if it is missing or damaged."""
     if name not in attributes:
         raise UserError(f"the result has no attribute {name}, without which it is not rendered again")
-    try:
-        return json.loads(attributes[name])
-    except (TypeError, ValueError, RecursionError) as error:
-        raise UserError(f"the attribute {name} of the result is damaged: it must be a text of JSON") from error
+    return parse_json(attributes[name], f"the attribute {name} of the result")
 
 
 def plugin_values(scene: mi.Scene, integrator: Any = None, used: Mapping[str, float] | None = None) -> str:
@@ -302,50 +311,66 @@ def _files_of(document: SceneDocument) -> Iterator[tuple[str, Setting]]:
 def _files_of_dict(scene: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the plugin and the name of each file of a scene given as a dict."""
     for key, value in scene.items():
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             yield from _files_of_dict(value)
-        elif key in FILE_PARAMETERS and isinstance(value, str):
-            yield scene.get("type", ""), value
+        elif key in FILE_PARAMETERS and isinstance(value, (str, os.PathLike)):
+            yield scene.get("type", ""), str(value)
 
 
-def _found(references: Iterator[tuple[str, str]], folder: Path) -> dict[tuple[str, str], tuple[str, str]]:
-    """Return path and SHA-256 of the files that exist, relative to the working folder or, for Mitsuba, the scene's."""
+def _found(references: Iterator[tuple[str, str]], folders: Sequence[Path]) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return path and SHA-256 of the files that exist, relative to the working folder.
+
+    Files of Mitsuba's plugins are looked for in the folders of the scene before, and in those of its file resolver.
+    Raises UserError if one of the files is no regular one, has control characters in its name, or is a damaged mesh.
+    """
+    import mitsuba as mi
+
     files = {}
+    searched = [*folders, *(Path(str(place)) for place in mi.file_resolver()), Path()]
     for plugin, name in references:
-        folders = [Path()] if is_own_plugin(plugin) else [folder, Path()]
-        path = next((found for place in folders if name and (found := place / name).is_file()), None)
+        places = [Path()] if is_own_plugin(plugin) else searched
+        path = next((found for place in places if name and is_there(found := place / name)), None)
         if path is not None:
             path = path.resolve()
-            files[plugin, name] = str(path), _sha256(path)
+            files[plugin, name] = str(path), (digest := _sha256(path))
+            _check_file(plugin, path, digest)
     return files
 
 
-def _unchanged(path: str, digest: str) -> str:
+@functools.lru_cache(maxsize=64)
+def _check_file(plugin: str, path: Path, _digest: str) -> None:
+    """Raise UserError if the name of a file has control characters, which Mitsuba would print, or a mesh is damaged.
+
+    A file with the same SHA-256 is checked once for a series of renders.
+    """
+    if printable(str(path)) != str(path):
+        raise UserError(f"cannot read {path}: its name must have no control characters")
+    if plugin in PLY_PLUGINS:
+        check_ply(path)
+
+
+def _unchanged(plugin: str, path: str, digest: str) -> str:
     """Return the path of a file; raise UserError if it is missing or its SHA-256 is another one."""
-    if not Path(path).is_file():
+    if not is_there(Path(path)):
         raise UserError(f"{path} is missing, a file of the scene of the result: restore it, or render the scene anew")
     if _sha256(Path(path)) != digest:
         raise UserError(
             f"{path} has changed since the result was rendered (its SHA-256 is not {digest[:12]}...): restore it, or "
             "render the scene anew"
         )
+    _check_file(plugin, Path(path), digest)
     return path
 
 
 def _sha256(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    try:
-        state = path.stat()
-        return _hashed(path, state.st_size, state.st_mtime_ns)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    """Return the SHA-256 of a file; raise UserError if it is no regular one."""
+    check_regular(path)
+    state = path.stat()
+    return _hashed(path, state.st_size, state.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=64)
 def _hashed(path: Path, size: int, modified_ns: int) -> str:
     """Return the SHA-256 of a file in a state, which a series of renders computes once."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(2**20):
-            digest.update(block)
-    return digest.hexdigest()
+    with open_file(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -96,7 +96,9 @@ def _load_dict(scene: Mapping[str, Any] | SceneRecord) -> LoadedScene:
 
     given = scene.scene_dict() if isinstance(scene, SceneRecord) else scene
     check_dict(given)
-    record = scene if isinstance(scene, SceneRecord) else SceneRecord.of_dict(scene)
+    # Of a record, too: its files are those that it names, not those that it lists.
+    found = SceneRecord.of_dict(given)
+    record = scene if isinstance(scene, SceneRecord) else found
     with as_user_error(), _own_file_resolver():
         loaded = _instantiate(lambda config: mi.parser.parse_dict(config, {"type": "scene", **given}))
     return LoadedScene(loaded, "scene", {}, record)
@@ -120,8 +122,6 @@ def _load_xml(
     text = record.place_files(document)
     with as_user_error(document), _own_file_resolver(document.folder):
         loaded = _instantiate(lambda config: mi.parser.parse_string(config, text))
-    if not isinstance(loaded, mi.Scene):
-        raise UserError(f"scene {document.name} holds a {type(loaded).__name__}: its root element must be <scene>")
     if unused := [name for name in document.parameters if name not in document.used]:
         _tell_missing_part(loaded, unused)
     return LoadedScene(loaded, document.name, dict(document.parameters), record)
@@ -179,16 +179,17 @@ def as_user_error(document: SceneDocument | None = None) -> Iterator[None]:
     """Convert a ``RuntimeError`` of Mitsuba's parser to a `UserError` of one sentence.
 
     Mitsuba wraps an exception of a Python plugin, with its traceback, in a ``RuntimeError``. A wrapped ``UserError`` or
-    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. Where a message names a parameter
+    Ctrl-C is unwrapped; any other wrapped exception is a bug and keeps its traceback. A message that quotes bytes of a
+    file which are no UTF-8 comes as a ``UnicodeDecodeError``. Where a message names a parameter
     of a plugin that a given parameter of the document sets under another name, that name is added.
     """
     try:
         yield
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:
         if is_interruption(error):
             raise KeyboardInterrupt from error
         raise_if_out_of_memory(error)
-        text = str(error)
+        text = error.object.decode("utf-8", "replace") if isinstance(error, UnicodeDecodeError) else str(error)
         if wrapped := re.findall(r"UserError: (.*)", text):
             message = " ".join(wrapped[-1].split())
             raise UserError(message + _set_by(message, document)) from error

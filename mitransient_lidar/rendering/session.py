@@ -134,6 +134,8 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
             raise UserError(f"integrator = {shown(wanted)} must be the name or the dict of an integrator plugin")
         given = {"type": wanted} if isinstance(wanted, str) else dict(wanted)
         check_dict(given)
+        # The files of objects in it, which no integrator of ours has, are checked as well.
+        SceneRecord.of_dict(given)
         with as_user_error():
             chosen = mi.load_dict(given, parallel=False)
     if not isinstance(chosen, LidarIntegrator) and isinstance(wanted, str):

@@ -24,6 +24,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result, silence_openexr
+from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
 
 _EXACT = "mitransientLidar"
@@ -129,10 +130,7 @@ def exact_metadata(path: str | os.PathLike[str], attributes: Mapping[str, Any]) 
     foreign = f"{path} is an OpenEXR file, but not a result of mitransient-lidar."
     if _EXACT not in attributes:
         raise UserError(foreign)
-    try:
-        exact = json.loads(attributes[_EXACT])
-    except ValueError as error:
-        raise UserError(_damaged(path)) from error
+    exact = parse_json(attributes[_EXACT], f"the header attribute {_EXACT} of {path}")
     if not isinstance(exact, dict):
         raise UserError(foreign)
     return exact

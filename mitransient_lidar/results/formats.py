@@ -14,6 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.core.array_files import EXR_SIGNATURE
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import open_file
 
 Format = Literal["exr", "netcdf"]
 
@@ -51,11 +52,8 @@ def input_format(path: str | os.PathLike[str]) -> Format:
     UserError
         If the file cannot be read or has another format.
     """
-    try:
-        with Path(path).open("rb") as file:
-            signature = file.read(len(_HDF5_SIGNATURE))
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    with open_file(path) as file:
+        signature = file.read(len(_HDF5_SIGNATURE))
     if signature.startswith(EXR_SIGNATURE):
         return "exr"
     if signature == _HDF5_SIGNATURE:

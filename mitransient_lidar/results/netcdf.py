@@ -14,8 +14,10 @@ import numpy as np
 import xarray as xr
 from xarray.backends import H5NetCDFStore
 
-from mitransient_lidar.core.array_files import check_size, damaged_file, largest_result
+from mitransient_lidar.core.array_files import check_hdf5, check_size, damaged_file, largest_result
+from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.marks import LONGEST_TAIL
 from mitransient_lidar.results.formats import attribute, picture_order
 
@@ -66,7 +68,7 @@ def check_sum(path: str | os.PathLike[str]) -> bool:
     when another program changes the file.
     """
     length = len(_CHECKSUM) + 2 * hashlib.sha256().digest_size
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         start = file.seek(max(file.seek(0, os.SEEK_END) - length - LONGEST_TAIL, 0))
         tail = file.read()
         if (place := tail.rfind(_CHECKSUM)) < 0:
@@ -90,14 +92,17 @@ def read_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
     UserError
         If the file is damaged, truncated, or larger than half of the memory.
     """
+    damaged = f"{path} is damaged or truncated: its NetCDF data cannot be read."
     check_sum(path)
+    with damaged_file(damaged):
+        check_hdf5(path)
     with (
-        damaged_file(f"{path} is damaged or truncated: its NetCDF data cannot be read."),
+        damaged_file(damaged),
         xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file,
     ):
         check_size(path, file.nbytes, largest_result())
         dataset = file.load().drop_encoding()
-        lists = json.loads(dataset.attrs.pop(_LISTS, "[]"))
+        lists = parse_json(dataset.attrs.pop(_LISTS, "[]"), f"the attribute {_LISTS} of {path}")
         dataset.attrs = {
             str(name): np.atleast_1d(value).tolist() if name in lists else attribute(str(name), value)
             for name, value in dataset.attrs.items()

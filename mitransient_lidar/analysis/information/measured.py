@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -409,11 +410,14 @@ def _times(dataset: xr.Dataset) -> FloatArray:
 
 def _read_csv(path: Path) -> Measured:
     """Read a table of waveforms; see `measured`."""
-    lines = [line for line in csv.reader(read_text(path).splitlines()) if any(cell.strip() for cell in line)]
+    try:
+        lines = [line for line in csv.reader(read_text(path).splitlines()) if any(cell.strip() for cell in line)]
+    except csv.Error as problem:
+        raise UserError(f"{path} is not a CSV file.") from problem
     heading = [name.strip() for name in lines[0]] if lines else []
     if _TIME not in heading or len(heading) < 2:
         raise UserError(f"{path} must begin with a heading of {_TIME} and names of pixels, separated by commas")
-    if twice := [name for name in heading if heading.count(name) > 1]:
+    if twice := [name for name, count in Counter(heading).items() if count > 1]:
         raise UserError(f"{path} has two columns {twice[0]!r}: every column must have a name of its own")
     rows = []
     for number, line in enumerate(lines[1:], start=2):

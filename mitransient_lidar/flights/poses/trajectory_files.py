@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from mitransient_lidar.core.array_files import check_size
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import open_file, read_text
 from mitransient_lidar.core.validation import FloatArray, integer, is_number
 from mitransient_lidar.flights.poses.records import TrajectoryRecords, check_records
 
@@ -28,8 +29,8 @@ _COLUMNS = {
 #: Largest text file [bytes]: four million records.
 _LARGEST_TEXT = 2**28
 
-#: Numbers of a record of an SBET file.
-_SBET_NUMBERS = 17
+#: Numbers of a record of an SBET file, and the largest file [bytes]: eleven hours of 200 records a second.
+_SBET_NUMBERS, _LARGEST_SBET = 17, 2**30
 
 #: Largest code of a coordinate system.
 _LARGEST_EPSG = 10**6
@@ -113,17 +114,16 @@ def read_sbet_records(path: str | os.PathLike[str], epsg: int) -> TrajectoryReco
     Raises
     ------
     UserError
-        If the file cannot be read, its size is no multiple of 136 bytes, a record is not finite, not on the Earth, or
-        not later than the one before; the coordinate system is unknown, has no metres, or has another scale there;
-        or pyproj is missing.
+        If the file cannot be read or has more than 1 GiB; its size is no multiple of 136 bytes; a record is not finite,
+        not on the Earth, or not later than the one before; the coordinate system is unknown, has no metres, or has
+        another scale there; or pyproj is missing.
     """
     path = Path(path)
     width = 8 * _SBET_NUMBERS
-    try:
-        size = path.stat().st_size
-        data = None if size % width else np.fromfile(path, dtype="<f8").reshape(-1, _SBET_NUMBERS)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        check_size(path, size, _LARGEST_SBET)
+        data = None if size % width else np.fromfile(file, dtype="<f8").reshape(-1, _SBET_NUMBERS)
     if data is None:
         raise UserError(f"{path} has {size} bytes, but an SBET file must have a multiple of {width}.")
 

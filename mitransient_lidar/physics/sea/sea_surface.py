@@ -412,7 +412,10 @@ def _read_table(path: str) -> TabulatedSpectrum:
     arrays = read_npz(Path(path), names)
     if len(arrays) < len(names):
         raise UserError(f"{path} must have the arrays kx, ky and density")
-    return TabulatedSpectrum(arrays["kx"], arrays["ky"], arrays["density"])
+    table = TabulatedSpectrum(arrays["kx"], arrays["ky"], arrays["density"])
+    if table.peak_wavenumber == 0:
+        raise UserError(f"{path} has its largest density at the wavenumber 0: it must be above 0")
+    return table
 
 
 def _required(path: str, spectrum: str) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mitransient_lidar.core.array_files import check_size, damaged_file, read_exr, read_npy, readable_suffix
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import open_file
 from mitransient_lidar.transport.opaque import aligned
 
 
@@ -43,7 +44,7 @@ def read_image(name: str, path: str) -> NDArray[np.float64]:
 
 def _read_png(path: Path) -> NDArray[Any]:
     """Read a PNG file, unless its header says that it is too large."""
-    with damaged_file(f"{path} is damaged, or is not a PNG file."), path.open("rb") as file:
+    with damaged_file(f"{path} is damaged, or is not a PNG file."), open_file(path) as file:
         width, height = np.frombuffer(file.read(24)[16:], dtype=">u4").tolist()
         check_size(path, 8.0 * width * height)
         return np.array(mi.Bitmap(str(path)))

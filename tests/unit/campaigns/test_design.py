@@ -1,7 +1,10 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from mitransient_lidar.campaigns.design import Campaign, Range
+from mitransient_lidar.campaigns.sweep import render_row
 from mitransient_lidar.core.errors import UserError
 
 CAMPAIGN = {
@@ -218,3 +221,52 @@ def test_invalid_campaigns(sections, message):
 def test_impossible_designs(sections, message):
     with pytest.raises(UserError, match=message):
         Campaign.of(changed(**sections)).table()
+
+
+RANGE = {"low": 1.0, "high": 2.0, "steps": 10**6}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "design", "message"),
+    [
+        (94, {"count": 10**7}, "has 10000000 runs of 94 parameters: it may have 100000000 values"),
+        (11, {"kind": "random", "count": 10**7}, "has 10000000 runs of 11 parameters"),
+        (2, {"kind": "grid"}, "has 1000000000000 runs"),
+        (500, {"kind": "grid"}, "it must have 1 to 10000000"),
+    ],
+)
+def test_tables_are_refused_before_they_take_memory(parameters, design, message):
+    """94 ranges of ten million runs took 15 GB, and a grid all values of its ranges."""
+    campaign = Campaign.of(
+        {"scene": "table1", "parameters": {f"p{i}": RANGE for i in range(parameters)}, "design": design}
+    )
+    tracemalloc.start()
+    with pytest.raises(UserError, match=message):
+        campaign.table()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
+
+
+def test_unknown_parameters_are_refused_before_the_table_is_made(monkeypatch):
+    campaign = Campaign.of(changed(parameters={"nothing": RANGE}, fixed=None, design={"count": 10**6}))
+    monkeypatch.setattr(Campaign, "table", lambda self: pytest.fail("the table was made"))
+    with pytest.raises(UserError, match="parameter 'nothing' is not one of scene table1"):
+        render_row(campaign, 0)
+
+
+def test_tables_of_too_many_values_are_refused(tmp_path):
+    """Their cells take fifty times the memory of the file."""
+    (tmp_path / "runs.csv").write_text("a" + (10**7 + 1) * ",\n")
+    campaign = Campaign.of({"scene": "table1", "design": {"file": "runs.csv"}}, tmp_path)
+    with pytest.raises(UserError, match="has 20000002 values: a table of runs may have 20000000"):
+        Campaign.table(campaign)
+
+
+@pytest.mark.parametrize("depth", [120, 300, 480])
+def test_deep_lists_are_refused(tmp_path, depth):
+    """TOML of 480 brackets is read, and ended in a traceback behind the reader."""
+    path = tmp_path / "a.toml"
+    path.write_text(f'scene = "table1"\n[fixed]\nlayout = {depth * "["}{depth * "]"}\n')
+    with pytest.raises(UserError, match="is nested more than 100 deep"):
+        Campaign.read(path)

@@ -25,6 +25,7 @@ from mitransient_lidar.campaigns.store import (
 )
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
+from mitransient_lidar.loading.scenes import load_scene
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 
 CAMPAIGN = Campaign.of(
@@ -340,3 +341,34 @@ def test_other_folders_are_refused(tmp_path):
         with pytest.raises(UserError, match=rf"{name} is no store of a campaign"):
             open_campaign(tmp_path / name)
     assert not (tmp_path / "none.zarr").exists()
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "waveform", "waveform/zarr.json", "status/c/0"])
+def test_links_in_a_store_are_not_followed(store, path, tmp_path, name):
+    """They would lead to any file of whoever opens the store, and `mend` would write to it."""
+    status, errors, arrays = filled(store, 0, 1)
+    status[:] = DONE
+    store.write(0, status, errors, arrays)
+    Store(path)
+    victim = tmp_path / "victim"
+    (path / name).rename(victim)
+    (path / name).symlink_to(victim)
+    for read in (Store, open_campaign, describe_campaign):
+        with pytest.raises(UserError, match=f"{name} is a link, and no link in it is followed"):
+            read(path)
+
+
+def test_pipes_in_a_store_are_refused(store, path):
+    os.mkfifo(path / "waveform" / "pipe")
+    with pytest.raises(UserError, match=r"waveform/pipe: it is a named pipe"):
+        Store(path)
+
+
+def test_an_include_in_the_scene_of_a_store_is_refused(store, path):
+    """Its seal is right: whoever changes the store makes it anew."""
+    group = zarr.open_group(str(path), mode="r+")
+    attributes = dict(group.attrs)
+    attributes["scene"]["scene_xml"] = '<scene version="3.0.0"><include filename="part.xml"/></scene>'
+    group.attrs.update({"scene": attributes["scene"], "sha256": seal(attributes)})
+    with pytest.raises(UserError, match=r"includes 'part.xml': only the file of a scene may include others"):
+        load_scene(Store(path).renderer().scene)

@@ -1,6 +1,8 @@
 """The command line: output, sentences and exit codes."""
 
 import errno
+import io
+import logging
 import os
 import signal
 import subprocess
@@ -10,6 +12,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import rich.console
 from command_line import assert_refused, run
 
 from mitransient_lidar import __version__, results
@@ -311,3 +314,54 @@ def test_command_line_imports_nothing_slow():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"
+
+
+#: Sets colour and title of a terminal, rings, and turns the order of letters.
+STEERING = "\x1b[31mred\x1b]0;title\x07\u202e"
+SHOWN = r"\x1b[31mred\x1b]0;title\x07\u202e"
+
+
+def test_control_characters_do_not_reach_the_terminal(scene, calls, tmp_path, monkeypatch):
+    """Of a parameter, a pixel in the summary, a message in the log, and of what a command prints."""
+    assert_refused(run("render", scene, "-o", tmp_path, "-D", f"{STEERING}=1", "-D", "x"), r"-D")
+    assert_refused(run("render", STEERING), SHOWN)
+    built = results.build
+
+    def build(*arrays, **options):
+        logging.getLogger("mitransient_lidar.test").warning("%s is odd", STEERING)
+        return built(*arrays, **{**options, "pixel_names": [STEERING, "green"]})
+
+    monkeypatch.setattr(results, "build", build)
+    done = run("render", scene, "-o", tmp_path, "--no-plot")
+    assert done.exit_code == 0, done.output
+    assert not set(done.stdout + done.stderr) & set(STEERING) - set("[31mred]0;title")
+    text = "".join(done.stderr.split())
+    assert f"{SHOWN}isodd" in text
+    assert f"peakpower,{SHOWN}(W)" in text
+
+
+def test_progress_on_a_terminal_holds_only_its_own_control_characters(monkeypatch):
+    out = io.StringIO()
+    console = rich.console.Console(file=out, force_terminal=True, width=200)
+    monkeypatch.setattr(messages, "_console", lambda: console)
+    with messages.reporting(quiet=False) as show:
+        show(Progress(3, 20, STEERING, 0.1))
+        clock.sleep(0.3)
+    assert SHOWN in out.getvalue()
+    assert "\x07" not in out.getvalue()
+
+
+def test_output_of_lines_is_as_before(capsys):
+    with messages.printable_streams():
+        print("a\tb\nc", flush=True)
+        sys.stderr.writelines(["d\x1b", "[2J\n"])
+        assert not hasattr(sys.stdout, "buffer")
+        assert sys.stdout.isatty() is False
+    assert capsys.readouterr() == ("a\tb\nc\n", "d\\x1b[2J\n")
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\x1b[2J"])
+def test_outputs_have_printable_names(scene, calls, tmp_path, name):
+    assert_refused(run("render", scene, "-o", tmp_path / name), "its name must have no control characters")
+    assert calls.seen == []
+    assert not (tmp_path / name).exists()

@@ -6,7 +6,7 @@ import os
 import h5py
 import numpy as np
 import pytest
-from input_files import write_bag
+from array_inputs import write_bag
 
 from mitransient_lidar.core import survey_files
 from mitransient_lidar.core.errors import UserError
@@ -78,7 +78,7 @@ def test_bag_has_its_first_row_in_the_south(tmp_path, corners):
         ({"corners": "0,0 7,1"}, r"has 3 cells along x, but corners that are 7 cells apart"),
         ({"corners": "0 1"}, "is damaged, or is not a Bathymetric Attributed Grid"),
         ({"system": "GEOGCS[]"}, "has coordinates in degrees"),
-        ({"head": "<!DOCTYPE a [<!ENTITY b 'c'>]>"}, "has metadata with a document type"),
+        ({"head": "<!DOCTYPE a [<!ENTITY b 'c'>]>"}, "its metadata holds a DOCTYPE"),
     ],
 )
 def test_bag_with_other_metadata_is_refused(tmp_path, changes, message):

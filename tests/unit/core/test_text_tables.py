@@ -5,8 +5,9 @@ import logging
 import numpy as np
 import pytest
 
+from mitransient_lidar.core import text_tables
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.headings import Column
+from mitransient_lidar.core.headings import TIME, Column
 from mitransient_lidar.core.text_tables import read_table, read_time_samples
 
 POWER = Column("power", ("p", "v", "mv"))
@@ -125,3 +126,14 @@ def test_unreadable_files_are_rejected(path):
     path.write_bytes(b"\xff")
     with pytest.raises(UserError, match=r"table.txt is not a text file in UTF-8"):
         read_time_samples(path, POWER)
+
+
+@pytest.mark.parametrize("text", ["x," * 10**5 + "\n1,2\n", "a b c d\n" * 20_000 + "1 2\n"])
+def test_headings_are_looked_for_in_the_first_letters_alone(path, text, monkeypatch):
+    """Megabytes of words above the first row took minutes: each was compared with all names."""
+    path.write_text(text)
+    asked = []
+    monkeypatch.setattr(text_tables, "parse_heading", lambda text, columns: asked.append(text))
+    with pytest.raises(UserError, match="has no heading with known columns"):
+        read_table(path, (TIME, POWER))
+    assert len(asked) <= 2**16

@@ -1,5 +1,8 @@
 """Scenes that would make Mitsuba load a library of their author."""
 
+import itertools
+import json
+import os
 import subprocess
 import sys
 
@@ -49,7 +52,7 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
         ({"scene_xml": "<scene/>", "scene_files": "[3]"}, "scene_files of the result is damaged"),
         ({"scene_xml": "<scene/>", "scene_files": "{"}, "scene_files of the result is damaged"),
         ({"scene_xml": "<scene>"}, "is not well-formed XML"),
-        ({"scene_dict": "[" * 10**5}, "its text must be JSON of a scene"),
+        ({"scene_dict": "[" * 10**5}, "the scene of the result is nested more than 100 deep"),
         ({"scene_dict": "[1]"}, "its text must be JSON of a scene"),
         ({"scene_dict": '{"to_world": {"matrix": 3, "inverse_transpose": []}}'}, "its text must be JSON of a scene"),
         ({}, "does not hold its scene"),
@@ -58,6 +61,126 @@ def test_folders_of_a_scene_are_not_kept_for_others(tmp_path):
 def test_damaged_records_are_refused(attributes, message):
     with pytest.raises(UserError, match=message):
         load_scene(SceneRecord.from_attributes(attributes))
+
+
+def stranger(folder, name, text):
+    """Write a file into a folder in which a library of a stranger lies beside ``plugins``, and return its path."""
+    (folder / "plugins").mkdir(parents=True, exist_ok=True)
+    (folder / "evil.so").write_bytes(b"not a library")
+    (folder / name).write_text(text)
+    return folder / name
+
+
+PART = '<scene version="3.0.0"><shape type="../evil"/></scene>'
+
+
+def test_an_entity_that_becomes_an_include_is_refused(tmp_path):
+    """Its file was never checked, and Mitsuba loaded the library that it names."""
+    stranger(tmp_path, "part.xml", PART)
+    entity = """<!DOCTYPE scene [<!ENTITY e "&#60;include filename='part.xml'/>">]>"""
+    with pytest.raises(UserError, match="holds a DOCTYPE: it must hold elements, attributes and comments only"):
+        load_scene(stranger(tmp_path, "a.xml", f'{entity}<scene version="3.0.0">&e;</scene>'))
+
+
+@pytest.mark.parametrize("tag", ["include", "default name='a' value='b'/><include"])
+def test_includes_in_results_are_refused(tmp_path, tag):
+    part = stranger(tmp_path, "part.xml", PART)
+    text = f'<scene version="3.0.0"><{tag} filename="{part}"/></scene>'
+    with pytest.raises(UserError, match=r"includes .*part.xml': only the file of a scene may include others"):
+        load_scene(SceneRecord.from_attributes({"scene_xml": text}))
+
+
+def test_a_part_that_is_an_include_is_refused(tmp_path):
+    """Mitsuba takes the root of a part as it is, unless it is a scene."""
+    stranger(tmp_path, "deep.xml", PART)
+    stranger(tmp_path, "part.xml", '<include version="3.0.0" filename="deep.xml"/>')
+    with pytest.raises(UserError, match=r"includes 'deep.xml': only the file of a scene may include others"):
+        load_scene(stranger(tmp_path, "a.xml", '<scene version="3.0.0"><include filename="part.xml"/></scene>'))
+
+
+@pytest.mark.parametrize("root", ['<shape version="3.0.0" type="../evil"/>', '<scene version="3.0.0" type="../evil"/>'])
+def test_the_type_of_the_root_is_checked(tmp_path, root):
+    with pytest.raises(UserError, match=r"has a root element .*: it must be <scene>"):
+        load_scene(stranger(tmp_path, "a.xml", root))
+
+
+def test_a_path_within_another_path_is_refused(tmp_path):
+    """Mitsuba looks for a folder in those before, too: libraries of a/b would have been loaded."""
+    stranger(tmp_path / "a" / "b", "x", "")
+    text = '<scene version="3.0.0"><path value="a"/><path value="b"/><shape type="evil"/></scene>'
+    with pytest.raises(UserError, match="path = 'b' is no folder in"):
+        load_scene(stranger(tmp_path, "a.xml", text))
+
+
+def test_libraries_in_resources_of_a_dict_are_refused(tmp_path):
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "evil.so").write_bytes(b"not a library")
+    scene = {"type": "scene", "folder": {"type": "resources", "path": str(tmp_path)}, "shape": {"type": "evil"}}
+    record = SceneRecord.from_attributes({"scene_dict": json.dumps(scene)})
+    for one in (scene, record):
+        with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
+            load_scene(one)
+    with pytest.raises(UserError, match="path = 'nowhere' of resources must be a folder"):
+        load_scene({**scene, "folder": {"type": "resources", "path": "nowhere"}})
+
+
+def test_libraries_in_the_current_folder_of_a_script_are_refused(tmp_path, monkeypatch):
+    """It may be another one than that in which the process began, and Mitsuba looks there last."""
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "evil.so").write_bytes(b"not a library")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"evil.so would run as a plugin of Mitsuba"):
+        load_scene({"type": "scene", "shape": {"type": "evil"}})
+
+
+@pytest.mark.parametrize("plugin", ["blender", "serialized"])
+def test_plugins_that_trust_what_they_are_given_are_refused(plugin):
+    with pytest.raises(UserError, match=f"type = '{plugin}' is not loaded"):
+        load_scene({"type": "scene", "shape": {"type": plugin, "filename": "a"}})
+
+
+@pytest.mark.parametrize(
+    "name", ["../../elsewhere/important", "/tmp/a", "a/b", "", "..", "a\nb", "\x1b[2J", "x" * 300, 3]
+)
+def test_the_name_of_the_scene_of_a_result_is_that_of_a_file(name):
+    """Files of the result's repetition begin with it: a path led out of the folder of ``-o``."""
+    with pytest.raises(UserError, match=r"the attribute scene = .* of the result is damaged") as caught:
+        SceneRecord.from_attributes({"scene": name, "scene_xml": "<scene/>"})
+    assert str(caught.value).isprintable()
+
+
+def test_a_pipe_that_mitsuba_would_read_is_refused(tmp_path, monkeypatch):
+    """In the folder of the scene, in one that it names, in the current one, and of a texture, a mesh and a spectrum."""
+    (tmp_path / "other").mkdir()
+    (tmp_path / "here").mkdir()
+    for folder in ("", "other", "here"):
+        os.mkfifo(tmp_path / folder / f"pipe{folder}")
+    monkeypatch.chdir(tmp_path / "here")
+    parts = (
+        '<shape type="ply"><string name="filename" value="{}"/></shape>',
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
+        "</bsdf>",
+        '<bsdf type="diffuse"><spectrum name="reflectance" filename="{}"/></bsdf>',
+    )
+    for folder, part in itertools.product(("", "other", "here"), parts):
+        text = f'<scene version="3.0.0"><path value="other"/>{part.format(f"pipe{folder}")}</scene>'
+        (tmp_path / "a.xml").write_text(text)
+        with pytest.raises(UserError, match=f"pipe{folder}: it is a named pipe"):
+            load_scene(tmp_path / "a.xml")
+    given = {"type": "scene", "mesh": {"type": "ply", "filename": "pipehere"}}
+    for one in (given, SceneRecord.from_attributes({"scene_dict": json.dumps(given)})):
+        with pytest.raises(UserError, match="pipehere: it is a named pipe"):
+            load_scene(one)
+    with pytest.raises(UserError, match="pipehere: it is a named pipe"):
+        choose_integrator(load_scene({"type": "scene"})[0], {**given, "type": "lidar_merging"})
+
+
+def test_names_of_files_that_mitsuba_would_print_are_refused(tmp_path):
+    path = tmp_path / "a\x1b]0;title\x07.ply"
+    path.write_text("ply\n")
+    with pytest.raises(UserError, match="its name must have no control characters") as caught:
+        load_scene({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
+    assert str(caught.value).isprintable()
 
 
 def test_types_are_checked_with_parameters_in_place(tmp_path):

@@ -40,6 +40,8 @@ def test_a_table_has_pixels_errors_and_missing_values(tmp_path):
         ("", "must begin with a heading of time_ns"),
         ("t,a\n1,2\n2,3", "must begin with a heading of time_ns"),
         ("time_ns,a,a\n1,2,3\n2,3,4", "two columns 'a'"),
+        ("time_ns" + 2 * 10**5 * ",a" + "\n1,2", "two columns 'a'"),
+        ("time_ns," + 2 * 10**5 * " " + "a\n1,2", "is not a CSV file"),
         ("time_ns,a\n1,2", "has 1 rows of numbers: it must have 2 or more"),
         ("time_ns,a\n1,2\n2", "row 3 has 1 values but must have 2"),
         ("time_ns,a\n1,2\n2,x", "row 3: a = 'x' must be a number"),

@@ -1,0 +1,67 @@
+"""Documents that others write, of XML and JSON: only what cannot do more than hold elements, numbers and texts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+from xml.parsers import expat
+
+from mitransient_lidar.core.errors import UserError
+
+#: Deepest nesting of lists and tables in a document of JSON or TOML; functions that walk it are recursive.
+_DEEPEST = 100
+_NESTED = (list, tuple, Mapping)
+
+
+def check_xml(text: str | bytes, name: object) -> None:
+    """Raise `UserError` if a document of XML is not well-formed, or holds more than elements, attributes and comments.
+
+    A DOCTYPE, entities of its own and processing instructions are refused where they begin, before anything is
+    expanded: an entity may become any element, and grow without limit. `name` is that of the document in the message.
+    """
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = _refusing(name, "a DOCTYPE")
+    parser.EntityDeclHandler = _refusing(name, "an entity")
+    parser.ProcessingInstructionHandler = _refusing(name, "a processing instruction")
+    try:
+        parser.Parse(text, True)
+    except (expat.ExpatError, UnicodeEncodeError) as error:
+        raise UserError(f"{name} is not well-formed XML: {error}.") from error
+
+
+def _refusing(name: object, what: str) -> Callable[..., None]:
+    """Return the handler that refuses a part of a document."""
+
+    def refuse(*_: object) -> None:
+        raise UserError(f"{name} holds {what}: it must hold elements, attributes and comments only.")
+
+    return refuse
+
+
+def parse_json(text: Any, name: str) -> Any:
+    """Return the value of a text of JSON; raise `UserError` for another text, or one that is nested too deeply."""
+    try:
+        value = json.loads(text)
+    except RecursionError as error:
+        raise too_deep(name) from error
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{name} is damaged: it must be a text of JSON") from error
+    check_nesting(value, name)
+    return value
+
+
+def check_nesting(value: Any, name: object) -> None:
+    """Raise `UserError` if lists and tables are nested more than 100 deep."""
+    level = [value]
+    for _ in range(_DEEPEST + 1):
+        lists = [part.values() if isinstance(part, Mapping) else part for part in level if isinstance(part, _NESTED)]
+        level = [one for part in lists for one in part]
+        if not level:
+            return
+    raise too_deep(name)
+
+
+def too_deep(name: object) -> UserError:
+    """Return the error of a document whose lists and tables are nested too deeply."""
+    return UserError(f"{name} is nested more than {_DEEPEST} deep, which is the limit")

@@ -1,0 +1,128 @@
+"""Files of arrays that users give to the package: height maps, images and meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_HEIGHTS = 0.1 * np.sin(np.arange(24.0))[:, None] * np.ones(20)
+
+
+def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[float, float], **changes: Any) -> Path:
+    """Write a Bathymetric Attributed Grid from its south-western cell on; `changes` are parts of its metadata."""
+    import h5py
+
+    rows, columns = np.shape(heights)
+    last = (first[0] + (columns - 1) * cell[0], first[1] + (rows - 1) * cell[1])
+    corners = changes.get("corners", f"{first[0]!r},{first[1]!r} {last[0]!r},{last[1]!r}")
+    axes = "".join(
+        f'<gmd:MD_Dimension><gmd:dimensionName><gmd:MD_DimensionNameTypeCode codeListValue="{name}"/>'
+        f'</gmd:dimensionName><gmd:resolution><gco:Measure uom="m">{size!r}</gco:Measure></gmd:resolution>'
+        "</gmd:MD_Dimension>"
+        for name, size in (("row", cell[1]), ("column", cell[0]))
+    )
+    text = (
+        f'<gmi:MI_Metadata xmlns:gmi="gmi" xmlns:gmd="gmd" xmlns:gco="gco" xmlns:gml="gml">{axes}'
+        f"<gmd:cornerPoints><gml:Point><gml:coordinates>{corners}</gml:coordinates></gml:Point></gmd:cornerPoints>"
+        f"<system>{changes.get('system', 'PROJCS[GEOGCS[]]')}</system></gmi:MI_Metadata>"
+    )
+    text = changes.get("head", "") + text
+    with h5py.File(path, "w") as file:
+        root = file.create_group("BAG_root")
+        root["elevation"] = np.asarray(heights, dtype=np.float32)
+        root["metadata"] = np.array([one.encode() for one in text], dtype="S1")
+    return path
+
+
+def height_map(suffix: str) -> Callable[[Path], Path]:
+    """Return what writes a height map."""
+
+    def make(folder: Path) -> Path:
+        import OpenEXR
+        import xarray as xr
+
+        path = folder / f"map{suffix}"
+        positions = {"x": np.arange(20.0), "y": np.arange(24.0)}
+        if suffix == ".npy":
+            np.save(path, _HEIGHTS)
+        elif suffix == ".npz":
+            np.savez(path, heights=_HEIGHTS, **positions)
+        elif suffix == ".exr":
+            kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+            with OpenEXR.File(kind, {"Y": _HEIGHTS.astype(np.float32)}) as file:
+                file.write(str(path))
+        elif suffix == ".nc":
+            xr.Dataset({"height": (("y", "x"), _HEIGHTS)}, positions).to_netcdf(path, engine="h5netcdf")
+        elif suffix == ".bag":
+            write_bag(path, _HEIGHTS, (500000.0, 6000000.0), (1.0, 1.0))
+        elif suffix == ".xyz":
+            places = np.random.default_rng(0).uniform(0, 20, (200, 2))
+            rows = (f"{x:.2f} {y:.2f} {0.1 * np.sin(y):.3f}" for x, y in places)
+            path.write_text("\n".join(("x y z", *rows)))
+        else:
+            head = "ncols 20\nnrows 24\nxllcorner 0\nyllcorner 0\ncellsize 1\nnodata_value -9999\n"
+            path.write_text(head + "\n".join(" ".join(f"{one:.4f}" for one in row) for row in _HEIGHTS))
+        return path
+
+    return make
+
+
+def load_map(path: Path) -> None:
+    """Read a height map."""
+    from mitransient_lidar.physics.sea.height_maps import read_height_map
+
+    holes = "fill" if path.suffix == ".xyz" else "refuse"
+    read_height_map(path, size=20.0 if path.suffix in (".npy", ".exr") else None, holes=holes)
+
+
+def image(suffix: str) -> Callable[[Path], Path]:
+    """Return what writes a grey image."""
+
+    def make(folder: Path) -> Path:
+        import mitsuba as mi
+
+        path = folder / f"image{suffix}"
+        values = np.arange(1, 64, dtype=np.uint8).reshape(7, 9)
+        if suffix == ".npy":
+            np.save(path, values)
+        else:
+            mi.Bitmap(values[..., None] if suffix == ".png" else values[..., None].astype(np.float32)).write(str(path))
+        return path
+
+    return make
+
+
+def read_image(path: Path) -> None:
+    """Read a grey image."""
+    from mitransient_lidar.transport.sensor.image_sampling import read_image as read
+
+    read("pixel_map", str(path))
+
+
+def mesh(name: str) -> Callable[[Path], Path]:
+    """Return what writes the mesh of a square, as PLY of text or binary records, or as OBJ."""
+    corners = np.array([(-1, -1, -3), (1, -1, -3), (1, 1, -3), (-1, 1, -3)], dtype="<f4")
+    faces = [(0, 1, 2), (0, 2, 3)]
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        if path.suffix == ".obj":
+            lines = [f"v {x:g} {y:g} {z:g}" for x, y, z in corners] + [
+                f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces
+            ]
+            path.write_text("\n".join(lines) + "\n")
+            return path
+        binary = "binary" in name
+        head = ["ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0", "element vertex 4"]
+        head += [f"property float {axis}" for axis in "xyz"]
+        head += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+        rows = [f"{x:g} {y:g} {z:g}" for x, y, z in corners] + [f"3 {a} {b} {c}" for a, b, c in faces]
+        records = b"".join(b"\x03" + np.array(face, dtype="<i4").tobytes() for face in faces)
+        body = corners.tobytes() + records if binary else ("\n".join(rows) + "\n").encode()
+        path.write_bytes(("\n".join(head) + "\n").encode() + body)
+        return path
+
+    return make
