@@ -25,7 +25,8 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine, 1 to 1024; by default one for each core.")
+        int | None,
+        typer.Option(help="Processes on this machine, 1 to 1024; by default one for each processor that may be used."),
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
@@ -60,7 +61,6 @@ def sweep(
     if show:
         _show(campaign, output or campaign.with_suffix(".png"))
         return
-    from mitransient_lidar.campaigns import store as campaign_store
     from mitransient_lidar.campaigns import sweep as campaigns
 
     options: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "retry_failed": retry_failed}
@@ -78,7 +78,7 @@ def sweep(
             campaigns.sweep(campaign, store, shard_size=shard_size, progress=progress, **options)
     typer.echo(store)
     if not quiet:
-        typer.echo("\n".join(campaign_store.describe_campaign(store)))
+        typer.echo("\n".join(campaigns.describe_campaign(store)))
 
 
 def _check_alternatives(workers: int | None, scheduler: str | None, row: int | None, show: bool) -> None:
@@ -105,7 +105,8 @@ def _render_row(campaign: Path, row: int, path: Path, quiet: bool) -> None:
 def _show(store: Path, path: Path) -> None:
     """Draw a store."""
     check_figure(path)
-    from mitransient_lidar.campaigns.store import describe_campaign, open_campaign, reporting_damage
+    from mitransient_lidar.campaigns.store import open_campaign, reporting_damage
+    from mitransient_lidar.campaigns.sweep import describe_campaign
     from mitransient_lidar.plots.campaigns import plot_campaign
 
     dataset = open_campaign(store)

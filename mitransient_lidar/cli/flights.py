@@ -21,7 +21,8 @@ def fly(
         typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; output/FLIGHT by default."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine, 1 to 1024; by default one for each core.")
+        int | None,
+        typer.Option(help="Processes on this machine, 1 to 1024; by default one for each processor that may be used."),
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")

@@ -204,7 +204,7 @@ def _host_name() -> str:
 
 
 def _process_space() -> str:
-    """Return 12 hexadecimal digits of what process numbers have a meaning in: a container, since its machine was booted.
+    """Return 12 hexadecimal digits of where process numbers have a meaning: a container, since its machine was booted.
 
     Containers may have the same host name. Where the system has neither, as macOS, the digits are always the same.
     """

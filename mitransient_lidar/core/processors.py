@@ -18,10 +18,8 @@ def usable_processors() -> int:
     It is the smallest of: the processors of the machine, those of the affinity (``taskset``, batch systems), and the
     quotas of the control groups (containers), rounded up.
     """
-    if hasattr(os, "sched_getaffinity"):
-        number = len(os.sched_getaffinity(0))
-    else:  # macOS has no affinity
-        number = os.cpu_count() or 1
+    # macOS has no affinity.
+    number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([number, *(math.ceil(quota) for quota in _quotas(_GROUPS, _MOUNT))]))
 
 
@@ -35,13 +33,11 @@ def _quotas(groups: Path, mount: Path) -> Iterator[float]:
         # A container sees its own group as the mount, whatever the path is.
         folder = root / path.lstrip("/")
         for group in (folder, *folder.parents[: len(folder.parts) - len(root.parts)]):
-            if controllers:
-                limit = _text(group / "cpu.cfs_quota_us"), _text(group / "cpu.cfs_period_us")
-            else:
-                limit = (*_text(group / "cpu.max").split(), "", "")[:2]
+            names = ("cpu.cfs_quota_us", "cpu.cfs_period_us") if controllers else ("cpu.max",)
             with contextlib.suppress(ValueError):  # "max", or no such file
-                if (quota := float(limit[0])) > 0:
-                    yield quota / float(limit[1])
+                quota, period = (float(word) for name in names for word in _text(group / name).split())
+                if quota > 0:
+                    yield quota / period
 
 
 def _mounted(mount: Path, controllers: str) -> Path:

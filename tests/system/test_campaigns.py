@@ -21,7 +21,7 @@ from few_paths import few_paths
 
 from mitransient_lidar import results
 from mitransient_lidar.campaigns import shard as shards
-from mitransient_lidar.campaigns import sweep as sweeping
+from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
 from mitransient_lidar.core.errors import UserError
@@ -255,25 +255,25 @@ def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
     path = tmp_path / "cluster.zarr"
     command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
     command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
-    workers = [subprocess.Popen(command, **SILENT) for _ in range(2)]
+    nodes = [subprocess.Popen(command, **SILENT) for _ in range(2)]
     try:
         seen = []
 
         def watch(state):
             seen.append(state.done)
-            if state.done >= 2 and workers[0].poll() is None:
-                os.killpg(workers[0].pid, signal.SIGKILL)
+            if state.done >= 2 and nodes[0].poll() is None:
+                os.killpg(nodes[0].pid, signal.SIGKILL)
 
         address = json.loads(file.read_text())["address"]
         data = sweep(campaign, path, scheduler=address, shard_size=2, progress=watch)
-        assert workers[0].wait(10) == -signal.SIGKILL
+        assert nodes[0].wait(10) == -signal.SIGKILL
         assert (data["status"] == DONE).all()
         assert seen[-1] == 12
         alone = sweep(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
         assert files_of(path) == files_of(tmp_path / "alone.zarr")
         assert np.array_equal(data["waveform"], alone["waveform"])
     finally:
-        for worker in workers:
+        for worker in nodes:
             if worker.poll() is None:
                 os.killpg(worker.pid, signal.SIGKILL)
             worker.wait()
@@ -441,14 +441,11 @@ def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
     def render(path, shard, *rest):
         return shards.Outcome(0, 0, "shard 0: lost") if shard == 0 else original(path, shard, *rest)
 
-    from distributed import Client, LocalCluster
-
-    with LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster, Client(cluster) as client:
-        monkeypatch.setattr(sweeping, "render_in_process", render)
-        with pytest.raises(
-            UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.zarr\.log"
-        ):
-            resume(path, scheduler=client)
+    monkeypatch.setattr(workers, "render_in_process", render)
+    with pytest.raises(
+        UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.zarr\.log"
+    ):
+        resume(path, workers=1)
     assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE] * 6
 
 
