@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import check_figure, check_suffix, check_writable
-from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
+from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.core.errors import UserError
 
@@ -50,7 +50,8 @@ def sweep(
     """Render a campaign of many runs.
 
     Runs take other values of the scene's parameters, on the cores of this machine or on a Dask cluster, into one Zarr
-    store. After an interruption, the same command goes on. docs/guide/campaigns.md describes the file.
+    store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
+    docs/guide/campaigns.md describes the file.
     """
     _check_alternatives(workers, scheduler, row, show)
     if row is not None:
@@ -79,6 +80,7 @@ def sweep(
     typer.echo(store)
     if not quiet:
         typer.echo("\n".join(campaigns.describe_campaign(store)))
+    exit_if_failed(store)
 
 
 def _check_alternatives(workers: int | None, scheduler: str | None, row: int | None, show: bool) -> None:

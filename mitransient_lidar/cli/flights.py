@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import check_writable
-from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.messages import exit_if_failed, reporting
 from mitransient_lidar.cli.options import OUTPUT, Quiet
 
 
@@ -39,8 +39,8 @@ def fly(
     """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
 
     Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr of all pulses, and prints
-    the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on.
-    docs/guide/flights.md describes the file.
+    the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on. Failed
+    pulses end it with exit code 1. docs/guide/flights.md describes the file.
     """
     folder = output or OUTPUT / Path(flight).stem
     check_writable(folder, [])
@@ -60,3 +60,4 @@ def fly(
     for path in plot_flight(flown, points, folder):
         typer.echo(path)
     typer.echo("\n".join(describe_points(points)))
+    exit_if_failed(folder / STORE)
