@@ -181,13 +181,23 @@ def connected(scheduler: Client | str) -> Iterator[Client]:
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
         # Dask tells of workers and connections that come and go.
         logging.getLogger(name).setLevel(logging.CRITICAL)
+
+    class Connection(Client):
+        """Client that is closed by this context alone: one without a connection would wait half a minute at its end."""
+
+        def __del__(self) -> None:
+            pass
+
+    # Dask asserts what a scheduler answers, and that it closes: one that stops, and other servers, may answer anything.
     try:
-        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+        client = Connection(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except Exception as error:
-        # Dask asserts what a scheduler answers; one that stops, and another server, may answer anything.
         raise UserError(f"scheduler = {scheduler!r} cannot be reached: give its address, tcp://HOST:PORT") from error
-    with client:
+    try:
         yield client
+    finally:
+        with contextlib.suppress(Exception):
+            client.close(timeout=_CONNECT_S)
 
 
 def _task(path: str, shard: int, retry_failed: bool, topic: str, versions: Mapping[str, str]) -> Outcome | str:

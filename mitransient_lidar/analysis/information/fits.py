@@ -185,7 +185,7 @@ class WaveformFit:
             errors = self._errors(values, used, scale_errors)
             change = np.array([values[name] - former[name] for name in values])
             settled = bool(np.all(np.abs(change) <= _SETTLED * np.nan_to_num(errors.stderr, nan=np.inf)))
-        return self._dataset(values, used, errors, rounds, settled and not self._exhausted)
+        return self._dataset(values, used, errors, rounds, settled and not (self._exhausted or self.interrupted))
 
     def _solution(
         self, values: Mapping[str, float], misfit: Misfit, used: BoolArray, tolerance: float = _TOLERANCE
