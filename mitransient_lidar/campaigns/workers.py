@@ -124,12 +124,12 @@ class _Cluster:
                     f"the scheduler cannot reach its worker at {address}: check its address and the firewall"
                 ) from answer
             else:
-                # Releases before 0.3 do not know their versions.
+                # Releases up to 0.2 do not know their versions.
                 name = "mitransient-lidar"
                 found = self._client.run(importlib.metadata.version, name, workers=[address], on_error="return")
-                version = next(iter(found.values()), "unknown")
-                version = version if isinstance(version, str) else "which is not installed there,"
-                raise UserError(other_versions(place, difference({name: self._versions[name]}, {name: version}) or ""))
+                version, own = found.get(address), self._versions[name]
+                differs = f"other files of {name}" if version == own else f"{name} {version} instead of {own}"
+                raise UserError(other_versions(place, differs))
 
 
 @contextlib.contextmanager
