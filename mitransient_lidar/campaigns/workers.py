@@ -182,7 +182,7 @@ def connected(scheduler: Client | str) -> Iterator[Client]:
         # Dask tells of workers and connections that come and go.
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
-    class Connection(Client):
+    class Connection(Client):  # type: ignore[misc]
         """Client that is closed by this context alone: one without a connection would wait half a minute at its end."""
 
         def __del__(self) -> None:
