@@ -149,7 +149,7 @@ def on_cluster(client: Client, path: str, retry_failed: bool, tell: Tell) -> Ite
     Raises
     ------
     UserError
-        If the scheduler is lost, or a shard has lost its worker too often.
+        If the scheduler is lost or has other versions, or a shard has lost its worker too often.
     """
     from distributed import KilledWorker
     from distributed.comm import CommClosedError
@@ -163,6 +163,12 @@ def on_cluster(client: Client, path: str, retry_failed: bool, tell: Tell) -> Ite
             workers.end()
     except KilledWorker as error:
         raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
+    except RuntimeError as error:
+        if "deserialization of the task graph" not in str(error):
+            raise
+        raise UserError(
+            "the scheduler has no mitransient-lidar, or another version: it must have the same as its workers"
+        ) from error
     except (CancelledError, OSError) as error:
         # A connection that times out is an OSError, and so may be what a worker tells.
         if client.status == "running" and not isinstance(error, (CancelledError, CommClosedError)):

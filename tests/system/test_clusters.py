@@ -26,10 +26,11 @@ SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new
 
 
 @pytest.fixture
-def scheduler(tmp_path):
+def scheduler(tmp_path, request):
     """Dask scheduler in a process of its own: this process, and the file with its address."""
     file = tmp_path / "scheduler.json"
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1"]
+    code = f"{getattr(request, 'param', 'import sys')}; from distributed.cli.dask_scheduler import main; main()"
+    command = [sys.executable, "-c", code, "--port", "0", "--host", "127.0.0.1"]
     with subprocess.Popen([*command, "--no-dashboard", "--scheduler-file", str(file)], **SILENT) as process:
         while not (file.exists() and file.read_text().endswith("}")):
             time.sleep(0.1)
@@ -167,6 +168,21 @@ def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
     processes = shards.Processes({**own_versions(), "drjit": "1.4.9"}, "the worker at tcp://a:1")
     with pytest.raises(UserError, match=r"the worker at tcp://a:1 has drjit 1\.5\.0 instead of 1\.4\.9: all that"):
         shards.render_in_process(str(path), 0, processes=processes)
+    assert (Store(path).status() == PLANNED).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scheduler", ["import sys; sys.modules['mitransient_lidar'] = None"], indirect=True)
+def test_a_scheduler_without_the_package(quick, tmp_path, scheduler):
+    path = planned_copy(quick, tmp_path / "other.zarr")
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
+    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
+    with subprocess.Popen(command, **SILENT) as worker:
+        try:
+            with pytest.raises(UserError, match="the scheduler has no mitransient-lidar, or another version: it must"):
+                resume(path, scheduler=json.loads(scheduler[1].read_text())["address"])
+        finally:
+            worker.kill()
     assert (Store(path).status() == PLANNED).all()
 
 
