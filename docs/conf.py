@@ -68,7 +68,7 @@ if any((DOCS / "gallery").glob("*.py")):
         "abort_on_example_error": True,
         "download_all_examples": False,
         "parallel": 2,
-        "reset_modules": ("matplotlib", "seaborn", "gallery_processes.start_as_usual"),
+        "reset_modules": ("matplotlib", "seaborn"),
         "show_memory": False,
         "min_reported_time": 0,
         "within_subsection_order": "FileNameSortKey",

@@ -47,6 +47,7 @@ except _UserError as _error:
         sys.stderr.write(f"{_error}\n")
         raise SystemExit(2) from None
     raise ImportError(str(_error)) from None
+_variants.limit_threads()
 
 if TYPE_CHECKING:
     import xarray

@@ -232,7 +232,8 @@ def store(folder: Path) -> Path:
 
 def read_store(path: Path) -> None:
     """Read everything that a store holds, as far as it is not damaged, and draw it."""
-    from mitransient_lidar.campaigns.store import Store, describe_campaign, open_campaign, reporting_damage
+    from mitransient_lidar.campaigns.store import Store, open_campaign, reporting_damage
+    from mitransient_lidar.campaigns.sweep import describe_campaign
     from mitransient_lidar.plots.campaigns import plot_campaign
 
     def draw() -> None:

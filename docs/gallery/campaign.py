@@ -34,29 +34,28 @@ CAMPAIGN = {
 }
 
 # %%
-# Runs are rendered by new processes, which import this script: the call stands below this condition.
+# Runs are rendered by processes, as many at a time as there are workers.
 
-if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as folder:
-        data = mitransient_lidar.sweep(CAMPAIGN, Path(folder) / "bottoms.zarr", workers=1).load()
-    bottom = data.sel(echo="bottom").isel(pixel=0)
-    error = bottom.echo_depth_m - bottom.true_bottom_depth
-    stated = np.hypot(bottom.echo_depth_m_stderr, bottom.echo_depth_m_method_error)
-    optical = bottom.attenuation * bottom.bottom_depth
-    print(f"{data.sizes['run']} runs, {int(np.isfinite(error).sum())} bottoms found")
-    print(f"error of the depths found: median {100 * float(error.median()):+.1f} cm")
+with tempfile.TemporaryDirectory() as folder:
+    data = mitransient_lidar.sweep(CAMPAIGN, Path(folder) / "bottoms.zarr", workers=1).load()
+bottom = data.sel(echo="bottom").isel(pixel=0)
+error = bottom.echo_depth_m - bottom.true_bottom_depth
+stated = np.hypot(bottom.echo_depth_m_stderr, bottom.echo_depth_m_method_error)
+optical = bottom.attenuation * bottom.bottom_depth
+print(f"{data.sizes['run']} runs, {int(np.isfinite(error).sum())} bottoms found")
+print(f"error of the depths found: median {100 * float(error.median()):+.1f} cm")
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.4), layout="constrained")
-    for run in range(4):
-        one = data.isel(run=run, pixel=0)
-        label = f"{float(one.bottom_depth):.1f} m, c = {float(one.attenuation):.2f}"
-        left.semilogy(one.time, 1e6 * one.waveform.where(one.waveform > 0), label=label, linewidth=1)
-    left.set(xlabel="time (ns)", ylabel="power (µW)", xlim=(1400, 1580), ylim=(0.1, 5000))
-    left.legend(frameon=False, fontsize="small")
-    right.errorbar(optical, 100 * error, 100 * stated, fmt="o")
-    right.axhline(0, color="0.6", linestyle="--")
-    right.set(xlabel="attenuation times depth", ylabel="error of the depth (cm)")
-    plt.show()
+figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.4), layout="constrained")
+for run in range(4):
+    one = data.isel(run=run, pixel=0)
+    label = f"{float(one.bottom_depth):.1f} m, c = {float(one.attenuation):.2f}"
+    left.semilogy(one.time, 1e6 * one.waveform.where(one.waveform > 0), label=label, linewidth=1)
+left.set(xlabel="time (ns)", ylabel="power (µW)", xlim=(1400, 1580), ylim=(0.1, 5000))
+left.legend(frameon=False, fontsize="small")
+right.errorbar(optical, 100 * error, 100 * stated, fmt="o")
+right.axhline(0, color="0.6", linestyle="--")
+right.set(xlabel="attenuation times depth", ylabel="error of the depth (cm)")
+plt.show()
 
 # %%
 # **What to see.** Left, four runs of the campaign: deep bottoms in turbid water are weak. Right, what the shipped

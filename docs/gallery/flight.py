@@ -43,25 +43,24 @@ FLIGHT = {
 SURFACE, BOTTOM = 41, 40  # classes of LAS for water surface and bottom
 
 # %%
-# Pulses are rendered by new processes, which import this script: the call stands below this condition.
+# Pulses are rendered by processes, as many at a time as there are workers.
 
-if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as folder:
-        points = mitransient_lidar.fly(FLIGHT, folder, workers=1).load()
+with tempfile.TemporaryDirectory() as folder:
+    points = mitransient_lidar.fly(FLIGHT, folder, workers=1).load()
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.5), layout="constrained")
-    for kind, name, colour in ((SURFACE, "water surface", "tab:blue"), (BOTTOM, "bottom", "tab:orange")):
-        own = points.where(points.kind == kind, drop=True)
-        error = own.z - own.true_z
-        rms = float((error**2).mean() ** 0.5)
-        stated = float(own.vertical_uncertainty.median())
-        print(f"{name}: {own.z.size} points, rms error {100 * rms:.1f} cm, stated {100 * stated:.1f} cm")
-        left.plot(own.x, own.y, ".", color=colour, label=name)
-        right.plot(own.x, own.z, ".", color=colour)
-    left.set(xlabel="east (m)", ylabel="north (m)", aspect="equal")
-    left.legend(frameon=False, fontsize="small")
-    right.set(xlabel="east (m)", ylabel="height (m)")
-    plt.show()
+figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3.5), layout="constrained")
+for kind, name, colour in ((SURFACE, "water surface", "tab:blue"), (BOTTOM, "bottom", "tab:orange")):
+    own = points.where(points.kind == kind, drop=True)
+    error = own.z - own.true_z
+    rms = float((error**2).mean() ** 0.5)
+    stated = float(own.vertical_uncertainty.median())
+    print(f"{name}: {own.z.size} points, rms error {100 * rms:.1f} cm, stated {100 * stated:.1f} cm")
+    left.plot(own.x, own.y, ".", color=colour, label=name)
+    right.plot(own.x, own.z, ".", color=colour)
+left.set(xlabel="east (m)", ylabel="north (m)", aspect="equal")
+left.legend(frameon=False, fontsize="small")
+right.set(xlabel="east (m)", ylabel="height (m)")
+plt.show()
 
 # %%
 # **What to see.** Left, the points on the sea, and those on the bottom, which lie outside them, as the beams go on

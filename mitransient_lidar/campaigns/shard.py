@@ -2,8 +2,9 @@
 
 The process ends with its shard, and with it the memory that Mitsuba does not give back. It ends, too, when the process
 that has started it does, and after an error of the program, since what Dr.Jit was recording is in an unknown state. Its
-standard input holds the store, the shard, and the runs that are not to be rendered, with the reasons; it writes one
-line of JSON for each event: ``begin`` and ``end`` of a run, ``done``, ``error`` or ``bug``.
+standard input holds the store, the shard, the versions that it must have, and the runs that are not to be rendered,
+with the reasons; it writes one line of JSON for each event: ``begin`` and ``end`` of a run, ``done``, ``error``,
+``bug``, or ``differs`` for other versions. After SIGTERM it writes the runs that it has, and ends.
 
 A log beside the store, ``NAME.zarr.log``, holds the messages of processes that ended before their shard.
 """
@@ -13,13 +14,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +30,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.campaigns.runs import Array, Renderer
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store
+from mitransient_lidar.campaigns.versions import difference, other_versions, own_versions
 from mitransient_lidar.core.errors import LINES, UserError, printable, raise_if_out_of_memory
 from mitransient_lidar.core.files import open_log
 
@@ -45,6 +48,9 @@ _LONGEST_REASON = 200
 
 #: Variables of the environment with numbers of threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+#: Time for a process to write the runs that it has when the campaign ends [s].
+_WRITE_S = 10.0
 
 Report = Callable[[int, int], None]
 
@@ -65,7 +71,58 @@ class _End(NamedTuple):
     is_bug: bool = False
 
 
-def render_in_process(path: str, shard: int, retry: bool = False, report: Report | None = None) -> Outcome:
+class Processes:
+    """Processes of the shards of a campaign, which `end` ends together.
+
+    Parameters
+    ----------
+    versions
+        Versions that they must have, as of `versions.own_versions`; by default any.
+    place
+        Where they are, for messages.
+    """
+
+    def __init__(self, versions: Mapping[str, str] | None = None, place: str = "this machine") -> None:
+        self.versions, self.place = dict(versions or {}), place
+        self.is_ended = False
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[str]] = set()
+
+    @contextlib.contextmanager
+    def holding(self, process: subprocess.Popen[str]) -> Iterator[None]:
+        """Context in which a process is one of those that `end` ends."""
+        with self._lock:
+            self._running.add(process)
+            if self.is_ended:
+                process.kill()
+        try:
+            yield
+        finally:
+            process.kill()
+            with self._lock:
+                self._running.discard(process)
+
+    def end(self) -> None:
+        """End the processes, which write the runs that they have if that takes at most 10 s; start no others."""
+        with self._lock:
+            self.is_ended = True
+            running = list(self._running)
+        until = time.monotonic() + _WRITE_S
+        try:
+            for process in running:
+                process.terminate()
+            for process in running:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(until - time.monotonic(), 0))
+        finally:
+            for process in running:
+                process.kill()
+                process.wait()
+
+
+def render_in_process(
+    path: str, shard: int, retry: bool = False, report: Report | None = None, processes: Processes | None = None
+) -> Outcome:
     """Render the runs of a shard that are not done in a new process.
 
     A run in which the process ends twice has failed. Runs that meet an error of the program stay planned, and so do all
@@ -81,20 +138,25 @@ def render_in_process(path: str, shard: int, retry: bool = False, report: Report
         Whether to render runs that have failed, too.
     report
         Called with the numbers of runs done and failed after each run.
+    processes
+        Processes that the new one belongs to.
 
     Raises
     ------
     UserError
-        If the store cannot be read or written.
+        If the store cannot be read or written, or the process has other versions than it must have.
     """
+    processes = processes or Processes()
     reasons: dict[int, str] = {}
     left: dict[int, str] = {}
     deaths: Counter[int | None] = Counter()
     while True:
         order = {"store": path, "shard": shard, "retry": retry, "failed": reasons, "left": list(left)}
-        ended = _one_process(order, report)
+        ended = _one_process({**order, "versions": processes.versions}, report, processes)
         if isinstance(ended, Outcome):
             return ended._replace(left=next(iter(left.values()), ""))
+        if processes.is_ended:
+            return Outcome(0, 0, f"shard {shard}: the campaign was ended")
         deaths[ended.run] += 1
         if ended.run is not None and ended.is_bug:
             left[ended.run] = f"run {ended.run}: {ended.reason}"
@@ -123,7 +185,7 @@ def _log(store: str, shard: int, text: str) -> None:
         file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} shard {shard}\n{printable(text.rstrip(), kept=LINES)}\n\n")
 
 
-def _one_process(order: dict[str, Any], report: Report | None) -> Outcome | _End:
+def _one_process(order: dict[str, Any], report: Report | None, processes: Processes) -> Outcome | _End:
     """Return the outcome of a shard, or how its process ended before."""
     environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
     # A session of its own: Ctrl-C is for the process that has started it.
@@ -136,47 +198,61 @@ def _one_process(order: dict[str, Any], report: Report | None) -> Outcome | _End
         env=environment,
         start_new_session=True,
     ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        assert process.stderr is not None
         told: list[str] = []
         reader = threading.Thread(target=lambda: told.extend(process.stderr or ()), daemon=True)
         reader.start()
-        run: int | None = None
-        try:
-            process.stdin.write(json.dumps(order) + "\n")
-            process.stdin.flush()
-            for line in process.stdout:
-                if not line.startswith("{"):
-                    continue
-                event = json.loads(line)
-                if "done" in event:
-                    return Outcome(event["done"], event["failed"])
-                if "error" in event:
-                    raise UserError(event["error"])
-                if "bug" in event:
-                    _log(order["store"], order["shard"], event["traceback"])
-                    return _End(run, event["bug"], is_bug=True)
-                run = event.get("begin", run)
-                if "end" in event and report is not None:
-                    report(*event["end"])
-        except BrokenPipeError:
-            pass
-        finally:
-            process.kill()
+        with processes.holding(process):
+            found = _events(process, order, report, processes.place)
         code = process.wait()
         reader.join(timeout=5)
+        if isinstance(found, (Outcome, _End)):
+            return found
         if told:
             _log(order["store"], order["shard"], "".join(told))
         last = " ".join((told or ["without a message"])[-1].split())
         why = f"by signal {-code}" if code < 0 else f"with exit code {code}: {last}"
-        return _End(run, f"the process ended {why}")
+        return _End(found, f"the process ended {why}")
+
+
+def _events(
+    process: subprocess.Popen[str], order: dict[str, Any], report: Report | None, place: str
+) -> Outcome | _End | int | None:
+    """Return what a process tells of its end; of one that ends before, the run that it was rendering."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    run: int | None = None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(json.dumps(order) + "\n")
+        process.stdin.flush()
+        for line in process.stdout:
+            if not line.startswith("{"):
+                continue
+            event = json.loads(line)
+            if "done" in event:
+                return Outcome(event["done"], event["failed"])
+            if "error" in event:
+                raise UserError(event["error"])
+            if "differs" in event:
+                raise UserError(other_versions(place, event["differs"]))
+            if "bug" in event:
+                _log(order["store"], order["shard"], event["traceback"])
+                return _End(run, event["bug"], is_bug=True)
+            run = event.get("begin", run)
+            if "end" in event and report is not None:
+                report(*event["end"])
+    return run
 
 
 def render_shard(
-    path: str, shard: int, retry: bool, failed: dict[int, str], left: set[int], tell: Callable[..., None]
+    path: str,
+    shard: int,
+    retry: bool,
+    failed: dict[int, str],
+    left: set[int],
+    tell: Callable[..., None],
+    is_ended: Callable[[], bool],
 ) -> None:
-    """Render the runs of a shard that are not done nor to be left, and write them."""
+    """Render the runs of a shard that are not done nor to be left, and write them; none more once it is ended."""
     store = Store(path)
     renderer, runs = store.renderer(), store.runs_of(shard)
     inputs = store.inputs(runs)
@@ -185,6 +261,9 @@ def render_shard(
         status[status == FAILED] = PLANNED
     written = time.monotonic()
     for rows in renderer.batches(inputs):
+        if is_ended():
+            store.write(shard, status, errors, arrays)
+            return
         first = runs.start + rows[0]
         if first in left or not np.any(status[rows] == PLANNED):
             continue
@@ -242,6 +321,8 @@ def _main() -> None:
 
     import drjit as dr
 
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # What a run tells belongs to its result; a campaign has thousands.
@@ -256,8 +337,12 @@ def _main() -> None:
         out.flush()
 
     try:
+        if differs := difference(order["versions"], own_versions()):
+            tell(differs=differs)
+            return
         failed = {int(run): reason for run, reason in order["failed"].items()}
-        render_shard(order["store"], order["shard"], order["retry"], failed, set(order["left"]), tell)
+        left = set(order["left"])
+        render_shard(order["store"], order["shard"], order["retry"], failed, left, tell, ended.is_set)
     except UserError as error:
         tell(error=str(error))
     except Exception as error:

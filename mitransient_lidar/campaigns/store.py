@@ -26,6 +26,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mitransient_lidar.campaigns.design import MOST_RUNS, Column
 from mitransient_lidar.campaigns.runs import Array, Renderer
+from mitransient_lidar.campaigns.versions import own_versions
 from mitransient_lidar.core.errors import UserError, WriteError
 from mitransient_lidar.core.files import check_encodable, check_tree, sweep, temporary_beside
 from mitransient_lidar.core.validation import integer
@@ -405,22 +406,6 @@ def open_campaign(path: str | os.PathLike[str]) -> xr.Dataset:
     return picture_order(dataset)
 
 
-def describe_campaign(path: str | os.PathLike[str]) -> list[str]:
-    """Return lines on a campaign: the numbers of its runs by status, and the most frequent reasons of failures."""
-    store = Store(path)
-    status = store.status()
-    done, failures, planned = (int(np.count_nonzero(status == value)) for value in (DONE, FAILED, PLANNED))
-    lines = [f"{store.count} runs: {done} done, {failures} failed, {planned} planned"]
-    if failures:
-        failed = np.flatnonzero(status == FAILED)
-        reasons, first, number = np.unique(
-            store.errors()[failed].astype(np.str_), return_index=True, return_counts=True
-        )
-        for reason, place, times in sorted(zip(reasons, first, number, strict=True), key=lambda row: -row[2])[:5]:
-            lines.append(f"failed {times}, the first run {failed[place]}: {reason}")
-    return lines
-
-
 def _fill(
     group: zarr.Group,
     renderer: Renderer,
@@ -488,6 +473,7 @@ def _fill(
         "coordinates": " ".join(name for name in secondary if name in group),
         _ORDER[0]: _ORDER[1],
         **versions(),
+        "versions": own_versions(),
         **attributes,
     }
     group.attrs.update({**about, _SEAL: seal(about)})

@@ -1,15 +1,15 @@
-"""Campaigns on Dask: shards as tasks, on processes of this machine or on a cluster."""
+"""Campaigns: shards of runs on workers, into a store."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import itertools
 import logging
 import os
+import threading
 import time
-import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,12 @@ import xarray as xr
 
 from mitransient_lidar.campaigns.design import Campaign
 from mitransient_lidar.campaigns.runs import RunRenderer, check_names, record_of
-from mitransient_lidar.campaigns.shard import Outcome, log_path, render_in_process
+from mitransient_lidar.campaigns.shard import Outcome, log_path
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
+from mitransient_lidar.campaigns.versions import check_versions
+from mitransient_lidar.campaigns.workers import REPORT_S, Workers, connected, on_cluster, on_this_machine
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import integer, shown
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 
@@ -38,9 +41,6 @@ _MOST_LEFT = 8
 #: Runs that are tried until one of them shows the arrays of a store.
 _TRIALS = 8
 
-#: Time between two reports of a shard, and time to wait for a scheduler [s].
-_REPORT_S, _CONNECT_S = 1.0, 15.0
-
 
 def sweep(
     campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str],
@@ -54,8 +54,6 @@ def sweep(
 ) -> xr.Dataset:
     """Render the runs of a campaign into a Zarr store, or those that an interrupted one has left.
 
-    Scripts call it below ``if __name__ == "__main__":``, since new processes import the script.
-
     Parameters
     ----------
     campaign
@@ -63,10 +61,10 @@ def sweep(
     store
         Folder of the store. One that holds the same campaign is completed.
     workers
-        Processes on this machine, 1 to 1024; by default one for each core.
+        Processes on this machine, 1 to 1024; by default one for each processor that this process may use.
     scheduler
         Address of a Dask scheduler, or a ``distributed.Client``, instead of processes on this machine. Its workers need
-        this package, and the store at the same path.
+        the same versions of this package, Mitsuba, Dr.Jit, NumPy and Python, and the store at the same path.
     shard_size
         Runs of a shard, which one process renders and writes, 1 to 1 000 000; by default a sixteenth of the runs, but
         8 to 1024, and fewer where a shard would take more than half a gigabyte.
@@ -83,11 +81,11 @@ def sweep(
     Raises
     ------
     UserError
-        If the campaign is invalid, the store holds another one or cannot be written, the first runs all fail, the
-        scheduler or one of its workers cannot be reached, or runs could not be rendered for another reason than their
-        parameters, after the others.
+        If the campaign is invalid, the store holds another one, was begun by other versions or cannot be written, the
+        first runs all fail, the scheduler or one of its workers cannot be reached, a worker has other versions, or runs
+        could not be rendered for another reason than their parameters, after the others.
     KeyboardInterrupt
-        After Ctrl-C; runs that are written stay.
+        After Ctrl-C; processes write the runs that they have, which stay.
     """
     return open_campaign(
         complete(
@@ -132,6 +130,22 @@ def render_row(campaign: Campaign | Mapping[str, Any] | str | os.PathLike[str], 
         values = {name: column[row].item() for name, column in table.items()}
     series: xr.Dataset = renderer.series(row, values, **options)
     return series
+
+
+def describe_campaign(path: str | os.PathLike[str]) -> list[str]:
+    """Return lines on a campaign: the numbers of its runs by status, and the most frequent reasons of failures."""
+    store = Store(path)
+    status = store.status()
+    done, failures, planned = (int(np.count_nonzero(status == value)) for value in (DONE, FAILED, PLANNED))
+    lines = [f"{store.count} runs: {done} done, {failures} failed, {planned} planned"]
+    if failures:
+        failed = np.flatnonzero(status == FAILED)
+        reasons, first, number = np.unique(
+            store.errors()[failed].astype(np.str_), return_index=True, return_counts=True
+        )
+        for reason, place, times in sorted(zip(reasons, first, number, strict=True), key=lambda row: -row[2])[:5]:
+            lines.append(f"failed {times}, the first run {failed[place]}: {reason}")
+    return lines
 
 
 def _campaign(given: Campaign | Mapping[str, Any] | str | os.PathLike[str]) -> Campaign:
@@ -182,10 +196,10 @@ def complete(
     """Render what is missing in a store, and return it; options as for `sweep`."""
     if workers is not None and scheduler is not None:
         raise UserError(f"workers = {workers} are of this machine, and the scheduler has its own: give one of both")
-    number = os.cpu_count() or 1 if workers is None else integer("workers", workers, 1, 1024)
+    number = usable_processors() if workers is None else integer("workers", workers, 1, 1024)
     with contextlib.ExitStack() as stack:
         # A scheduler that is away leaves no store.
-        client = None if scheduler is None else stack.enter_context(_connected(scheduler))
+        client = None if scheduler is None else stack.enter_context(connected(scheduler))
         store = prepare()
         store.mend()
         status = store.status()
@@ -193,12 +207,15 @@ def complete(
         shards = [shard for shard in store.shards if np.isin(status[store.runs_of(shard)], wanted).any()]
         if shards:
             store.check_pixel_order()
-            # Here for the warning of other versions: the processes of shards tell nothing.
-            store.renderer()
+            check_versions(store.path, store.attributes)
+            tally = _Tally(store, progress)
+            given = str(store.path.resolve()), retry_failed, tally.count
             try:
-                client = client or stack.enter_context(_local(min(number, len(shards))))
-                _render(store, shards, client, retry_failed, progress)
+                few = min(number, len(shards))
+                with on_cluster(client, *given) if client else on_this_machine(few, *given) as pool:
+                    _render(store, shards, pool, tally)
             except KeyboardInterrupt as error:
+                # Processes have written their runs, and ended.
                 done = int(np.count_nonzero(store.status() != PLANNED))
                 text = f"interrupted after {done} of {store.count} {store.unit}s, which are kept"
                 text += "; the same command goes on."
@@ -206,61 +223,26 @@ def complete(
     return store
 
 
-def _render(
-    store: Store, shards: list[int], client: Client, retry_failed: bool, progress: ProgressCallback | None
-) -> None:
-    """Render shards on the workers of a client."""
-    from concurrent.futures import CancelledError
-
-    from distributed import KilledWorker, as_completed
-    from distributed.comm import CommClosedError
-
-    topic = f"campaign-{uuid.uuid4().hex}"
-    tally = _Tally(store, progress)
-    client.subscribe_topic(topic, tally.receive)
-    path, waiting = str(store.path.resolve()), iter(shards)
-    futures = as_completed(loop=client.loop)
-    reached: set[str] = set()
-
-    def submit() -> None:
-        # Workers may come and go.
-        threads = client.nthreads()
-        _check_workers(client, set(threads) - reached)
-        reached.update(threads)
-        wanted = _AHEAD * max(sum(threads.values()), 1) - futures.count()
-        for shard in itertools.islice(waiting, max(wanted, 0)):
-            key = f"shard-{shard}-{topic}"
-            futures.add(client.submit(_task, path, shard, retry_failed, topic, pure=False, key=key))
-
+def _render(store: Store, shards: list[int], workers: Workers, tally: _Tally) -> None:
+    """Render shards on workers."""
+    waiting = iter(shards)
+    pending: dict[Future[Outcome | str], int] = {}
     left: list[str] = []
-    try:
-        if not client.nthreads():
-            _LOG.warning("the scheduler has no workers: the campaign waits for the first one")
-            while not client.nthreads():
-                time.sleep(_REPORT_S)
-        submit()
-        for future in futures:
-            found = future.result()
-            if isinstance(found, str):
-                raise UserError(found)
-            shard, outcome = found
+    while len(left) < _MOST_LEFT:
+        wanted = _AHEAD * workers.count() - len(pending)
+        for shard in itertools.islice(waiting, max(wanted, 0)):
+            pending[workers.submit(shard)] = shard
+        if not pending:
+            break
+        # Not for ever: workers of a cluster come and go.
+        for future in wait(pending, timeout=REPORT_S, return_when=FIRST_COMPLETED).done:
+            shard, outcome = pending.pop(future), future.result()
+            if isinstance(outcome, str):
+                raise UserError(outcome)
             tally.finish(shard, outcome)
             if outcome.left:
                 left.append(outcome.left)
                 _LOG.warning("runs of shard %d are left: %s", shard, outcome.left)
-                if len(left) >= _MOST_LEFT:
-                    break
-            submit()
-    except KilledWorker as error:
-        raise UserError(f"{error.task} has lost its worker too often: see the log of the scheduler") from error
-    except (CancelledError, OSError) as error:
-        # A connection that times out is an OSError, and so may be what a worker tells.
-        if client.status == "running" and not isinstance(error, (CancelledError, CommClosedError)):
-            raise
-        raise UserError("the scheduler was lost: what is written is kept, and the same command goes on") from error
-    finally:
-        with contextlib.suppress(OSError):
-            client.unsubscribe_topic(topic)
     if left:
         raise UserError(
             f"{len(left)} of {len(shards)} shards are not complete, the first for {left[0]}; {log_path(store.path)} "
@@ -268,41 +250,12 @@ def _render(
         )
 
 
-def _check_workers(client: Client, addresses: set[str]) -> None:
-    """Raise `UserError` if the scheduler cannot reach a worker, which would wait for ever."""
-    answers = client.run(os.getpid, workers=sorted(addresses), on_error="return") if addresses else {}
-    for address, answer in answers.items():
-        if isinstance(answer, BaseException) and address in client.nthreads():
-            raise UserError(f"the scheduler cannot reach its worker at {address}: check its address and the firewall")
-
-
-def _task(path: str, shard: int, retry_failed: bool, topic: str) -> tuple[int, Outcome] | str:
-    """Render a shard on a worker; return its number and outcome, or the message of a `UserError`.
-
-    Dask would log the error itself with its traceback.
-    """
-    from distributed import get_worker
-
-    worker = get_worker()
-    last = time.monotonic()
-
-    def report(done: int, failed: int) -> None:
-        nonlocal last
-        if time.monotonic() - last > _REPORT_S:
-            last = time.monotonic()
-            worker.log_event(topic, {"shard": shard, "done": done, "failed": failed})
-
-    try:
-        return shard, render_in_process(path, shard, retry_failed, report)
-    except UserError as error:
-        return str(error)
-
-
 class _Tally:
-    """Counts of the runs of a campaign, by shard."""
+    """Counts of the runs of a campaign, by shard; threads may call it."""
 
     def __init__(self, store: Store, progress: ProgressCallback | None) -> None:
         self._store, self._progress = store, progress
+        self._lock = threading.Lock()
         status = store.status()
         self._shards = {
             shard: tuple(int(np.count_nonzero(status[store.runs_of(shard)] == one)) for one in (DONE, FAILED))
@@ -312,18 +265,19 @@ class _Tally:
         self._finished: set[int] = set()
         self._tell()
 
-    def receive(self, event: tuple[float, Mapping[str, int]]) -> None:
+    def count(self, shard: int, done: int, failed: int) -> None:
         """Count the runs of a shard that a worker renders."""
-        news = event[1]
-        if news["shard"] not in self._finished:
-            self._shards[news["shard"]] = news["done"], news["failed"]
-            self._tell()
+        with self._lock:
+            if shard not in self._finished:
+                self._shards[shard] = done, failed
+                self._tell()
 
     def finish(self, shard: int, outcome: Outcome) -> None:
         """Count the runs of a shard that is written."""
-        self._finished.add(shard)
-        self._shards[shard] = outcome.done, outcome.failed
-        state = self._tell()
+        with self._lock:
+            self._finished.add(shard)
+            self._shards[shard] = outcome.done, outcome.failed
+            state = self._tell()
         _LOG.info(
             "shard %d written: %d of %d %ss, %d failed, %.3g a second, ends in %.0f s",
             shard, state.done, state.planned, state.unit, state.failed, state.rate or 0, state.remaining_s or 0,
@@ -346,50 +300,3 @@ class _Tally:
         if self._progress is not None:
             self._progress(state)
         return state
-
-
-@contextlib.contextmanager
-def _connected(scheduler: Client | str) -> Iterator[Client]:
-    """Yield a client of a running scheduler."""
-    from distributed import Client
-
-    if isinstance(scheduler, Client):
-        yield scheduler
-        return
-    _silence()
-    try:
-        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"scheduler = {scheduler!r} cannot be reached: give its address, tcp://HOST:PORT") from error
-    with client:
-        yield client
-
-
-@contextlib.contextmanager
-def _local(workers: int) -> Iterator[Client]:
-    """Yield a client of new processes on this machine."""
-    from distributed import Client, LocalCluster
-
-    _silence()
-    # The processes of the shards hold the memory, not these.
-    options = {
-        "threads_per_worker": 1,
-        "processes": True,
-        "memory_limit": 0,
-        "dashboard_address": "127.0.0.1:0",
-        "silence_logs": logging.CRITICAL,
-    }
-    try:
-        started = LocalCluster(n_workers=workers, **options)
-    except (OSError, RuntimeError) as error:
-        raise UserError(f"{workers} worker processes could not be started; the same command tries again") from error
-    with started as cluster, Client(cluster, set_as_default=False) as client:
-        if importlib.util.find_spec("bokeh") is not None:
-            _LOG.info("dashboard: %s", cluster.dashboard_link)
-        yield client
-
-
-def _silence() -> None:
-    """Keep Dask from telling of workers and connections that come and go."""
-    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -1,15 +1,18 @@
 """The command line ``mitransient-lidar``.
 
-Invalid input ends a command with one sentence on stderr and exit code 2, Ctrl-C with exit code 130. Results go to
-stdout, everything else to stderr. Commands import what they need when they run, so that help appears at once.
+Invalid input ends a command with one sentence on stderr and exit code 2, Ctrl-C with exit code 130, SIGTERM with 143
+and SIGHUP with 129; 1 is a comparison that finds a difference, or failed runs. Results go to stdout, everything else to
+stderr. Commands import what they need when they run, so that help appears at once.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Annotated, Any
 
 import typer
@@ -136,6 +139,18 @@ _scenes_app = typer.Typer(rich_markup_mode=None)
 
 def main() -> None:
     """Run the command line."""
+    _open_standard_streams()
+    try:
+        _run()
+    finally:
+        # Between the command and the end of the process, a signal has nothing to interrupt.
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, _end_at_once)
+
+
+def _run() -> None:
+    """Run the command of the arguments."""
     # Commands draw to files only: Matplotlib refuses to be imported with an unknown backend.
     os.environ["MPLBACKEND"] = "agg"
     if sys.argv[1:2] not in (["sweep"], ["fly"]) and not {"dask", "xarray"} & sys.modules.keys():
@@ -143,6 +158,28 @@ def main() -> None:
         # xarray that a script has imported before remembers where Dask is, and goes on with it.
         sys.modules["dask"] = None  # type: ignore[assignment]
     app(prog_name="mitransient-lidar")
+
+
+def _end_at_once(number: int, _frame: FrameType | None) -> None:
+    """End the process with the exit code of a signal."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(128 + number)
+
+
+def _open_standard_streams() -> None:
+    """Open standard input, output and errors that are closed, as by ``2>&-``, to nothing.
+
+    Files would take their numbers, and messages of libraries would be written into them.
+    """
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            # The lowest free number is this one.
+            os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(descriptor, "w" if descriptor else "r", encoding="utf-8", closefd=False))
 
 
 def _show_version(wanted: bool) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mitransient_lidar.cli.files import announced, check_figure, check_suffix, check_writable
-from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
+from mitransient_lidar.cli.messages import exit_if_failed, exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import Quiet
 from mitransient_lidar.core.errors import UserError
 
@@ -25,7 +25,8 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine, 1 to 1024; by default one for each core.")
+        int | None,
+        typer.Option(help="Processes on this machine, 1 to 1024; by default one for each processor that may be used."),
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
@@ -49,7 +50,8 @@ def sweep(
     """Render a campaign of many runs.
 
     Runs take other values of the scene's parameters, on the cores of this machine or on a Dask cluster, into one Zarr
-    store. After an interruption, the same command goes on. docs/guide/campaigns.md describes the file.
+    store. After an interruption, the same command goes on. Failed runs end it with exit code 1.
+    docs/guide/campaigns.md describes the file.
     """
     _check_alternatives(workers, scheduler, row, show)
     if row is not None:
@@ -60,7 +62,6 @@ def sweep(
     if show:
         _show(campaign, output or campaign.with_suffix(".png"))
         return
-    from mitransient_lidar.campaigns import store as campaign_store
     from mitransient_lidar.campaigns import sweep as campaigns
 
     options: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "retry_failed": retry_failed}
@@ -78,7 +79,8 @@ def sweep(
             campaigns.sweep(campaign, store, shard_size=shard_size, progress=progress, **options)
     typer.echo(store)
     if not quiet:
-        typer.echo("\n".join(campaign_store.describe_campaign(store)))
+        typer.echo("\n".join(campaigns.describe_campaign(store)))
+    exit_if_failed(store)
 
 
 def _check_alternatives(workers: int | None, scheduler: str | None, row: int | None, show: bool) -> None:
@@ -105,7 +107,8 @@ def _render_row(campaign: Path, row: int, path: Path, quiet: bool) -> None:
 def _show(store: Path, path: Path) -> None:
     """Draw a store."""
     check_figure(path)
-    from mitransient_lidar.campaigns.store import describe_campaign, open_campaign, reporting_damage
+    from mitransient_lidar.campaigns.store import open_campaign, reporting_damage
+    from mitransient_lidar.campaigns.sweep import describe_campaign
     from mitransient_lidar.plots.campaigns import plot_campaign
 
     dataset = open_campaign(store)

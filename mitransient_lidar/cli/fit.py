@@ -9,10 +9,11 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import announced, check_targets, write_netcdf
-from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.messages import exit_if_interrupted, reporting
 from mitransient_lidar.cli.options import OUTPUT, Define, Instrument, Quiet, parameters
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
+from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.validation import finite
 
 
@@ -70,7 +71,8 @@ def fit(
     """Fit parameters of a scene to waveforms.
 
     Weighted least squares with the derivatives of renders. Prints values with standard errors, and writes fit.nc (with
-    covariance, fitted waveform and residuals), fit.csv and fit.png.
+    covariance, fitted waveform and residuals), fit.csv and fit.png. Ctrl-C ends the fit at its last step, which it
+    prints and writes (exit code 130).
     """
     targets = [output / f"fit.{kind}" for kind in ("nc", "csv", "png")]
     check_targets(output, targets, str(file))
@@ -80,33 +82,35 @@ def fit(
     from mitransient_lidar.plots.studies.fit import plot_fit
     from mitransient_lidar.studies import fit as study
 
-    with reporting(quiet) as progress:
-        fitted = study.fit(
-            file,
-            scene,
-            names,
-            params=parameters(define),
-            instrument=instrument,
-            start=starts,
-            bounds=limits,
-            free_scale=free_scale,
-            free_time=free_time,
-            noise=noise,
-            receiver=receiver,
-            scale_errors=scale_errors,
-            passes=passes,
-            max_time=max_time,
-            seed=seed,
-            progress=progress,
-        )
-    output.mkdir(parents=True, exist_ok=True)
-    heading, rows = study.table_rows(fitted)
-    with announced():
-        write_netcdf(fitted, targets[0])
-        with replacing(targets[1]) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-            csv.writer(stream).writerows([heading, *rows])
-        plot_fit(fitted, targets[2])
+    with DeferredInterrupt(at_once=False):
+        with reporting(quiet) as progress:
+            fitted = study.fit(
+                file,
+                scene,
+                names,
+                params=parameters(define),
+                instrument=instrument,
+                start=starts,
+                bounds=limits,
+                free_scale=free_scale,
+                free_time=free_time,
+                noise=noise,
+                receiver=receiver,
+                scale_errors=scale_errors,
+                passes=passes,
+                max_time=max_time,
+                seed=seed,
+                progress=progress,
+            )
+        output.mkdir(parents=True, exist_ok=True)
+        heading, rows = study.table_rows(fitted)
+        with announced():
+            write_netcdf(fitted, targets[0])
+            with replacing(targets[1]) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+                csv.writer(stream).writerows([heading, *rows])
+            plot_fit(fitted, targets[2])
     typer.echo("\n".join(study.describe_fit(fitted)))
+    exit_if_interrupted(fitted)
 
 
 def _pairs(option: str, given: list[str] | None) -> dict[str, str]:

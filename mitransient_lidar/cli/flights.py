@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mitransient_lidar.cli.files import check_writable
-from mitransient_lidar.cli.messages import reporting
+from mitransient_lidar.cli.messages import exit_if_failed, reporting
 from mitransient_lidar.cli.options import OUTPUT, Quiet
 from mitransient_lidar.cli.overwriting import replace_freely
 from mitransient_lidar.core.marks import read_mark
@@ -23,7 +23,8 @@ def fly(
         typer.Option("-o", "--output", metavar="DIR", help="Folder of the files; output/FLIGHT by default."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine, 1 to 1024; by default one for each core.")
+        int | None,
+        typer.Option(help="Processes on this machine, 1 to 1024; by default one for each processor that may be used."),
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler instead, as tcp://host:8786.")
@@ -40,8 +41,8 @@ def fly(
     """Render the pulses of a flight, and write the points and waveforms that its receiver finds.
 
     Writes points.laz, waveforms.las with waveforms.wdp, pictures, and the store flight.zarr of all pulses, and prints
-    the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on.
-    docs/guide/flights.md describes the file.
+    the errors of the points' heights against the truth [cm]. After an interruption, the same command goes on. Failed
+    pulses end it with exit code 1. docs/guide/flights.md describes the file.
     """
     folder = output or OUTPUT / Path(flight).stem
     from mitransient_lidar.campaigns.store import Store
@@ -64,6 +65,7 @@ def fly(
     for path in plot_flight(flown, points, folder):
         typer.echo(path)
     typer.echo("\n".join(describe_points(points)))
+    exit_if_failed(folder / STORE)
 
 
 def _is_of_a_flight(path: Path) -> bool:

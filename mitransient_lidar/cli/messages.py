@@ -6,6 +6,7 @@ import contextlib
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from mitransient_lidar.rendering.passes import Progress
 
-_INVALID_INPUT = 2  # exit code
+_FAILED, _INVALID_INPUT = 1, 2  # exit codes
 _MOST_PIXELS = 12  # listed in the summary
 _REPORT_S = 15.0  # between two lines of progress
 
@@ -94,11 +95,29 @@ def exit_on_error() -> Iterator[None]:
 
 
 def exit_if_interrupted(dataset: xr.Dataset) -> None:
-    """Exit as after an interruption if one ended the render of a result or of a series of shots."""
+    """Exit as after an interruption if one ended the render of a result or of a series of shots, or a fit."""
     if dataset.attrs.get("interrupted"):
-        series = "shot" in dataset.dims
-        done = f"{dataset.sizes['shot']} of the shots" if series else f"{dataset.attrs['passes']} passes"
+        if "shot" in dataset.dims:
+            done = f"{dataset.sizes['shot']} of the shots"
+        elif "renders" in dataset.attrs:
+            done = f"{dataset.attrs['renders']} renders, before the fit has converged"
+        else:
+            done = f"{dataset.attrs['passes']} passes"
         raise KeyboardInterrupt(f"interrupted after {done}; their result is kept.")
+
+
+def exit_if_failed(path: Path) -> None:
+    """Exit with code 1 and a sentence if runs of a campaign or shots of a flight have failed."""
+    import numpy as np
+
+    from mitransient_lidar.campaigns.store import FAILED, Store
+
+    store = Store(path)
+    failed = np.flatnonzero(store.status() == FAILED)
+    if len(failed):
+        first = f"the first, {store.unit} {failed[0]}, so: {store.errors()[failed[0]]}"
+        typer.echo(f"{len(failed)} of {store.count} {store.unit}s failed, {first}", err=True)
+        raise typer.Exit(_FAILED)
 
 
 @contextlib.contextmanager

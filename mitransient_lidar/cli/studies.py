@@ -170,6 +170,7 @@ def shot_statistics(
     write_figure(shots, output, plot_shot_statistics)
     for name, value in study.slope_correlations(shots).items():
         typer.echo(f"correlation of {name} with the slope: {value:+.3f}")
+    exit_if_interrupted(shots)
 
 
 def target_signal(
@@ -210,6 +211,7 @@ def target_signal(
             found = study.target_map(scene, params, x=offsets, y=offsets, progress=progress, **options)
     write_figure(found, output, plot_target_signal if grid == 1 else plot_target_map)
     _print(study.describe_target(found) if grid == 1 else study.describe_map(found))
+    exit_if_interrupted(found)
 
 
 def detect(
@@ -305,6 +307,7 @@ def beam_spread(
     write_figure(found, output, plot_beam_spread)
     if not quiet:
         _print(study.describe_spread(found))
+    exit_if_interrupted(found)
 
 
 def estimate(
@@ -366,6 +369,7 @@ def fov_sweep(
         found = study.fov_sweep(scene, wanted, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_fov_sweep)
     _print(study.describe_fov_sweep(found))
+    exit_if_interrupted(found)
 
 
 def scattering_orders(
@@ -391,6 +395,7 @@ def scattering_orders(
         found = study.scattering_orders(scene, parameters(define), progress=progress, **options)
     write_figure(found, output, plot_scattering_orders)
     _print(study.describe_orders(found))
+    exit_if_interrupted(found)
 
 
 def water(

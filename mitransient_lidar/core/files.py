@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
 import platform
 import re
 import shutil
 import stat
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -19,10 +21,16 @@ from typing import TextIO
 from mitransient_lidar.core.errors import UserError, WriteError, printable
 from mitransient_lidar.core.interruption import DeferredInterrupt
 
-#: Beginning of the names of temporary files and folders; host, process and a unique number follow, which tell leftovers
-#: of processes that were killed from files of running ones.
+#: Beginning of the names of temporary files and folders; host, process space, process and a unique number follow, which
+#: tell leftovers of processes that were killed from files of running ones.
 _PREFIX = ".mitransient-lidar."
-_TEMPORARY = re.compile(re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<process>\d+)\.[0-9a-f]{32}(?P<suffix>\..*)?")
+_TEMPORARY = re.compile(
+    re.escape(_PREFIX) + r"(?P<host>.+)\.(?P<space>[0-9a-f]{12})\.(?P<process>\d+)\.[0-9a-f]{32}(?P<suffix>\..*)?"
+)
+
+#: Time after which a temporary file of another process space that nobody has changed is a leftover [s]. None is open as
+#: long as that; without it, those of a machine that has lost its power would stay for ever.
+_FORGOTTEN_S = 7 * 24 * 3600.0
 
 #: What is not read, besides folders: its end may never come.
 _OTHERS = {stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
@@ -274,29 +282,55 @@ def _kept(path: Path) -> Path | None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed processes of this user and machine have left in a folder: temporary files and folders."""
+    """Remove what killed processes of this user and machine have left in a folder: temporary files and folders.
+
+    Process numbers have a meaning only in their process space: files of others stay until nobody has changed them for a
+    week.
+    """
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             match = _TEMPORARY.fullmatch(entry.name)
-            if match is None or match["host"] != host_name() or _is_running(int(match["process"])):
+            if match is None or match["host"] != _host_name():
                 continue
             with contextlib.suppress(OSError):
-                if entry.stat(follow_symlinks=False).st_uid == os.getuid():
+                found = entry.stat(follow_symlinks=False)
+                if match["space"] == _process_space():
+                    is_left = not _is_running(int(match["process"]))
+                else:
+                    is_left = time.time() - found.st_ctime > _FORGOTTEN_S
+                if is_left and found.st_uid == os.getuid():
                     _remove(Path(entry.path))
 
 
 def temporary_beside(path: Path) -> Path:
     """Return the name of a temporary file or folder beside a path, of the same type."""
-    return path.with_name(f"{_PREFIX}{host_name()}.{os.getpid()}.{uuid.uuid4().hex}{path.suffix}")
+    return path.with_name(f"{temporary_prefix()}{uuid.uuid4().hex}{path.suffix}")
 
 
-def host_name() -> str:
-    """Return the name of this machine, which names of temporary files hold."""
+def temporary_prefix() -> str:
+    """Return the beginning of the names of the temporary files of this process."""
+    return f"{_PREFIX}{_host_name()}.{_process_space()}.{os.getpid()}."
+
+
+def _host_name() -> str:
     return platform.node() or "localhost"
 
 
+def _process_space() -> str:
+    """Return 12 hexadecimal digits of where process numbers have a meaning: a container, since its machine was booted.
+
+    Containers may have the same host name. Where the system has neither, as macOS, the digits are always the same.
+    """
+    found = []
+    with contextlib.suppress(OSError):
+        found.append(Path("/proc/sys/kernel/random/boot_id").read_text())
+    with contextlib.suppress(OSError):
+        found.append(str(os.stat("/proc/self/ns/pid").st_ino))
+    return hashlib.sha256(" ".join(found).encode()).hexdigest()[:12]
+
+
 def _is_running(process: int) -> bool:
-    """Return whether a process of this machine exists."""
+    """Return whether a process of this process space exists."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

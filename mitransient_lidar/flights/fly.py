@@ -43,8 +43,6 @@ def fly(
 ) -> xr.Dataset:
     """Render the pulses of a flight, or those that an interrupted one has left, and write its points and waveforms.
 
-    Scripts call it below ``if __name__ == "__main__":``, since new processes import the script.
-
     Parameters
     ----------
     flight

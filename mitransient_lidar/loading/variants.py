@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.processors import usable_processors
 
 #: Variants that the plugins support, in the order of preference.
 SUPPORTED_VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
@@ -134,6 +135,14 @@ def choose_variant() -> str:
         return "cuda_ad_mono"
     check_llvm()
     return "llvm_ad_mono"
+
+
+def limit_threads() -> None:
+    """Let Dr.Jit use as many threads as this process may use processors: it respects affinity, but not quotas."""
+    import drjit as dr
+
+    if usable_processors() < dr.thread_count():
+        dr.set_thread_count(usable_processors())
 
 
 def set_variant(name: str | None = None) -> str:

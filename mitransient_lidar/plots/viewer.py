@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import os
+import shutil
 import tempfile
+import time
 from pathlib import Path
 
 import xarray as xr
@@ -15,6 +18,7 @@ from mitransient_lidar.plots.drawing import scene_name
 from mitransient_lidar.plots.gate_viewer.page import page_text
 
 _NOTEBOOK_MB = 20.0  # of a page in a notebook, which is stored with it
+_FOLDER, _KEPT_S = "mitransient-lidar-view-", 3600.0  # of temporary pages
 
 
 class View:
@@ -45,19 +49,31 @@ class View:
     def save(self, path: str | os.PathLike[str] | None = None) -> Path:
         """Write the page to a file, by default a new one in the folder for temporary files, and return its path.
 
+        Such files of the same user are removed an hour later by the next call, when their browser has long read them.
+
         Raises
         ------
         UserError
             If the file name does not end in ``.html``, or the file cannot be written.
         """
         if path is None:
-            path = Path(tempfile.mkdtemp(prefix="mitransient-lidar-")) / "view.html"
+            _remove_former_pages()
+            path = Path(tempfile.mkdtemp(prefix=_FOLDER)) / "view.html"
         path = Path(path)
         if path.suffix.lower() != ".html":
             raise UserError(f"cannot write {path}: the file name must end in .html.")
         with replacing(path) as temporary:
             temporary.write_text(self.page, encoding="utf-8")
         return path
+
+
+def _remove_former_pages() -> None:
+    """Remove the folders of temporary pages of this user that are an hour old."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
+        with contextlib.suppress(OSError):
+            found = folder.lstat()
+            if found.st_uid == os.getuid() and time.time() - found.st_mtime > _KEPT_S:
+                shutil.rmtree(folder)
 
 
 def view(

@@ -133,7 +133,7 @@ def fit(
     starts = {**model.starts(start or {}), **(start or {})}
     problem = WaveformFit(found, model, starts, bounds, **options)
     problem.approach(most_renders=most_renders, until=began + limit)
-    if time.perf_counter() - began < limit:
+    if time.perf_counter() - began < limit and not problem.interrupted:
         model.passes = given or _passes(problem.noise_ratio())
         problem.forget()
     fitted = _run(problem, began, limit, most_renders, scale_errors)

@@ -1,7 +1,9 @@
-"""Fixtures of tests in a browser."""
+"""Fixtures of tests in a browser, and of tests of campaigns."""
 
 import pytest
 from browser_page import BROWSER, DRIVER, Page
+from few_paths import few_paths
+from quick_campaign import QUICK
 
 from mitransient_lidar.plots.gate_viewer.page import write_page
 
@@ -35,3 +37,19 @@ def show(browser, tmp_path):
     yield open_page
     assert browser.get_log("browser") == []
     assert browser.execute_script("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """The quick campaign, of a scene with few paths a pass."""
+    return {"scene": str(few_paths("table1", tmp_path_factory.mktemp("scene"))), **QUICK}
+
+
+@pytest.fixture(scope="module")
+def quick(campaign, tmp_path_factory):
+    """Store of the quick campaign, rendered in two shards."""
+    path = tmp_path_factory.mktemp("campaign") / "quick.zarr"
+    from mitransient_lidar.campaigns.sweep import sweep
+
+    sweep(campaign, path, workers=1, shard_size=6)
+    return path

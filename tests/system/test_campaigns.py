@@ -1,5 +1,6 @@
 """Campaigns from their files to data sets: labels, failures, interruption, clusters, and single runs."""
 
+import contextlib
 import json
 import os
 import resource
@@ -15,25 +16,19 @@ import numpy as np
 import pytest
 import significance
 import xarray as xr
+import zarr
 from command_line import assert_refused, run
 from descriptions import assert_described
 from few_paths import few_paths
+from quick_campaign import QUICK, files_of, planned_copy, write_toml
 
 from mitransient_lidar import results
 from mitransient_lidar.campaigns import shard as shards
-from mitransient_lidar.campaigns import sweep as sweeping
+from mitransient_lidar.campaigns import workers
 from mitransient_lidar.campaigns.store import DONE, FAILED, PLANNED, Store, open_campaign
 from mitransient_lidar.campaigns.sweep import render_row, resume, sweep
+from mitransient_lidar.campaigns.versions import FILES, check_versions
 from mitransient_lidar.core.errors import UserError
-
-#: Runs that take a tenth of a second each.
-QUICK = {
-    "target_error": 0.3,
-    "keep": ["waveform", "truth"],
-    "fixed": {"spectrum": "flat", "layout": "1x1", "time_start_ns": 1380, "bin_count": 160},
-    "parameters": {"bottom_depth": {"low": 2.0, "high": 9.0}, "bottom_reflectance": "0.02 * bottom_depth"},
-    "design": {"kind": "sobol", "count": 12, "seed": 4},
-}
 
 FULL = {
     "target_error": 0.6,
@@ -51,48 +46,6 @@ TABLE = """attenuation,target_depth,wind_speed
 0.3,5,-6
 0.35,5.5,6
 """
-
-
-def write_toml(path, campaign):
-    """Write a campaign as TOML, whose values are those of JSON but for tables."""
-
-    def text(value):
-        if isinstance(value, dict):
-            return "{ " + ", ".join(f"{key} = {text(one)}" for key, one in value.items()) + " }"
-        return json.dumps(value)
-
-    sections = {name: value for name, value in campaign.items() if isinstance(value, dict)}
-    lines = [f"{name} = {text(value)}" for name, value in campaign.items() if name not in sections]
-    for name, section in sections.items():
-        lines += [f"[{name}]", *(f"{key} = {text(value)}" for key, value in section.items())]
-    path.write_text("\n".join(lines))
-    return path
-
-
-def files_of(store):
-    """Return the contents of the files of a store by name."""
-    return {path.relative_to(store): path.read_bytes() for path in Path(store).rglob("*") if path.is_file()}
-
-
-@pytest.fixture(scope="module")
-def campaign(tmp_path_factory):
-    """The quick campaign, of a scene with few paths a pass."""
-    return {"scene": str(few_paths("table1", tmp_path_factory.mktemp("scene"))), **QUICK}
-
-
-def planned_copy(store, path):
-    """Copy a store, without the status of its runs."""
-    shutil.copytree(store, path)
-    shutil.rmtree(path / "status" / "c")
-    return path
-
-
-@pytest.fixture(scope="module")
-def quick(campaign, tmp_path_factory):
-    """Store of the quick campaign, rendered in two shards."""
-    path = tmp_path_factory.mktemp("campaign") / "quick.zarr"
-    sweep(campaign, path, workers=1, shard_size=6)
-    return path
 
 
 @pytest.mark.long
@@ -233,89 +186,6 @@ def shard_processes(mark):
     return found
 
 
-SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-
-
-@pytest.fixture
-def scheduler(tmp_path):
-    """Dask scheduler in a process of its own: this process, and the file with its address."""
-    file = tmp_path / "scheduler.json"
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1"]
-    with subprocess.Popen([*command, "--no-dashboard", "--scheduler-file", str(file)], **SILENT) as process:
-        while not (file.exists() and file.read_text().endswith("}")):
-            time.sleep(0.1)
-        yield process, file
-        process.kill()
-
-
-@pytest.mark.long
-def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
-    """A scheduler and two workers as on a cluster; one is killed while it renders."""
-    _, file = scheduler
-    path = tmp_path / "cluster.zarr"
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
-    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
-    workers = [subprocess.Popen(command, **SILENT) for _ in range(2)]
-    try:
-        seen = []
-
-        def watch(state):
-            seen.append(state.done)
-            if state.done >= 2 and workers[0].poll() is None:
-                os.killpg(workers[0].pid, signal.SIGKILL)
-
-        address = json.loads(file.read_text())["address"]
-        data = sweep(campaign, path, scheduler=address, shard_size=2, progress=watch)
-        assert workers[0].wait(10) == -signal.SIGKILL
-        assert (data["status"] == DONE).all()
-        assert seen[-1] == 12
-        alone = sweep(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
-        assert files_of(path) == files_of(tmp_path / "alone.zarr")
-        assert np.array_equal(data["waveform"], alone["waveform"])
-    finally:
-        for worker in workers:
-            if worker.poll() is None:
-                os.killpg(worker.pid, signal.SIGKILL)
-            worker.wait()
-
-
-@pytest.mark.slow
-def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
-    process, file = scheduler
-    path = planned_copy(quick, tmp_path / "lost.zarr")
-    address = json.loads(file.read_text())["address"]
-    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--scheduler", address]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as client:
-        assert "the scheduler has no workers: the campaign waits" in client.stderr.readline()
-        process.kill()
-        _, told = client.communicate(timeout=60)
-    assert client.returncode == 2
-    # Where the loss is noticed late, progress is told before.
-    told = [line for line in told.splitlines() if not line.startswith("run 0/")]
-    assert told == ["the scheduler was lost: what is written is kept, and the same command goes on"]
-
-
-@pytest.mark.slow
-def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
-    """Any call may notice first that the scheduler is lost; an error with a scheduler that is there is another one."""
-    from distributed import Client
-
-    path = planned_copy(quick, tmp_path / "lost.zarr")
-
-    def times_out():
-        raise OSError("Timed out trying to connect")
-
-    with Client(json.loads(scheduler[1].read_text())["address"], set_as_default=False) as client:
-        monkeypatch.setattr(client, "nthreads", times_out)
-        with pytest.raises(OSError, match="Timed out trying to connect"):
-            resume(path, scheduler=client)
-        monkeypatch.setattr(client, "status", "connecting")
-        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
-            resume(path, scheduler=client)
-        monkeypatch.undo()
-    assert (Store(path).status() == PLANNED).all()
-
-
 @pytest.mark.long
 def test_interruption_keeps_what_is_written(campaign, tmp_path):
     path, file = tmp_path / "out.zarr", write_toml(tmp_path / "quick.toml", campaign)
@@ -328,9 +198,95 @@ def test_interruption_keeps_what_is_written(campaign, tmp_path):
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert told.splitlines()[-1].startswith("interrupted after ")
+    done = np.count_nonzero(Store(path).status() == DONE)
+    text = f"interrupted after {done} of 12 runs, which are kept; the same command goes on."
+    assert told.splitlines()[-1] == text
     assert "Traceback" not in told
-    assert 0 < np.count_nonzero(Store(path).status() == DONE) < 12
+    assert 0 < done < 12
+
+
+#: No new process imports this script, so that it needs no condition. Ctrl-C comes when three runs are done.
+SCRIPT = """
+import json, os, signal, sys
+import mitransient_lidar
+signal.signal(signal.SIGINT, signal.default_int_handler)
+pressed = []
+def watch(state):
+    if state.done >= 3 and not pressed:
+        pressed.append(state.done)
+        os.kill(os.getpid(), signal.SIGINT)
+try:
+    mitransient_lidar.sweep(json.loads(sys.argv[1]), sys.argv[2], workers=1, shard_size=500, progress=watch)
+except KeyboardInterrupt as error:
+    print(pressed[0], error)
+"""
+
+
+@pytest.mark.long
+def test_a_script_without_a_main_guard_that_is_interrupted_keeps_runs_of_its_shard(campaign, tmp_path):
+    """It once ended in 193 lines of tracebacks; and what a process had rendered in the last minute was lost."""
+    path, script = tmp_path / "out.zarr", tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    many = {**campaign, "design": {**campaign["design"], "count": 500}}
+    done = subprocess.run(
+        [sys.executable, str(script), json.dumps(many), str(path)], capture_output=True, text=True, check=True
+    )
+    told, text = done.stdout.split(maxsplit=1)
+    kept = np.count_nonzero(Store(path).status() == DONE)
+    assert text == f"interrupted after {kept} of 500 runs, which are kept; the same command goes on.\n"
+    assert int(told) <= kept < 500
+    assert done.stderr == ""
+
+
+@pytest.mark.slow
+def test_failed_runs_end_with_exit_code_1(quick, tmp_path):
+    path = tmp_path / "failed.zarr"
+    shutil.copytree(quick, path)
+    store = Store(path)
+    store.array("status")[2:4] = np.array([FAILED, FAILED], dtype=np.uint8)
+    store.array("error")[2:4] = np.array(["wind_speed = -6 is too small", "another reason"])
+    out = run("sweep", path, "-q")
+    assert out.exit_code == 1
+    assert out.stderr == "2 of 12 runs failed, the first, run 2, so: wind_speed = -6 is too small\n"
+    assert out.stdout == f"{path}\n"
+    assert run("sweep", quick, "-q").exit_code == 0
+
+
+@pytest.mark.slow
+def test_a_store_of_other_versions_is_not_completed(quick, tmp_path, caplog):
+    path = planned_copy(quick, tmp_path / "older.zarr")
+    group = zarr.open_group(path, mode="r+")
+    now = group.attrs["versions"]
+    group.attrs["versions"] = {**now, "mitsuba": "3.9.0"}
+    text = r"older\.zarr was begun by other versions, and here is mitsuba 3\.9\.1 instead of 3\.9\.0: install those"
+    with pytest.raises(UserError, match=text):
+        resume(path, workers=1)
+    # Stores of version 0.2 have less.
+    del group.attrs["versions"]
+    group.attrs["drjit_version"] = "1.4.0"
+    with pytest.raises(UserError, match=r"drjit 1\.5\.0 instead of 1\.4\.0"):
+        resume(path, workers=1)
+    assert (Store(path).status() == PLANNED).all()
+    check_versions(path, {"versions": {**now, FILES: "0123456789ab"}})
+    assert "files of this package have changed since" in caplog.text
+
+
+@pytest.mark.long
+def test_nothing_listens_on_a_port(quick, tmp_path):
+    """Any user of the machine could once run code through the scheduler of a campaign."""
+    psutil = pytest.importorskip("psutil")
+    path, seen = planned_copy(quick, tmp_path / "closed.zarr"), []
+
+    def watch(state):
+        here = psutil.Process()
+        for process in (here, *here.children(recursive=True)):
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
+                seen.append([one for one in process.net_connections("inet") if one.status == psutil.CONN_LISTEN])
+
+    before = [one for one in psutil.Process().net_connections("inet") if one.status == psutil.CONN_LISTEN]
+    resume(path, workers=2, progress=watch)
+    assert len(seen) > 2
+    assert all(one in ([], before) for one in seen)
 
 
 @pytest.mark.slow
@@ -368,15 +324,6 @@ def test_invalid_use_leaves_nothing(campaign, quick, tmp_path):
     assert_refused(run("sweep", same, "-o", quick, "--shard-size", 5, "-q"), "shard_size = 5 must be that of", "6")
     assert files_of(quick) == before
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
-
-
-@pytest.mark.long
-def test_scheduler_that_does_not_answer(campaign, tmp_path):
-    """A quarter of a minute passes until it is given up."""
-    out, file = tmp_path / "out.zarr", write_toml(tmp_path / "campaign.toml", campaign)
-    done = run("sweep", file, "-o", out, "--scheduler", "tcp://127.0.0.1:9", "-q")
-    assert_refused(done, "scheduler = 'tcp://127.0.0.1:9' cannot be reached")
-    assert not out.exists()
 
 
 @pytest.mark.long
@@ -441,31 +388,12 @@ def test_shards_that_cannot_be_rendered_are_left(quick, tmp_path, monkeypatch):
     def render(path, shard, *rest):
         return shards.Outcome(0, 0, "shard 0: lost") if shard == 0 else original(path, shard, *rest)
 
-    from distributed import Client, LocalCluster
-
-    with LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster, Client(cluster) as client:
-        monkeypatch.setattr(sweeping, "render_in_process", render)
-        with pytest.raises(
-            UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.zarr\.log"
-        ):
-            resume(path, scheduler=client)
+    monkeypatch.setattr(workers, "render_in_process", render)
+    with pytest.raises(
+        UserError, match=r"1 of 2 shards are not complete, the first for shard 0: lost; .*left\.zarr\.log"
+    ):
+        resume(path, workers=1)
     assert Store(path).status().tolist() == [PLANNED] * 6 + [DONE] * 6
-
-
-@pytest.mark.long
-def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
-    """The campaign once waited for ever."""
-    path = planned_copy(quick, tmp_path / "unreachable.zarr")
-    nowhere = "tcp://127.0.0.1:9"
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
-    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
-    with subprocess.Popen(
-        [*command, "--listen-address", "tcp://127.0.0.1:0", "--contact-address", nowhere], **SILENT
-    ) as worker:
-        address = json.loads(scheduler[1].read_text())["address"]
-        with pytest.raises(UserError, match=r"cannot reach its worker at tcp://127\.0\.0\.1:9"):
-            resume(path, scheduler=address)
-        worker.kill()
 
 
 @pytest.mark.long

@@ -139,3 +139,41 @@ def test_a_full_disk_leaves_the_former_files(tmp_path, limit, file):
     assert "Traceback" not in stderr
     assert names(tmp_path) == ["table1.exr"]
     assert (tmp_path / "table1.exr").read_text() == "old"
+
+
+#: The command line, with a signal when the command has ended and the process has not.
+LATE = """
+import atexit, os, signal, sys
+number = int(sys.argv.pop(1))
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+atexit.register(lambda: os.kill(os.getpid(), number))
+from mitransient_lidar.cli import app
+app.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_after_the_last_file_ends_as_any_other(number, code):
+    """Ctrl-C once gave a traceback and exit code 0."""
+    process = start(LATE, int(number), "scenes", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    stdout, stderr = process.communicate(timeout=240)
+    assert (process.returncode, stderr) == (code, "")
+    assert "table1" in stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_a_render_with_closed_streams_writes_its_files_and_nothing_into_them(tmp_path, closed):
+    """It once wrote nothing, with exit code 2; files took the number of stderr, which libraries write to."""
+    arguments = [*RENDER, "--passes", "2", "-D", "surface_size=60", "-D", "surface_cell_size=0.5", "-o", str(tmp_path)]
+    command = f'"$@" {closed}'
+    done = subprocess.run(
+        ["sh", "-c", command, "sh", sys.executable, "-m", "mitransient_lidar", *arguments],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert names(tmp_path) == FILES
+    assert mitransient_lidar.open(tmp_path / "table1.nc").attrs["passes"] == 2
+    assert mitransient_lidar.open(tmp_path / "table1.exr").attrs["passes"] == 2

@@ -97,18 +97,19 @@ class WaveformFit:
         free_parameters({**starts, **later}, early)
         self.renders = 0
         self._kept: dict[tuple[float, ...], Prediction] = {}
+        self._former: tuple[dict[tuple[float, ...], Prediction], _Rendered | None] = {}, None
         self.units: dict[str, str] = {}
         # The last accepted step that was rendered, and why others were not tried.
         self._rendered: _Rendered | None = None
-        self._refusal, self._exhausted = "", False
+        self._refusal, self._exhausted, self.interrupted = "", False, False
         aligned = self._align({name: float(value) for name, value in starts.items()})
         self.free = free_parameters(aligned, bounds)
         self.values = aligned
 
     def forget(self) -> None:
-        """Forget the renders so far, after a change of the model."""
-        self._kept.clear()
-        self._rendered = None
+        """Forget the renders so far, after a change of the model; an interruption of the first one brings them back."""
+        self._former = self._kept, self._rendered
+        self._kept, self._rendered = {}, None
 
     def approach(self, *, most_renders: int = 60, until: float = math.inf) -> None:
         """Move `values` from the starts towards the solution, which `run` begins from, by a model that may be coarse.
@@ -169,8 +170,8 @@ class WaveformFit:
             ``measured``, ``measured_stderr``, ``fitted``, ``fitted_stderr`` (Monte Carlo of the model), ``residual`` in
             standard deviations of both, and ``used`` (1 for samples that were fitted). Attributes: ``chi_squared``,
             its mean ``expected`` and ``freedom`` (for errors that neighbours share, too), ``probability`` of a larger
-            one, ``renders``, ``rounds``, ``converged``, and ``messages``, sentences on what the waveforms do not
-            determine.
+            one, ``renders``, ``rounds``, ``converged``, ``interrupted`` (1 after Ctrl-C), and ``messages``, sentences
+            on what the waveforms do not determine.
         """
         self._limit, self._until = integer("most_renders", most_renders, 2, 10_000), until
         self._rendered, self._exhausted = None, False
@@ -184,7 +185,7 @@ class WaveformFit:
             errors = self._errors(values, used, scale_errors)
             change = np.array([values[name] - former[name] for name in values])
             settled = bool(np.all(np.abs(change) <= _SETTLED * np.nan_to_num(errors.stderr, nan=np.inf)))
-        return self._dataset(values, used, errors, rounds, settled and not self._exhausted)
+        return self._dataset(values, used, errors, rounds, settled and not (self._exhausted or self.interrupted))
 
     def _solution(
         self, values: Mapping[str, float], misfit: Misfit, used: BoolArray, tolerance: float = _TOLERANCE
@@ -222,7 +223,16 @@ class WaveformFit:
             near = self._rendered.prediction
             steps = [values[name] - self._rendered.values[name] for name in self.names]
             return near._replace(mean=near.mean + np.tensordot(steps, near.derivative, 1))
-        dataset = self.model(dict(zip(self.names, key, strict=True)))
+        try:
+            if self.interrupted:
+                raise KeyboardInterrupt
+            dataset = self.model(dict(zip(self.names, key, strict=True)))
+        except KeyboardInterrupt:
+            self.interrupted = True
+            if not self._kept and self._former[0]:
+                (self._kept, self._rendered), self._former = self._former, ({}, None)
+                return self._prediction(values)
+            raise
         self.renders += 1
         # A step that is refused leads back to the values before it.
         self._kept = dict([*self._kept.items()][-1:]) | {key: predict(self.found, dataset, self.names)}
@@ -249,8 +259,8 @@ class WaveformFit:
 
     @property
     def _is_over(self) -> bool:
-        """Whether there is neither time nor a number left for another render."""
-        return self.renders >= self._limit or time.perf_counter() >= self._until
+        """Whether there is neither time nor a number left for another render, or one was interrupted."""
+        return self.interrupted or self.renders >= self._limit or time.perf_counter() >= self._until
 
     def _key(self, values: Mapping[str, float]) -> tuple[float, ...]:
         """Return the values of the parameters of the model that are rendered."""
@@ -266,7 +276,7 @@ class WaveformFit:
         scale, times = values.get(SCALE, 1.0), self._model_times(values)
         mean, slopes = (self._resampled(values, array) for array in (model.mean, model.derivative))
         by_model, noise = (
-            None if variance is None else _interpolated(times, model.time_ns, variance)
+            None if variance is None else model.interpolated(times, variance)
             for variance in (model.model_variance, model.noise_variance)
         )
         assert by_model is not None
@@ -350,6 +360,10 @@ class WaveformFit:
         except UserError as error:
             self._refusal = str(error)
             return unknown
+        except KeyboardInterrupt:
+            # What was rendered before is what is left.
+            self._exhausted = True
+            return unknown
         return np.asarray(misfit.of(mean, np.nan_to_num(self.found.values))[used])
 
     def _jacobian(self, x: FloatArray, misfit: Misfit, used: BoolArray) -> FloatArray:
@@ -392,13 +406,7 @@ class WaveformFit:
             starts[TIME_OFFSET] = best_offset(self.found.time_ns, values, self._prediction(starts))
         if SCALE in self.nuisances and SCALE not in starts:
             mean, _, _, noise = self._at({**starts, SCALE: 1.0})
-            weight = np.where(np.isfinite(self.found.values), 1.0, 0.0)
-            if noise is not None:
-                weight = np.divide(weight, noise, out=np.zeros_like(mean), where=noise > 0)
-            scale = float(np.sum(weight * mean * values)) / max(float(np.sum(weight * mean**2)), 1e-300)
-            if not scale > 0:
-                raise UserError("the waveforms have no light where the scene has: they must rise with the light")
-            starts[SCALE] = scale
+            starts[SCALE] = self.found.best_scale(mean, noise)
         return starts
 
     def _errors(self, values: Mapping[str, float], used: BoolArray, scale_errors: bool) -> Errors:
@@ -485,11 +493,7 @@ class WaveformFit:
                 "renders": self.renders,
                 "rounds": rounds,
                 "converged": int(converged),
+                "interrupted": int(self.interrupted),
                 "messages": messages,
             },
         )
-
-
-def _interpolated(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
-    """Return rows of values at other times, linear between the known ones, and 0 outside."""
-    return np.array([np.interp(times, known, row, left=0.0, right=0.0) for row in values])

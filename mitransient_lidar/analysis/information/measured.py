@@ -90,6 +90,22 @@ class Measured:
         array = np.reshape(values, self.template.shape)
         return self.template.copy(data=array).assign_attrs({"units": unit, "long_name": name})
 
+    def best_scale(self, mean: FloatArray, noise: FloatArray | None) -> float:
+        """Return the scale of the samples of a model, of the same shape, by least squares with variances `noise`.
+
+        Raises
+        ------
+        UserError
+            If the waveforms have no light where the model has.
+        """
+        weight = np.where(np.isfinite(self.values), 1.0, 0.0)
+        if noise is not None:
+            weight = np.divide(weight, noise, out=np.zeros_like(mean), where=noise > 0)
+        scale = float(np.sum(weight * mean * np.nan_to_num(self.values))) / max(float(np.sum(weight * mean**2)), 1e-300)
+        if not scale > 0:
+            raise UserError("the waveforms have no light where the scene has: they must rise with the light")
+        return scale
+
 
 class Prediction(NamedTuple):
     """Samples of a model, at its own times."""
@@ -102,6 +118,10 @@ class Prediction(NamedTuple):
     valid: npt.NDArray[np.bool_]  #: Samples that are not saturated, shape (pixel, time).
     correlation: FloatArray  #: Of the Monte Carlo errors by the distance in samples, shape (lags,).
     batches: FloatArray | None  #: Deviations by batches of passes, shape (batch, pixel, time); see `batch_deviations`.
+
+    def interpolated(self, times: FloatArray, values: FloatArray) -> FloatArray:
+        """Return rows of values, shape (pixel, time), at other times: linear between its own ones, and 0 outside."""
+        return np.array([np.interp(times, self.time_ns, row, left=0.0, right=0.0) for row in values])
 
 
 class Misfit(NamedTuple):

@@ -7,7 +7,6 @@ Powers are means over time bins; before and after a record there is only the bac
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -18,6 +17,7 @@ import numpy.typing as npt
 
 from mitransient_lidar.core.constants import ELEMENTARY_CHARGE
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.processors import usable_processors
 from mitransient_lidar.core.validation import FloatArray, integer, non_negative_array, positive
 from mitransient_lidar.physics.receiver.detectors import (
     Detector,
@@ -179,7 +179,7 @@ class ReceiverChain:
                 charge = self.detector.sample(self.events(shifted, bin_width_ns, sky[own[1]]), part, 1, random)[0]
             record.signal[own], record.saturated[own] = self._process(charge, bin_width_ns, sky[own[1]], random)
 
-        with ThreadPoolExecutor(min(len(blocks), os.cpu_count() or 1, 8)) as pool:
+        with ThreadPoolExecutor(min(len(blocks), usable_processors(), 8)) as pool:
             for _ in pool.map(draw, range(len(blocks))):
                 pass
         whole = number, *np.shape(power)[:-1], shape[-1]

@@ -18,11 +18,11 @@ from mitransient_lidar.campaigns.store import (
     FAILED,
     PLANNED,
     Store,
-    describe_campaign,
     open_campaign,
     reporting_damage,
     seal,
 )
+from mitransient_lidar.campaigns.sweep import describe_campaign
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.loading.scenes import load_scene

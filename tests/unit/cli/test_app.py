@@ -13,6 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import rich.console
+import xarray as xr
 from command_line import assert_refused, run
 
 from mitransient_lidar import __version__, results
@@ -140,6 +141,28 @@ def test_interrupted_render_is_kept(scene, calls, tmp_path):
     assert "interrupted after 4 passes" in result.stderr
     assert len(result.stdout.splitlines()) == 4
     assert results.open(tmp_path / "fig09.nc").attrs["interrupted"] == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "describe"),
+    [
+        ("target-signal", "describe_target"),
+        ("beam-spread", "describe_spread"),
+        ("fov-sweep", "describe_fov_sweep"),
+        ("scattering-orders", "describe_orders"),
+    ],
+)
+def test_interrupted_studies_end_with_the_exit_code_of_the_signal(command, describe, monkeypatch, tmp_path):
+    """Their drawings are of the passes until then; the exit code was once 0."""
+    name = command.replace("-", "_")
+    study = f"mitransient_lidar.studies.{name}"
+    interrupted = xr.Dataset(attrs={"interrupted": 1, "passes": 3})
+    monkeypatch.setattr(f"{study}.{name}", lambda *_, **__: interrupted)
+    monkeypatch.setattr(f"{study}.{describe}", lambda _: ["lines"])
+    monkeypatch.setattr("mitransient_lidar.cli.studies.write_figure", lambda *_: None)
+    depths = ["--depths", "3"] if command == "beam-spread" else []
+    done = run(command, "table1", *depths, "-o", tmp_path / "out.png", "-q")
+    assert (done.exit_code, done.stderr) == (130, "interrupted after 3 passes; their result is kept.\n")
 
 
 def test_interruption_elsewhere_leaves_nothing(scene, calls, tmp_path):

@@ -123,7 +123,13 @@ def dead():
     """Beginning of the names of the temporary files of a process that has ended."""
     process = subprocess.Popen(["true"])
     process.wait()
-    return f".mitransient-lidar.{files.host_name()}.{process.pid}"
+    return name_of(process.pid)
+
+
+def name_of(process, space=None):
+    """Return the beginning of the names of the temporary files of a process, of this process space by default."""
+    host, own, _ = files.temporary_prefix().removesuffix(".").rsplit(".", 2)
+    return f"{host}.{space or own}.{process}"
 
 
 def test_leftovers_of_a_dead_process_are_removed(tmp_path, dead):
@@ -225,13 +231,62 @@ def test_an_interruption_before_a_render_acts_at_once(tmp_path, default_ctrl_c):
 
 
 def test_files_of_running_processes_and_other_machines_stay(tmp_path):
-    here, number = files.host_name(), "0" * 32
-    names = [f".mitransient-lidar.{here}.{os.getppid()}.{number}.nc", f".mitransient-lidar.elsewhere.1.{number}.nc"]
+    number = "0" * 32
+    names = [f"{name_of(os.getppid())}.{number}.nc", f".mitransient-lidar.elsewhere.{'0' * 12}.1.{number}.nc"]
     names += [".mitransient-lidar.nc", ".hidden.nc"]
     for name in names:
         (tmp_path / name).write_text("theirs")
     write(tmp_path, "a")
     assert contents(tmp_path) == {"a": "new"} | dict.fromkeys(names, "theirs")
+
+
+def test_leftovers_of_another_container_stay_for_a_week(tmp_path, dead, monkeypatch):
+    """Its host may have the same name, and the number of a process that runs there may be of none here."""
+    name = f"{name_of(dead.rsplit('.', 1)[1], space='0' * 12)}.{'a' * 32}.nc"
+    (tmp_path / name).write_text("theirs")
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {name: "theirs", "c": "new"}
+    now = files.time.time()
+    monkeypatch.setattr(files.time, "time", lambda: now + 8 * 24 * 3600)
+    write(tmp_path, "c")
+    assert contents(tmp_path) == {"c": "new"}
+
+
+#: Runs a command where it has the process number 1, as in a container.
+CONTAINER = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--mount-proc"]
+
+#: Writes a file beside another one, into a folder, while a line is awaited.
+SLOW = """
+import sys
+from pathlib import Path
+from mitransient_lidar.core.files import replacing
+with replacing(Path(sys.argv[1]) / "slow") as temporary:
+    temporary.write_text("theirs")
+    print(temporary.name, flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    subprocess.run([*CONTAINER, "true"], check=False, capture_output=True).returncode != 0, reason="no containers here"
+)
+def test_a_file_that_another_container_writes_stays(tmp_path):
+    """Here 1 is another process than there; a second container has none of the number of the first one's."""
+    command = [sys.executable, "-c", SLOW, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    # A shell that does not replace itself gives the writer the number 2.
+    with subprocess.Popen([*CONTAINER, "sh", "-c", '"$@"; exit $?', "sh", *command], **pipes) as first:
+        name = first.stdout.readline().strip()
+        assert ".2." in name
+        other = "from mitransient_lidar.core.files import sweep; import sys; from pathlib import Path; "
+        done = subprocess.run([*CONTAINER, sys.executable, "-c", f"{other}sweep(Path(sys.argv[1]))", str(tmp_path)])
+        assert done.returncode == 0
+        write(tmp_path, "c")
+        assert name in contents(tmp_path)
+        first.communicate("\n")
+    assert first.returncode == 0
+    assert contents(tmp_path) == {"slow": "theirs", "c": "new"}
 
 
 def test_a_full_disk_names_the_file_and_not_the_temporary_one(tmp_path):

@@ -356,6 +356,36 @@ def test_few_renders_end_without_convergence():
     assert fitted.attrs["messages"][0] == "the fit has not converged in 3 renders"
 
 
+@pytest.mark.parametrize("complete", [0, 1, 2, 3, 4])
+def test_an_interrupted_fit_has_its_last_step(complete):
+    """Ctrl-C in the render after so many, of an approach with a coarse model and of the fit that follows it."""
+    renders = []
+
+    def model(values):
+        if len(renders) == complete:
+            raise KeyboardInterrupt
+        renders.append(values)
+        return closed_form(values)
+
+    def interrupted():
+        problem = WaveformFit(measured(closed_form(TRUTH), noise=0.002), model, WRONG)
+        problem.approach()
+        if not problem.interrupted:
+            problem.forget()
+        return problem.run()
+
+    if complete == 0:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+        return
+    fitted = interrupted()
+    assert (fitted.attrs["interrupted"], fitted.attrs["converged"], fitted.attrs["renders"]) == (1, 0, complete)
+    assert fitted.attrs["messages"][0].startswith("the fit has not converged in ")
+    assert np.isfinite(fitted.attrs["chi_squared"])
+    if complete == 4:
+        np.testing.assert_allclose(fitted["value"], list(TRUTH.values()), rtol=0.1)
+
+
 def test_some_pixels_are_fitted_by_their_names():
     data = noisy(0.002, np.random.default_rng(7), pixels=("a", "b", "c")).isel(pixel=[2, 0])
 

@@ -1,0 +1,226 @@
+"""Campaigns on a Dask cluster: workers and schedulers that go, do not answer, or are of other versions."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from command_line import assert_refused, run
+from quick_campaign import files_of, planned_copy, write_toml
+
+from mitransient_lidar._version import __version__
+from mitransient_lidar.campaigns import shard as shards
+from mitransient_lidar.campaigns.store import DONE, PLANNED, Store
+from mitransient_lidar.campaigns.sweep import resume, sweep
+from mitransient_lidar.campaigns.versions import own_versions
+from mitransient_lidar.core.errors import UserError
+
+SILENT = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+
+
+@pytest.fixture
+def scheduler(tmp_path, request):
+    """Dask scheduler in a process of its own: this process, and the file with its address."""
+    file = tmp_path / "scheduler.json"
+    code = f"{getattr(request, 'param', 'import sys')}; from distributed.cli.dask_scheduler import main; main()"
+    command = [sys.executable, "-c", code, "--port", "0", "--host", "127.0.0.1"]
+    with subprocess.Popen([*command, "--no-dashboard", "--scheduler-file", str(file)], **SILENT) as process:
+        while not (file.exists() and file.read_text().endswith("}")):
+            time.sleep(0.1)
+        yield process, file
+        process.kill()
+
+
+@pytest.mark.long
+def test_cluster_that_loses_a_worker(campaign, tmp_path, scheduler):
+    """A scheduler and two workers as on a cluster; one is killed while it renders."""
+    _, file = scheduler
+    path = tmp_path / "cluster.zarr"
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
+    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
+    nodes = [subprocess.Popen(command, **SILENT) for _ in range(2)]
+    try:
+        seen = []
+
+        def watch(state):
+            seen.append(state.done)
+            if state.done >= 2 and nodes[0].poll() is None:
+                os.killpg(nodes[0].pid, signal.SIGKILL)
+
+        address = json.loads(file.read_text())["address"]
+        data = sweep(campaign, path, scheduler=address, shard_size=2, progress=watch)
+        assert nodes[0].wait(10) == -signal.SIGKILL
+        assert (data["status"] == DONE).all()
+        assert seen[-1] == 12
+        alone = sweep(campaign, tmp_path / "alone.zarr", workers=1, shard_size=2)
+        assert files_of(path) == files_of(tmp_path / "alone.zarr")
+        assert np.array_equal(data["waveform"], alone["waveform"])
+    finally:
+        for worker in nodes:
+            if worker.poll() is None:
+                os.killpg(worker.pid, signal.SIGKILL)
+            worker.wait()
+
+
+@pytest.mark.slow
+def test_scheduler_that_is_lost(quick, tmp_path, scheduler):
+    process, file = scheduler
+    path = planned_copy(quick, tmp_path / "lost.zarr")
+    address = json.loads(file.read_text())["address"]
+    command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(path), "--scheduler", address]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as client:
+        assert "the scheduler has no workers: the campaign waits" in client.stderr.readline()
+        process.kill()
+        _, told = client.communicate(timeout=60)
+    assert client.returncode == 2
+    # Where the loss is noticed late, progress is told before.
+    told = [line for line in told.splitlines() if not line.startswith("run 0/")]
+    assert told == ["the scheduler was lost: what is written is kept, and the same command goes on"]
+
+
+@pytest.mark.slow
+def test_connections_that_time_out(quick, tmp_path, scheduler, monkeypatch):
+    """Any call may notice first that the scheduler is lost; an error with a scheduler that is there is another one."""
+    from distributed import Client
+
+    path = planned_copy(quick, tmp_path / "lost.zarr")
+
+    def times_out():
+        raise OSError("Timed out trying to connect")
+
+    with Client(json.loads(scheduler[1].read_text())["address"], set_as_default=False) as client:
+        monkeypatch.setattr(client, "nthreads", times_out)
+        with pytest.raises(OSError, match="Timed out trying to connect"):
+            resume(path, scheduler=client)
+        monkeypatch.setattr(client, "status", "connecting")
+        with pytest.raises(UserError, match="the scheduler was lost: what is written is kept"):
+            resume(path, scheduler=client)
+        monkeypatch.undo()
+    assert (Store(path).status() == PLANNED).all()
+
+
+@pytest.mark.long
+def test_scheduler_that_does_not_answer(campaign, tmp_path):
+    """A quarter of a minute passes until it is given up."""
+    out, file = tmp_path / "out.zarr", write_toml(tmp_path / "campaign.toml", campaign)
+    done = run("sweep", file, "-o", out, "--scheduler", "tcp://127.0.0.1:9", "-q")
+    assert_refused(done, "scheduler = 'tcp://127.0.0.1:9' cannot be reached")
+    assert not out.exists()
+
+
+@pytest.mark.long
+def test_a_worker_that_the_scheduler_cannot_reach(quick, tmp_path, scheduler):
+    """The campaign once waited for ever."""
+    path = planned_copy(quick, tmp_path / "unreachable.zarr")
+    nowhere = "tcp://127.0.0.1:9"
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
+    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
+    with subprocess.Popen(
+        [*command, "--listen-address", "tcp://127.0.0.1:0", "--contact-address", nowhere], **SILENT
+    ) as worker:
+        address = json.loads(scheduler[1].read_text())["address"]
+        with pytest.raises(UserError, match=r"cannot reach its worker at tcp://127\.0\.0\.1:9"):
+            resume(path, scheduler=address)
+        worker.kill()
+
+
+#: A worker with another version, and one of a release whose workers do not know their versions.
+OTHERS = {
+    "0.1.9": (
+        "from mitransient_lidar import _version; _version.__version__ = '0.1.9'",
+        f"mitransient-lidar 0.1.9 instead of {__version__}",
+    ),
+    "unknown": (
+        "from mitransient_lidar.campaigns import workers, versions; del versions.own_versions",
+        "other files of mitransient-lidar",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OTHERS)
+def test_workers_of_other_versions_are_refused(quick, tmp_path, scheduler, kind):
+    """Half of a store once had the numbers of another version."""
+    path = planned_copy(quick, tmp_path / "other.zarr")
+    code = f"{OTHERS[kind][0]}; from distributed.cli.dask_worker import main; main()"
+    command = [sys.executable, "-c", code, "--scheduler-file", str(scheduler[1]), "--nthreads", "1", "--no-nanny"]
+    with subprocess.Popen([*command, "--no-dashboard", "--local-directory", str(tmp_path)], **SILENT) as worker:
+        text = rf"the worker at tcp://127\.0\.0\.1:\d+ has {re.escape(OTHERS[kind][1])}: all that"
+        try:
+            with pytest.raises(UserError, match=text):
+                resume(path, scheduler=json.loads(scheduler[1].read_text())["address"])
+        finally:
+            worker.kill()
+    assert (Store(path).status() == PLANNED).all()
+
+
+@pytest.mark.slow
+def test_the_process_of_a_shard_compares_versions_too(quick, tmp_path):
+    """Workers may join later, and files may change while a worker runs."""
+    path = planned_copy(quick, tmp_path / "other.zarr")
+    processes = shards.Processes({**own_versions(), "drjit": "1.4.9"}, "the worker at tcp://a:1")
+    with pytest.raises(UserError, match=r"the worker at tcp://a:1 has drjit 1\.5\.0 instead of 1\.4\.9: all that"):
+        shards.render_in_process(str(path), 0, processes=processes)
+    assert (Store(path).status() == PLANNED).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scheduler", ["import sys; sys.modules['mitransient_lidar'] = None"], indirect=True)
+def test_a_scheduler_without_the_package(quick, tmp_path, scheduler):
+    path = planned_copy(quick, tmp_path / "other.zarr")
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(scheduler[1])]
+    command += ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path), "--nthreads", "1"]
+    with subprocess.Popen(command, **SILENT) as worker:
+        try:
+            with pytest.raises(UserError, match="the scheduler has no mitransient-lidar, or another version: it must"):
+                resume(path, scheduler=json.loads(scheduler[1].read_text())["address"])
+        finally:
+            worker.kill()
+    assert (Store(path).status() == PLANNED).all()
+
+
+#: What other servers than schedulers do with a connection.
+SERVERS = {
+    "closes": lambda connection: connection.close(),
+    "http": lambda connection: (connection.recv(1000), connection.sendall(b"HTTP/1.0 200 OK\r\n\r\nok")),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", SERVERS)
+def test_other_servers_than_schedulers(campaign, tmp_path, kind):
+    """An HTTP server once gave a traceback, and 40 s."""
+    file = write_toml(tmp_path / "campaign.toml", campaign)
+
+    def serve():
+        while True:
+            connection, _ = server.accept()
+            with connection:
+                SERVERS[kind](connection)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve, daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        command = [sys.executable, "-m", "mitransient_lidar", "sweep", str(file), "-q", "--scheduler", address]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    text = f"scheduler = '{address}' cannot be reached: give its address, tcp://HOST:PORT\n"
+    assert (done.returncode, done.stderr) == (2, text)
+
+
+def test_a_scheduler_that_stops_while_it_starts(monkeypatch, tmp_path):
+    """Dask asserts what a scheduler answers."""
+    import distributed
+
+    def stops(self, address, **options):
+        raise AssertionError
+
+    monkeypatch.setattr(distributed.Client, "__init__", stops)
+    with pytest.raises(UserError, match="cannot be reached: give its address"):
+        sweep({"scene": "table1"}, tmp_path / "out.zarr", scheduler="tcp://127.0.0.1:1")

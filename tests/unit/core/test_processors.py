@@ -1,0 +1,71 @@
+"""The number of processors that a process may use: affinity, and quotas of control groups of both versions."""
+
+import os
+
+import drjit as dr
+import pytest
+
+from mitransient_lidar.core import processors
+from mitransient_lidar.loading import variants
+
+
+@pytest.fixture
+def groups(tmp_path, monkeypatch):
+    """Sixteen processors, and a writer of what the system shows of control groups."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: set(range(16)), raising=False)
+    monkeypatch.setattr(processors, "_GROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(processors, "_MOUNT", tmp_path / "mount")
+
+    def write(own, **limits):
+        (tmp_path / "cgroup").write_text(own)
+        for name, text in limits.items():
+            path = tmp_path / "mount" / name.replace("__", "/").replace("_dot_", ".")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("own", "limits", "number"),
+    [
+        ("", {}, 16),
+        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "max 100000\n"}, 16),
+        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "200000 100000\n"}, 2),
+        # A part of a processor is one; a group above has the smaller quota; one of more processors than there are.
+        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "20000 100000\n"}, 1),
+        ("0::/batch/job\n", {"batch__job__cpu_dot_max": "max 100000", "batch__cpu_dot_max": "250000 100000\n"}, 3),
+        ("0::/\n", {"cpu_dot_max": "9900000 100000\n"}, 16),
+        # A container of the first version sees its own group as the mount; memory limits no processors.
+        (
+            "7:memory:/a\n3:cpu,cpuacct:/docker/1f\n",
+            {"cpu,cpuacct__cpu_dot_cfs_quota_us": "400000\n", "cpu,cpuacct__cpu_dot_cfs_period_us": "100000\n"},
+            4,
+        ),
+        ("1:cpu:/\n", {"cpu__cpu_dot_cfs_quota_us": "-1\n", "cpu__cpu_dot_cfs_period_us": "100000\n"}, 16),
+    ],
+)
+def test_quotas(groups, own, limits, number):
+    groups(own, **limits)
+    assert processors.usable_processors() == number
+
+
+def test_affinity(groups, monkeypatch):
+    groups("0::/\n", cpu_dot_max="300000 100000\n")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {5})
+    assert processors.usable_processors() == 1
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert processors.usable_processors() == 1
+
+
+def test_renders_use_as_many_threads(monkeypatch):
+    """Dr.Jit respects the affinity, but not the quota of a container."""
+    before = dr.thread_count()
+    try:
+        for usable, number in ((before + 1, before), (1, 1)):
+            monkeypatch.setattr(variants, "usable_processors", lambda usable=usable: usable)
+            variants.limit_threads()
+            assert dr.thread_count() == number
+    finally:
+        dr.set_thread_count(before)
