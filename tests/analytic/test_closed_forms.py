@@ -12,7 +12,7 @@ import pytest
 import significance
 from oracles.beam_average import bottom_energy_per_bin, column_energy_per_bin, surface_energy_per_bin
 from oracles.echo_times import bottom_time_ns
-from oracles.lidar_equation import column_energy, surface_energy
+from oracles.lidar_equation import bottom_energy, column_energy, cos_water, surface_energy
 
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
@@ -275,6 +275,39 @@ def test_beam_and_view_of_millimetres_within_decimetres(lidar_scene, passes, int
     significance.assert_equal(found, expected[1:], error=0.02, bias=0.01)
     # The first decimetre.
     significance.assert_equal(found[:, :2], expected[1:3], error=0.02, bias=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view", [0.001, 0.003, 0.03])
+def test_narrow_view_of_a_wide_beam(lidar_scene, view):
+    """Column with one event and bottom without scattering, in the share of the beam that a view of 0.2 to 6 mm sees.
+
+    Ripples widen it to centimetres. Cells as narrow as the view lost 60 % of the column at 0.001 mrad.
+    """
+    angle, beam, depth, bin_ns = np.radians(20.0), 60.0, 8.0, 8.0
+    properties = 0.2, 0.1, 0.05
+    water = dict(zip(("attenuation", "scattering", "backscattering"), properties, strict=True))
+    share = -np.expm1(-0.5 * (view / beam) ** 2)
+    system = LidarSystem(200.0, angle, 1.34, GROUP_INDEX, energy=share * ENERGY, aperture_area=AREA)
+    column = WaterColumn(*(np.array([value]) for value in (0.0, *properties)))
+    surface_ns = float(surface_time_ns(200.0, angle))
+    scene = lidar_scene(
+        tx={"divergence_mrad": beam},
+        rx={**RECEIVER, "field_of_view_mrad": view, "layout": "1x1"},
+        film={"time_start_ns": surface_ns, "bin_width_ns": bin_ns, "bin_count": 12},
+        integrator={"type": "lidar_merging", "paths_per_pass": 2**14},
+        sea={"slope_variance": "1e-3"},
+        water={**water, "phase_function": "hg", "phase_g": 0.0, "refractive_index": 1.34, "group_index": GROUP_INDEX},
+        bottom=depth,
+        rho=REFLECTANCE,
+    )
+    renderer = scene.integrator().prepare(scene, scene.sensors()[0], classes=PathClasses(2))
+    energy = np.array([renderer.render_pass(seed).histogram.energy() for seed in range(16)]).reshape(16, 2, 3, -1)
+    bottom = float(bottom_energy(system, column, depth, REFLECTANCE, angle))
+    significance.assert_equal(energy[:, 0, 0, 5:].sum(axis=1), bottom, error=0.05, bias=5e-3)
+    edges = 0.5 * C0 / GROUP_INDEX * 1e-9 * bin_ns * np.arange(8) * float(cos_water(system, angle))
+    expected = column_energy(system, column, henyey_greenstein(np.pi, 0.0), edges[:-1], edges[1:], angle)
+    significance.assert_equal(energy[:, 0, 1, :7], expected, error=0.02, bias=5e-3)
 
 
 @pytest.mark.parametrize(

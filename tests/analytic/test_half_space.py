@@ -54,8 +54,7 @@ def half_space(lidar_scene, degrees, albedo, view, beam, integrator):
         tx={**pose, "beam_profile": "top_hat", "divergence_mrad": 2e3 * beam / slant},
         rx={**pose, "field_of_view_mrad": 2e3 * view / slant, "layout": "1x1"},
         film={"time_start_ns": 0.0, "bin_width_ns": 1e9 / C0 * (2 * slant + longest), "bin_count": 1},
-        # From so far some rays would fall through the seam of the sea's two triangles; it runs through the centre.
-        sea={"slope_variance": "1e-3", "centre_x": 10.0},
+        sea={"slope_variance": "1e-3"},
         water={
             **{"attenuation": 1.0, "scattering": albedo, "backscattering": albedo / 2},
             **{"phase_function": "hg", "phase_g": 0.0, "refractive_index": 1.0001, "group_index": 1.0},

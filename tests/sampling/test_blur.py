@@ -55,7 +55,7 @@ def gaussian_shares(centre, sigma, edges):
 def test_gaussian_blur_spreads_a_beam_as_its_integral_over_pixels(divergence, shift, blur, footprint):
     mean, error, view = energies({**SQUARE, "blur_mrad": blur}, {"divergence_mrad": divergence, "aim_y": shift})
     assert view.use_footprint == footprint
-    centre = [1e3 * float(g[0]) for g in view.centre]
+    centre = 1e3 * view.centre
     expected = gaussian_shares(centre, np.hypot(0.5 * divergence, blur), np.linspace(-8, 8, 5)).ravel()
     known = (expected > 0.01 * expected.sum()) & (error < 0.03 * expected)
     assert expected[known].sum() > 0.9 * expected.sum()

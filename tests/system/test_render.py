@@ -312,7 +312,7 @@ def test_small_patch_warns_of_the_light_that_it_loses(caplog):
 def test_share_lost_at_the_border_is_the_energy_that_a_larger_patch_receives(lidar_scene, integrator, count):
     """Same seeds, same flat sea: what the small patch receives less is what it must report, to 25 %, in most passes.
 
-    One bright path may be a fifth of all, and rarely one slips through the seam of the large patch's two triangles.
+    One bright path may be a fifth of all, and rarely one slips through a seam of the large patch's triangles.
     """
     engine = {"type": integrator, "paths_per_pass": 2**14}
     if integrator == "lidar_merging":

@@ -57,6 +57,9 @@ _MOST_CELLS, _FEWEST_CELLS = 4096, 16
 #: Side of each of several patches with the cells around it [m], and growth of these.
 _SIZE_OF_PATCH, _GROWTH_OF_PATCH = 200.0, 2.0
 
+#: Grid lines along x and y of a level sea, over its size.
+_LEVEL_LINES = (-0.5, 0.25, 0.5), (-0.5, 0.5)
+
 _SPECTRA = ("elfouhaily", "jonswap", "pierson_moskowitz", "table", "height_map", "flat")
 
 Wake = Callable[[FloatArray, FloatArray], FloatArray]
@@ -194,9 +197,9 @@ class SeaSurface:
     def mesh(self) -> SeaMesh:
         """Return the triangle mesh: the fine patch, surrounded by cells that grow out to the size."""
         if not math.isfinite(self.cell_size):
-            edges = np.array([-0.5, 0.5]) * self.size
-            x, y = edges + self.centre[0], edges + self.centre[1]
-            return triangulate(np.zeros((2, 2)), x, y, self.wind_direction)
+            # No edge is near the centre: rays pass between triangles of a kilometre in a gap of micrometres.
+            x, y = (np.array(ends) * self.size + at for ends, at in zip(_LEVEL_LINES, self.centre, strict=True))
+            return triangulate(np.zeros((len(y), len(x))), x, y, self.wind_direction)
         cells = max(2, 2 * math.ceil(0.5 * self.refined_size / self.cell_size))
         indices = grid_indices(cells, math.ceil(self.size / self.cell_size))
         # Integer cells: the sea does not depend on the position of the patch.

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.merging.region import SurfaceHeights
 from mitransient_lidar.transport.merging.rings import BeamRings
 from mitransient_lidar.transport.opaque import opaque
@@ -96,10 +95,14 @@ class RefractedProfile:
         of_facets = max(0.5 * scene.slope_variance - ripples, 0.0)
         self.shift_by_facets = max(max(shifts) * math.sqrt(of_facets), _LEAST_SLOPE)
 
-    def growth(self, depth: FloatArray, most: float) -> FloatArray:
-        """Return by how much ripples widen light down to depths [m], of the beam or, if less, of a deviation `most`."""
-        factors = [np.hypot(1, growth * depth / min(spread, most)) for spread, growth in self._own]
-        return np.asarray(np.minimum(*factors))
+    def growth(self, most: float) -> float:
+        """Return by how much ripples widen light of the beam or, if less, of a deviation `most`, for each metre."""
+        return min(growth / min(spread, most) for spread, growth in self._own)
+
+    @property
+    def blur(self) -> float:
+        """Standard deviation by which ripples displace light for each metre of depth, the larger of both axes."""
+        return max(growth for _, growth in self._own)
 
     def _axes(
         self, offset: tuple[mi.Float, mi.Float], depth: mi.Float, slopes: tuple[mi.Float, mi.Float]
@@ -145,13 +148,16 @@ class WaterGrid:
     width
         Horizontal side of a cell on the axis at the surface, over the core radius of the rings.
     growth
-        Growth of the width with depth [m/m], as light patterns of the waves blur with depth.
+        Growth of the width with depth [1/m], as light patterns of the waves blur with depth.
     thickness, uppermost
         Thickness of a cell, and that of the uppermost ones, which may be thinner [m]: narrow beams spread fast there.
     depth
         Depth within which different layers have different buckets [m].
     bits
         Logarithm to base 2 of the number of buckets of a shot.
+    view_growth, widening
+        Further growth with depth [1/m] of cells that a narrow view limits at the surface, as ripples widen the light
+        that is seen, and the largest width that it reaches, over that at the surface.
     """
 
     def __init__(
@@ -165,11 +171,14 @@ class WaterGrid:
         uppermost: float,
         depth: float,
         bits: int = MOST_BUCKET_BITS,
+        view_growth: float = 0.0,
+        widening: float = 1.0,
     ) -> None:
         self.heights, self.rings, self.profile, self.bits = heights, rings, profile, bits
         uppermost = min(max(uppermost, _LEAST_THICKNESS * thickness), thickness)
         layers = math.log(thickness / uppermost) / _THICKNESS_PER_DEPTH
         self.width, self.growth, self.thickness = opaque(width), opaque(growth), opaque(thickness)
+        self._view_growth, self._widening = opaque(view_growth), opaque(widening)
         # Depth below which layers have their final thickness, and the number of those above it.
         self._even, self._layers = opaque((thickness - uppermost) / _THICKNESS_PER_DEPTH), opaque(layers)
         self._uppermost = opaque(uppermost)
@@ -211,8 +220,10 @@ class WaterGrid:
         return self.bits - self.bits_z - self.bits_ring
 
     def widths(self, depth: mi.Float) -> mi.Float:
-        """Return the widths of rings over the core radius at a depth [m]."""
-        return self.width * dr.minimum(dr.fma(depth, self.growth, 1), _MOST_GROWTH)
+        """Return the widths of rings over the core radius in layers that begin at a depth [m]."""
+        middle = dr.fma(0.5, self.thickness_at(depth), depth)
+        width = self.width * dr.minimum(dr.fma(middle, self._view_growth, 1), self._widening)
+        return width * dr.minimum(dr.fma(depth, self.growth, 1), _MOST_GROWTH)
 
     def thickness_at(self, depth: mi.Float) -> mi.Float:
         """Return the thickness of layers at a depth of at least 0 [m]."""

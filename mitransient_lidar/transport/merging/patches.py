@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitransient_lidar.core.validation import FloatArray
 from mitransient_lidar.transport.merging.cells import ORIGIN, low_bits
 from mitransient_lidar.transport.merging.region import PROBE_RAYS, Region
 from mitransient_lidar.transport.merging.rings import BeamRings, RingSector
@@ -121,7 +120,9 @@ class SolidPatches:
     least
         Least side of squares, and of sectors on the solids [m].
     growth
-        Factors by which ripples widen unscattered light down to depths [m]; None for patches that grow as the rings.
+        Growth of unscattered light with depth by ripples [1/m]; None for patches that grow as the rings.
+    widening
+        Largest further growth of sectors with depth, of those that a narrow view limits at the surface.
     """
 
     def __init__(
@@ -135,7 +136,8 @@ class SolidPatches:
         uneven: Sequence[mi.Shape] = (),
         side_bits: int = MOST_SIDE_BITS,
         least: float = 0.0,
-        growth: Callable[[FloatArray], FloatArray] | None = None,
+        growth: float | None = None,
+        widening: float = 1.0,
     ) -> None:
         self.scene, self._rings, self._side_bits = scene, rings, side_bits
         self._start = mi.UInt32(0)
@@ -146,11 +148,14 @@ class SolidPatches:
         for number, solid in zip(numbers, scene.solids, strict=True):
             depths[number] = np.clip(-float(solid.bbox().center().z), 0, depth)
         core = rings.core(mi.Float(0))
-        self._ring_width = opaque(width) / core
+        growths = np.hypot(1, (growth or 0.0) * depths)
+        ring_widths = opaque(width) * aligned(mi.Float, np.minimum(growths, widening)) / core
         cores = rings.core(aligned(mi.Float, depths))
         if growth is not None:
-            cores = dr.minimum(cores, _MOST_GROWTH * core * aligned(mi.Float, growth(depths)))
-        self._cores = dr.maximum(cores, opaque(least) / self._ring_width)
+            cores = dr.minimum(cores, _MOST_GROWTH * core * aligned(mi.Float, growths))
+        cores = dr.maximum(cores, opaque(least) / ring_widths)
+        # Of each solid: core radius, and width of rings over it.
+        self._sizes = dr.ravel(mi.Point2f(cores, ring_widths))
         self._shift = shift
         self._bounded = [
             solid
@@ -182,8 +187,8 @@ class SolidPatches:
         w = dr.select(along_x, si.p.x, dr.select(along_y, si.p.y, si.p.z))
         cu, cv = dr.floor(u / self.width + self._shift.x), dr.floor(v / self.width + self._shift.y)
         i, j = mi.UInt32(mi.Int32(cu) + ORIGIN), mi.UInt32(mi.Int32(cv) + ORIGIN)
-        along, across, core = self._offset(si)
-        sector = self._rings.sector(along, across, core, self._ring_width, self._shift)
+        along, across, (core, ring_width) = self._offset(si)
+        sector = self._rings.sector(along, across, core, ring_width, self._shift)
         level_patch = axis == 2
         i, j = dr.select(level_patch, sector.ring, i), dr.select(level_patch, sector.number, j)
         projected = dr.select(level_patch, self._rings.area(sector), self.width * self.width)
@@ -214,9 +219,9 @@ class SolidPatches:
     def typical_area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """Return the approximate area of the patches at points on solids, a smooth function on each face [m^2]."""
         axis, normal = self._projection(si)
-        along, across, core = self._offset(si)
+        along, across, (core, ring_width) = self._offset(si)
         scale = dr.square(core) + along * along + across * across
-        sector = dr.square(self._ring_width) * scale / self._rings.cosine
+        sector = dr.square(ring_width) * scale / self._rings.cosine
         return dr.select(axis == 2, sector, self.width * self.width) / dr.abs(normal)
 
     def _projection(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
@@ -229,13 +234,13 @@ class SolidPatches:
         axis = dr.select(along_x, mi.UInt32(0), dr.select(along_y, mi.UInt32(1), mi.UInt32(2)))
         return axis, dr.select(along_x, si.n.x, dr.select(along_y, si.n.y, against))
 
-    def _offset(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Return offsets of points on solids from the beam, and the core radius of their solid [m]."""
+    def _offset(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float, mi.Point2f]:
+        """Return offsets of points on solids from the beam [m], and core radius [m] and ring width of their solid."""
         x, y = self._rings.slant
         below = -si.p.z - self._depth
         along, across = self._rings.offset(si.p.x - x * below, si.p.y - y * below, self._rings.depth_at(-self._depth))
-        number = dr.minimum(dr.reinterpret_array(mi.UInt32, si.shape), opaque_index(dr.width(self._cores) - 1))
-        return along, across, dr.gather(mi.Float, self._cores, number)
+        number = dr.minimum(dr.reinterpret_array(mi.UInt32, si.shape), opaque_index(dr.width(self._sizes) // 2 - 1))
+        return along, across, dr.gather(mi.Point2f, self._sizes, number)
 
     def _is_bounded(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return whether a solid may end inside the region."""

@@ -27,6 +27,10 @@ _ENTRY_RAYS = 64
 #: Share of rays that may fall outside the region on either side, and margin over its size.
 _REGION_TAIL, _REGION_MARGIN = 0.002, 0.15
 
+#: Distance beside the view within which light counts, over the size of the view and over the longest way in the water:
+#: tables of the heights below all of a very wide beam would not resolve its waves.
+_BESIDE_PER_VIEW, _BESIDE_PER_LENGTH = 2.0, 2.0
+
 #: Distance beside the beam within which light spreads, over the depth.
 _SPREAD_PER_DEPTH = 0.25
 
@@ -45,7 +49,7 @@ _NO_BED = -1e9
 
 @dataclass(frozen=True)
 class Region:
-    """Rectangle of the sea that is lit or seen: corners (x, y) [m]."""
+    """Rectangle of the sea that is lit or seen, as far as paths to the receiver reach: corners (x, y) [m]."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -64,6 +68,9 @@ class Region:
         if not ends:
             raise UserError("laser and receiver look above the horizon: at least one must look down at the sea")
         low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+        if len(places[0]):
+            beside = _BESIDE_PER_VIEW * np.ptp(ends[0], axis=0) + _BESIDE_PER_LENGTH * _longest_way(scene)
+            low, high = np.maximum(low, ends[0][0] - beside), np.minimum(high, ends[0][1] + beside)
         return cls.between(low, high, _REGION_MARGIN * (high - low))
 
     @classmethod
@@ -94,11 +101,7 @@ class Region:
 
     def track_length(self, scene: LidarScene) -> float:
         """Return the mean distance in the water along the axis to a solid, or to the depth of the record's end [m]."""
-        transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
-        spot = transmitter.ground_point()
-        down = refract_level(transmitter.axis, scene.refractive_index)
-        air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
-        longest = (scene.axis.path_end - air) / (2 * scene.group_index)
+        down = refract_level(scene.transmitter.pose.axis, scene.refractive_index)
         # From the mean sea level: below the deepest trough, which lies anywhere, may be below a shallow bottom here.
         ray = mi.Ray3f(mi.Point3f(*self.probe_points(), opaque(0.0)), mi.Vector3f(down.tolist()))
         length, at_sea = dr.zeros(mi.Float, PROBE_RAYS), dr.full(mi.Bool, True, PROBE_RAYS)
@@ -107,7 +110,7 @@ class Region:
             length += dr.select(at_sea, dr.select(si.is_valid(), si.t, dr.inf), 0)
             at_sea &= si.is_valid() & scene.is_surface(si.shape)
             ray = si.spawn_ray(ray.d)
-        return float(dr.mean(dr.minimum(length, max(longest, 0.1)))[0])
+        return float(dr.mean(dr.minimum(length, _longest_way(scene)))[0])
 
     def is_below(self, box: mi.ScalarBoundingBox3f, scene: LidarScene) -> bool:
         """Return whether a bounding box extends beyond light and view at its depth, by their size on every side."""
@@ -117,6 +120,14 @@ class Region:
             and float(box.max[axis]) > below.high[axis] + below.size[axis]
             for axis in (0, 1)
         )
+
+
+def _longest_way(scene: LidarScene) -> float:
+    """Return the distance in the water along the axis to the depth of the record's end, at least 0.1 m [m]."""
+    transmitter, receiver = scene.transmitter.pose, scene.receiver.pose
+    spot = transmitter.ground_point()
+    air = sum(float(np.linalg.norm(spot - pose.origin)) for pose in (transmitter, receiver))
+    return max((scene.axis.path_end - air) / (2 * scene.group_index), 0.1)
 
 
 def meet_sea(scene: LidarScene, pose: KernelPose, angles: mi.Point2f) -> FloatArray:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -47,7 +45,8 @@ _PATHS, _PATHS_PER_PIXEL, _MOST_PATHS = 2**15, 16, 2**21
 _PHOTONS, _PHOTONS_FOR_IMAGES = 2**15, 2**16
 
 #: Width of the cells at the surface, over the beam's standard deviation there, over the side of the sea's facets, and
-#: over the diameter of the field of view: of larger cells, few would hold the light that is seen.
+#: over the diameter of the field of view, which ripples widen with depth: of larger cells, few would hold the light
+#: that is seen.
 _CELL_PER_FOOTPRINT, _CELL_PER_FACET, _CELL_PER_VIEW = 0.025, 0.05, 0.02
 
 #: Width of the cells of a lidar under water, from which that of patches follows, over the beam's standard deviation.
@@ -60,8 +59,9 @@ _GROWTH_PER_METRE, _GROWTH_PER_SCATTERING = 0.4, 0.5
 #: Width of the patches of solids, over the width of the cells at the surface.
 _PATCH_PER_CELL = 3.2
 
-#: Least width of the patches over the size of the largest solid, eight times the rounding of positions on it.
-_PATCH_PER_SOLID = 2**-22
+#: Least width of the patches over the size of the largest solid, eight times the rounding of positions on it; and that
+#: of cells over the largest coordinate of the lidar's spot and of the water below, where a narrow view limits them.
+_PATCH_PER_SOLID, _CELL_PER_COORDINATE = 2**-22, 2**-21
 
 #: Thickness of the cells, over the distance of points and over the attenuation length.
 _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
@@ -70,6 +70,10 @@ _THICKNESS_PER_SPACING, _THICKNESS_PER_ATTENUATION = 0.5, 0.3
 #: which neighbouring facets move light by their own side, and over the attenuation length; the last one for beams from
 #: whose width scattered light is lost within a cell.
 _UPPERMOST_PER_SPREAD, _UPPERMOST_PER_FACET, _UPPERMOST_PER_ATTENUATION = 0.25, 0.1, 0.05
+
+#: Distance on the sea from which light reaches the view in the water, over the standard deviation by which ripples
+#: displace light, and over the depth, for scattering.
+_SPREAD_PER_BLUR, _SPREAD_PER_DEPTH = 3.0, 0.5
 
 #: Least attenuation, against division by zero [1/m].
 _LEAST_ATTENUATION = 1e-6
@@ -134,7 +138,11 @@ class MergingLayout:
     patch_width, least_patch
         Width of the patches of solids on the axis at the surface, and the least one on the solids [m].
     growth
-        Factors by which ripples widen unscattered light down to depths [m].
+        Growth of unscattered light with depth by ripples [1/m].
+    widening
+        Largest growth of cells and patches with depth, of those that a narrow view limits at the surface.
+    spread
+        Distance from the view, on the sea, from which light reaches the view in the water [m].
     light_segments, sensor_segments, hits
         Capacities for segments and hits of solids of each path; they grow when a pass needs more.
     side_bits
@@ -155,10 +163,12 @@ class MergingLayout:
     depth: float
     patch_width: float
     least_patch: float
-    growth: Callable[[FloatArray], FloatArray] | None
+    growth: float | None
     light_segments: float
     sensor_segments: float
     hits: float = 2.0
+    widening: float = 1.0
+    spread: float = 0.0
     side_bits: int = MOST_SIDE_BITS
     photons_of_cell: int = PHOTONS_OF_CELL
     widens: bool = True
@@ -244,8 +254,8 @@ class MergingLayout:
         # Cells are longer along the azimuth of the beam: the mean of their sides counts.
         facet = scene.facet_size * float(np.sqrt(max(-pose.axis[2], 0.0)))
         view = scene.receiver.pixels.field_of_view * scene.receiver.pose.ground_range
-        widths = _CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet, _CELL_PER_VIEW * view
-        width = options.cell_size or min(widths)
+        widest = options.cell_size or min(_CELL_PER_FOOTPRINT * footprint, _CELL_PER_FACET * facet)
+        width = options.cell_size or min(max(_CELL_PER_VIEW * view, _least_cell(scene, reach)), widest)
         growth = _GROWTH_PER_METRE + _GROWTH_PER_SCATTERING * float(column.scattering.min())
         core = CORE_PER_SPREAD * footprint
         depth = reach * -float(refract_level(pose.axis, scene.refractive_index)[2])
@@ -260,14 +270,26 @@ class MergingLayout:
             _UPPERMOST_PER_FACET * scene.facet_size / profile.shift_by_facets,
             max(_UPPERMOST_PER_ATTENUATION / max(float(column.attenuation[0]), _LEAST_ATTENUATION), footprint),
         )
-        grid = WaterGrid(rings, heights, profile, width / core, growth, thickness, uppermost, reach)
         # The standard deviation of even light in the field of view is a quarter of its diameter.
+        by_ripples = profile.growth(most=0.25 * view)
+        grid = WaterGrid(
+            *(rings, heights, profile, width / core, growth, thickness, uppermost, reach),
+            view_growth=by_ripples,
+            widening=widest / width,
+        )
         patches = _PATCH_PER_CELL * width, _least_patch(scene)
-        by_ripples = functools.partial(profile.growth, most=0.25 * view)
         return cls(
             *(region, entries[0], uneven, grid, rings, spacing, reach, depth, *patches, by_ripples, segments, segments),
+            widening=widest / width,
+            spread=(_SPREAD_PER_BLUR * profile.blur + _SPREAD_PER_DEPTH) * depth,
             widens=not options.cell_size,
         )
+
+
+def _least_cell(scene: LidarScene, reach: float) -> float:
+    """Return the least width of cells that a narrow view limits [m]."""
+    spots = [pose.ground_point()[:2] for pose in (scene.transmitter.pose, scene.receiver.pose)]
+    return _CELL_PER_COORDINATE * float(np.abs(spots).max() + reach)
 
 
 def _least_patch(scene: LidarScene) -> float:
@@ -298,7 +320,7 @@ class MergingRenderer(PassRenderer):
         self.photons = options.photons_per_pass or photons
         self.layout = layout.of_scene_alike(scene) if layout else MergingLayout.of_scene(scene, self.sampler, options)
         self._connections = connections
-        self._beam = BeamSampler(scene.transmitter, scene.receiver)
+        self._beam = BeamSampler(scene.transmitter, scene.receiver, self.layout.spread)
 
     @property
     def path_count(self) -> int:
@@ -346,16 +368,9 @@ class MergingRenderer(PassRenderer):
         shifts = shots.uniform(_COMMON_STREAM, 6)
         cells = layout.grid.cells(mi.Point4f(shifts[:4]))
         patches = SolidPatches(
-            scene,
-            layout.region,
-            layout.rings,
-            layout.depth,
-            layout.patch_width,
+            *(scene, layout.region, layout.rings, layout.depth, layout.patch_width),
             mi.Point2f(shifts[4:]),
-            layout.uneven,
-            layout.side_bits,
-            layout.least_patch,
-            layout.growth,
+            *(layout.uneven, layout.side_bits, layout.least_patch, layout.growth, layout.widening),
         )
         points_per_path = _POINTS_OF_LIGHT * layout.reach / layout.spacing
         rates = ConnectionRates.of_pass(scene, cells, self.photons, points_per_path, self._connections)

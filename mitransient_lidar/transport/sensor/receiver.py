@@ -13,6 +13,7 @@ from mitransient_lidar.core.validation import in_range
 from mitransient_lidar.transport.opaque import opaque
 from mitransient_lidar.transport.pose import KernelPose
 from mitransient_lidar.transport.rng import Lanes, interleaved_point, pass_streams, stratified_point, unit_points
+from mitransient_lidar.transport.sensor.octaves import Octaves
 from mitransient_lidar.transport.sensor.pixels import PixelArray
 from mitransient_lidar.transport.sensor.point_spread import PointSpread
 
@@ -141,9 +142,8 @@ class SensorSample:
 class SensorSampler:
     """Samples the receiver's rays: some paths over the field of view, the others around the laser's footprint.
 
-    Around the footprint, directions beyond a core are equally many in each octave of their distance from its centre, as
-    scattering spreads the light of a narrow beam. Both parts are weighted by the balance heuristic. Samples are
-    stratified, and neighbours have similar directions.
+    Around the footprint, directions are distributed in `Octaves`, as scattering spreads the light of a narrow beam.
+    Both parts are weighted by the balance heuristic. Samples are stratified, and neighbours have similar directions.
 
     With blur, directions over the view draw the place p on the detector and the direction p - delta, the others the
     direction g and the place g + delta. Both draw delta from the point-spread function, whose density cancels.
@@ -152,40 +152,24 @@ class SensorSampler:
     def __init__(self, receiver: Receiver, transmitter: mi.Emitter) -> None:
         self.receiver = receiver
         spot, pixels = transmitter.pose.ground_point(), receiver.pixels
-        centre = receiver.pose.angles_of(spot - receiver.pose.origin)
-        self.centre = [opaque(angle) for angle in centre]
+        self.centre = receiver.pose.angles_of(spot - receiver.pose.origin)
         ranges = (np.linalg.norm(spot - pose.origin) for pose in (transmitter.pose, receiver.pose))
         spread = transmitter.widest_angular_spread * float(next(ranges)) / float(next(ranges))
-        core = _CORE_PER_SPREAD * spread
-        self.sigma, self._core = opaque(spread), opaque(core)
+        self.sigma = opaque(spread)
         # The edge of the field of view, at most as far from its centre as the corner of a square.
         corner = 1.0 if pixels.field_of_view_shape == "circle" else float(np.sqrt(2))
-        edge = 0.5 * corner * pixels.field_of_view + float(np.hypot(*centre))
-        self._edge, self._log_range = opaque(edge), opaque(np.log1p((edge / core) ** 2))
+        edge = 0.5 * corner * pixels.field_of_view + float(np.hypot(*self.centre))
+        self._footprint = Octaves(self.centre, _CORE_PER_SPREAD * spread, edge)
         self.use_footprint = self._footprint_share() > _SMALLEST_FOOTPRINT_SHARE
         self._of_view = _OF_VIEW_IN_IMAGES if pixels.count >= IMAGE_PIXELS else _OF_VIEW
 
     def _footprint_share(self) -> float:
         """Return the share of a Gaussian footprint's samples that fall inside a pixel."""
         u = unit_points(4096)
-        angle_x, angle_y = self._around(self.sigma * dr.sqrt(-2 * dr.log(1 - u.x)), u.y)
+        angle_x, angle_y = self._footprint.around(self.sigma * dr.sqrt(-2 * dr.log(1 - u.x)), u.y)
         dx, dy = self.receiver.displacement(pass_streams(0, 0, 4096))
         _, count = self.receiver.pixels.pixel_at(angle_x + dx, angle_y + dy, mi.Float(0.5))
         return float(dr.mean(dr.select(count > 0, mi.Float(1), 0))[0])
-
-    def _around(self, radius: mi.Float, turn: mi.Float) -> tuple[mi.Float, mi.Float]:
-        sin, cos = dr.sincos(dr.two_pi * turn)
-        return dr.fma(radius, cos, self.centre[0]), dr.fma(radius, sin, self.centre[1])
-
-    def _sample_footprint(self, u: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """Map uniform numbers to directions of density 1 / (pi ln(1 + R^2 / q^2) (r^2 + q^2)) up to the edge R."""
-        return self._around(self._core * dr.sqrt(dr.maximum(dr.exp(u.x * self._log_range) - 1, 0)), u.y)
-
-    def _footprint_density(self, angle_x: mi.Float, angle_y: mi.Float) -> mi.Float:
-        """Return the density of `_sample_footprint` [1/rad^2]."""
-        radius2 = dr.square(angle_x - self.centre[0]) + dr.square(angle_y - self.centre[1])
-        density = dr.inv_pi / (self._log_range * (radius2 + self._core * self._core))
-        return dr.select(radius2 <= self._edge * self._edge, density, 0)
 
     def sample_shots(self, lanes: Lanes, count: int, rng: mi.PCG32) -> SensorSample:
         """Sample directions for `count` paths of each shot, with pixels counted shot after shot."""
@@ -205,14 +189,14 @@ class SensorSampler:
         dx, dy = self.receiver.displacement(rng)
         angle_x, angle_y = px - dx, py - dy
         if self.use_footprint:
-            fx, fy = self._sample_footprint(point)
+            fx, fy = self._footprint.sample(point)
             angle_x, angle_y = dr.select(of_footprint, fx, angle_x), dr.select(of_footprint, fy, angle_y)
             px, py = dr.select(of_footprint, fx + dx, px), dr.select(of_footprint, fy + dy, py)
         pixel, pixels_here = self.receiver.pixels.pixel_at(px, py, rng.next_float32())
         density = pixels_here * opaque(1 / self.receiver.pixels.area)
         if self.use_footprint:
             of_view = count // _SETS * self._of_view + min(count % _SETS, self._of_view)
-            density = dr.lerp(self._footprint_density(angle_x, angle_y), density, opaque(of_view / count))
+            density = dr.lerp(self._footprint.density(angle_x, angle_y), density, opaque(of_view / count))
         # A point in several pixels is assigned to one of them at random: weight by their number.
         collection = pixels_here * opaque(self.receiver.optics.collection / count)
         weight = collection * solid_angle_factor(angle_x, angle_y) / density

@@ -168,7 +168,7 @@ def test_a_flat_sea_with_a_mean_slope_is_a_plane_and_slopes_are_limited():
     mesh = read(spectrum="flat", slope_x_deg=3.0, refined_size=6.0, cell_size=0.5, size=20.0).mesh()
     inside = np.abs(mesh.vertices[:, 0]) <= 3.0
     np.testing.assert_allclose(mesh.vertices[inside, 2], np.tan(np.radians(3.0)) * mesh.vertices[inside, 0], atol=1e-12)
-    assert len(read(spectrum="flat", size=20.0).mesh().faces) == 2
+    assert len(read(spectrum="flat", size=20.0).mesh().faces) == 4
     with pytest.raises(UserError, match="slope_y_deg = 16 must lie between -15 and 15"):
         read(slope_y_deg=16.0)
 
