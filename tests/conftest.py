@@ -3,8 +3,6 @@
 # Before Mitsuba: the package sets the path of LLVM for Dr.Jit.
 import mitransient_lidar  # noqa: F401, I001
 
-import sys
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,9 +10,6 @@ import pytest
 import significance
 
 from mitransient_lidar.loading.variants import SUPPORTED_VARIANTS
-
-# Campaigns need Python 3.11.
-collect_ignore_glob = [] if sys.version_info >= (3, 11) else ["*/campaigns/*", "system/test_campaigns.py"]
 
 #: Comparisons of each worker of pytest-xdist.
 _comparisons = {}

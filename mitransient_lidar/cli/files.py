@@ -127,7 +127,11 @@ class GateFiles:
 
     @classmethod
     def of(cls, folder: Path, stem: str, **wanted: bool) -> GateFiles:
-        """Return the files of a gate stack, given the options for the kinds of file."""
+        """Return the files of a gate stack, given the options for the kinds of file; refuse a movie without ffmpeg."""
+        if wanted.get("mp4"):
+            from mitransient_lidar.plots.gates.images import find_ffmpeg
+
+            find_ffmpeg(folder / f"{stem}_gates.mp4")
         return cls(folder, stem, frozenset(kind for kind, on in wanted.items() if on))
 
     def check(self) -> None:

@@ -48,7 +48,7 @@ def gates(
         bool, typer.Option("--sequence", help="Also write numbered EXR files, one for each gate.")
     ] = False,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie, by ffmpeg.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
 ) -> None:

@@ -32,7 +32,7 @@ def render(
     integrator: Annotated[str | None, typer.Option(help="Integrator to use instead of the scene's.")] = None,
     plot: Annotated[bool, typer.Option("--plot/--no-plot", help="Draw waveforms, pixels and gates.")] = True,
     gif: Annotated[bool, typer.Option("--gif", help="Also write an animation of the gates.")] = False,
-    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates.")] = False,
+    mp4: Annotated[bool, typer.Option("--mp4", help="Also write a movie of the gates, by ffmpeg.")] = False,
     html: Annotated[bool, typer.Option("--html", help="Also write a page that shows the gates in a browser.")] = False,
     quiet: Quiet = False,
     **options: Any,

@@ -89,6 +89,8 @@ def _read_array(path: Path, file: IO[bytes]) -> Array:
     """Read an array in NumPy's format; raise `UserError` by its header if it is larger than `LARGEST_ARRAY`."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = readers[np.lib.format.read_magic(file)](file)
+    if any(size < 0 for size in shape):
+        raise ValueError(f"shape {shape}")  # some versions of NumPy read it
     check_size(path, math.prod(shape) * dtype.itemsize)
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
+import tomllib
 from collections.abc import Collection, Mapping
 from typing import Any
 
 from mitransient_lidar.core.documents import check_nesting, too_deep
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 
 def parse_toml(text: str, name: object) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib
+import inspect
 import re
 
 
@@ -28,14 +29,13 @@ def plugin_parameters(plugin: str) -> list[str]:
     module = _plugin_modules().get(plugin)
     if module is None:
         return []
-    pages = [page.__doc__ or "" for page in vars(importlib.import_module(module)).values() if isinstance(page, type)]
+    classes = [one for one in vars(importlib.import_module(module)).values() if isinstance(one, type)]
     names: list[str] = []
-    for page in pages:
-        rules = list(re.finditer(r"^ *(=+)  =[= ]+$", page, re.MULTILINE))
+    for page in (inspect.cleandoc(one.__doc__ or "") for one in classes):
+        rules = list(re.finditer(r"^(=+)  =[= ]+$", page, re.MULTILINE))
         if f"``{plugin}``" in page and len(rules) >= 3:
-            start, width = rules[0].start(1) - page.rfind("\n", 0, rules[0].start(1)) - 1, len(rules[0][1])
             rows = page[rules[1].end() : rules[2].start()].splitlines()
-            cells = ", ".join(row[start : start + width] for row in rows)
+            cells = ", ".join(row[: len(rules[0][1])] for row in rows)
             names += re.findall(r"(?<![\w(.])[a-z]\w*(?![\w).])", cells)
     return list(dict.fromkeys(names))
 

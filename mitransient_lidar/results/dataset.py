@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -373,7 +373,7 @@ def provenance(attributes: Mapping[str, Any]) -> dict[str, Any]:
         "Conventions": "CF-1.11",
         "title": f"Received lidar power, scene {attributes['scene']}" if "scene" in attributes else "Lidar power",
         "source": f"mitransient-lidar {__version__}",
-        "history": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} rendered by mitransient-lidar {__version__}",
+        "history": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} rendered by mitransient-lidar {__version__}",
         **{text(name): attribute(name, value) for name, value in attributes.items()},
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +39,6 @@ _FACET_PER_WAVE = 0.25
 _BOTTOM_PER_LARGEST = 0.25
 
 
-SceneT = TypeVar("SceneT", bound="WaterScene")
 Vector = TypeVar("Vector", mi.Vector3f, mi.Point3f, mi.Normal3f)
 
 
@@ -102,14 +101,14 @@ class WaterScene:
     receiver_poses: KernelPose | None = field(default=None, kw_only=True)
     perturbations: Perturbations = field(default_factory=Perturbations, kw_only=True)
 
-    def of(self: SceneT, lanes: Lanes) -> SceneT:
+    def of(self, lanes: Lanes) -> Self:
         """Return the scene as the shots of lanes meet it, in the frame of the lidar."""
         if not self.parts:
             return self
         poses = None if self.receiver_poses is None else self.receiver_poses.of(lanes)
         return replace(self, parts=tuple(part.of(lanes) for part in self.parts), receiver_poses=poses)
 
-    def with_parts_of(self: SceneT, shapes: Sequence[mi.Shape]) -> SceneT:
+    def with_parts_of(self, shapes: Sequence[mi.Shape]) -> Self:
         """Return a scene in parts without the parts that hold none of the shapes; the same one if all hold none."""
         parts = [part for part in self.parts if any(one is shape for one in part.shapes.shapes() for shape in shapes)]
         return replace(self, parts=tuple(parts)) if parts else self

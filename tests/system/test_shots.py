@@ -132,7 +132,7 @@ def test_survey_measures_every_shot_and_its_command_draws(tmp_path):
     assert done.exit_code == 0, done.output
     assert done.stdout.splitlines()[:2] == [str(target), str(target.with_suffix(".nc"))]
     assert "correlation of strength with the slope" in done.stdout
-    with xr.open_dataset(target.with_suffix(".nc")) as found:
+    with xr.open_dataset(target.with_suffix(".nc"), engine="h5netcdf") as found:
         assert dict(found.sizes) == {"shot": 5, "pixel": 4}
         place = {**WAVES, "aim_x": float(found.aim_x[2]), "aim_y": float(found.aim_y[2])}
         again = mitransient_lidar.render(scene, params=place, passes=8, seed=2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self
 
 import numpy as np
 
@@ -22,8 +22,6 @@ _SMALLEST_DESCENT = 1e-3
 
 #: Horizontal component of an axis below which it has no azimuth.
 _SMALLEST_AZIMUTH = 1e-9
-
-PoseT = TypeVar("PoseT", bound="Pose")
 
 
 @dataclass(frozen=True)
@@ -48,9 +46,7 @@ class Pose:
     left: FloatArray
 
     @classmethod
-    def from_angles(
-        cls: type[PoseT], altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0
-    ) -> PoseT:
+    def from_angles(cls, altitude: float, off_nadir_deg: float, aim_x: float = 0.0, aim_y: float = 0.0) -> Self:
         """Return the pose whose axis lies in the x-z plane and points to +x, and down or, under water, up.
 
         Parameters
@@ -77,7 +73,7 @@ class Pose:
         return cls(origin, np.array([sin, 0.0, -cos]), np.array([cos, 0.0, sin]), np.array([0.0, 1.0, 0.0]))
 
     @classmethod
-    def from_matrix(cls: type[PoseT], name: str, matrix: FloatArray) -> PoseT:
+    def from_matrix(cls, name: str, matrix: FloatArray) -> Self:
         """Return the pose of a transformation, shape (4, 4), a parameter of this name.
 
         It maps the local axes as Mitsuba's ``look_at`` with ``up = (0, 0, 1)`` does: z is the optical axis, y is
@@ -97,12 +93,12 @@ class Pose:
         """The directions axis, far and left as rows, shape (..., 3, 3)."""
         return np.stack([self.axis, self.far, self.left], axis=-2)
 
-    def moved(self: PoseT, rotation: FloatArray, shift: FloatArray) -> PoseT:
+    def moved(self, rotation: FloatArray, shift: FloatArray) -> Self:
         """Return the poses after rotations, shape (..., 3, 3), and displacements [m], shape (..., 3)."""
         origin, axis, far, left = (rotation @ each for each in (self.origin, self.axis, self.far, self.left))
         return replace(self, origin=origin + shift, axis=axis, far=far, left=left)
 
-    def part(self: PoseT, rows: slice | IntArray) -> PoseT:
+    def part(self, rows: slice | IntArray) -> Self:
         """Return the poses of some of the shots."""
         return replace(self, **{name: getattr(self, name)[rows] for name in ("origin", "axis", "far", "left")})
 

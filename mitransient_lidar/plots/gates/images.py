@@ -84,18 +84,16 @@ def plot_gates(dataset: xr.Dataset, path: drawing.FilePath | None = None, log: b
 
 
 def check_animation(stack: xr.Dataset, path: Path) -> None:
-    """Raise a `UserError` if the stack has no images, or the file is an MP4 and there is no ffmpeg."""
+    """Raise a `UserError` if the stack has no images."""
     if "pixel" in stack.dims:
         raise UserError(
             f"cannot write {path}: an animation needs images, but this stack has {stack.sizes['pixel']} single pixels; "
             "draw its contact sheet."
         )
-    if path.suffix.lower() == ".mp4" and _ffmpeg() is None:
-        raise UserError(f"cannot write {path}: .mp4 needs the program ffmpeg, which is not installed; choose .gif.")
 
 
-def _ffmpeg() -> str | None:
-    """Return the ffmpeg that Matplotlib finds, or else that of the package imageio-ffmpeg; None without both."""
+def find_ffmpeg(path: Path) -> str:
+    """Return the ffmpeg that Matplotlib finds, or that of the extra ``movie``; raise `UserError` without both."""
     if FFMpegWriter.isAvailable():
         return str(matplotlib.rcParams["animation.ffmpeg_path"])
     try:
@@ -103,7 +101,10 @@ def _ffmpeg() -> str | None:
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
-        return None
+        raise UserError(
+            f"cannot write {path}: .mp4 needs the program ffmpeg, which pip install 'mitransient-lidar[movie]' brings; "
+            "choose .gif without it."
+        ) from None
 
 
 def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False) -> None:
@@ -129,7 +130,7 @@ def animate_gates(dataset: xr.Dataset, path: drawing.FilePath, log: bool = False
     figure.set_layout_engine("none")
     kind: type[AbstractMovieWriter] = PillowWriter if suffix == ".gif" else FFMpegWriter
     writer = kind(fps=_FRAMES_PER_SECOND)
-    program: dict[Any, Any] = {} if suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
+    program: dict[Any, Any] = {} if suffix == ".gif" else {"animation.ffmpeg_path": find_ffmpeg(path)}
     with replacing(path) as temporary:
         try:
             with matplotlib.rc_context(program), writer.saving(figure, os.fspath(temporary), _FRAME_DPI):

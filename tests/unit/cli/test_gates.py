@@ -46,6 +46,13 @@ def stored(tmp_path):
     return path, dataset
 
 
+@pytest.fixture
+def no_ffmpeg(tmp_path, monkeypatch):
+    """Hide the programs of the system and the extra ``movie``."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+
+
 def run(*arguments):
     return command_line.run("gates", *arguments)
 
@@ -67,6 +74,7 @@ def test_files_beside_the_result(stored):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_ffmpeg")
 def test_all_kinds_of_files_in_a_new_folder(stored, tmp_path):
     path, _ = stored
     folder = tmp_path / "new" / "folder"
@@ -144,12 +152,21 @@ def test_gates_that_a_file_has_are_drawn_as_they_are(stored, tmp_path):
     np.testing.assert_array_equal(again["gate_energy"], gate_files.open_stack(cut)["gate_energy"])
 
 
-def test_a_movie_that_cannot_be_leaves_no_files(stored, tmp_path, monkeypatch):
-    path, _ = stored
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    result = run(path, *TRAIN, "-o", tmp_path / "out", "--mp4")
+def assert_no_movie(result, folder):
     assert result.exit_code == 2
     assert result.stdout == ""
-    assert ".mp4 needs the program ffmpeg" in result.stderr
-    assert not (tmp_path / "out").exists()
+    assert ".mp4 needs the program ffmpeg, which pip install 'mitransient-lidar[movie]' brings" in result.stderr
+    assert not folder.exists()
+
+
+@pytest.mark.usefixtures("no_ffmpeg")
+def test_a_movie_that_cannot_be_leaves_no_files(stored, tmp_path):
+    path, _ = stored
+    assert_no_movie(run(path, *TRAIN, "-o", tmp_path / "out", "--mp4"), tmp_path / "out")
+
+
+@pytest.mark.usefixtures("no_ffmpeg")
+def test_a_movie_that_cannot_be_is_refused_before_the_render(tmp_path, monkeypatch):
+    monkeypatch.setattr("mitransient_lidar.rendering.render.render", lambda *_, **__: pytest.fail("rendered"))
+    result = command_line.run("render", "gated_waves", "-o", tmp_path / "out", "--mp4")
+    assert_no_movie(result, tmp_path / "out")

@@ -1,6 +1,7 @@
 """Parameters that the objects of the plugins keep: every one of their manual pages, with its default."""
 
 import importlib
+import inspect
 import json
 import re
 
@@ -68,17 +69,17 @@ def _table(plugin):
     """Return the texts of the table of a plugin's manual page by the names of parameters."""
     module = next(name for name in PLUGIN_MODULES if name.rpartition(".")[2] == plugin)
     page = next(
-        part.__doc__
+        inspect.cleandoc(part.__doc__)
         for part in vars(importlib.import_module(f"mitransient_lidar.plugins.{module}")).values()
         if isinstance(part, type) and f"(``{plugin}``)" in (part.__doc__ or "")
     )
-    rules = list(re.finditer(r"^ *(=+)  =[= ]+$", page, re.MULTILINE))
-    start, width = 4, len(rules[0][1])
+    rules = list(re.finditer(r"^(=+)  =[= ]+$", page, re.MULTILINE))
+    width = len(rules[0][1])
     rows, names = {}, ()
     for line in page[rules[1].end() : rules[2].start()].splitlines():
-        cell = tuple(re.findall(r"[a-z]\w*", line[start : start + width]))
+        cell = tuple(re.findall(r"[a-z]\w*", line[:width]))
         names = cell or names
-        rows[names] = f"{rows.get(names, '')} {' '.join(line[start + width :].split())}"
+        rows[names] = f"{rows.get(names, '')} {' '.join(line[width:].split())}"
     return rows
 
 

@@ -220,7 +220,7 @@ def test_mp4_passes_every_frame_to_ffmpeg(tmp_path, fake_ffmpeg):
 
 
 @pytest.mark.slow
-def test_mp4_needs_no_program_besides_the_package(tmp_path, monkeypatch):
+def test_mp4_needs_no_program_besides_the_extra(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     animate_gates(make(3), tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"  # the first box of an MP4 file

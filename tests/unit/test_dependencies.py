@@ -1,0 +1,42 @@
+"""Packages that are imported against those that `pyproject.toml` declares."""
+
+import ast
+import sys
+
+from dependency_versions import ROOT, requirements
+from packaging.utils import canonicalize_name
+
+#: Packages by their modules, where the names differ.
+PACKAGES = {"PIL": "pillow"}
+
+#: Dependencies that no file imports: a shared library, what builds the wheel in a test, and a plugin of pytest.
+NOT_IMPORTED = {"karellen-llvm-core", "setuptools", "pytest-xdist"}
+
+#: Packages that tests import where they are installed: of tests with a browser, and a second reader of LAS files.
+OPTIONAL = {"selenium", "lazpy"}
+
+
+def declared(*extras):
+    """Return the names of the dependencies and of those of extras, as package indices normalise them."""
+    return {canonicalize_name(requirement.name) for requirement in requirements(*extras)}
+
+
+def imported(*folders):
+    """Return the names of the packages whose modules the Python files of folders import, at any depth of the code."""
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    own = {"mitransient_lidar", *(path.stem for path in (ROOT / "tests").iterdir())}
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_bytes()))]
+    modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    modules |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.level == 0}
+    names = {module.partition(".")[0] for module in modules} - own - sys.stdlib_module_names
+    return {canonicalize_name(PACKAGES.get(name, name)) for name in names}
+
+
+def test_the_package_imports_what_it_declares_and_nothing_else():
+    assert imported("mitransient_lidar", "plugins", "scenes") == declared("geo", "movie") - NOT_IMPORTED
+
+
+def test_the_tests_import_what_their_extra_declares_and_nothing_else():
+    found = imported("tests")
+    assert found <= declared("geo", "movie", "test") | OPTIONAL
+    assert declared("test") - declared() - found - declared("movie") == NOT_IMPORTED - declared()
