@@ -15,6 +15,7 @@ import xarray as xr
 from mitransient_lidar.campaigns.design import Campaign, Column
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.options import SMALLEST_SHARE
@@ -311,6 +312,7 @@ class RunRenderer:
         margin, width = _MARGIN * (end - start), ends[0][1].bin_width_ns
         return TimeAxis.covering(start - margin, end + margin, width, None, None)
 
+    @alone
     def own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
         """Return the automatic time bins of a run."""
         from mitransient_lidar.transport.scene_parts import find_lidar_scene

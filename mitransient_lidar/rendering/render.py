@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.options import RenderOptions
@@ -37,6 +38,7 @@ DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
 _DEFAULT_MAX_MEMORY_GB = 2.0
 
 
+@alone
 def render(
     scene: str | Path | Mapping[str, Any] | mi.Scene | Session | SceneRecord | xarray.Dataset,
     *,
