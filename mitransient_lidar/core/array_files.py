@@ -6,7 +6,6 @@ Formats are .npy, .npz, OpenEXR, NetCDF-4, ESRI ASCII grid and GeoTIFF.
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 import warnings
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.exr_chunks import check_chunks, read_headers
 from mitransient_lidar.core.files import read_text
 from mitransient_lidar.core.validation import integer, positive
 
@@ -132,18 +132,16 @@ def read_exr(path: Path) -> dict[str, Array]:
         if file.read(len(EXR_SIGNATURE)) != EXR_SIGNATURE:
             raise UserError(damaged)
     check_exr(path, damaged, LARGEST_ARRAY)
-    with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), separate_channels=True) as image:
+    with damaged_file(damaged), OpenEXR.File(os.fspath(path), separate_channels=True) as image:
         return {name: channel.pixels.copy() for name, channel in image.channels().items()}
 
 
 def check_exr(path: str | os.PathLike[str], damaged: str, most: int) -> None:
     """Raise `UserError` if an OpenEXR file is damaged, or has more bytes of pixels than allowed by its headers."""
-    import OpenEXR
-
-    with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), header_only=True) as file:
-        for part in file.parts:
-            first, last = (np.asarray(end, dtype=np.float64) for end in part.header["dataWindow"])
-            check_size(path, 4.0 * float(np.prod(last - first + 1)) * max(len(part.header["channels"]), 1), most)
+    with damaged_file(damaged):
+        for part in read_headers(path):
+            check_size(path, 4.0 * part.shape[0] * part.shape[1] * max(part.channels, 1), most)
+        check_chunks(path)
 
 
 def read_netcdf(path: Path) -> dict[str, Variable]:
@@ -250,18 +248,3 @@ def _check_geotiff(path: Path, file: Any) -> None:
         raise UserError(f"{path} has coordinates in {system.linear_units_factor[0]}: they must be in metres.")
     if (file.units[0] or "m").lower() not in _METRES:
         raise UserError(f"{path} has heights in {file.units[0]}: they must be in metres.")
-
-
-@contextlib.contextmanager
-def silence_openexr() -> Iterator[None]:
-    """Suppress messages that OpenEXR prints from C (file descriptor 2) and from Python (stdout)."""
-    saved = os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
