@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import warnings
 import zipfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -214,13 +213,13 @@ def read_geotiff(path: Path) -> Grid:
             f"cannot read {path}: GeoTIFF needs the extra geo, pip install 'mitransient-lidar[geo]'."
         ) from error
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(path, driver="GTiff") as file:
-                _check_geotiff(path, file)
-                check_size(path, 8.0 * file.width * file.height)
-                masked, place = file.read(1, masked=True), file.transform
-                scale, offset = file.scales[0], file.offsets[0]
+        with rasterio.open(path, driver="GTiff") as file:
+            _check_geotiff(path, file)
+            check_size(path, 8.0 * file.width * file.height)
+            masked, place = file.read(1, masked=True), file.transform
+            scale, offset = file.scales[0], file.offsets[0]
+    except rasterio.errors.NotGeoreferencedWarning as error:  # where warnings are errors
+        raise UserError(_without_coordinates(path)) from error
     except rasterio.errors.RasterioError as error:
         raise UserError(f"{path} is damaged, or is not a GeoTIFF.") from error
     values = scale * masked.astype(np.float64).filled(np.nan) + offset
@@ -239,7 +238,7 @@ def _check_geotiff(path: Path, file: Any) -> None:
     if file.count != 1:
         raise UserError(f"{path} has {file.count} bands: a height map must have one.")
     if place.is_identity:
-        raise UserError(f"{path} has no map coordinates: a GeoTIFF must have them.")
+        raise UserError(_without_coordinates(path))
     if place.b != 0 or place.d != 0:
         raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
     if system is not None and system.is_geographic:
@@ -248,3 +247,7 @@ def _check_geotiff(path: Path, file: Any) -> None:
         raise UserError(f"{path} has coordinates in {system.linear_units_factor[0]}: they must be in metres.")
     if (file.units[0] or "m").lower() not in _METRES:
         raise UserError(f"{path} has heights in {file.units[0]}: they must be in metres.")
+
+
+def _without_coordinates(path: Path) -> str:
+    return f"{path} has no map coordinates: a GeoTIFF must have them."
