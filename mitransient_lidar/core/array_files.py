@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.exr_chunks import check_chunks, read_headers
 from mitransient_lidar.core.files import read_text
-from mitransient_lidar.core.validation import integer, positive
+from mitransient_lidar.core.validation import integer, positive, usable_memory
 
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
 LARGEST_ARRAY = 2**28
@@ -103,8 +103,8 @@ def check_size(path: str | os.PathLike[str], size: float, most: int = LARGEST_AR
 
 
 def largest_result() -> int:
-    """Return the size of the largest arrays of a result that is read: half of the memory of this machine [bytes]."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    """Return the size of the largest arrays of a result that is read: half of the memory of this process [bytes]."""
+    return int(usable_memory())
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passe
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     Session,
+    check_components,
     choose_integrator,
     open_scene,
     pass_attributes,
@@ -204,6 +205,8 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
+    if components:
+        check_components(session.scene)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     if components:

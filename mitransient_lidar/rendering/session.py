@@ -150,6 +150,13 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     return chosen
 
 
+def check_components(scene: mi.Scene) -> None:
+    """Raise `UserError` for too many solids to separate their light, before a renderer is prepared for all of them."""
+    from mitransient_lidar.transport.path_classes import check_solids
+
+    check_solids(sum(not shape.is_medium_transition() for shape in scene.shapes()))
+
+
 def pass_attributes(log: PassLog, seed: int) -> dict[str, Any]:
     """Return the attributes of a result that describe its passes.
 

@@ -105,6 +105,7 @@ class Renders:
                 found[number].append(as_series(result.isel(shot=slice(edges[number], edges[number + 1]))))
         return [joined(parts) for parts in found]
 
+    @alone
     def session(self, scene: str, sea: int = 0) -> Session:
         """Return a loaded scene, on its own sea (0) or on another one."""
         key = (scene, sea)
