@@ -155,7 +155,7 @@ def time_samples(times_ns: npt.ArrayLike, name: str, values: npt.ArrayLike) -> t
 
 
 def usable_memory() -> float:
-    """Return the memory that large arrays may take [bytes]: half of what this machine, or a limit, gives the process."""
+    """Return the memory that large arrays may take [bytes]: half of what machine and limits give this process."""
     limits = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
     soft = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
     limits += [float(limit) for limit in soft if limit != resource.RLIM_INFINITY]
