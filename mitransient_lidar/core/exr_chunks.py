@@ -23,8 +23,8 @@ _ZIPS, _ZIP, _PXR24 = 2, 3, 5
 #: Bits of the version: a single part of tiles, parts of samples at several depths, several parts.
 _TILED, _DEEP, _SEVERAL = 0x200, 0x800, 0x1000
 
-#: Bytes of a sample of the types UINT, HALF and FLOAT.
-_SAMPLE_BYTES = (4, 2, 4)
+#: Bytes of a sample of the types UINT, HALF and FLOAT, and within the data of PXR24.
+_SAMPLE_BYTES, _PXR24_BYTES = (4, 2, 4), (4, 2, 3)
 
 #: Longest name of an attribute or a channel, and largest header [bytes].
 _LONGEST_NAME, _LARGEST_HEADER = 255, 2**28
@@ -38,6 +38,7 @@ class Part:
     first_line: int
     channels: int
     pixel_bytes: int  #: Bytes of all samples of a pixel.
+    inflated_bytes: int  #: Those within the data of zlib.
     compression: int
     chunks: int  #: Number of chunks.
     is_plain: bool  #: Whether it has scan lines of a known compression, with samples in all pixels.
@@ -46,13 +47,13 @@ class Part:
         """Raise an error for a damaged chunk, at whose first line the file is."""
         lines = _LINES[self.compression]
         line, size = struct.unpack("<ii", file.read(8))
-        whole = min(lines, self.shape[0] - number * lines) * self.shape[1] * self.pixel_bytes
+        pixels = min(lines, self.shape[0] - number * lines) * self.shape[1]
+        whole, inflated = pixels * self.pixel_bytes, pixels * self.inflated_bytes
         data = file.read(size) if 0 < size <= whole else b""
         if line != self.first_line + number * lines or not data or len(data) != size:
             raise ValueError(f"chunk {number} is damaged")
         if self.compression in (_ZIPS, _ZIP, _PXR24) and size < whole:
-            inflated = zlib.decompressobj().decompress(data, whole + 1)
-            if len(inflated) > whole or (len(inflated) != whole and self.compression != _PXR24):
+            if len(zlib.decompressobj().decompress(data, inflated + 1)) != inflated:
                 raise ValueError(f"chunk {number} is damaged")
 
 
@@ -127,8 +128,10 @@ def _part(attributes: dict[str, bytes], version: int) -> Part:
     """Return the part of a header."""
     left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     shape = bottom - top + 1, right - left + 1
-    channels, plain = _channels(attributes["channels"])
+    kinds, plain = _channels(attributes["channels"])
     compression = attributes["compression"][0]
+    whole = sum(_SAMPLE_BYTES[kind] for kind in kinds)
+    inflated = sum(_PXR24_BYTES[kind] for kind in kinds) if compression == _PXR24 else whole
     scan_lines = attributes.get("type", b"scanlineimage") == b"scanlineimage" and not version & (_TILED | _DEEP)
     known = compression < len(_LINES)
     if min(shape) < 1:
@@ -137,17 +140,17 @@ def _part(attributes: dict[str, bytes], version: int) -> Part:
         (chunks,) = struct.unpack("<i", attributes["chunkCount"])
     else:
         chunks = -(-shape[0] // _LINES[compression]) if known else 0
-    return Part(shape, top, len(channels), sum(channels), compression, chunks, plain and scan_lines and known)
+    return Part(shape, top, len(kinds), whole, inflated, compression, chunks, plain and scan_lines and known)
 
 
 def _channels(data: bytes) -> tuple[list[int], bool]:
-    """Return the bytes of a sample of each channel of a list, and whether all of them have one in each pixel."""
+    """Return the types of the samples of each channel of a list, and whether all of them have one in each pixel."""
     found, plain, place = [], True, 0
     while data[place]:
         end = data.index(b"\0", place)
         data[place:end].decode()
         kind, sampling_x, sampling_y = struct.unpack_from("<i4xii", data, end + 1)
-        found.append(_SAMPLE_BYTES[kind])
+        found.append(kind)
         plain = plain and sampling_x == sampling_y == 1
         place = end + 17
     return found, plain
