@@ -52,9 +52,9 @@ class Part:
         data = file.read(size) if 0 < size <= whole else b""
         if line != self.first_line + number * lines or not data or len(data) != size:
             raise ValueError(f"chunk {number} is damaged")
-        if self.compression in (_ZIPS, _ZIP, _PXR24) and size < whole:
-            if len(zlib.decompressobj().decompress(data, inflated + 1)) != inflated:
-                raise ValueError(f"chunk {number} is damaged")
+        is_deflated = self.compression in (_ZIPS, _ZIP, _PXR24) and size < whole
+        if is_deflated and len(zlib.decompressobj().decompress(data, inflated + 1)) != inflated:
+            raise ValueError(f"chunk {number} is damaged")
 
 
 def read_headers(path: str | os.PathLike[str]) -> list[Part]:
