@@ -15,7 +15,7 @@ import xarray as xr
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray, finite, in_range
+from mitransient_lidar.core.validation import FloatArray, finite, in_range, integer, require_memory
 from mitransient_lidar.physics.receiver.electronics import Digitiser
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.physics.receiver.receiver_files import Channel, ReceiverChannels, Setting, instrument_receiver
@@ -24,6 +24,7 @@ from mitransient_lidar.physics.receiver.receiver_files import receiver as receiv
 _LOG = logging.getLogger(__name__)
 
 DENSEST = 12.0  # largest optical density
+_BYTES_PER_SAMPLE = 8  # memory of a sample: signal, saturation, and what is computed of them
 _LISTED_PIXELS = 12  # most pixels whose saturation is listed
 
 
@@ -223,6 +224,8 @@ def _record_channel(
     if smoothed and float(dataset.attrs.get("response_time_ns", 0)) > 0:
         _LOG.warning("the waveform includes a response time already, and the amplifier's bandwidth smooths it again")
     receiver, density, fitting = _in_range(given, channel.gain, channel.optical_density, light, width, sky)
+    number = integer("shots", shots, 1, 10**9)
+    require_memory(f"{number} records of {light.size} samples", _BYTES_PER_SAMPLE * number * light.size, "take fewer")
     power, background = 10**-density * light, np.broadcast_to(10**-density * sky, light.shape[:-1])
     signal, saturated = receiver.apply(power, width, shots, seeds[1], background, series=series, common_seed=seeds[0])
     number = len(signal)

@@ -17,6 +17,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.document import read_document
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
@@ -314,6 +315,7 @@ class RunRenderer:
         margin, width = _MARGIN * (end - start), ends[0][1].bin_width_ns
         return TimeAxis.covering(start - margin, end + margin, width, None, None)
 
+    @alone
     def own_axis(self, values: Mapping[str, Any]) -> TimeAxis:
         """Return the automatic time bins of a run."""
         from mitransient_lidar.transport.scene_parts import find_lidar_scene

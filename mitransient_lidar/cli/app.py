@@ -11,6 +11,7 @@ import contextlib
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Annotated, Any
@@ -153,6 +154,8 @@ def _run() -> None:
     """Run the command of the arguments."""
     # Commands draw to files only: Matplotlib refuses to be imported with an unknown backend.
     os.environ["MPLBACKEND"] = "agg"
+    # Rasterio says it of a GeoTIFF that is then refused.
+    warnings.filterwarnings("ignore", "Dataset has no geotransform")
     if sys.argv[1:2] not in (["sweep"], ["fly"]) and not {"dask", "xarray"} & sys.modules.keys():
         # xarray imports Dask wherever it is installed, which takes a third of a second. Campaigns alone need it. An
         # xarray that a script has imported before remembers where Dask is, and goes on with it.

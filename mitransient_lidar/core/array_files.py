@@ -6,10 +6,8 @@ Formats are .npy, .npz, OpenEXR, NetCDF-4, ESRI ASCII grid and GeoTIFF.
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
-import warnings
 import zipfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -19,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.exr_chunks import check_chunks, read_headers
 from mitransient_lidar.core.files import check_regular, is_there, open_file, read_text
-from mitransient_lidar.core.validation import integer, positive
+from mitransient_lidar.core.validation import integer, positive, usable_memory
 
 #: Largest arrays of a map, a table or an image that a scene names [bytes].
 LARGEST_ARRAY = 2**28
@@ -104,8 +103,8 @@ def check_size(path: str | os.PathLike[str], size: float, most: int = LARGEST_AR
 
 
 def largest_result() -> int:
-    """Return the size of the largest arrays of a result that is read: half of the memory of this machine [bytes]."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    """Return the size of the largest arrays of a result that is read: half of the memory of this process [bytes]."""
+    return int(usable_memory())
 
 
 @contextlib.contextmanager
@@ -132,19 +131,17 @@ def read_exr(path: Path) -> dict[str, Array]:
         if file.read(len(EXR_SIGNATURE)) != EXR_SIGNATURE:
             raise UserError(damaged)
     check_exr(path, damaged, LARGEST_ARRAY)
-    with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), separate_channels=True) as image:
+    with damaged_file(damaged), OpenEXR.File(os.fspath(path), separate_channels=True) as image:
         return {name: channel.pixels.copy() for name, channel in image.channels().items()}
 
 
 def check_exr(path: str | os.PathLike[str], damaged: str, most: int) -> None:
     """Raise `UserError` if an OpenEXR file is damaged, or has more bytes of pixels than allowed by its headers."""
-    import OpenEXR
-
     check_regular(path)
-    with damaged_file(damaged), silence_openexr(), OpenEXR.File(os.fspath(path), header_only=True) as file:
-        for part in file.parts:
-            first, last = (np.asarray(end, dtype=np.float64) for end in part.header["dataWindow"])
-            check_size(path, 4.0 * float(np.prod(last - first + 1)) * max(len(part.header["channels"]), 1), most)
+    with damaged_file(damaged):
+        for part in read_headers(path):
+            check_size(path, 4.0 * part.shape[0] * part.shape[1] * max(part.channels, 1), most)
+        check_chunks(path)
 
 
 def check_hdf5(path: str | os.PathLike[str]) -> None:
@@ -256,13 +253,13 @@ def read_geotiff(path: Path) -> Grid:
         if beside.name.startswith(f"{path.stem}."):
             check_regular(beside)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(path, driver="GTiff") as file:
-                _check_geotiff(path, file)
-                check_size(path, 8.0 * file.width * file.height)
-                masked, place = file.read(1, masked=True), file.transform
-                scale, offset = file.scales[0], file.offsets[0]
+        with rasterio.open(path, driver="GTiff") as file:
+            _check_geotiff(path, file)
+            check_size(path, 8.0 * file.width * file.height)
+            masked, place = file.read(1, masked=True), file.transform
+            scale, offset = file.scales[0], file.offsets[0]
+    except rasterio.errors.NotGeoreferencedWarning as error:  # where warnings are errors
+        raise UserError(_without_coordinates(path)) from error
     except rasterio.errors.RasterioError as error:
         raise UserError(f"{path} is damaged, or is not a GeoTIFF.") from error
     values = scale * masked.astype(np.float64).filled(np.nan) + offset
@@ -281,7 +278,7 @@ def _check_geotiff(path: Path, file: Any) -> None:
     if file.count != 1:
         raise UserError(f"{path} has {file.count} bands: a height map must have one.")
     if place.is_identity:
-        raise UserError(f"{path} has no map coordinates: a GeoTIFF must have them.")
+        raise UserError(_without_coordinates(path))
     if place.b != 0 or place.d != 0:
         raise UserError(f"{path} is rotated against its map coordinates: rows must run along x.")
     if system is not None and system.is_geographic:
@@ -292,16 +289,5 @@ def _check_geotiff(path: Path, file: Any) -> None:
         raise UserError(f"{path} has heights in {file.units[0]}: they must be in metres.")
 
 
-@contextlib.contextmanager
-def silence_openexr() -> Iterator[None]:
-    """Suppress messages that OpenEXR prints from C (file descriptor 2) and from Python (stdout)."""
-    saved = os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
+def _without_coordinates(path: Path) -> str:
+    return f"{path} has no map coordinates: a GeoTIFF must have them."

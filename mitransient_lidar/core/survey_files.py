@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
-import warnings
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -65,18 +65,13 @@ def read_points(path: Path) -> FloatArray:
         head = file.read(_HEAD).decode("utf-8-sig", "replace").splitlines()
     columns, skipped, separator = _layout(path, head)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an empty table
-            points = np.loadtxt(
-                path,
-                delimiter=separator,
-                skiprows=skipped,
-                usecols=columns,
-                comments=_COMMENTS,
-                ndmin=2,
-                max_rows=_MOST_POINTS + 1,
-                encoding="utf-8-sig",
-            )
+        with path.open(encoding="utf-8-sig") as file:
+            # NumPy warns of tables without rows, and of blank lines.
+            rows = filter(_is_row, itertools.islice(file, skipped, None))
+            first, points = list(itertools.islice(rows, 1)), np.empty((0, 3))
+            if first:
+                chosen = itertools.chain(first, itertools.islice(rows, _MOST_POINTS))
+                points = np.loadtxt(chosen, delimiter=separator, usecols=columns, comments=_COMMENTS, ndmin=2)
     except (ValueError, OverflowError) as error:
         raise UserError(f"{path} is not a table of points x, y and z: {' '.join(str(error).split())[:200]}.") from error
     if len(points) > _MOST_POINTS:
@@ -85,6 +80,12 @@ def read_points(path: Path) -> FloatArray:
     for row in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
         raise UserError(f"{path} has the point {', '.join(f'{one:g}' for one in points[row])}: points must be finite.")
     return points
+
+
+def _is_row(line: str) -> bool:
+    """Return whether a line of a table is neither blank nor a comment."""
+    text = line.strip()
+    return bool(text) and not text.startswith(_COMMENTS)
 
 
 def _layout(path: Path, head: list[str]) -> tuple[tuple[int, ...], int, str | None]:

@@ -1,7 +1,11 @@
 """Validators of numeric parameters: each returns the clean value or raises ``UserError`` with one sentence."""
 
+import contextlib
 import math
 import operator
+import os
+import resource
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -159,3 +163,20 @@ def time_samples(times_ns: npt.ArrayLike, name: str, values: npt.ArrayLike) -> t
     if t.shape != v.shape:
         raise UserError(f"times_ns of shape {t.shape} and {name} of shape {v.shape} must have equal lengths")
     return t, v
+
+
+def usable_memory() -> float:
+    """Return the memory that large arrays may take [bytes]: half of what machine and limits give this process."""
+    limits = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
+    soft = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
+    limits += [float(limit) for limit in soft if limit != resource.RLIM_INFINITY]
+    # Of a container: a number, or "max".
+    with contextlib.suppress(OSError, ValueError):
+        limits.append(float(Path("/sys/fs/cgroup/memory.max").read_text("ascii")))
+    return min(limits) / 2
+
+
+def require_memory(what: str, size: float, advice: str) -> None:
+    """Raise `UserError` if arrays of a size [bytes] exceed `usable_memory`; `what` is their name in the plural."""
+    if size > (most := usable_memory()):
+        raise UserError(f"{what} take {size / 1e9:.3g} GB of memory, and at most {most / 1e9:.3g} GB may be: {advice}")

@@ -21,6 +21,7 @@ from mitransient_lidar.flights.las import write_points, write_waveforms
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import pixel_turns, poses_of
 from mitransient_lidar.flights.positions import PointClass, fit_surface, positions
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.pose import Pose
 from mitransient_lidar.physics.lidar.refraction import cos_in_water
 
@@ -206,6 +207,7 @@ def describe_points(points: xr.Dataset) -> list[str]:
     return lines
 
 
+@alone
 def _truth(flown: Flown, plan: FlightPlan, points: xr.Dataset) -> dict[str, Any]:
     """Return what is known of points: height of the sea in the beam or of the highest solid there, and of the pulse."""
     from mitransient_lidar.rendering.session import open_scene

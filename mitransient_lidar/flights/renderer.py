@@ -21,6 +21,7 @@ from mitransient_lidar.core.validation import FloatArray, IntArray
 from mitransient_lidar.flights.plan import FlightPlan
 from mitransient_lidar.flights.poses.mounting import PulsePoses, pixel_turns, poses_of
 from mitransient_lidar.flights.recording import SETTINGS, chosen_settings, has_automatic_settings, pooled_errors, record
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.session import open_scene
@@ -105,6 +106,7 @@ class FlightRenderer:
         return self.plan.text
 
     @classmethod
+    @alone
     def of(cls, plan: FlightPlan) -> tuple[FlightRenderer, dict[str, Column]]:
         """Return the renderer of a new flight, and the inputs of its pulses, in groups.
 
@@ -156,10 +158,12 @@ class FlightRenderer:
                 yield list(range(first, row))
                 first = row
 
+    @alone
     def stacked(self, numbers: npt.NDArray[np.int64], inputs: Mapping[str, Column]) -> dict[str, Array]:
         """Return the arrays of pulses of one group that are rendered together; raise `UserError` if that fails."""
         return self._stacked(inputs)[0]
 
+    @alone
     def sample(self, inputs: Mapping[str, Column]) -> tuple[dict[str, Array], dict[str, Array], dict[str, Any]]:
         """Return arrays of pulses, the coordinates of their dimensions, and the attributes of echoes."""
         arrays, echoes = self._stacked(inputs, turned=False)

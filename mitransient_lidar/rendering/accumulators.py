@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, require_memory
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import ErrorInflation, ErrorWindow, PassStatistics
@@ -328,6 +328,7 @@ def choose_accumulator(
     film_bytes, gates = per_bin * bins, 0 if train is None else _BYTES_PER_KEPT_GATE * pixels * train.count
     everything = film_bytes + _BYTES_PER_KEPT_BIN * bins + _BYTES_PER_BATCH * each * batches + gates
     if everything <= limit:
+        require_memory(f"histograms of {pixels} pixels x {scene.axis.bin_count} bins", everything, "take fewer of them")
         return WaveformAccumulator(scene, window, train, origins, parameters, reweighted, differences, batches)
     size = f"the histogram of {pixels} pixels x {scene.axis.bin_count} bins takes {1e-9 * everything:.2g} GB"
     if origins:

@@ -12,6 +12,7 @@ from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.ranges import unit_of
 from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.parameters import parameter_of, value_of, with_value
 from mitransient_lidar.physics.lidar.gate_train import GateTrain
 from mitransient_lidar.physics.lidar.pulse import waveform
@@ -198,6 +199,7 @@ class Differences:
         return self._gates.stderr
 
 
+@alone
 def differences(
     session: Session,
     integrator: LidarIntegrator,

@@ -17,6 +17,7 @@ from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive, shown
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord
 from mitransient_lidar.rendering.accuracy import RatioStatistics
 from mitransient_lidar.rendering.options import RenderOptions
@@ -46,6 +47,7 @@ MOST_FRAMES = 10_000
 _TIME_PARAMETER = "surface_time"  # time of the sea of an XML scene [s]
 
 
+@alone
 def render_passive(
     scene: str | Path | Mapping[str, Any] | mi.Scene,
     params: Mapping[str, Any] | None = None,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering import again
 from mitransient_lidar.rendering.accumulators import choose_accumulator
 from mitransient_lidar.rendering.options import RenderOptions
@@ -15,6 +16,7 @@ from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passe
 from mitransient_lidar.rendering.session import (
     TOLERATED_LOSS,
     Session,
+    check_components,
     choose_integrator,
     open_scene,
     pass_attributes,
@@ -37,6 +39,7 @@ DEFAULT_GATE_GOAL = Goal(target_error=0.1, max_time=60.0)
 _DEFAULT_MAX_MEMORY_GB = 2.0
 
 
+@alone
 def render(
     scene: str | Path | Mapping[str, Any] | mi.Scene | Session | SceneRecord | xarray.Dataset,
     *,
@@ -202,6 +205,8 @@ def _render(
     """Render a loaded scene, as `render` describes."""
     seed, components, share = options.seed or 0, bool(options.components), options.pass_share or 1.0
     max_memory = options.max_memory or _DEFAULT_MAX_MEMORY_GB
+    if components:
+        check_components(session.scene)
     chosen = choose_integrator(session.scene, integrator)
     renderer = chosen.prepare(session.scene, session.sensor)
     if components:

@@ -11,6 +11,7 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading import variants
 from mitransient_lidar.loading.checks import check_dict
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.loading.scene_record import SceneRecord, plugin_values
 from mitransient_lidar.loading.scenes import as_user_error, load
 from mitransient_lidar.rendering.passes import PassLog
@@ -75,6 +76,7 @@ class Session:
             logger.info("%s%s", text, end)
 
 
+@alone
 def open_scene(
     scene: Any,
     params: Mapping[str, Any] | None = None,
@@ -147,6 +149,13 @@ def choose_integrator(scene: mi.Scene, wanted: Any, passive: bool = False) -> Li
     if chosen.passive and not passive:
         raise UserError(f"integrator: {chosen.plugin} has no laser; use a lidar integrator, or render_passive")
     return chosen
+
+
+def check_components(scene: mi.Scene) -> None:
+    """Raise `UserError` for too many solids to separate their light, before a renderer is prepared for all of them."""
+    from mitransient_lidar.transport.path_classes import check_solids
+
+    check_solids(sum(not shape.is_medium_transition() for shape in scene.shapes()))
 
 
 def pass_attributes(log: PassLog, seed: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import xarray as xr
 from mitransient_lidar import results
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray
-from mitransient_lidar.rendering.session import Session, choose_integrator, open_scene
+from mitransient_lidar.rendering.session import Session, check_components, choose_integrator, open_scene
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -61,6 +61,8 @@ class ShotScene:
         self._derivatives = derivatives
         self._instrument, self._place = instrument, (float(places[0, 0]), float(places[0, 1]))
         self.session = self._open(self._at(*self._place))
+        if components:
+            check_components(self.session.scene)
         self._integrator = choose_integrator(self.session.scene, None)
         shifts = [(float(x), float(y)) for x, y in places - places[0]]
         own = find_lidar_scene(self.session.scene, self.session.sensor, shifts=shifts).axis

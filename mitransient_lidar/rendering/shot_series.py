@@ -19,6 +19,7 @@ from mitransient_lidar.core.headings import Column
 from mitransient_lidar.core.interruption import DeferredInterrupt
 from mitransient_lidar.core.text_tables import read_two_columns
 from mitransient_lidar.core.validation import FloatArray, IntArray, finite_array, integer
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
@@ -61,6 +62,7 @@ def random_places(sea: SeaMap, count: int, seed: int) -> FloatArray:
     return np.random.default_rng(seed).uniform(sea.x[0], sea.x[-1], (count, 2))
 
 
+@alone
 def render_shots(
     scene: Any,
     params: Mapping[str, Any] | None = None,

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result, silence_openexr
+from mitransient_lidar.core.array_files import check_exr, damaged_file, largest_result
 from mitransient_lidar.core.documents import parse_json
 from mitransient_lidar.core.errors import UserError
 
@@ -145,17 +145,16 @@ def write_parts(path: str | os.PathLike[str], parts: Sequence[Part]) -> None:
         If the file cannot be written.
     """
     kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with silence_openexr():
-        try:
-            with OpenEXR.File(
-                [
-                    OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
-                    for part in parts
-                ]
-            ) as file:
-                file.write(os.fspath(path))
-        except RuntimeError as error:
-            raise OSError(str(error)) from error
+    try:
+        with OpenEXR.File(
+            [
+                OpenEXR.Part({**part.attributes, _CHECKSUM: _checksum(part), **kind}, part.channels, part.name)
+                for part in parts
+            ]
+        ) as file:
+            file.write(os.fspath(path))
+    except RuntimeError as error:
+        raise OSError(str(error)) from error
 
 
 def read_parts(path: str | os.PathLike[str]) -> list[Part]:
@@ -168,11 +167,7 @@ def read_parts(path: str | os.PathLike[str]) -> list[Part]:
         own. Files of other programs have none.
     """
     check_exr(path, _damaged(path), largest_result())
-    with (
-        damaged_file(_damaged(path)),
-        silence_openexr(),
-        OpenEXR.File(os.fspath(path), separate_channels=True) as file,
-    ):
+    with damaged_file(_damaged(path)), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
         # Closing the file clears its dictionaries and frees the pixels.
         parts = [
             Part(

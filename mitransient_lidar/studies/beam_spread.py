@@ -12,6 +12,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.level_sea import LevelSea
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Goal, ProgressCallback, run_passes
@@ -62,6 +63,7 @@ _COLUMNS = (
 _COLUMN = 17
 
 
+@alone
 def beam_spread(
     scene: Any,
     depths: npt.ArrayLike,

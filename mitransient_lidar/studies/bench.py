@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
@@ -159,6 +160,7 @@ def _row(labels: Iterable[str], cells: Iterable[str]) -> str:
     return " ".join([*(f"{label:<14}" for label in labels), *(f"{cell:>10}" for cell in cells)])
 
 
+@alone
 def measure(
     case: str, integrator: str, quick: bool, target_error: float | None, max_time: float | None
 ) -> dict[str, float]:

@@ -20,6 +20,7 @@ from mitransient_lidar.analysis.receiver import DENSEST, receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.files import replacing
 from mitransient_lidar.core.validation import in_range, integer, non_negative, positive, shown
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.receiver.receiver_files import ReceiverChannels
 from mitransient_lidar.rendering.options import RenderOptions
 from mitransient_lidar.rendering.passes import Progress, ProgressCallback, pass_seed
@@ -34,6 +35,7 @@ MOST_DESIGNS = 1000
 _JOINED = ("bound", "bound_stderr", "bound_known", "variance_share", "monte_carlo_share", "correlation")
 
 
+@alone
 def bounds(
     scene: Any,
     params: Mapping[str, Any] | None = None,

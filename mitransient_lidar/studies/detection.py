@@ -17,6 +17,7 @@ from mitransient_lidar.analysis.detection.trials import COMBINATIONS, Experiment
 from mitransient_lidar.analysis.receiver import receiver_of
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import in_range, integer, non_negative
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.receiver.presets import ReceiverChain
 from mitransient_lidar.rendering.options import RenderOptions
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 
+@alone
 def detect(
     scene: Any,
     params: Mapping[str, Any] | None = None,

@@ -13,6 +13,7 @@ import xarray as xr
 from mitransient_lidar.core.constants import C0
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.echo_estimate import Arrivals, EchoEstimate
 from mitransient_lidar.physics.lidar.lidar_equation import LidarSystem
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
@@ -59,6 +60,7 @@ _BELOW_ONE = np.float32(1 - 2**-24)
 _ORIGINS = ("surface", "water", "bottom")
 
 
+@alone
 def estimate(
     scene: Any,
     params: Mapping[str, Any] | None = None,

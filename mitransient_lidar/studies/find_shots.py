@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SLOPE_KINDS, SeaMap, Shot, footprint, transmitter_of
 from mitransient_lidar.rendering.session import open_scene
@@ -51,6 +52,7 @@ class RenderedShots:
     pixel_count: int
 
 
+@alone
 def find_shots(
     scene: Any, params: Mapping[str, Any] | None = None, *, slope_sigmas: float = 2.0, count: int = 1
 ) -> list[Shot]:
@@ -82,6 +84,7 @@ def find_shots(
     return [shot for kind in SLOPE_KINDS for shot in sea.find(kind, slope_sigmas, count, apart)]
 
 
+@alone
 def shots_at(scene: Any, places: Sequence[tuple[float, float]], params: Mapping[str, Any] | None = None) -> list[Shot]:
     """Return shots at given places (x, y) [m] of the sea of a scene; raises as `find_shots`."""
     loaded = open_scene(scene, params).scene
@@ -89,6 +92,7 @@ def shots_at(scene: Any, places: Sequence[tuple[float, float]], params: Mapping[
     return [Shot(f"shot {number}", x, y, *sea.slope_at(x, y)) for number, (x, y) in enumerate(places, start=1)]
 
 
+@alone
 def render_found_shots(
     scene: Any,
     shots: Sequence[Shot],

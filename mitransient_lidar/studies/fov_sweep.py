@@ -18,6 +18,7 @@ from mitransient_lidar.analysis.retrieval.column_slope import BEAM_EDGE, ColumnB
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, finite_array, integer
 from mitransient_lidar.loading import catalogue
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.physics.lidar.system_attenuation import system_attenuation
 from mitransient_lidar.physics.water.water_types import InherentProperties
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
+@alone
 def fov_sweep(
     scene: Any,
     fov_mrad: npt.ArrayLike,

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from mitransient_lidar.core.validation import integer
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.rendering.accuracy import PassStatistics
 from mitransient_lidar.rendering.options import RenderOptions
@@ -19,6 +20,7 @@ from mitransient_lidar.transport.path_classes import MOST_ORDERS, PathClasses
 _REVERSALS = ("one", "several")
 
 
+@alone
 def scattering_orders(
     scene: Any,
     params: Mapping[str, Any] | None = None,

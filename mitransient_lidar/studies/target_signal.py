@@ -13,6 +13,7 @@ import xarray as xr
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.validation import FloatArray, integer, positive
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.pulse import waveform
 from mitransient_lidar.physics.lidar.time_axis import TimeAxis
 from mitransient_lidar.rendering.accuracy import PassStatistics
@@ -27,6 +28,7 @@ _HALF_GATE = 1.0
 _GROUPS = 16
 
 
+@alone
 def target_signal(
     scene: Any,
     params: Mapping[str, Any] | None = None,
@@ -106,6 +108,7 @@ def target_signal(
     return result.assign_coords(pixel=list(pixels.names)).assign_attrs(attributes)
 
 
+@alone
 def target_map(
     scene: Any,
     params: Mapping[str, Any] | None = None,

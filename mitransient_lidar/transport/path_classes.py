@@ -27,6 +27,12 @@ ORIGINS = ("surface", "water")
 _MOST_SOLIDS = 30
 
 
+def check_solids(number: int) -> None:
+    """Raise `UserError` if there are too many solids to separate their light."""
+    if number > _MOST_SOLIDS:
+        raise UserError(f"components: the scene has {number} solids; allowed are at most {_MOST_SOLIDS}")
+
+
 @dataclass(frozen=True)
 class PathClasses:
     """Classes into which the light of each pixel is separated.
@@ -44,8 +50,7 @@ class PathClasses:
     @classmethod
     def by_origin(cls, solids: list[mi.Shape]) -> PathClasses:
         """Return the classes of light by origin; raise UserError for too many solids."""
-        if len(solids) > _MOST_SOLIDS:
-            raise UserError(f"components: the scene has {len(solids)} solids; allowed are at most {_MOST_SOLIDS}")
+        check_solids(len(solids))
         return cls(solids=tuple(solids))
 
     @property

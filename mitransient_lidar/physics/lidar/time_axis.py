@@ -15,6 +15,9 @@ from mitransient_lidar.core.validation import FloatArray
 #: Largest number of bins.
 MOST_BINS = 1_000_000
 
+#: Longest record of automatic length [ns], which light travels 3000 km.
+LONGEST_NS = 1e7
+
 #: Parts of a fitted record, at least, between the readable times at which it may start and end.
 _PARTS = 20
 
@@ -44,7 +47,7 @@ class TimeAxis:
         Raises
         ------
         UserError
-            If the record has more than 1 000 000 bins.
+            If the record has more than 1 000 000 bins, or its length is automatic and more than 10 ms.
         """
         begin = first_ns if start_ns is None else start_ns
         bins = max(last_ns - min(begin, first_ns), 0.0) / bin_width_ns
@@ -54,6 +57,11 @@ class TimeAxis:
         if start_ns is None:
             start_ns = step * math.floor(first_ns / (step * bin_width_ns)) * bin_width_ns
         if bin_count is None:
+            if last_ns - start_ns > LONGEST_NS:
+                raise UserError(
+                    f"the record from {start_ns:g} to {last_ns:g} ns is longer than {LONGEST_NS:g} ns, the most of an "
+                    "automatic one: give time_start_ns and bin_count"
+                )
             bin_count = step * max(math.ceil((last_ns - start_ns) / (step * bin_width_ns) - 1e-9), 1)
         if bin_count > MOST_BINS:
             raise UserError(

@@ -14,6 +14,7 @@ import xarray as xr
 
 from mitransient_lidar.core.validation import integer, relative_error
 from mitransient_lidar.loading.catalogue import scene_parameters
+from mitransient_lidar.loading.exclusive import alone
 from mitransient_lidar.physics.lidar.lidar_geometry import LidarGeometry
 from mitransient_lidar.rendering.passes import ProgressCallback
 from mitransient_lidar.rendering.sea_map import SeaMap
@@ -104,6 +105,7 @@ class Renders:
                 found[number].append(as_series(result.isel(shot=slice(edges[number], edges[number + 1]))))
         return [joined(parts) for parts in found]
 
+    @alone
     def session(self, scene: str, sea: int = 0) -> Session:
         """Return a loaded scene, on its own sea (0) or on another one."""
         key = (scene, sea)
@@ -111,6 +113,7 @@ class Renders:
             self._sessions[key] = open_scene(scene, {"surface_seed": sea} if sea else None)
         return self._sessions[key]
 
+    @alone
     def sea(self, scene: str, sea: int = 0) -> SeaMap:
         """Return the map of the sea of a scene, on its own sea (0) or on another one."""
         key = (scene, sea)

@@ -101,6 +101,9 @@ _COARSE, _PHOTONS_OF_COARSE, _COARSE_PATCHES = 8.0, 32, 2.0
 #: Points of a light path that are expected, over those of a straight one, to scale the rate of connections.
 _POINTS_OF_LIGHT = 0.8
 
+#: Largest capacity for segments of a path before a pass has needed more: light that is scattered more often is weak.
+_MOST_SEGMENTS = 64.0
+
 #: Capacity for segments and hits over the need of the last pass.
 _CAPACITY_MARGIN = 1.25
 
@@ -236,7 +239,7 @@ class MergingLayout:
         if attenuation > 0:
             thickness = min(thickness, _THICKNESS_PER_ATTENUATION / attenuation)
         # Rounded, so that other shots use the same kernels.
-        segments = 0.5 * np.ceil(3 * (1 + scattering * reach)) + 1
+        segments = min(0.5 * np.ceil(3 * (1 + scattering * reach)) + 1, _MOST_SEGMENTS)
         pose = scene.transmitter.pose
         if scene.submerged:
             width = options.cell_size or _CELL_PER_BEAM * scene.transmitter.angular_spread * nearest

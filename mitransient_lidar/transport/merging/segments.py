@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mitransient_lidar.core.validation import require_memory
 from mitransient_lidar.transport.contribution import Contribution
 from mitransient_lidar.transport.opaque import opaque, opaque_index
 from mitransient_lidar.transport.path_classes import PathClasses
@@ -17,6 +18,9 @@ from mitransient_lidar.transport.scene import LidarScene
 
 #: Numbers that tell the points of a path apart; those of paths with more points may be those of other paths.
 _KEYS_PER_PATH = 1021
+
+#: Memory of a segment, and of four of its sums of perturbations [bytes].
+_BYTES_PER_SEGMENT, _BYTES_PER_SUMS = 60, 16
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,8 @@ class SegmentBuffer:
         self.paths, self._shots = paths, shots
         self.spacing = opaque(spacing)
         self.capacity, self._capacity = capacity, opaque_index(capacity)
+        size = capacity * (_BYTES_PER_SEGMENT + _BYTES_PER_SUMS * -(-self._perturbations.count // 4))
+        require_memory(f"{capacity} segments of {shots * paths} paths", size, "take fewer paths_per_pass")
         self._stored = dr.zeros(mi.UInt32, 1)
         self._of_path = dr.zeros(mi.UInt32, shots * paths)
         self._place = dr.zeros(mi.UInt32, 2 * capacity)

@@ -1,9 +1,14 @@
 """EXR stacks: channels, header attributes, damage."""
 
+import concurrent.futures
+import os
+import sys
+
 import numpy as np
 import OpenEXR
 import pytest
 
+from mitransient_lidar.core.array_files import read_exr
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.results import exr
 
@@ -82,6 +87,49 @@ def test_every_truncation_and_a_flipped_byte_are_detected(tmp_path, capfd):
     part.write_bytes(data[:-20] + bytes([data[-20] ^ 255]) + data[-19:])
     with pytest.raises(UserError, match="damaged"):
         exr.read(part)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_threads_that_read_damaged_files_change_nothing_of_the_process(tmp_path, capfd):
+    exr.write(tmp_path / "a.exr", {"bin": {"Y": np.ones((20, 8, 200))}}, {}, {})
+    (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-20])
+    before = sys.stdout, os.fstat(2).st_ino
+
+    def read(number):
+        if number % 2:
+            exr.read(tmp_path / "a.exr")
+        else:
+            with pytest.raises(UserError, match="damaged"):
+                exr.read(tmp_path / "b.exr")
+        # Another one may print while a file is read.
+        sys.stdout.write(f"{number}\n")
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        list(pool.map(read, range(32)))
+    assert (sys.stdout, os.fstat(2).st_ino) == before
+    out, err = capfd.readouterr()
+    assert sorted(map(int, out.split())) == list(range(32))
+    assert err == ""
+
+
+@pytest.mark.parametrize("compression", ["NO", "ZIPS", "ZIP", "PXR24"])
+def test_damaged_images_are_refused_in_silence(tmp_path, capfd, compression):
+    values = np.cumsum(np.random.default_rng(3).normal(size=(40, 30)), axis=1).astype(np.float32)
+    kind = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(kind, {"Y": values}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    read = read_exr(tmp_path / "a.exr")
+    np.testing.assert_allclose(read["Y"], values, rtol=1e-3)
+    data, random, refused = (tmp_path / "a.exr").read_bytes(), np.random.default_rng(4), 0
+    for place in random.integers(4, len(data), 150):
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << random.integers(8)
+        (tmp_path / "b.exr").write_bytes(damaged if place % 2 else data[:place])
+        try:
+            read_exr(tmp_path / "b.exr")
+        except UserError:
+            refused += 1
+    assert refused > 70
     assert capfd.readouterr() == ("", "")
 
 

@@ -1,0 +1,127 @@
+"""Renders, files, retrieval and records in threads: the same bits as alone, and nothing of the process changed."""
+
+import concurrent.futures
+import gc
+import os
+import signal
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from same_bits import assert_same_bits
+
+import mitransient_lidar
+from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.plots.waveforms import plot_waveforms
+from mitransient_lidar.rendering.session import open_scene
+from mitransient_lidar.results.dataset import save
+
+SCENE = {"layout": "1x1", "spectrum": "flat", "time_start_ns": 1380, "bin_count": 200}
+INTEGRATORS = (
+    {"type": "lidar_merging", "paths_per_pass": 4096, "photons_per_pass": 4096},
+    {"type": "lidar_volpath", "paths_per_pass": 8192},
+)
+RENDERS = [(integrator, seed) for seed in range(12) for integrator in INTEGRATORS]
+
+
+def state():
+    """Return what of the process a library call must not change."""
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    files = [(os.fstat(descriptor).st_dev, os.fstat(descriptor).st_ino) for descriptor in (0, 1, 2)]
+    streams = sys.stdin, sys.stdout, sys.stderr
+    return handlers, files, streams, list(warnings.filters), dict(os.environ), os.getcwd(), np.geterr()
+
+
+def open_files():
+    """Return the number of open files; xarray closes those of former tests when it needs to."""
+    if sys.platform != "linux":
+        return 0
+    descriptors = [f"/proc/self/fd/{name}" for name in os.listdir("/proc/self/fd")]
+    # Matplotlib keeps the files of its fonts open for each thread.
+    return sum(os.path.exists(one) and not os.path.realpath(one).endswith(".ttf") for one in descriptors)
+
+
+def in_threads(count, function, given):
+    """Return the values of a function, called in a number of threads; fail where the process is changed."""
+    gc.collect()
+    before, files = state(), open_files()
+    with concurrent.futures.ThreadPoolExecutor(count) as pool:
+        found = list(pool.map(function, given))
+    gc.collect()
+    assert state() == before
+    assert open_files() <= files
+    return found
+
+
+def render(case):
+    integrator, seed = case
+    return mitransient_lidar.render("table1", params=SCENE, integrator=integrator, passes=2, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return [render(case) for case in RENDERS]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [2, 4, 8])
+def test_renders_have_the_bits_of_those_alone(alone, threads):
+    for expected, found in zip(alone, in_threads(threads, render, RENDERS), strict=True):
+        assert_same_bits(expected, found)
+
+
+@pytest.mark.slow
+def test_a_scene_of_another_thread_has_the_bits_of_one_alone(alone):
+    sessions = in_threads(4, lambda _: open_scene("table1", SCENE), range(4))
+    # Each is rendered by a thread that another one has loaded it for, while others are loaded and freed.
+    found = in_threads(
+        4,
+        lambda case: mitransient_lidar.render(
+            sessions[case % 4], integrator=RENDERS[case][0], passes=2, seed=RENDERS[case][1]
+        ),
+        range(8),
+    )
+    for expected, one in zip(alone, found, strict=False):
+        assert_same_bits(expected, one)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return mitransient_lidar.render("table1", params={"bin_count": 400}, passes=8, seed=3)
+
+
+@pytest.mark.slow
+def test_files_and_records_have_the_bits_of_those_alone(result, tmp_path):
+    def use(case):
+        """Write and read a result, and record it, while other threads do so."""
+        found = []
+        for suffix in (".exr", ".nc"):
+            path, damaged = tmp_path / f"{case}{suffix}", tmp_path / f"damaged_{case}{suffix}"
+            save(result.assign_attrs(case=case % 4), path)
+            found.append(mitransient_lidar.open(path))
+            damaged.write_bytes(path.read_bytes()[:-100])
+            with pytest.raises(UserError, match="damaged"):
+                mitransient_lidar.open(damaged)
+        recorded = mitransient_lidar.record(result, "published_airborne", seed=case % 4)
+        return [*found, recorded, mitransient_lidar.waveforms(recorded)]
+
+    expected = [use(case) for case in range(4)]
+    for threads in (2, 4, 8):
+        for case, found in enumerate(in_threads(threads, use, range(24))):
+            for one, other in zip(expected[case % 4], found, strict=True):
+                assert_same_bits(one, other)
+
+
+@pytest.mark.slow
+def test_retrieval_and_figures_have_the_bits_of_those_alone(result, tmp_path):
+    def use(case):
+        """Retrieve from a result and draw it, while other threads do so."""
+        path = tmp_path / f"{case}.png"
+        plot_waveforms(result, path)
+        return mitransient_lidar.retrieve(result), path.read_bytes()
+
+    retrieved, picture = use(-1)
+    for found, drawn in in_threads(8, use, range(8)):
+        assert_same_bits(retrieved, found)
+        assert drawn == picture
