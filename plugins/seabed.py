@@ -65,9 +65,7 @@ class Bottom:
 
     def __init__(self, get: Get) -> None:
         self.terrain = _read_terrain(get)
-        # The heights of a map may be relative to the sea level; those of a survey are.
-        surveyed = self.terrain is not None and (self.terrain.origin is not None or get("map_values", "") == "depths")
-        depth = get("depth", 0.0 if surveyed else 8.0)
+        depth = get("depth", 8.0 if self.terrain is None else 0.0)
         self.depth = ranged("depth", (positive if self.terrain is None else non_negative)("depth", depth))
         #: Rise along x and y [m/m].
         self.slope = tuple(
@@ -134,7 +132,7 @@ class Bottom:
                 )
         height = float(self.heights(*(np.array([value]) for value in self.centre))[0, 0])
         if height >= 0:
-            hint = "" if self.terrain is None else ", and map_values be depths if the map is of depths"
+            hint = "" if self.terrain is None else ", and map_values be depths or heights, as those of the map are"
             raise UserError(
                 f"depth = {self.depth:g} puts the bottom at z = {height:.3g} m in its middle, "
                 f"({self.centre[0]:g}, {self.centre[1]:g}): it must lie below the sea there{hint}"
@@ -176,17 +174,17 @@ class Bottom:
 def _read_terrain(get: Get) -> HeightMap | None:
     """Read the height map, if there is one."""
     path = get("filename", "")
-    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell")
-    size, x, y, values, holes, cell = (get(name, None) for name in names)
+    names = ("map_size", "origin_x", "origin_y", "map_values", "map_holes", "map_cell", "map_unit", "map_no_data")
+    given = size, x, y, values, holes, cell, unit, no_data = tuple(get(name, None) for name in names)
     if not path:
-        for name, value in zip(names, (size, x, y, values, holes, cell), strict=True):
+        for name, value in zip(names, given, strict=True):
             if value is not None:
                 raise UserError(f"{name} = {value} needs a height map: give its filename")
         return None
     if (x is None) != (y is None):
         raise UserError(f"origin_x = {x} and origin_y = {y} must be given together")
     origin = None if x is None else (finite("origin_x", x), finite("origin_y", y))
-    return read_height_map(path, size, origin, values or "heights", holes or "refuse", cell)
+    return read_height_map(path, size, origin, values, holes or "refuse", cell, unit, no_data)
 
 
 def _read_patches(text: str) -> tuple[Patch, ...]:
