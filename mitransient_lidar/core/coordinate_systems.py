@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.validation import FloatArray
+from mitransient_lidar.core.validation import FloatArray, shown
 
 #: Largest difference of a projection's scale from 1. UTM zones and national grids have up to 0.003, Mercator's
 #: projection beyond 8 degrees of latitude has more.
@@ -52,8 +52,9 @@ def parsed_system(name: object, text: Any) -> Any:
     try:
         return pyproj.CRS.from_cf(text) if isinstance(text, dict) else pyproj.CRS.from_user_input(text)
     except (pyproj.exceptions.CRSError, KeyError, TypeError, ValueError) as error:
-        shown = text if isinstance(text, (int, str)) and len(str(text)) < 80 else "its coordinate system"
-        raise UserError(f"{name} = {shown} is no coordinate system that pyproj knows, such as EPSG:32633") from error
+        raise UserError(
+            f"{name} = {shown(text)} is no coordinate system that pyproj knows, such as EPSG:32633"
+        ) from error
 
 
 def is_east_north(system: Any) -> bool:
@@ -86,14 +87,16 @@ def map_system(path: object, system: Any) -> MapSystem:
     if horizontal.is_projected and not is_east_north(horizontal):
         directions = " and ".join(str(axis.direction) for axis in axes)
         raise UserError(f"{path} has coordinates in {name}, to {directions}: they must be to east and north.")
-    stated = {} if vertical is None else {
-        "vertical_unit": str(vertical.unit_name),
-        "vertical_metres": float(vertical.unit_conversion_factor),
-        "is_down": str(vertical.direction) == "down",
-        "datum": system.sub_crs_list[1].name if system.is_compound else f"the ellipsoid of {name}",
-    }  # fmt: skip
     unit, metres = (str(axes[0].unit_name), float(axes[0].unit_conversion_factor)) if axes else ("metre", 1.0)
-    return MapSystem(horizontal if horizontal.is_projected else None, name, unit, metres, **stated)
+    found = MapSystem(horizontal if horizontal.is_projected else None, name, unit, metres)
+    if vertical is None:
+        return found
+    return found._replace(
+        vertical_unit=str(vertical.unit_name),
+        vertical_metres=float(vertical.unit_conversion_factor),
+        is_down=str(vertical.direction) == "down",
+        datum=system.sub_crs_list[1].name if system.is_compound else f"the ellipsoid of {name}",
+    )
 
 
 def read_prj(path: Path) -> MapSystem | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.headings import Column, Heading
-from mitransient_lidar.core.text_tables import MISSING, find_rows
+from mitransient_lidar.core.text_tables import MISSING, find_rows, is_number_or_missing, split_line
 from mitransient_lidar.core.validation import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -116,7 +116,23 @@ def read_long_table(
             encoding="utf-8-sig",
         )
     except (ValueError, OverflowError) as error:  # pandas' errors are ValueErrors
-        raise UserError(f"{what}: {' '.join(str(error).split())[:200]}.") from error
+        where = _faulty_line(path, rows[0].number, order, width) or " ".join(str(error).split())[:200]
+        raise UserError(f"{what}: {where}.") from error
     if len(frame) > _MOST_ROWS:
         raise UserError(f"{path} has more than {_MOST_ROWS} rows, the most of a table.")
     return LongTable(frame[order].to_numpy(), [one for _, one in chosen], path, rows[0].number)
+
+
+def _faulty_line(path: Path, first: int, order: Sequence[int], width: int) -> str:
+    """Return the number and the text of the first line whose cells are too many, or no numbers in the columns `order`.
+
+    An empty text, if there is none.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        for number, text in itertools.islice(enumerate(file, 1), first - 1, None):
+            line = split_line(number, text.partition("#")[0].strip())
+            if len(line.cells) > width or not all(
+                is_number_or_missing(line.cells[i]) for i in order if i < len(line.cells)
+            ):
+                return f"line {number} is {line.text[:80]!r}"
+    return ""

@@ -243,7 +243,7 @@ def _is_mostly_numbers(line: Line) -> bool:
 
 def _is_row(line: Line) -> bool:
     """Return whether all cells are numbers or missing values, and not all of them missing."""
-    return all(map(_is_number, line.cells)) and any(_number(cell) is not None for cell in line.cells)
+    return all(map(is_number_or_missing, line.cells)) and any(_number(cell) is not None for cell in line.cells)
 
 
 def _find_heading(
@@ -256,7 +256,11 @@ def _find_heading(
             break
         names = line.heading(width)
         known = sum(parse_heading(name, columns) is not None for name in names)
-        if known > 1 and (len(names) in (width, known) or not width) and not any(map(_is_number, filter(None, names))):
+        if (
+            known > 1
+            and (len(names) in (width, known) or not width)
+            and not any(map(is_number_or_missing, filter(None, names)))
+        ):
             return names, i + 1
     for line in comments:
         names = line.heading(width)
@@ -272,7 +276,7 @@ def _with_units(
 ) -> tuple[list[str], int]:
     """Return the names with the units of the line below them, and the index of the first row."""
     cells = lines[start].cells if start < len(lines) else []
-    if len(cells) != len(names) or all(map(_is_number, cells)):
+    if len(cells) != len(names) or all(map(is_number_or_missing, cells)):
         return names, start
     named = [(name, parse_heading(name, columns), cell) for name, cell in zip(names, cells, strict=True)]
     if not all(is_unit(cell, heading.column) for _, heading, cell in named if heading):
@@ -324,7 +328,7 @@ def _values(
                 number = _number(line.cells[i])
                 if number is not None:
                     column[row] = number
-                elif not _is_number(line.cells[i]):
+                elif not is_number_or_missing(line.cells[i]):
                     raise _invalid_line(path, line, names, headings, i) from None
         if heading.column.fill_values:
             column[np.isin(column, _FILL_VALUES)] = np.nan
@@ -363,5 +367,6 @@ def _number(cell: str) -> float | None:
         return None
 
 
-def _is_number(cell: str) -> bool:
+def is_number_or_missing(cell: str) -> bool:
+    """Return whether a cell of a table is a number, or stands for a missing one."""
     return cell.lower() in MISSING or _number(cell) is not None

@@ -14,7 +14,7 @@ from mitransient_lidar.core.errors import UserError, is_interruption, raise_if_o
 from mitransient_lidar.core.validation import shown
 from mitransient_lidar.loading.catalogue import scene_path
 from mitransient_lidar.loading.checks import check, check_dict
-from mitransient_lidar.loading.document import SceneDocument, read_document
+from mitransient_lidar.loading.document import DOLLAR, SceneDocument, read_document
 from mitransient_lidar.loading.instruments import mount
 from mitransient_lidar.loading.parameters import check_params, fill
 from mitransient_lidar.loading.plugin_pages import unknown_parameters
@@ -154,6 +154,10 @@ def _instantiate(parse: Callable[[Any], Any]) -> Any:
         if node.props.plugin_name() == "ocean_surface":
             node.props[WAITS] = True
     mi.parser.transform_all(config, parsed)
+    for node in parsed.nodes:
+        for name, value in node.props.items():
+            if isinstance(value, str) and DOLLAR in value:
+                node.props[name] = value.replace(DOLLAR, "$")
     return mi.parser.instantiate(config, parsed)
 
 

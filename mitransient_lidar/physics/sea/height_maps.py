@@ -184,11 +184,11 @@ def _points(path: Path, cell: float | None, given: _Given) -> Grid:
 
 def _grid(path: Path, grid: Grid, given: _Given) -> Grid:
     """Return a grid with heights and positions in metres."""
-    ends = [
+    x, y = [
         np.array([first, first + (count - 1) * cell])
         for first, count, cell in zip(grid.first, grid.values.shape[::-1], grid.cell, strict=True)
     ]
-    check_positions(path, grid.stated, *ends, min(grid.cell))
+    check_positions(path, grid.stated, x, y, min(grid.cell))
     metres, heights = position_unit(path, grid.stated), heights_in_metres(path, grid.values, grid.stated, *given)
     first, cell = ((metres * pair[0], metres * pair[1]) for pair in (grid.first, grid.cell))
     return Grid(heights, first, cell, grid.stated)

@@ -103,7 +103,7 @@ def _height_unit(path: Path, stated: Stated, unit: str | None) -> float:
 
 def position_unit(path: Path, stated: Stated) -> float:
     """Return the unit of positions in metres, 1 where it is not stated."""
-    if stated.system is not None:
+    if stated.system is not None and stated.position_unit == stated.system.unit:
         return stated.system.metres
     return length_unit(f"{path} has positions", stated.position_unit) if stated.position_unit else 1.0
 
@@ -123,8 +123,8 @@ def _check_values(path: Path, values: FloatArray, metres: float) -> None:
     kinds, counts = np.unique(suspects, return_counts=True)
     value, count = float(kinds[np.argmax(counts)]), int(counts.max())
     raise UserError(
-        f"{path} has {count} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no data:"
-        f" map_no_data = {value:.9g} of a seabed must say so if they are."
+        f"{path} has {count} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no"
+        f" data: map_no_data = {value:.9g} of a seabed must say so if they are."
     )
 
 
@@ -144,7 +144,9 @@ def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, ce
     """
     middle = [0.5 * float(one.min() + one.max()) for one in (x, y)]
     if stated.system is not None:
-        stated.system.check_scale(path, *middle)
+        # CF asks for units of the coordinates themselves, which may be kilometres.
+        unit = position_unit(path, stated) / stated.system.metres
+        stated.system.check_scale(path, unit * middle[0], unit * middle[1])
         return
     is_within = all(np.abs(one).max() <= most for one, most in zip((x, y), _LARGEST_ANGLES, strict=True))
     is_away = any(abs(place) > 2 * float(np.ptp(one)) for place, one in zip(middle, (x, y), strict=True))

@@ -54,14 +54,13 @@ def read_netcdf_heights(path: Path) -> tuple[Array, dict[str, Array], Stated]:
         units = variables[name].units if name in variables else ""
         if units.lower().startswith("deg") or name.lower() in ("lat", "lon", "latitude", "longitude"):
             raise UserError(f"{path} has positions {name} in degrees: they must be projected, in metres or feet.")
-    stated = stated_by(None if (mapping := _mapping(variables)) is None else map_system(path, parsed_system(path, mapping)))
-    units = {variable.units for variable in positions.values()}
-    if len(units) > 1:
-        raise UserError(f"{path} has x and y in {' and '.join(sorted(units))}: they must have the same units.")
-    unit = "".join(units - set(_NO_UNIT))
-    if unit and stated.system is not None and unit != stated.position_unit:
-        # CF asks for units of the coordinates themselves, which may be kilometres.
-        stated = stated._replace(system=None)
+    stated = stated_by(
+        None if (mapping := _mapping(variables)) is None else map_system(path, parsed_system(path, mapping))
+    )
+    of_axes = {variable.units for variable in positions.values()}
+    if len(of_axes) > 1:
+        raise UserError(f"{path} has x and y in {' and '.join(sorted(of_axes))}: they must have the same units.")
+    unit = "".join(of_axes - set(_NO_UNIT))
     stated = stated._replace(
         unit=stated.unit if heights.units in _NO_UNIT else heights.units,
         is_down=_is_down(names[0], heights.attributes, stated.is_down),

@@ -48,8 +48,8 @@ def read_points(path: Path) -> tuple[FloatArray, Stated]:
     Raises
     ------
     UserError
-        As `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y have different
-        units; or a position is not finite.
+        As `read_long_table`; or if columns are missing, ambiguous, in an unknown unit, or angles; x and y have
+        different units; or a position is not finite.
     """
 
     def choose(names: list[str]) -> list[tuple[int, Heading]]:
@@ -85,7 +85,8 @@ def grid_of_points(path: Path, points: FloatArray, cell: float | None) -> Grid:
     Raises
     ------
     UserError
-        If there are fewer than 3 points, they are on a line, or too many; or the cell is more than half of their extent.
+        If there are fewer than 3 points, they are on a line, or too many; or the cell is more than half of their
+        extent.
     """
     if missing := int(np.isnan(points[:, 2]).sum()):
         logger.warning("%s: %d of %d points have no height and are left out", path, missing, len(points))
@@ -144,5 +145,3 @@ def _own_grid(places: FloatArray, heights: FloatArray) -> Grid | None:
     values = np.full((rows, columns), np.nan)
     values[index[1], index[0]] = heights
     return Grid(values, (0.0, 0.0), (cells[0], cells[1]))
-
-

@@ -57,7 +57,9 @@ def test_bag_without_one_grid_is_refused(tmp_path, capfd):
             file["BAG_root"][change] = [1, 2]
             if change == "varres_refinements":
                 file["BAG_root/varres_metadata"] = [1, 2]
-        with pytest.raises(UserError, match=r"is damaged, or is not a Bathymetric .* of one resolution|has no map coordinates"):
+        with pytest.raises(
+            UserError, match=r"is damaged, or is not a Bathymetric .* of one resolution|has no map coordinates"
+        ):
             read_bag(path)
     assert capfd.readouterr() == ("", "")
 
