@@ -22,6 +22,13 @@ _ASCII_EMPTY, _BAG_EMPTY = -9999.0, 1e6
 #: Relative difference of a cell from the value that stands for no height: six digits may be written of it.
 _ROUNDED = 1e-5
 
+#: Largest distance of heights from the mean sea level [m]: deeper than any sea.
+_HIGHEST = 12_000.0
+
+#: Numbers that programs write for no data, of either sign, where no other height is nearer than a tenth of them.
+NO_DATA = (99.0, 999.0, 9999.0)
+_NEAR = 0.1
+
 #: Largest deviation of the corners of a BAG file from its cells, in cells.
 _CORNER_TOLERANCE = 0.1
 
@@ -51,6 +58,31 @@ def without_no_data(values: npt.NDArray[Any], no_data: float | None) -> FloatArr
         with np.errstate(invalid="ignore", over="ignore"):
             values[np.abs(values - no_data) <= _ROUNDED * abs(no_data)] = np.nan
     return values
+
+
+class Suspect(NamedTuple):
+    """Value that looks like one for no data."""
+
+    value: float
+    count: int
+    reason: str
+
+
+def undeclared_no_data(values: FloatArray, metres: float = 1.0, numbers: tuple[float, ...] = NO_DATA) -> Suspect | None:
+    """Return the most frequent height, in a unit in metres, that is none but is not declared to be no data.
+
+    Such heights are beyond 12 000 m, or one of `numbers` of either sign that is far from all others.
+    """
+    known = values[np.isfinite(values)]
+    suspects, reason = known[np.abs(metres * known) > _HIGHEST], f"beyond {_HIGHEST:g} m"
+    for value in (sign * one for one in numbers for sign in (-1, 1)):
+        near = known[np.abs(known - value) < _NEAR * abs(value)]
+        if not suspects.size and near.size and np.all(near == value):
+            suspects, reason = near, "far from all others"
+    if not suspects.size:
+        return None
+    kinds, counts = np.unique(suspects, return_counts=True)
+    return Suspect(float(kinds[np.argmax(counts)]), int(counts.max()), reason)
 
 
 def read_ascii_grid(path: Path) -> Grid:

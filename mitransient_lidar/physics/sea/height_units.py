@@ -10,18 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.grids import Stated, without_no_data
+from mitransient_lidar.core.grids import Stated, undeclared_no_data, without_no_data
 from mitransient_lidar.core.headings import METRES
 from mitransient_lidar.core.validation import FloatArray, finite
 
 logger = logging.getLogger(__name__)
-
-#: Largest distance of heights from the mean sea level [m]: deeper than any sea.
-_HIGHEST = 12_000.0
-
-#: Numbers that programs write for no data, of either sign, where no other height is nearer than a tenth of them.
-_NO_DATA = (99.0, 999.0, 9999.0)
-_NEAR = 0.1
 
 #: Largest angles [deg], and the cell below which positions among them are taken for degrees.
 _LARGEST_ANGLES, _SMALLEST_CELL = (360.0, 90.0), 0.02
@@ -78,7 +71,11 @@ def heights_in_metres(
         raise UserError(f"map_values = {sign!r} must be heights or depths")
     metres = _height_unit(path, stated, unit)
     values = without_no_data(values, None if no_data is None else finite("map_no_data", no_data))
-    _check_values(path, values, metres)
+    if suspect := undeclared_no_data(values, metres):
+        raise UserError(
+            f"{path} has {suspect.count} of {values.size} heights of {suspect.value:.9g}, {suspect.reason}, which it"
+            f" does not declare to be no data: map_no_data = {suspect.value:.9g} of a seabed must say so if they are."
+        )
     is_down = bool(stated.is_down) if sign is None else sign == "depths"
     return -metres * values if is_down else metres * values
 
@@ -106,26 +103,6 @@ def position_unit(path: Path, stated: Stated) -> float:
     if stated.system is not None and stated.position_unit == stated.system.unit:
         return stated.system.metres
     return length_unit(f"{path} has positions", stated.position_unit) if stated.position_unit else 1.0
-
-
-def _check_values(path: Path, values: FloatArray, metres: float) -> None:
-    """Refuse heights that no sea has, and what looks like an undeclared value for no data."""
-    known = values[np.isfinite(values)]
-    suspects = known[np.abs(metres * known) > _HIGHEST]
-    reason = f"beyond {_HIGHEST:g} m"
-    for number in (-one for one in _NO_DATA), _NO_DATA:
-        for value in number if not suspects.size else ():
-            near = known[np.abs(known - value) < _NEAR * abs(value)]
-            if near.size and np.all(near == value):
-                suspects, reason = near, "far from all others"
-    if not suspects.size:
-        return
-    kinds, counts = np.unique(suspects, return_counts=True)
-    value, count = float(kinds[np.argmax(counts)]), int(counts.max())
-    raise UserError(
-        f"{path} has {count} of {values.size} heights of {value:.9g}, {reason}, which it does not declare to be no"
-        f" data: map_no_data = {value:.9g} of a seabed must say so if they are."
-    )
 
 
 def check_positions(path: Path, stated: Stated, x: FloatArray, y: FloatArray, cell: float) -> None:
