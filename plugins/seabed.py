@@ -217,7 +217,7 @@ class Seabed(mi.Mesh):
     Parameter                 Type    Meaning
     ========================  ======  ==================================================================================
     depth                     float   Depth at x = y = 0 [m], above 0 to 1e5; with a height map from 0, added to its
-                                      depths. Default: 8, or 0 with a map of depths, or in map coordinates
+                                      depths. Default: 8, or 0 with a height map
     slope_x_deg, slope_y_deg  float   Tilt, -45 to 45 [deg]: positive where the bottom rises towards +x, +y. Default: 0
     curvature                 float   Curvature of a bowl about the centre, -1 to 1 [1/m], negative for a mound; it ends
                                       half of ``refined_size`` from the centre. Default: 0
@@ -225,19 +225,22 @@ class Seabed(mi.Mesh):
                                       none. Default: 0
     ripple_length             float   Distance of their crests [m]. Default: 0.2
     ripple_bearing_deg        float   Direction across the crests, from +x to +y [deg]. Default: 0
-    filename                  string  Height map that is added: .npy, .npz, .exr, .nc, an ESRI ASCII grid (.asc), a
-                                      GeoTIFF (.tif) with the extra ``geo``, a Bathymetric Attributed Grid (.bag), or
-                                      points (.xyz, .csv, .txt). Where its heights are those above the mean sea level,
-                                      give ``depth`` 0
+    filename                  string  Height map above the mean sea level: .npy, .npz, .exr, .nc, an ESRI ASCII grid
+                                      (.asc), a GeoTIFF (.tif), a Bathymetric Attributed Grid (.bag), or points (.xyz,
+                                      .csv, .txt)
     map_size                  float   Side along x of a height map that carries no positions [m]
-    map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: ``heights``
+    map_values                string  ``heights``, positive up, or ``depths``, positive down. Default: what the file
+                                      states, or ``heights``
+    map_unit                  string  Unit of the values where the file does not state it: ``m``, ``cm``, ``km``,
+                                      ``ft``, ``ftUS`` (US survey foot) or ``fathom``. Default: ``m``
+    map_no_data               float   Value of cells without a height where the file does not declare it
     map_holes                 string  ``refuse`` or ``fill`` cells without a value, with that of the nearest cell.
                                       Default: ``refuse``
     map_cell                  float   Cell of the grid on which points are interpolated [m]. Default: their own grid,
                                       or their mean spacing
-    origin_x, origin_y        float   Point of the map, in its coordinates, that lies at x = y = 0 [m]. Default: the
-                                      centre of an .asc, .tif or .bag, or of points; positions in other files are those
-                                      of the scene
+    origin_x, origin_y        float   Point of the map, in its coordinates in metres, that lies at x = y = 0. Default:
+                                      the centre of an .asc, .tif or .bag, or of points; positions in other files are
+                                      those of the scene
     reflectance               float   Lambertian reflectance, 0 to 1. Default: 0.1
     patches                   string  Discs of another reflectance, ``"x y radius reflectance; ..."`` in metres and 0 to
                                       1; where they overlap the last one counts. Default: none

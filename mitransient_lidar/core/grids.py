@@ -64,7 +64,7 @@ class Suspect(NamedTuple):
     """Value that looks like one for no data."""
 
     value: float
-    count: int
+    times: int  #: How often it occurs.
     reason: str
 
 

@@ -73,7 +73,7 @@ def heights_in_metres(
     values = without_no_data(values, None if no_data is None else finite("map_no_data", no_data))
     if suspect := undeclared_no_data(values, metres):
         raise UserError(
-            f"{path} has {suspect.count} of {values.size} heights of {suspect.value:.9g}, {suspect.reason}, which it"
+            f"{path} has {suspect.times} of {values.size} heights of {suspect.value:.9g}, {suspect.reason}, which it"
             f" does not declare to be no data: map_no_data = {suspect.value:.9g} of a seabed must say so if they are."
         )
     is_down = bool(stated.is_down) if sign is None else sign == "depths"

@@ -353,7 +353,7 @@ def _checked(path: Path, columns: _Columns) -> _Columns:
             _require(z >= 0, "z = {:g} must not be negative, unless all z are heights of at most 0", z)
         columns["depth"] = np.abs(z)
     if suspect := undeclared_no_data(columns["depth"], numbers=NO_DATA[1:]):
-        text = f"{suspect.count} depths of {suspect.value:g} m, {suspect.reason}, must not stand for missing values"
+        text = f"{suspect.times} depths of {suspect.value:g} m, {suspect.reason}, must not stand for missing values"
         _require(columns["depth"] != suspect.value, text, columns["depth"])
     for name, values in columns.items():
         _require(np.isfinite(values), name + " = {:g} must be finite", values)
