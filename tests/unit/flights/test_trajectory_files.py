@@ -37,6 +37,17 @@ def test_text_in_any_order(tmp_path, heading, order, separator):
     np.testing.assert_array_equal(found, ROWS)
 
 
+def test_units_and_decimal_commas_of_text(tmp_path):
+    """Milliseconds, radians and feet as a spreadsheet writes them; in metres z would be 3.28 times as high."""
+    rows = ROWS / [1e-3, *[180 / np.pi] * 3, 1200 / 3937, 1200 / 3937, 0.3048]
+    text = "\n".join(";".join(f"{one:.12f}".replace(".", ",") for one in row) for row in rows)
+    heading = '"time_ms";"roll [rad]";"pitch (rad)";heading/rad;x_ftUS;Northing (US survey feet);"z in ft"'
+    (tmp_path / "flight.csv").write_text(f"{heading}\n{text}\n")
+    records = read_text_records(tmp_path / "flight.csv")
+    found = np.column_stack([records.time_s, records.roll_deg, records.pitch_deg, records.yaw_deg, records.position])
+    np.testing.assert_allclose(found, ROWS, rtol=0, atol=1e-9)
+
+
 def test_files_of_a_plan_have_an_origin_and_lines(tmp_path):
     _write(tmp_path / "flight.trj", [], NAMES)
     given = {"kind": "csv", "file": "flight.trj", "origin": [10, 20, 100], "lines_s": [[0, 0.5], [1, 1.25]]}
