@@ -7,7 +7,6 @@ and Mitsuba loads it (`scenes.load`). Each step takes the document of the step b
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -103,9 +102,6 @@ class SceneDocument:
             if element.tagName != "default":
                 for attribute, template in element.attributes.items():
                     value, referred = _resolved(template, values)
-                    if unknown := re.search(r"\$\w*", value):
-                        where = f"{template!r} of {element.getAttribute('name') or element.tagName}"
-                        raise UserError(f"scene {self.name}: {unknown[0]} in {where} is no parameter of the scene")
                     found.append(Setting(element, attribute, template, value.replace(DOLLAR, "$"), tuple(referred)))
         return found
 

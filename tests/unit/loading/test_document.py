@@ -236,5 +236,5 @@ def test_dollar_signs_in_values_are_taken_as_they_are(tmp_path, monkeypatch, fol
             assert again.scene.bbox().max.z == pytest.approx(-6)
             assert again.record.parameters["file"] == given
     own.write_text(text.replace('value="$depth"', 'value="$dept"'))
-    with pytest.raises(UserError, match=r"scene own: \$dept in '\$dept' of depth is no parameter of the scene"):
+    with pytest.raises(UserError, match=r"depth = '\$dept' refers to an unknown parameter of the scene"):
         scenes.load(own)
