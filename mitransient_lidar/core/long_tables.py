@@ -96,7 +96,8 @@ def read_long_table(
     chosen = choose(names)
     width, separator = len(rows[0].cells), rows[0].separator
     what = f"{path} is not a table of {', '.join(column.name for column in columns)}"
-    if width < 1 + max(i for i, _ in chosen) or (names and width not in (len(names), len(names) + 1)):
+    named = width - (rows[0].cells[-1] == "" and width == len(names) + 1)  # a separator may end each row
+    if width < 1 + max(i for i, _ in chosen) or (names and named != len(names)):
         raise UserError(f"{what}: line {rows[0].number} has {width} values, {' '.join(rows[0].cells)[:80]!r}.")
     order = [i for i, _ in chosen]
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import math
 import re
 from pathlib import Path
 
@@ -13,8 +13,6 @@ from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.core.grids import Stated, undeclared_no_data, without_no_data
 from mitransient_lidar.core.headings import METRES
 from mitransient_lidar.core.validation import FloatArray, finite
-
-logger = logging.getLogger(__name__)
 
 #: Largest angles [deg], and the cell below which positions among them are taken for degrees.
 _LARGEST_ANGLES, _SMALLEST_CELL = (360.0, 90.0), 0.02
@@ -87,7 +85,7 @@ def _height_unit(path: Path, stated: Stated, unit: str | None) -> float:
     if stated.unit:
         from_system = system is not None and stated.unit == system.vertical_unit
         metres = system.vertical_metres if from_system and system else length_unit(f"{path} has heights", stated.unit)
-        if given not in (None, metres):
+        if given is not None and not math.isclose(given, metres, rel_tol=1e-9):
             raise UserError(f"map_unit = {unit!r} must not differ from that of {path}, {stated.unit}.")
         return metres
     if given is None and position_unit(path, stated) != 1:

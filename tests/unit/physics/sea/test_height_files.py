@@ -184,6 +184,7 @@ READ = {
         ("tif", Content(HEIGHTS / FT, unit="ft", crs=32633), {}),
         ("tif", Content(HEIGHTS / FTUS, unit="US survey foot"), {}),
         ("tif", Content(HEIGHTS / FTUS, 1 / FTUS, STATE_PLANE, "EPSG:2263+6360"), {}),
+        ("tif", Content(HEIGHTS / FTUS, 1 / FTUS, STATE_PLANE, "EPSG:2263+6360"), {"unit": "ftUS"}),
         ("tif", Content(HEIGHTS / FTUS, 1 / FTUS, STATE_PLANE, "EPSG:2263", unit="ftUS"), {}),
     ],
     "State Plane in a .prj": [

@@ -27,6 +27,7 @@ POINTS = np.array([[1.0, 10.0, -3.0], [2.5, 11.0, -3.5], [4.0, 13.0, -4.0]])
         '"x"\t"y"\t"z"\n"1"\t"10"\t"-3"\n"2,5"\t"11"\t"-3,5"\n"4"\t"13"\t"-4"\n',
         '"x","y","z"\n"1","10","-3"\n"2,5","11","-3,5"\n4,13,-4\n',
         " 1  10 -3 # first\n# second\n2,5 11 -3,5\n 4  13 -4\n",
+        "x,y,z\n1,10,-3,\n2.5,11,-3.5,\n4,13,-4,\n",
         "x,y,z\nm,m,m\n1,10,-3\n2.5,11,-3.5\n4,13,-4\n",
     ],
 )
@@ -53,6 +54,7 @@ def test_points_without_a_height_are_left_out(tmp_path, missing, caplog):
         ("1 2 3\n4 x 6\n", "is not a table of x, y, z: line 2 is '4 x 6'"),
         ("1 2 3\n4 5 6 7\n", "is not a table of x, y, z: line 2 is '4 5 6 7'"),
         ("x,y,z\n1,5,2,5,-3,2\n1,5,3,5,-3,2\n", "line 2 has 6 values, '1 5 2 5 -3 2'"),
+        ("x,y,z\n1,5,2,-3\n", "line 2 has 4 values, '1 5 2 -3'"),
         ("name depth\n1 2\n", r"has no heading with known columns \(found: name, depth\): allowed are x, y, z"),
         ("lon,lat,z\n1,2,3\n", r"has columns of degrees \(lon, lat, z\): positions must be projected"),
         ("Longitude [deg];Latitude [deg];Depth [m]\n1;2;3\n", "has columns of degrees"),
