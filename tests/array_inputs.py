@@ -37,9 +37,7 @@ def write_bag(path: Path, heights: Any, first: tuple[float, float], cell: tuple[
         for wkt in systems
         if wkt
     )
-    spaces = "".join(
-        f' xmlns:{name}="http://www.isotc211.org/2005/{name}"' for name in ("gmi", "gmd", "gco", "gml")
-    )
+    spaces = "".join(f' xmlns:{name}="http://www.isotc211.org/2005/{name}"' for name in ("gmi", "gmd", "gco", "gml"))
     text = (
         f"<gmi:MI_Metadata{spaces}><gmd:spatialRepresentationInfo><gmd:MD_Georectified>{axes}<gmd:cornerPoints>"
         f"<gml:Point><gml:coordinates>{corners}</gml:coordinates></gml:Point></gmd:cornerPoints></gmd:MD_Georectified>"
@@ -58,6 +56,7 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
 
     def make(folder: Path) -> Path:
         import OpenEXR
+        import rasterio
         import xarray as xr
 
         path = folder / f"map{suffix}"
@@ -74,6 +73,11 @@ def height_map(suffix: str) -> Callable[[Path], Path]:
             xr.Dataset({"height": (("y", "x"), _HEIGHTS)}, positions).to_netcdf(path, engine="h5netcdf")
         elif suffix == ".bag":
             write_bag(path, _HEIGHTS, (500000.0, 6000000.0), (1.0, 1.0))
+        elif suffix == ".tif":
+            shape = {"width": 20, "height": 24, "count": 1, "dtype": "float64", "crs": "EPSG:32633"}
+            place = rasterio.Affine(1, 0, 500000, 0, -1, 6000024)
+            with rasterio.open(path, "w", driver="GTiff", transform=place, **shape) as file:
+                file.write(_HEIGHTS[::-1], 1)
         elif suffix == ".xyz":
             places = np.random.default_rng(0).uniform(0, 20, (200, 2))
             rows = (f"{x:.2f} {y:.2f} {0.1 * np.sin(y):.3f}" for x, y in places)

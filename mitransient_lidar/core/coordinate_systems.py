@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import is_there, read_text
 from mitransient_lidar.core.validation import FloatArray, shown
 
 #: Largest difference of a projection's scale from 1. UTM zones and national grids have up to 0.003, Mercator's
@@ -104,10 +105,10 @@ def read_prj(path: Path) -> MapSystem | None:
 
     Such files are WKT, or lines such as ``Projection UTM`` and ``Units METERS`` in an old format of ESRI.
     """
-    prj = next((one for one in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if one.is_file()), None)
+    prj = next((one for one in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if is_there(one)), None)
     if prj is None:
         return None
-    text = prj.read_text("utf-8-sig", "replace").strip()
+    text = read_text(prj).strip()
     if not text.lower().startswith("projection"):
         return map_system(path, parsed_system(prj, text))
     words = [line.split() for line in text.upper().splitlines()]

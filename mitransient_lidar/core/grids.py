@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mitransient_lidar.core.array_files import LARGEST_ARRAY, check_size, damaged_file, silence_openexr
+from mitransient_lidar.core.array_files import LARGEST_ARRAY, check_hdf5, check_size, damaged_file, silence_openexr
 from mitransient_lidar.core.coordinate_systems import MapSystem, map_system, parsed_system, read_prj
 from mitransient_lidar.core.errors import UserError
-from mitransient_lidar.core.files import read_text
+from mitransient_lidar.core.files import check_regular, read_text
 from mitransient_lidar.core.validation import FloatArray, integer, positive
 
 #: Value of cells of an ASCII grid without a height, if the header does not name another, and of BAG cells.
@@ -147,6 +147,13 @@ def _read_raster(path: Path, driver: str, kind: str) -> Grid:
     """Read the first band of a raster by a driver of GDAL."""
     import rasterio
 
+    if driver == "BAG":
+        with damaged_file(f"{path} is damaged, or is not a {kind}."):
+            check_hdf5(path)
+    # GDAL reads files beside it of the same name, such as .tfw and .tif.aux.xml.
+    for beside in path.parent.iterdir():
+        if beside.name.startswith(f"{path.stem}."):
+            check_regular(beside)
     # GDAL's HDF5 prints to stderr, as OpenEXR does.
     with warnings.catch_warnings(), silence_openexr(), damaged_file(f"{path} is damaged, or is not a {kind}."):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import logging
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mitransient_lidar.core.errors import UserError
+from mitransient_lidar.core.files import open_file
 from mitransient_lidar.core.headings import Column, Heading
 from mitransient_lidar.core.text_tables import MISSING, find_rows, is_number_or_missing, split_line
 from mitransient_lidar.core.validation import FloatArray
-
-logger = logging.getLogger(__name__)
 
 #: Largest table [bytes], and most rows in it.
 _LARGEST, _MOST_ROWS = 2**29, 10**7
@@ -37,9 +36,9 @@ class LongTable(NamedTuple):
 
     def line(self, row: int) -> int:
         """Return the number of the line of a row."""
-        with self.path.open(encoding="utf-8-sig", errors="replace") as file:
+        with open_file(self.path) as file:
             numbered = itertools.islice(enumerate(file, 1), self.first_line - 1, None)
-            return next(itertools.islice((n for n, line in numbered if line.partition("#")[0].strip()), row, None))
+            return next(itertools.islice((n for n, line in numbered if line.partition(b"#")[0].strip()), row, None))
 
 
 def read_head(path: Path) -> str:
@@ -50,12 +49,8 @@ def read_head(path: Path) -> str:
     UserError
         If the file cannot be read, or is larger than 512 MiB.
     """
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}.") from error
+    with open_file(path) as file:
+        size, head = os.fstat(file.fileno()).st_size, file.read(_HEAD)
     if size > _LARGEST:
         raise UserError(f"{path} has {size / 2**20:.4g} MiB: a table may have {_LARGEST / 2**20:g} MiB.")
     text = head.decode("utf-8-sig", "replace")
@@ -101,21 +96,22 @@ def read_long_table(
         raise UserError(f"{what}: line {rows[0].number} has {width} values, {' '.join(rows[0].cells)[:80]!r}.")
     order = [i for i, _ in chosen]
     try:
-        frame = pd.read_csv(
-            path,
-            sep=separator or r"\s+",
-            decimal="," if any(row.has_decimal_commas for row in rows) else ".",
-            header=None,
-            index_col=False,
-            skiprows=rows[0].number - 1,
-            nrows=_MOST_ROWS + 1,
-            comment="#",
-            skipinitialspace=True,
-            na_values=sorted({word.upper() for word in MISSING} | MISSING),
-            dtype=dict.fromkeys(order, np.float64),
-            low_memory=False,  # otherwise pandas warns of columns of numbers and words
-            encoding="utf-8-sig",
-        )
+        with open_file(path) as file:
+            frame = pd.read_csv(
+                file,
+                sep=separator or r"\s+",
+                decimal="," if any(row.has_decimal_commas for row in rows) else ".",
+                header=None,
+                index_col=False,
+                skiprows=rows[0].number - 1,
+                nrows=_MOST_ROWS + 1,
+                comment="#",
+                skipinitialspace=True,
+                na_values=sorted({word.upper() for word in MISSING} | MISSING),
+                dtype=dict.fromkeys(order, np.float64),
+                low_memory=False,  # otherwise pandas warns of columns of numbers and words
+                encoding="utf-8-sig",
+            )
     except (ValueError, OverflowError) as error:  # pandas' errors are ValueErrors
         where = _faulty_line(path, rows[0].number, order, width) or " ".join(str(error).split())[:200]
         raise UserError(f"{what}: {where}.") from error
@@ -129,9 +125,9 @@ def _faulty_line(path: Path, first: int, order: Sequence[int], width: int) -> st
 
     An empty text, if there is none.
     """
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
+    with open_file(path) as file:
         for number, text in itertools.islice(enumerate(file, 1), first - 1, None):
-            line = split_line(number, text.partition("#")[0].strip())
+            line = split_line(number, text.decode("utf-8", "replace").partition("#")[0].strip())
             if len(line.cells) > width or not all(
                 is_number_or_missing(line.cells[i]) for i in order if i < len(line.cells)
             ):

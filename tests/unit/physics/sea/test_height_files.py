@@ -15,7 +15,7 @@ import pyproj
 import pytest
 import rasterio
 import xarray as xr
-from input_files import write_bag
+from array_inputs import write_bag
 
 from mitransient_lidar.core.errors import UserError
 from mitransient_lidar.physics.sea.height_maps import read_height_map
